@@ -1,0 +1,19 @@
+"""Batched MuJoCo worlds for robot learning: one task source, two engines, arrays shared with torch."""
+
+import warp as _wp
+
+_wp.config.log_level = _wp.LOG_WARNING
+
+from lyceum_warp.env import Env, make
+from lyceum_warp.fields import vec10
+from lyceum_warp.kernels.faults import Done
+from lyceum_warp.kernels.random import normal, uniform
+from lyceum_warp.models import gymnasium_model
+from lyceum_warp.task import Row, Task, body, dof, geom, mocap, qpos, register, sensor, site, tasks
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Done", "Env", "Row", "Task", "body", "dof", "geom", "gymnasium_model", "make", "mocap", "normal", "qpos",
+    "register", "sensor", "site", "tasks", "uniform", "vec10",
+]  # fmt: skip

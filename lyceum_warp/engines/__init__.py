@@ -1,0 +1,74 @@
+"""Physics behind one contract: the C engine (mujoco.batch) and the Warp engine (mujoco_warp)."""
+
+import importlib
+
+import mujoco
+import warp as wp
+
+from lyceum_warp.engines.base import Engine, EngineFactory, torch_view
+from lyceum_warp.fields import Field, Stage, describe, elements
+
+_ENGINES = {
+    "mujoco": ("lyceum_warp.engines.c", "MujocoEngine"),
+    "warp": ("lyceum_warp.engines.warp", "WarpEngine"),
+}
+
+
+def find_device(device: str | None) -> wp.Device:
+    """The Warp device of a name.
+
+    Raises:
+        ValueError: There is no such device on this machine.
+    """
+    try:
+        return wp.get_device(device or "cpu")
+    except (ValueError, RuntimeError) as error:
+        names = ", ".join(repr(d.alias) for d in wp.get_devices())
+        raise ValueError(
+            f"there is no device {device!r} on this machine; it has {names} (for a GPU, check that nvidia-smi "
+            "shows it and that its driver is recent enough for Warp)"
+        ) from error
+
+
+def open_engine(
+    engine: "str | EngineFactory", model: mujoco.MjModel, nworld: int, device: wp.Device, **options: int | None
+) -> Engine:
+    """Make an engine by name, or by a factory of your own.
+
+    Args:
+        engine: "mujoco", "warp", "auto" (Warp on CUDA, MuJoCo's C engine on the CPU), or a callable with the
+            signature of an engine class.
+        model: The compiled model.
+        nworld: Number of worlds.
+        device: Where it runs.
+        options: Engine options: ``nthread`` of the C engine, ``nconmax`` and ``njmax`` of the Warp engine.
+            None leaves an engine its default.
+
+    Raises:
+        ValueError: There is no such engine, or it refuses the model, the device or an option.
+    """
+    if engine == "auto":
+        engine = "mujoco" if device.is_cpu else "warp"
+    if isinstance(engine, str):
+        if engine not in _ENGINES:
+            raise ValueError(f"there is no engine {engine!r}: use one of 'auto', {', '.join(map(repr, _ENGINES))}")
+        module, attribute = _ENGINES[engine]
+        known = {"mujoco": {"nthread"}, "warp": {"nconmax", "njmax"}}[engine]
+        given = {key: value for key, value in options.items() if value is not None}
+        if unknown := given.keys() - known:
+            raise ValueError(f"the {engine} engine takes no {', '.join(sorted(unknown))}; it takes {sorted(known)}")
+        return getattr(importlib.import_module(module), attribute)(model, nworld, device, **given)
+    return engine(model, nworld, device)
+
+
+__all__ = [
+    "Engine",
+    "EngineFactory",
+    "Field",
+    "Stage",
+    "describe",
+    "elements",
+    "find_device",
+    "open_engine",
+    "torch_view",
+]

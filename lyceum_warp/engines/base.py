@@ -1,0 +1,184 @@
+"""The contract between an environment and the physics behind it."""
+
+import abc
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import torch
+import warp as wp
+
+from lyceum_warp.fields import Field, Stage, describe
+from lyceum_warp.kernels import state as kernels
+
+
+def flat(array: wp.array) -> wp.array:
+    """The same memory as a (nworld, n) array of float32, for copies that do not care about types."""
+    n = array.size * wp.types.type_size_in_bytes(array.dtype) // 4 // max(array.shape[0], 1)
+    alias = wp.array(ptr=array.ptr, dtype=wp.float32, shape=(array.shape[0], n), device=array.device)
+    alias.owner = array  # keeps the memory alive as long as the alias
+    return alias
+
+
+class Engine(abc.ABC):
+    """Many worlds of one model, stepped together.
+
+    An engine knows nothing of tasks. Whatever it shows lies in Warp arrays with a leading ``nworld`` axis and
+    an address that never changes, so that launches which read them can be recorded once.
+
+    The order of calls in a step is: write ``ctrl``, ``step``, read fields and ``fault``; for worlds that
+    begin again, ``reset``, then write state fields, then ``commit`` and ``refresh``.
+
+    Args:
+        model: The compiled model; the engine keeps it and does not change it.
+        nworld: Number of worlds.
+        device: Where the arrays live.
+    """
+
+    name: str
+    recordable: bool
+    """Whether every call is made of Warp launches, so that a whole step can be recorded as one graph."""
+
+    ctrl: wp.array
+    """Controls of the next step, (nworld, nu), float32."""
+    fault: wp.array
+    """Bits of ``Done`` for each world, (nworld,), int32; set by ``find_faults``."""
+
+    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device) -> None:
+        self.model = model
+        self.nworld = nworld
+        self.device = device
+        self.fields: dict[str, Field] = {}
+        self.arrays: dict[str, wp.array] = {}
+        self.fault = wp.zeros(nworld, dtype=int, device=device)
+        spec = mujoco.mjtState.mjSTATE_INTEGRATION
+        self.integration_size = mujoco.mj_stateSize(model, spec.value)
+
+    # fields
+
+    def field(self, name: str, *, lagged: bool = False) -> wp.array:
+        """Ask for a field by MuJoCo's name; from now on it is kept up to date.
+
+        Args:
+            name: Attribute of MjData.
+            lagged: Want it as ``mj_step`` leaves it instead of belonging to the state. Quantities of the
+                acceleration stage always are.
+
+        Returns:
+            The live array, (nworld, ...).
+
+        Raises:
+            ValueError: There is no such field, or it was asked for the other way before.
+        """
+        if name not in self.fields:
+            field = describe(self.model, name, lagged=lagged)
+            self.arrays[name] = self._bind(field)
+            self.fields[name] = field
+        elif lagged and not self.fields[name].snapshot and self.fields[name].reset > Stage.NONE:
+            raise ValueError(f"the field {name!r} is already kept current and can't be had lagged, too")
+        return self.arrays[name]
+
+    @property
+    def stage(self) -> Stage:
+        """What has to be computed after the substeps, for the fields that belong to the state."""
+        return max((field.refresh for field in self.fields.values()), default=Stage.NONE)
+
+    @property
+    def reset_stage(self) -> Stage:
+        """What has to be computed for worlds that were reset."""
+        return max((field.reset for field in self.fields.values()), default=Stage.NONE)
+
+    @property
+    def snapshots(self) -> list[Field]:
+        """Fields that are no function of the integration state, in the order of the state vector."""
+        return [field for field in self.fields.values() if field.snapshot]
+
+    @property
+    def state_size(self) -> int:
+        """Floats in one world's state: the integration state (mjSTATE_INTEGRATION) and the snapshots."""
+        return self.integration_size + sum(field.size for field in self.snapshots)
+
+    @abc.abstractmethod
+    def _bind(self, field: Field) -> wp.array:
+        """The array that will hold a field, (nworld, *field.shape) of field.dtype."""
+
+    # physics
+
+    @abc.abstractmethod
+    def step(self, nstep: int) -> None:
+        """Advance every world by ``nstep`` substeps under ``ctrl`` and bring the fields up to date."""
+
+    @abc.abstractmethod
+    def find_faults(self) -> None:
+        """Write ``fault``: not-a-number or absurd state, overflows and warnings since the last call."""
+
+    @abc.abstractmethod
+    def reset(self, mask: wp.array) -> None:
+        """Put the masked worlds into the model's initial state, state fields included.
+
+        Made of Warp launches on every engine. Derived fields follow with ``refresh``.
+        """
+
+    @abc.abstractmethod
+    def commit(self, mask: wp.array) -> None:
+        """Take over what was written into the masked worlds' state fields. Made of Warp launches."""
+
+    @abc.abstractmethod
+    def refresh(self, mask: wp.array) -> None:
+        """Make every derived field of the masked worlds that of a forward pass at their state.
+
+        Worlds outside the mask keep the values that they have.
+        """
+
+    # state
+
+    def get_state(self, state: wp.array) -> None:
+        """Write every world's state into (nworld, state_size) float64. Made of Warp launches."""
+        self._get_integration(state[:, : self.integration_size])
+        start = self.integration_size
+        for field in self.snapshots:
+            source = flat(self.arrays[field.name])
+            target = state[:, start : start + field.size]
+            self._launch(kernels.widen, source.shape, [self._everyone, source, target])
+            start += field.size
+
+    def set_state(self, state: wp.array, mask: wp.array) -> None:
+        """Put the masked worlds into the given states, exactly; every field reflects them afterwards."""
+        self._set_integration(state[:, : self.integration_size], mask)
+        self._refresh_current(mask)
+        start = self.integration_size
+        for field in self.snapshots:
+            target = flat(self.arrays[field.name])
+            source = state[:, start : start + field.size]
+            self._launch(kernels.narrow, target.shape, [mask, source, target])
+            start += field.size
+
+    @abc.abstractmethod
+    def _get_integration(self, state: wp.array) -> None: ...
+
+    @abc.abstractmethod
+    def _set_integration(self, state: wp.array, mask: wp.array) -> None: ...
+
+    @abc.abstractmethod
+    def _refresh_current(self, mask: wp.array) -> None: ...
+
+    # helpers
+
+    @property
+    def _everyone(self) -> wp.array:
+        if not hasattr(self, "_all"):
+            self._all = wp.full(self.nworld, True, dtype=bool, device=self.device)
+        return self._all
+
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], args: list) -> None:
+        if np.prod(dim) > 0:
+            wp.launch(kernel, dim, args, device=self.device)
+
+
+EngineFactory = Callable[..., Engine]
+"""Called with (model, nworld, device=..., **options); returns an engine."""
+
+
+def torch_view(array: wp.array) -> torch.Tensor:
+    """The torch tensor that shares an array's memory."""
+    return wp.to_torch(array, requires_grad=False)

@@ -1,0 +1,159 @@
+"""The C engine: MuJoCo itself, many worlds on a pool of threads (mujoco.batch), float64 inside."""
+
+import copy
+import logging
+
+import mujoco
+import numpy as np
+import warp as wp
+from mujoco.batch import Batch
+
+from lyceum_warp.engines.base import Engine, flat
+from lyceum_warp.fields import STATE_FIELDS, Field, Stage
+from lyceum_warp.kernels import faults, state
+
+log = logging.getLogger(__name__)
+
+
+def _quiet(message: str) -> None:
+    # MuJoCo would print every warning and append it to MUJOCO_LOG.TXT in the current folder; here warnings
+    # are counted per world and become done reasons
+    log.debug("MuJoCo: %s", message)
+
+
+class MujocoEngine(Engine):
+    """Worlds as rows of float64 state in ``mujoco.batch.Batch``, with float32 copies for whoever asked.
+
+    Args:
+        model: The compiled model.
+        nworld: Number of worlds.
+        device: Must be the CPU.
+        nthread: Threads of the pool; 0 takes all cores.
+
+    Raises:
+        ValueError: The device is not the CPU.
+    """
+
+    name = "mujoco"
+    recordable = False
+
+    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device, *, nthread: int = 0) -> None:
+        if not device.is_cpu:
+            raise ValueError(
+                f"the mujoco engine runs on the CPU, not on {device.alias!r}: use device='cpu' or engine='warp'"
+            )
+        super().__init__(model, nworld, device)
+        mujoco.set_mju_user_warning(_quiet)
+        self._model = copy.copy(model)
+        # a world in trouble is to be seen, not silently reset in the middle of a step
+        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.nthread = nthread
+        self._open(persistent=False)
+        self.ctrl = wp.zeros((nworld, model.nu), dtype=float, device=device)
+
+    def _open(self, *, persistent: bool) -> None:
+        self.batch = Batch(self._model, self.nworld, self.nthread, persistent)
+        self._initial = wp.array(self.batch.state[0].copy(), dtype=wp.float64, device=self.device)
+        self._rows = self._alias(self.batch.state)
+        self._warning = wp.array(self.batch.warning, dtype=int, device=self.device, copy=False)
+        self._sources: dict[str, np.ndarray] = {}
+        self._columns: dict[str, wp.array] = {}
+
+    def _alias(self, rows: np.ndarray) -> wp.array:
+        return wp.array(rows, dtype=wp.float64, device=self.device, copy=False)
+
+    # fields
+
+    def _bind(self, field: Field) -> wp.array:
+        if field.refresh > Stage.NONE and not self.batch.persistent:
+            # with an MjData for each world, the next step goes on from what was computed for this one
+            previous, old_stage = self.batch.state.copy(), self.stage
+            self._open(persistent=True)
+            self.batch.state[:] = previous
+            for known in self.fields.values():
+                self._connect(known)
+            if old_stage > Stage.NONE:
+                self.batch.forward(stage=int(old_stage))
+        array = wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
+        self.arrays[field.name] = array
+        self._connect(field)
+        if field.reset > Stage.NONE:
+            self.batch.forward(stage=int(field.reset))
+        self._copy(field)
+        return array
+
+    def _connect(self, field: Field) -> None:
+        """Find the engine's own float64 array behind a field."""
+        if field.name in STATE_FIELDS:
+            offset, size = self.batch._component(STATE_FIELDS[field.name])
+            source = self.batch.state[:, offset : offset + size]
+            self._columns[field.name] = self._alias(source)
+        else:
+            source = self.batch.bind(field.name)
+        self._sources[field.name] = source.reshape(self.arrays[field.name].numpy().shape)
+
+    def _copy(self, field: Field, mask: np.ndarray | None = None) -> None:
+        target = self.arrays[field.name].numpy()
+        if mask is None:
+            np.copyto(target, self._sources[field.name], casting="unsafe")
+        else:
+            where = mask.reshape(-1, *[1] * (target.ndim - 1))
+            np.copyto(target, self._sources[field.name], casting="unsafe", where=where)
+
+    # physics
+
+    def step(self, nstep: int) -> None:
+        np.copyto(self.batch.ctrl, self.ctrl.numpy(), casting="unsafe")
+        stage = self.stage
+        lagged = [field for field in self.fields.values() if field.lagged]
+        if lagged and stage > Stage.NONE:
+            self.batch.step(nstep=nstep)
+            for field in lagged:
+                self._copy(field)
+            self.batch.forward(stage=int(stage))
+        else:
+            self.batch.step(nstep=nstep, stage=int(stage))
+            for field in lagged:
+                self._copy(field)
+        for field in self.fields.values():
+            if not field.lagged:
+                self._copy(field)
+
+    def find_faults(self) -> None:
+        nphysics = 1 + self.model.nq + self.model.nv + self.model.na
+        args = [self._rows, nphysics, self._warning, self.fault]
+        wp.launch(faults.faults_of_rows, self.nworld, args, device=self.device)
+
+    def reset(self, mask: wp.array) -> None:
+        self._launch(state.fill_rows64, self._rows.shape, [mask, self._initial, self._rows])
+        for name, column in self._columns.items():
+            self._launch(state.narrow, column.shape, [mask, column, flat(self.arrays[name])])
+
+    def commit(self, mask: wp.array) -> None:
+        for name, column in self._columns.items():
+            self._launch(state.widen, column.shape, [mask, flat(self.arrays[name]), column])
+
+    def refresh(self, mask: wp.array) -> None:
+        self._forward(mask, self.reset_stage, list(self.fields.values()))
+
+    def _refresh_current(self, mask: wp.array) -> None:
+        current = [field for field in self.fields.values() if not field.snapshot]
+        self._forward(mask, self.stage, current)
+        for name, column in self._columns.items():
+            self._launch(state.narrow, column.shape, [mask, column, flat(self.arrays[name])])
+
+    def _forward(self, mask: wp.array, stage: Stage, fields: list[Field]) -> None:
+        chosen = mask.numpy()
+        if stage > Stage.NONE and chosen.any():
+            self.batch.forward(ids=chosen, stage=int(stage))
+            for field in fields:
+                if field.name not in STATE_FIELDS:
+                    self._copy(field, chosen)
+
+    # state
+
+    def _get_integration(self, state_out: wp.array) -> None:
+        self._launch(state.copy_rows64, self._rows.shape, [self._everyone, self._rows, state_out])
+
+    def _set_integration(self, state_in: wp.array, mask: wp.array) -> None:
+        self._launch(state.copy_rows64, self._rows.shape, [mask, state_in, self._rows])

@@ -1,0 +1,533 @@
+"""Env: one task in many worlds."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+import warp as wp
+
+from lyceum_warp.engines import EngineFactory, find_device, open_engine, torch_view
+from lyceum_warp.fields import STATE_FIELDS, Stage, elements
+from lyceum_warp.kernels import random, state, steps
+from lyceum_warp.kernels.faults import FAULTS, Done
+from lyceum_warp.kernels.recorder import Recorder
+from lyceum_warp.models import ModelSource
+from lyceum_warp.spaces import Space
+from lyceum_warp.task import BoundTask, Task, find_task
+
+_COUNTERS = ("step", "key", "episode")
+
+
+def make(task: str | type[Task], **options: Any) -> "Env":
+    """Make an environment: see ``Env`` for the options; all others are parameters of the task.
+
+    Example:
+        >>> env = make("hopper", nworld=64, ctrl_cost_weight=1e-2)
+    """
+    return Env(task, **options)
+
+
+class Env:
+    """One task in many worlds, with every array allocated once and shared with torch.
+
+    Write ``action``, call ``step``, read ``obs``, ``reward``, ``eval``, ``terminated``, ``truncated``,
+    ``success``, ``done``, ``done_reason`` and ``final_obs``: the tensors stay the same objects at the same
+    addresses and change in place. A world whose episode ends begins a new, random one within the same step;
+    ``obs`` is then the first observation of the new episode, ``final_obs`` the last one of the old.
+
+    Args:
+        task: Name of a task, a file with one, or its class.
+        nworld: Number of worlds.
+        device: "cpu" or a CUDA device.
+        engine: "mujoco" (C, on CPU cores), "warp", or "auto": Warp on CUDA and C on the CPU.
+        seed: Seed of the worlds' random streams.
+        autoreset: False lets finished worlds keep stepping with their ``done`` set until they are reset. Only
+            worlds with a fault still begin again at once.
+        horizon: Steps after which an episode is truncated, 0 for never; the task's own by default.
+        record: False runs every launch unrecorded, for debugging; the numbers are the same to the bit.
+        model: Another model than the task's: a file or an MjSpec.
+        frame_skip: Another number of substeps in a step.
+        cone: Another friction cone: "pyramidal" or "elliptic".
+        nthread: Threads of the C engine; all cores by default.
+        nconmax: Contacts that the Warp engine has room for in each world, on average; probed by default.
+        njmax: Constraints that the Warp engine has room for in each world; probed by default.
+        params: The task's parameters; a scalar may also be given as one value a world.
+
+    Raises:
+        ValueError: Something given does not fit; the message names it and the mend.
+        FileNotFoundError: A model or task file is missing.
+    """
+
+    obs: torch.Tensor
+    """Observations, (nworld, nobs), float32."""
+    final_obs: torch.Tensor
+    """Observations of the states that the last step led to, before any reset, (nworld, nobs), float32."""
+    reward: torch.Tensor
+    """Rewards of the last step, (nworld,), float32."""
+    eval: torch.Tensor
+    """The task's evaluation metric of the states that the last step led to, (nworld,), float32."""
+    terminated: torch.Tensor
+    """Whether the task, or a fault, ended the episode, (nworld,), bool."""
+    truncated: torch.Tensor
+    """Whether the time limit was reached, (nworld,), bool."""
+    success: torch.Tensor
+    """Whether the task's goal is met, (nworld,), bool."""
+    done: torch.Tensor
+    """Whether the episode ended for any reason, (nworld,), bool."""
+    done_reason: torch.Tensor
+    """Bits of ``Done``, (nworld,), int32."""
+    action: torch.Tensor
+    """Actions of the next step, (nworld, nu), float32."""
+
+    def __init__(
+        self,
+        task: str | type[Task],
+        *,
+        nworld: int = 1,
+        device: str | None = None,
+        engine: str | EngineFactory = "auto",
+        seed: int = 0,
+        autoreset: bool = True,
+        horizon: int | None = None,
+        record: bool = True,
+        model: ModelSource | None = None,
+        frame_skip: int | None = None,
+        cone: str | None = None,
+        nthread: int | None = None,
+        nconmax: int | None = None,
+        njmax: int | None = None,
+        **params: Any,
+    ) -> None:
+        if int(nworld) != nworld or nworld < 1:
+            raise ValueError(f"nworld has to be a whole number of at least 1, not {nworld!r}")
+        self._options = dict(
+            device=device, engine=engine, model=model, frame_skip=frame_skip, cone=cone, nthread=nthread,
+            nconmax=nconmax, njmax=njmax, **params,
+        )  # fmt: skip
+        self.nworld = int(nworld)
+        self.device = find_device(device)
+        self.task = BoundTask(
+            find_task(task), self.nworld, model=model, frame_skip=frame_skip, cone=cone, **params
+        )
+        self.horizon = self.task.task.horizon if horizon is None else int(horizon)
+        self.autoreset = autoreset
+        self.timestep: float = self.task.timestep
+        """Seconds in a step."""
+        self.model: mujoco.MjModel = self.task.model
+        self.engine = open_engine(
+            engine, self.model, self.nworld, self.device, nthread=nthread, nconmax=nconmax, njmax=njmax
+        )
+        self._record = Recorder(self.device, record)
+        self._scratch: Env | None = None
+        with wp.ScopedDevice(self.device):
+            self._allocate()
+        self.rand_reset(seed)
+
+    def _allocate(self) -> None:
+        n, model, kernels = self.nworld, self.model, self.task.kernels
+        self._memory = wp.zeros((n, self.task.task.memory), dtype=float)
+        self._params = self.task.params_array(self.device)
+        # the fields of the state that a step leads to, live, and copies of those that it came from
+        self._after, self._before, self._pairs = kernels.Batch(), kernels.Batch(), []
+        for name, kind in self.task.fields.items():
+            live = self._memory if name == "memory" else self.engine.field(name, lagged=name in self.task.task.lagged)
+            self._check_type(name, kind, live)
+            copy = wp.zeros_like(live)
+            setattr(self._after, name, live)
+            setattr(self._before, name, copy)
+            self._pairs.append((copy, live))
+
+        nobs = sum(self.task.obs_layout.values())
+        self._out = steps.Outcome()
+        for name, dtype in [("reward", float), ("eval", float), ("terminated", bool), ("truncated", bool),
+                            ("success", bool), ("done", bool), ("done_reason", int)]:  # fmt: skip
+            setattr(self._out, name, wp.zeros(n, dtype=dtype))
+        self._out.obs, self._out.final_obs = wp.zeros((n, nobs), dtype=float), wp.zeros((n, nobs), dtype=float)
+        for name in self._out._cls.vars:
+            setattr(self, name, torch_view(getattr(self._out, name)))
+
+        ranges = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf))
+        low, high = self.task.task.action_range or (None, None)
+        if low is None:
+            scale = np.tile((1.0, 0.0), (model.nu, 1))
+            bounds = ranges
+        else:
+            gain = (ranges[:, 1] - ranges[:, 0]) / (high - low)
+            scale = np.stack([gain, ranges[:, 0] - gain * low], axis=1)
+            bounds = np.tile((low, high), (model.nu, 1))
+        self._ranges = wp.array(ranges, dtype=float)
+        self._scale = wp.array(scale, dtype=float)
+        self._action, self._safe_action = wp.zeros((n, model.nu), dtype=float), wp.zeros((n, model.nu), dtype=float)
+        self.action = torch_view(self._action)
+
+        self._step, self._episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
+        self._key, self._rng = wp.zeros(n, dtype=wp.uint32), wp.zeros((n, 1), dtype=wp.uint32)
+        self._action_fault, self._no_fault = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
+        self._fault_count = wp.zeros(int(FAULTS).bit_length(), dtype=int)
+        self._everyone, self._mask = wp.full(n, True, dtype=bool), wp.zeros(n, dtype=bool)
+        self._restarting, self._no_memory = wp.zeros(n, dtype=bool), wp.zeros_like(self._memory)
+        self._mask_view, self._time_view = torch_view(self._mask), torch_view(self.engine.field("time"))
+        self._seed = wp.zeros(1, dtype=int)
+
+        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) or f"actuator_{i}" for i in range(model.nu)]
+        limits = bounds.astype(np.float32)
+        self.action_space = Space.of(dict.fromkeys(names, 1), low=limits[:, 0], high=limits[:, 1])
+        self.obs_space = Space.of(self.task.obs_layout)
+        self.reward_space = self.eval_space = Space()
+        self.state_space = Space.of(self._state_layout(), dtype=torch.float64)
+        self._state = wp.zeros((n, self.state_space.size), dtype=wp.float64)
+        self._state_view = torch_view(self._state)
+
+    def _check_type(self, name: str, kind: Any, live: wp.array) -> None:
+        rows = hasattr(kind, "ndim")
+        dtype, ndim = (kind.dtype, kind.ndim) if rows else (kind, 0)
+        if not wp.types.types_equal(dtype, live.dtype) or ndim != live.ndim - 1:
+            wanted = live.dtype.__name__ if live.ndim == 1 else f"Row[{wp.types.type_repr(live.dtype)}]"
+            raise ValueError(f"World.{name} of the task {self.task.name!r} has to be declared as {wanted}")
+
+    def _state_layout(self) -> dict[str, int]:
+        sizes = {}
+        spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
+        for bit in range(32):
+            if spec >> bit & 1:
+                name = next((k for k, v in STATE_FIELDS.items() if v.value == 1 << bit), None)
+                name = name or mujoco.mjtState(1 << bit).name.removeprefix("mjSTATE_").lower()
+                if size := mujoco.mj_stateSize(self.model, 1 << bit):
+                    sizes[name] = size
+        sizes |= {field.name: field.size for field in self.engine.snapshots}
+        sizes |= dict.fromkeys(_COUNTERS, 1)
+        return sizes | ({"memory": self.task.task.memory} if self.task.task.memory else {})
+
+    # the step
+
+    def step(self, action: torch.Tensor | None = None) -> None:
+        """Advance every world by one step under ``action``, and begin new episodes where one ended.
+
+        Args:
+            action: Copied into ``env.action`` first, if given; (nworld, nu).
+        """
+        if action is not None:
+            self.action.copy_(action)
+        if self.engine.recordable:
+            self._record(self._whole_step)
+        else:
+            self._whole_step()
+
+    def _whole_step(self) -> None:
+        self._record(self._begin)
+        self.engine.step(self.task.frame_skip)
+        if self.engine.reset_stage == Stage.NONE:
+            self._record(self._finish)
+        else:
+            self._record(self._judge_and_restart)
+            self.engine.refresh(self._restarting)
+            self._record(self._look)
+
+    def _begin(self) -> None:
+        kernels = self.task.kernels
+        for copy, live in self._pairs:
+            wp.copy(copy, live)
+        wp.launch(kernels.act, self.nworld, [
+            self._after, self._params, self._action, self._ranges, self._scale, self._step, self._safe_action,
+            self._action_fault, self.engine.ctrl,
+        ], device=self.device)  # fmt: skip
+
+    def _finish(self) -> None:
+        self._judge_and_restart()
+        self._look()
+
+    def _judge_and_restart(self) -> None:
+        kernels = self.task.kernels
+        self.engine.find_faults()
+        if kernels.remember is not None:
+            wp.launch(kernels.remember, self.nworld, [
+                self._before, self._after, self._params, self._safe_action, self._step, self._key, self._episode,
+                self._rng,
+            ], device=self.device)  # fmt: skip
+        self._judge(self._everyone, self.engine.fault, self._action_fault, transition=True)
+        wp.launch(steps.count_faults, self.nworld, [self.engine.fault, self._fault_count], device=self.device)
+        self._restart(self._restarting, True)
+
+    def _judge(self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool) -> None:
+        sticky = transition and not self.autoreset
+        wp.launch(self.task.kernels.judge, self.nworld, [
+            mask, self._before, self._after, self._params, self._safe_action, self._step, self.horizon, transition,
+            sticky, fault, action_fault, self._out, self._restarting,
+        ], device=self.device)  # fmt: skip
+
+    def _restart(self, mask: wp.array, randomly: bool) -> None:
+        self.engine.reset(mask)
+        if self.task.task.memory:
+            wp.launch(state.copy_rows, self._memory.shape, [mask, self._no_memory, self._memory], device=self.device)
+        wp.launch(self.task.kernels.restart, self.nworld, [
+            mask, randomly, self._after, self._params, self._key, self._rng, self._step, self._episode,
+        ], device=self.device)  # fmt: skip
+        self.engine.commit(mask)
+
+    def _look(self) -> None:
+        args = [self._restarting, self._after, self._params, self._out.obs]
+        wp.launch(self.task.kernels.look, self.nworld, args, device=self.device)
+
+    # resets
+
+    def reset(self, mask: torch.Tensor | None = None) -> None:
+        """Put worlds into the task's fixed initial state, with zero actions.
+
+        Args:
+            mask: Which worlds, (nworld,) bool; all by default.
+        """
+        self._begin_episodes(mask, randomly=False)
+
+    def rand_reset(self, seed: int | None = None, mask: torch.Tensor | None = None) -> None:
+        """Put worlds into random initial states, with zero actions.
+
+        Args:
+            seed: Starts the worlds' random streams anew; by default each world goes on with its own.
+            mask: Which worlds, (nworld,) bool; all by default.
+        """
+        self._set_mask(mask)
+        if seed is not None:
+            if int(seed) != seed or not 0 <= seed < 2**31:
+                raise ValueError(f"the seed has to be a whole number from 0 to 2**31 - 1, not {seed!r}")
+            self._seed.fill_(int(seed))
+            args = [self._mask, self._seed, self._key, self._episode]
+            wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
+        self._begin_episodes(mask, randomly=True)
+
+    def _begin_episodes(self, mask: torch.Tensor | None, *, randomly: bool) -> None:
+        self._set_mask(mask)
+        self.action.masked_fill_(self._mask_view[:, None], 0.0)
+        if self.engine.recordable:
+            self._record(self._whole_reset, randomly)
+        else:
+            self._whole_reset(randomly)
+
+    def _whole_reset(self, randomly: bool) -> None:
+        self._record(self._restart, self._mask, randomly)
+        self.engine.refresh(self._mask)
+        self._record(self._judge_state)
+
+    def _judge_state(self) -> None:
+        self._judge(self._mask, self._no_fault, self._no_fault, transition=False)
+
+    def _set_mask(self, mask: torch.Tensor | None) -> None:
+        if mask is None:
+            self._mask_view.fill_(True)
+            return
+        if not isinstance(mask, torch.Tensor) or mask.dtype != torch.bool or mask.shape != (self.nworld,):
+            raise ValueError(f"a mask has to be a bool tensor of shape ({self.nworld},), not {_described(mask)}")
+        self._mask_view.copy_(mask)
+
+    # the state
+
+    def get_state(self, out: torch.Tensor | None = None) -> torch.Tensor:
+        """Everything that the future depends on, (nworld, state_space.size), float64.
+
+        The engine's integration state, fields that are as the last substep left them, the step counter, the
+        random stream and the task's memory; ``state_space.parts`` says where each lies.
+        """
+        self._record(self._pack)
+        return self._given(self._state_view, out)
+
+    def set_state(self, state: torch.Tensor, mask: torch.Tensor | None = None, *, check: bool = True) -> None:
+        """Put worlds into states from ``get_state``, exactly; every getter reflects them afterwards.
+
+        The reward becomes 0: no action has led there.
+
+        Args:
+            state: (nworld, state_space.size), float64.
+            mask: Which worlds, (nworld,) bool; all by default.
+            check: Whether to refuse states that are not finite, which on a GPU waits for the device.
+
+        Raises:
+            ValueError: The state has another shape or type, or is not finite.
+        """
+        self._check(state, "state", self._state_view)
+        if check and not torch.isfinite(state if mask is None else state[mask]).all():
+            world, column = (~torch.isfinite(state)).nonzero()[0].tolist()
+            part = next(name for name, part in self.state_space.parts.items() if part.start <= column < part.stop)
+            raise ValueError(f"the state of world {world} has {state[world, column].item()} in its {part!r}")
+        self._set_mask(mask)
+        self._state_view.copy_(state)
+        if self.engine.recordable:
+            self._record(self._unpack)
+        else:
+            self._unpack()
+
+    def _pack(self) -> None:
+        size = self.engine.state_size
+        self.engine.get_state(self._state[:, :size])
+        counters = [self._step, self._key, self._episode, self._state[:, size : size + 3]]
+        wp.launch(state.pack_counters, self.nworld, counters, device=self.device)
+        if self.task.task.memory:
+            memory = self._state[:, size + 3 :]
+            args = [self._everyone, self._memory, memory]
+            wp.launch(state.widen, self._memory.shape, args, device=self.device)
+
+    def _unpack(self) -> None:
+        size = self.engine.state_size
+        self.engine.set_state(self._state[:, :size], self._mask)
+        self._record(self._unpack_counters)
+        self._record(self._judge_state)
+
+    def _unpack_counters(self) -> None:
+        size = self.engine.state_size
+        counters = [self._mask, self._state[:, size : size + 3], self._step, self._key, self._episode]
+        wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)
+        if self.task.task.memory:
+            args = [self._mask, self._state[:, size + 3 :], self._memory]
+            wp.launch(state.narrow, self._memory.shape, args, device=self.device)
+
+    # getters and setters of the paper's interface
+
+    def get_obs(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
+        """Observations of the current states, or of given ones, (nworld, nobs)."""
+        return self._given(self.obs if state is None else self._scratch_at(state).obs, out)
+
+    def get_eval(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
+        """The evaluation metric after the last step, or of given states, (nworld,)."""
+        return self._given(self.eval if state is None else self._scratch_at(state).eval, out)
+
+    def get_terminated(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
+        """Whether the last step, or given states, end the episode, (nworld,) bool."""
+        return self._given(self.terminated if state is None else self._scratch_at(state).terminated, out)
+
+    def get_reward(
+        self,
+        before: torch.Tensor | None = None,
+        action: torch.Tensor | None = None,
+        after: torch.Tensor | None = None,
+        out: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Rewards of the last step, or of given transitions, (nworld,).
+
+        Given transitions are judged in scratch worlds; the live ones are untouched.
+
+        Args:
+            before: States before, (nworld, state_space.size).
+            action: Actions, (nworld, nu).
+            after: States after.
+            out: Where to write the rewards.
+
+        Raises:
+            ValueError: Only a part of a transition is given, or it has the wrong shape or type.
+        """
+        if before is None and action is None and after is None:
+            return self._given(self.reward, out)
+        if before is None or action is None or after is None:
+            raise ValueError("a reward belongs to a transition: give before, action and after, or none of them")
+        self._check(action, "action", self.action)
+        scratch = self._scratch_at(before)
+        for copy, live in scratch._pairs:
+            wp.copy(copy, live)
+        scratch.set_state(after)
+        torch_view(scratch._safe_action).copy_(action)
+        scratch._judge(scratch._everyone, scratch._no_fault, scratch._no_fault, transition=True)
+        return self._given(scratch.reward, out)
+
+    def get_action(self, out: torch.Tensor | None = None) -> torch.Tensor:
+        """The actions of the next step, (nworld, nu)."""
+        return self._given(self.action, out)
+
+    def set_action(self, action: torch.Tensor) -> None:
+        """Set the actions of the next step, with every check; ``env.action.copy_`` is the way without.
+
+        Raises:
+            ValueError: The action has another shape or type, or is not finite.
+        """
+        self._check(action, "action", self.action)
+        if not torch.isfinite(action).all():
+            world, i = (~torch.isfinite(action)).nonzero()[0].tolist()
+            name = list(self.action_space.parts)[i]
+            raise ValueError(f"the action {name!r} of world {world} is {action[world, i].item()}: it has to be finite")
+        self.action.copy_(action)
+
+    @property
+    def time(self) -> torch.Tensor:
+        """Simulated seconds since the reset, (nworld,), float32."""
+        return self._time_view
+
+    def field(self, name: str, element: str | None = None) -> torch.Tensor:
+        """A live view of one of the engine's fields, by MuJoCo's name.
+
+        On the C engine it is a copy that every step renews: read it, and write through ``set_state``.
+
+        Args:
+            name: Attribute of MjData, for instance "qpos" or "site_xpos".
+            element: A name from the model: a joint in "qpos" or "qvel", a sensor in "sensordata", a body,
+                site, geom or camera elsewhere.
+
+        Raises:
+            ValueError: There is no such field or element.
+        """
+        known = name in self.engine.fields
+        view = torch_view(self.engine.field(name))
+        if not known:
+            if self.engine.fields[name].snapshot:
+                self._grow_state()
+            self._record.forget()
+        if element is None:
+            return view
+        where = elements(self.model, name, element)
+        one_object = view.ndim > 2 and not name.startswith("cdof")
+        return view[:, where.start] if one_object else view[:, where]
+
+    def set_params(self, **params: Any) -> None:
+        """Change parameters of the task from the next step on, in place.
+
+        Raises:
+            ValueError: There is no such parameter, or the observation would change its size.
+        """
+        previous = dict(self.task.params)
+        self.task.params.update(self.task._checked_params(params))
+        if self.task.layout() != self.task.obs_layout:
+            self.task.params = previous
+            raise ValueError(f"{', '.join(params)} would change the observation's parts: make a new environment")
+        changed = self.task.params_array(self.device)
+        if changed.shape == self._params.shape:
+            wp.copy(self._params, changed)
+        else:
+            self._params = changed
+            self._record.forget()
+        self._scratch = None
+
+    @property
+    def fault_counts(self) -> dict[str, int]:
+        """How often each kind of fault has happened since construction; waits for the device."""
+        counts = self._fault_count.numpy()
+        return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
+
+    # helpers
+
+    def _grow_state(self) -> None:
+        self.state_space = Space.of(self._state_layout(), dtype=torch.float64)
+        self._state = wp.zeros((self.nworld, self.state_space.size), dtype=wp.float64, device=self.device)
+        self._state_view = torch_view(self._state)
+        self._scratch = None
+
+    def _scratch_at(self, given: torch.Tensor) -> "Env":
+        """Worlds of the same task for judging given states; made when first needed."""
+        if self._scratch is None:
+            self._scratch = Env(self.task.task, nworld=self.nworld, horizon=self.horizon, **self._options)
+            for field in self.engine.fields.values():
+                self._scratch.field(field.name)
+            self._scratch.set_params(**{k: v for k, v in self.task.params.items() if k != "dt"})
+        self._scratch.set_state(given)
+        return self._scratch
+
+    def _given(self, values: torch.Tensor, out: torch.Tensor | None) -> torch.Tensor:
+        if out is None:
+            return values.clone()
+        self._check(out, "out", values)
+        return out.copy_(values)
+
+    def _check(self, value: torch.Tensor, name: str, like: torch.Tensor) -> None:
+        if not isinstance(value, torch.Tensor) or value.shape != like.shape or value.dtype != like.dtype:
+            raise ValueError(f"{name} has to be {_described(like)}, not {_described(value)}")
+
+
+def _described(value: object) -> str:
+    if isinstance(value, torch.Tensor):
+        return f"a {str(value.dtype).removeprefix('torch.')} tensor of shape {tuple(value.shape)}"
+    return f"{type(value).__name__} {value!r}"

@@ -1,0 +1,185 @@
+"""The simulator's fields: at which stage each is computed, its Warp type, and how it stays current."""
+
+import dataclasses
+import difflib
+import enum
+
+import mujoco
+import numpy as np
+import warp as wp
+
+vec10 = wp.types.vector(length=10, dtype=wp.float32)
+
+
+class Stage(enum.IntEnum):
+    """How far a forward pass goes; the values are mjtStage's."""
+
+    NONE = 0
+    POSITION = 1
+    VELOCITY = 2
+    ACCELERATION = 3
+
+
+STATE_FIELDS = {
+    "time": mujoco.mjtState.mjSTATE_TIME,
+    "qpos": mujoco.mjtState.mjSTATE_QPOS,
+    "qvel": mujoco.mjtState.mjSTATE_QVEL,
+    "act": mujoco.mjtState.mjSTATE_ACT,
+    "qacc_warmstart": mujoco.mjtState.mjSTATE_WARMSTART,
+    "ctrl": mujoco.mjtState.mjSTATE_CTRL,
+    "qfrc_applied": mujoco.mjtState.mjSTATE_QFRC_APPLIED,
+    "xfrc_applied": mujoco.mjtState.mjSTATE_XFRC_APPLIED,
+    "mocap_pos": mujoco.mjtState.mjSTATE_MOCAP_POS,
+    "mocap_quat": mujoco.mjtState.mjSTATE_MOCAP_QUAT,
+    "userdata": mujoco.mjtState.mjSTATE_USERDATA,
+}
+"""Fields that are part of the integration state, with their mjtState component."""
+
+_POSITION = (
+    "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat cam_xpos cam_xmat "
+    "light_xpos light_xdir subtree_com cdof cinert ten_length actuator_length crb"
+)
+_VELOCITY = (
+    "cvel cdof_dot ten_velocity actuator_velocity qfrc_bias qfrc_spring qfrc_damper qfrc_gravcomp qfrc_fluid "
+    "qfrc_passive subtree_linvel subtree_angmom"
+)
+_ACCELERATION = (
+    "act_dot actuator_force qfrc_actuator qfrc_smooth qacc_smooth qfrc_constraint qacc cacc cfrc_int cfrc_ext"
+)
+DERIVED_FIELDS = (
+    dict.fromkeys(_POSITION.split(), Stage.POSITION)
+    | dict.fromkeys(_VELOCITY.split(), Stage.VELOCITY)
+    | dict.fromkeys(_ACCELERATION.split(), Stage.ACCELERATION)
+)
+"""Fields that a forward pass computes, with the stage that does."""
+
+ON_DEMAND = {
+    "cacc": mujoco.mjtSensor.mjSENS_FRAMELINACC,
+    "cfrc_int": mujoco.mjtSensor.mjSENS_FRAMELINACC,
+    "cfrc_ext": mujoco.mjtSensor.mjSENS_FRAMELINACC,
+    "subtree_linvel": mujoco.mjtSensor.mjSENS_SUBTREELINVEL,
+    "subtree_angmom": mujoco.mjtSensor.mjSENS_SUBTREEANGMOM,
+}
+"""Fields that MuJoCo leaves at zero unless a sensor of the model needs them, with such a sensor."""
+
+_TYPES = {3: wp.vec3, 4: wp.quat, 6: wp.spatial_vector, 9: wp.mat33, 10: vec10}
+
+# the objects along a field's first axis, for access by name
+_OBJECTS = {
+    "ten": mujoco.mjtObj.mjOBJ_TENDON,
+    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
+    "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "site": mujoco.mjtObj.mjOBJ_SITE,
+    "cam": mujoco.mjtObj.mjOBJ_CAMERA,
+    "light": mujoco.mjtObj.mjOBJ_LIGHT,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Field:
+    """One field of one model, and the way in which it is wanted."""
+
+    name: str
+    shape: tuple[int, ...]
+    """Shape of one world's value, without the axis that ``dtype`` holds."""
+    dtype: type
+    """Warp type of an element: float, wp.vec3, wp.quat (w, x, y, z as in MuJoCo), ..."""
+    refresh: Stage
+    """The stage that has to be computed again for this field to belong to the state."""
+    reset: Stage
+    """The stage that has to be computed after a reset."""
+    lagged: bool
+    """Wanted as ``mj_step`` leaves it."""
+    snapshot: bool
+    """No function of the integration state: saved and restored with it."""
+
+    @property
+    def size(self) -> int:
+        """Floats in one world's value."""
+        return int(np.prod(self.shape, dtype=int)) * wp.types.type_size_in_bytes(self.dtype) // 4
+
+
+def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field:
+    """Find out what a field is in a model.
+
+    Args:
+        model: The compiled model.
+        name: MuJoCo's name of the field (an attribute of MjData).
+        lagged: Whether it is wanted as ``mj_step`` leaves it, one substep behind the state.
+
+    Raises:
+        ValueError: There is no such field, or it is not the same on both engines.
+    """
+    if name in STATE_FIELDS:
+        refresh = reset = Stage.NONE
+        snapshot = lagged = False
+    elif name == "sensordata":
+        stages = set(int(stage) for stage in model.sensor_needstage)
+        current = max(stages - {int(Stage.ACCELERATION)}, default=0)
+        refresh, reset = Stage(0 if lagged else current), Stage(max(stages, default=0))
+        snapshot = lagged or Stage.ACCELERATION in stages
+    elif name in DERIVED_FIELDS:
+        reset = DERIVED_FIELDS[name]
+        lagged = lagged and reset < Stage.ACCELERATION
+        snapshot = lagged or reset == Stage.ACCELERATION
+        refresh = Stage.NONE if snapshot else reset
+    else:
+        known = [*STATE_FIELDS, *DERIVED_FIELDS, "sensordata"]
+        close = difflib.get_close_matches(name, known, 3)
+        hint = f"did you mean {' or '.join(close)}?" if close else f"the fields are {', '.join(sorted(known))}"
+        raise ValueError(f"there is no field {name!r}: {hint}")
+    template = np.asarray(getattr(mujoco.MjData(model), name)) if name != "time" else np.zeros(())
+    if template.ndim == 2:
+        return Field(name, template.shape[:1], _TYPES[template.shape[1]], refresh, reset, lagged, snapshot)
+    return Field(name, template.shape, wp.float32, refresh, reset, lagged, snapshot)
+
+
+def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
+    """Where a named element of the model lies in a field, along the axis after the worlds.
+
+    A joint has its coordinates in ``qpos`` and its degrees of freedom in ``qvel`` and its like, a sensor its
+    numbers in ``sensordata``, a mocap body its row in ``mocap_pos``; everything else is one row an object.
+
+    Raises:
+        ValueError: The model has no such element.
+    """
+
+    def find(kind: mujoco.mjtObj) -> int:
+        index = mujoco.mj_name2id(model, kind, element)
+        if index < 0:
+            count = {mujoco.mjtObj.mjOBJ_JOINT: model.njnt, mujoco.mjtObj.mjOBJ_SENSOR: model.nsensor}.get(kind)
+            if count is None:
+                count = getattr(model, f"n{kind.name.removeprefix('mjOBJ_').lower()}".replace("actuator", "u"), 0)
+            names = [mujoco.mj_id2name(model, kind, i) for i in range(count)]
+            kind_name = kind.name.removeprefix("mjOBJ_").lower()
+            known = ", ".join(sorted(n for n in names if n)) or "none that are named"
+            raise ValueError(f"the model has no {kind_name} {element!r} for the field {name!r}; it has: {known}")
+        return index
+
+    if name == "sensordata":
+        i = find(mujoco.mjtObj.mjOBJ_SENSOR)
+        return slice(int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i]))
+    if name == "qpos":
+        i = find(mujoco.mjtObj.mjOBJ_JOINT)
+        end = model.jnt_qposadr[i + 1] if i + 1 < model.njnt else model.nq
+        return slice(int(model.jnt_qposadr[i]), int(end))
+    if name in ("qvel", "qacc", "cdof", "cdof_dot", "qacc_warmstart", "qacc_smooth") or name.startswith("qfrc_"):
+        i = find(mujoco.mjtObj.mjOBJ_JOINT)
+        end = model.jnt_dofadr[i + 1] if i + 1 < model.njnt else model.nv
+        return slice(int(model.jnt_dofadr[i]), int(end))
+    if name in ("mocap_pos", "mocap_quat"):
+        i = int(model.body_mocapid[find(mujoco.mjtObj.mjOBJ_BODY)])
+        if i < 0:
+            raise ValueError(f"the body {element!r} is no mocap body, so it has no {name!r}")
+        return slice(i, i + 1)
+    prefix = name.partition("_")[0]
+    if name == "ctrl":
+        kind = mujoco.mjtObj.mjOBJ_ACTUATOR
+    elif name in ("xanchor", "xaxis"):
+        kind = mujoco.mjtObj.mjOBJ_JOINT
+    elif name in ("time", "act", "act_dot", "userdata"):
+        raise ValueError(f"the field {name!r} has no named elements")
+    else:
+        kind = _OBJECTS.get(prefix, mujoco.mjtObj.mjOBJ_BODY)
+    i = find(kind)
+    return slice(i, i + 1)

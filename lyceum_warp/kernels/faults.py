@@ -1,0 +1,107 @@
+"""What makes a world unfit to go on, per world and as bits.
+
+Both engines report the same bits for the same trouble, so that a task, a log and a test need not know which
+engine ran. Bits below ``NAN`` are ordinary ends of an episode.
+"""
+
+import enum
+
+import warp as wp
+
+
+class Done(enum.IntFlag):
+    """Why an episode ended; ``env.done_reason`` holds these bits for each world."""
+
+    TERMINATED = 1
+    """The task said so."""
+    TRUNCATED = 2
+    """The time limit was reached."""
+    NAN = 4
+    """The state became not-a-number or absurd (beyond 1e10)."""
+    CONTACT_OVERFLOW = 8
+    """More contacts than the engine had room for."""
+    CONSTRAINT_OVERFLOW = 16
+    """More constraints than the engine had room for."""
+    ENGINE_WARNING = 32
+    """Any other warning of the engine."""
+    ACTION = 64
+    """The action was not finite; it was applied as zero."""
+
+
+FAULTS = Done.NAN | Done.CONTACT_OVERFLOW | Done.CONSTRAINT_OVERFLOW | Done.ENGINE_WARNING | Done.ACTION
+
+ABSURD = wp.constant(1.0e10)
+NAN = wp.constant(int(Done.NAN))
+CONTACT = wp.constant(int(Done.CONTACT_OVERFLOW))
+CONSTRAINT = wp.constant(int(Done.CONSTRAINT_OVERFLOW))
+WARNING = wp.constant(int(Done.ENGINE_WARNING))
+
+
+@wp.func
+def is_absurd(x: float) -> bool:
+    # written so that not-a-number, for which every comparison is false, counts as absurd
+    return not (wp.abs(x) < ABSURD)
+
+
+@wp.kernel(enable_backward=False)
+def faults_of_rows(
+    state_in: wp.array2d[wp.float64],
+    nphysics: int,
+    warning_inout: wp.array3d[int],
+    fault_out: wp.array[int],
+):
+    """Faults of the C engine: time, qpos, qvel and act lead its rows, warnings are (nworld, kind, 2) counters.
+
+    The kinds are mjtWarning's: 0 inertia, 1 contacts full, 2 constraints full, 3 to 5 bad qpos, qvel, qacc,
+    6 bad control. A counter is cleared once seen.
+    """
+    w = wp.tid()
+    fault = int(0)
+    for i in range(nphysics):
+        if not (wp.abs(state_in[w, i]) < wp.float64(ABSURD)):
+            fault = fault | NAN
+    for kind in range(warning_inout.shape[1]):
+        if warning_inout[w, kind, 1] > 0:
+            warning_inout[w, kind, 1] = 0
+            if kind == 1:
+                fault = fault | CONTACT
+            elif kind == 2:
+                fault = fault | CONSTRAINT
+            elif kind >= 3 and kind <= 5:
+                fault = fault | NAN
+            else:
+                fault = fault | WARNING
+    fault_out[w] = fault
+
+
+@wp.kernel(enable_backward=False)
+def faults_of_fields(
+    qpos_in: wp.array2d[float],
+    qvel_in: wp.array2d[float],
+    act_in: wp.array2d[float],
+    overflow_in: wp.array[int],
+    contact_bits: int,
+    constraint_bits: int,
+    ignored_bits: int,
+    fault_out: wp.array[int],
+):
+    """Faults of the Warp engine: its state fields, and its own overflow bits sorted into ours."""
+    w = wp.tid()
+    fault = int(0)
+    for i in range(qpos_in.shape[1]):
+        if is_absurd(qpos_in[w, i]):
+            fault = fault | NAN
+    for i in range(qvel_in.shape[1]):
+        if is_absurd(qvel_in[w, i]):
+            fault = fault | NAN
+    for i in range(act_in.shape[1]):
+        if is_absurd(act_in[w, i]):
+            fault = fault | NAN
+    overflow = overflow_in[w] & ~ignored_bits
+    if (overflow & contact_bits) != 0:
+        fault = fault | CONTACT
+    if (overflow & constraint_bits) != 0:
+        fault = fault | CONSTRAINT
+    if (overflow & ~(contact_bits | constraint_bits)) != 0:
+        fault = fault | WARNING
+    fault_out[w] = fault

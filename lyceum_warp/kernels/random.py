@@ -1,0 +1,52 @@
+"""Counted random streams: what is drawn depends on (seed, world, episode, step), never on who drew before.
+
+The four numbers are hashed one inside the other. A sum of them would give seed 0, episode 1 and seed 1,
+episode 0 the same stream.
+"""
+
+import warp as wp
+
+
+@wp.func
+def world_key(seed: int, world: int) -> wp.uint32:
+    """Key of one world's streams."""
+    return wp.rand_init(seed, world)
+
+
+@wp.func
+def stream(key: wp.uint32, episode: int, step: int) -> wp.uint32:
+    """Start of the stream of one step of one episode; step 0 is the reset."""
+    return wp.rand_init(int(wp.rand_init(int(key), episode)), step)
+
+
+@wp.func
+def uniform(rng: wp.array[wp.uint32], low: float, high: float) -> float:
+    """Draw from U(low, high) and advance the stream.
+
+    The stream is a row of one element because a number passed by value would not advance in the caller, and
+    two draws would be the same.
+    """
+    state = rng[0]
+    value = wp.randf(state, low, high)
+    rng[0] = state
+    return value
+
+
+@wp.func
+def normal(rng: wp.array[wp.uint32]) -> float:
+    """Draw from N(0, 1) and advance the stream."""
+    state = rng[0]
+    value = wp.randn(state)
+    rng[0] = state
+    return value
+
+
+@wp.kernel(enable_backward=False)
+def seed_worlds(
+    mask_in: wp.array[bool], seed_in: wp.array[int], key_out: wp.array[wp.uint32], episode_out: wp.array[int]
+):
+    """Give the masked worlds the streams of a seed, from their first episode on."""
+    w = wp.tid()
+    if mask_in[w]:
+        key_out[w] = world_key(seed_in[0], w)
+        episode_out[w] = -1

@@ -1,0 +1,49 @@
+"""Launches recorded once as a graph, and replayed."""
+
+from collections.abc import Callable, Hashable
+from typing import Any
+
+import warp as wp
+
+
+class Recorder:
+    """Runs functions made of Warp launches, replaying a recording of them from the third call on.
+
+    The first call of a function runs it as it is, which loads every module that it needs; the second records
+    it and replays the recording. A function that is called while another one is being recorded becomes part
+    of that recording. Recordings hold addresses and scalar arguments: a function must launch the same kernels
+    on the same arrays each time.
+
+    Args:
+        device: Where the launches run; "cpu" records as CUDA does.
+        enabled: False runs every function unrecorded.
+    """
+
+    def __init__(self, device: wp.Device, enabled: bool = True) -> None:
+        self.device = device
+        self.enabled = enabled
+        self._graphs: dict[Hashable, Any] = {}
+        self._recording = False
+
+    def __call__(self, function: Callable[..., None], *args: Hashable) -> None:
+        if not self.enabled or self._recording:
+            function(*args)
+            return
+        key = (function, args)
+        if key not in self._graphs:
+            self._graphs[key] = None
+            function(*args)
+            return
+        if self._graphs[key] is None:
+            self._recording = True
+            try:
+                with wp.ScopedCapture(device=self.device) as capture:
+                    function(*args)
+            finally:
+                self._recording = False
+            self._graphs[key] = capture.graph
+        wp.capture_launch(self._graphs[key])
+
+    def forget(self) -> None:
+        """Drop all recordings, after the launches or the arrays behind them have changed."""
+        self._graphs.clear()

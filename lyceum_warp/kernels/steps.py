@@ -1,0 +1,225 @@
+"""The kernels of one step, around the functions of a task."""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from lyceum_warp.kernels import faults
+from lyceum_warp.kernels.random import stream
+
+TERMINATED = wp.constant(int(faults.Done.TERMINATED))
+TRUNCATED = wp.constant(int(faults.Done.TRUNCATED))
+ACTION = wp.constant(int(faults.Done.ACTION))
+
+
+@wp.struct
+class Outcome:
+    """What a step tells about each world; every array is (nworld,) but for the observations."""
+
+    reward: wp.array[float]
+    eval: wp.array[float]
+    terminated: wp.array[bool]
+    truncated: wp.array[bool]
+    success: wp.array[bool]
+    done: wp.array[bool]
+    done_reason: wp.array[int]
+    obs: wp.array2d[float]
+    final_obs: wp.array2d[float]
+
+
+@wp.kernel(enable_backward=False)
+def count_faults(fault_in: wp.array[int], count_out: wp.array[int]):
+    """Count each kind of fault, by the place of its bit in Done."""
+    w = wp.tid()
+    fault = fault_in[w]
+    if fault != 0:
+        for bit in range(count_out.shape[0]):
+            if ((fault >> bit) & 1) != 0:
+                wp.atomic_add(count_out, bit, 1)
+
+
+def make_kernels(
+    Batch,  # noqa: N803
+    view,
+    Params,  # noqa: N803
+    *,
+    module: str,
+    observe,
+    control,
+    reward,
+    evaluate,
+    terminated,
+    success,
+    initialize,
+    randomize,
+    advance,
+    has_control: bool,
+    has_evaluate: bool,
+    has_advance: bool,
+) -> SimpleNamespace:
+    """Fuse a task's functions into the kernels of a step.
+
+    Args:
+        Batch: Struct of the task's fields for all worlds.
+        view: Function from (batch, world) to the struct that the task's functions take.
+        Params: Struct of the task's parameters; an array of them holds one entry, or one a world.
+        module: Name of the Warp module that the kernels are compiled into, one for each task.
+        observe, ..., advance: The task's functions, or defaults for them.
+        has_control: False maps actions to controls by a scale and an offset.
+        has_evaluate: False lets the evaluation be the reward.
+        has_advance: Whether the task has memory to write.
+    """
+
+    @wp.kernel(module=module, enable_backward=False)
+    def act(
+        batch: Batch,
+        params: wp.array[Params],
+        action_in: wp.array2d[float],
+        range_in: wp.array2d[float],
+        scale_in: wp.array2d[float],
+        step_inout: wp.array[int],
+        safe_action_out: wp.array2d[float],
+        fault_out: wp.array[int],
+        ctrl_out: wp.array2d[float],
+    ):
+        """Map actions to controls, within their ranges; an action that is not finite counts as zero."""
+        w = wp.tid()
+        fault = int(0)
+        for i in range(action_in.shape[1]):
+            if not wp.isfinite(action_in[w, i]):
+                fault = ACTION
+        fault_out[w] = fault
+        for i in range(action_in.shape[1]):
+            safe_action_out[w, i] = wp.where(fault == 0, action_in[w, i], 0.0)
+        if wp.static(has_control):
+            control(view(batch, w), safe_action_out[w], params[w % params.shape[0]], ctrl_out[w])
+        else:
+            for i in range(ctrl_out.shape[1]):
+                ctrl_out[w, i] = safe_action_out[w, i] * scale_in[i, 0] + scale_in[i, 1]
+        for i in range(ctrl_out.shape[1]):
+            ctrl_out[w, i] = wp.clamp(ctrl_out[w, i], range_in[i, 0], range_in[i, 1])
+        step_inout[w] = step_inout[w] + 1
+
+    @wp.kernel(module=module, enable_backward=False)
+    def remember(
+        before: Batch,
+        after: Batch,
+        params: wp.array[Params],
+        action_in: wp.array2d[float],
+        step_in: wp.array[int],
+        key_in: wp.array[wp.uint32],
+        episode_in: wp.array[int],
+        rng_inout: wp.array2d[wp.uint32],
+    ):
+        """Let the task write its memory."""
+        w = wp.tid()
+        rng_inout[w, 0] = stream(key_in[w], episode_in[w], step_in[w])
+        p = params[w % params.shape[0]]
+        advance(view(before, w), action_in[w], view(after, w), p, rng_inout[w])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def judge(
+        mask_in: wp.array[bool],
+        before: Batch,
+        after: Batch,
+        params: wp.array[Params],
+        action_in: wp.array2d[float],
+        step_in: wp.array[int],
+        horizon: int,
+        transition: bool,
+        sticky: bool,
+        fault_inout: wp.array[int],
+        action_fault_in: wp.array[int],
+        out: Outcome,
+        restart_out: wp.array[bool],
+    ):
+        """Reward, evaluation, termination and observation of a transition, or of a state alone.
+
+        A faulted transition has reward 0, the evaluation of the state before it, and the last good
+        observation; it counts as terminated, so that nobody bootstraps from it.
+        """
+        w = wp.tid()
+        if not mask_in[w]:
+            return
+        p = params[w % params.shape[0]]
+        s0 = view(before, w)
+        s1 = view(after, w)
+        fault = fault_inout[w] | action_fault_in[w]
+        fault_inout[w] = fault
+        gain = float(0.0)
+        if fault == 0:
+            if transition:
+                gain = reward(s0, action_in[w], s1, p)
+            observe(s1, p, out.final_obs[w])
+        else:
+            for i in range(out.obs.shape[1]):
+                out.final_obs[w, i] = out.obs[w, i]
+        if wp.static(has_evaluate):
+            if fault == 0:
+                out.eval[w] = evaluate(s1, p)
+            else:
+                out.eval[w] = evaluate(s0, p)
+        else:
+            out.eval[w] = gain
+        out.reward[w] = gain
+        reason = fault
+        if fault == 0:
+            if terminated(s1, p):
+                reason = reason | TERMINATED
+            out.success[w] = success(s1, p)
+        else:
+            out.success[w] = False
+        if horizon > 0 and step_in[w] >= horizon:
+            reason = reason | TRUNCATED
+        if sticky:
+            reason = reason | out.done_reason[w]
+        out.done_reason[w] = reason
+        out.terminated[w] = (reason & ~TRUNCATED) != 0
+        out.truncated[w] = (reason & TRUNCATED) != 0
+        out.done[w] = reason != 0
+        for i in range(out.obs.shape[1]):
+            out.obs[w, i] = out.final_obs[w, i]
+        if transition:
+            # whoever steps on after the end still can't step on after a fault
+            restart_out[w] = wp.where(sticky, fault != 0, reason != 0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def restart(
+        mask_in: wp.array[bool],
+        random: bool,
+        batch: Batch,
+        params: wp.array[Params],
+        key_in: wp.array[wp.uint32],
+        rng_inout: wp.array2d[wp.uint32],
+        step_out: wp.array[int],
+        episode_inout: wp.array[int],
+    ):
+        """Begin an episode in worlds that the engine has put into the model's initial state."""
+        w = wp.tid()
+        if not mask_in[w]:
+            return
+        step_out[w] = 0
+        episode = episode_inout[w] + 1
+        episode_inout[w] = episode
+        rng_inout[w, 0] = stream(key_in[w], episode, 0)
+        p = params[w % params.shape[0]]
+        s = view(batch, w)
+        initialize(s, p)
+        if random:
+            randomize(s, p, rng_inout[w])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def look(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], obs_out: wp.array2d[float]):
+        """Observe the masked worlds."""
+        w = wp.tid()
+        if mask_in[w]:
+            observe(view(batch, w), params[w % params.shape[0]], obs_out[w])
+
+    return SimpleNamespace(
+        Batch=Batch,
+        act=act,
+        remember=remember if has_advance else None,
+        judge=judge,
+        restart=restart,
+        look=look,
+    )

@@ -1,0 +1,112 @@
+"""Where a task's model comes from, and what is changed in it so that both engines run the same physics."""
+
+import difflib
+import importlib.util
+import inspect
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+
+import mujoco
+
+from lyceum_warp.fields import ON_DEMAND
+
+log = logging.getLogger(__name__)
+
+ModelSource = str | Path | mujoco.MjSpec | mujoco.MjModel
+
+
+def gymnasium_model(name: str) -> mujoco.MjSpec:
+    """A model that the gymnasium package ships, for changing; gymnasium itself is not imported.
+
+    Raises:
+        FileNotFoundError: gymnasium is not installed or has no such model.
+    """
+    return mujoco.MjSpec.from_file(str(_gymnasium_assets() / _existing(name, _gymnasium_assets())))
+
+
+def _gymnasium_assets() -> Path:
+    package = importlib.util.find_spec("gymnasium")
+    if package is None or not package.submodule_search_locations:
+        raise FileNotFoundError(
+            "the models of Gymnasium's tasks come with the package gymnasium, which is not installed: "
+            "pip install 'gymnasium>=1.0,<2'"
+        )
+    return Path(package.submodule_search_locations[0], "envs", "mujoco", "assets")
+
+
+def _existing(name: str, folder: Path) -> str:
+    if not (folder / name).is_file():
+        files = sorted(path.name for path in folder.glob("*.xml"))
+        close = difflib.get_close_matches(name, files, 3) or files
+        raise FileNotFoundError(f"there is no model file {name!r} in {folder}; it has {', '.join(close)}")
+    return name
+
+
+def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
+    """Read a model, editable.
+
+    Args:
+        source: A path, absolute or relative to the current folder or to the file that defines ``owner``;
+            otherwise the name of a model that gymnasium ships; or an MjSpec, which is copied.
+        owner: The task class.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: MuJoCo can't read the file, or the source is a compiled model.
+    """
+    if isinstance(source, mujoco.MjModel):
+        raise ValueError("a task's model has to be a file or an MjSpec, not a compiled MjModel: give its MjSpec")
+    if isinstance(source, mujoco.MjSpec):
+        return source.copy()
+    folders = [Path()]
+    if owner is not None:
+        folders.append(Path(inspect.getfile(owner)).parent)
+    for folder in folders:
+        path = folder / Path(source).expanduser()
+        if path.is_file():
+            break
+    else:
+        assets = _gymnasium_assets()
+        if Path(source).name != str(source):
+            raise FileNotFoundError(f"there is no model file {str(source)!r}")
+        path = assets / _existing(str(source), assets)
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ValueError(f"MuJoCo can't read the model {path}: {error}") from error
+
+
+def compile_model(spec: mujoco.MjSpec, fields: Iterable[str], *, cone: str | None = None) -> mujoco.MjModel:
+    """Compile a model for either engine.
+
+    MuJoCo Warp has no PGS solver, so a model that asks for it gets Newton on both engines, which converges to
+    the same accelerations. Fields that MuJoCo computes only where a sensor needs them get such a sensor, after
+    the model's own: without it a task would read zeros.
+
+    Args:
+        spec: The model; changed in place.
+        fields: Names of the fields that will be read.
+        cone: "pyramidal" or "elliptic" friction cones instead of the model's own.
+
+    Raises:
+        ValueError: MuJoCo refuses the model.
+    """
+    if spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
+        spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+        log.info("%s asks for the PGS solver, which MuJoCo Warp lacks: both engines use Newton", spec.modelname)
+    if cone is not None:
+        cones = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+        if cone not in cones:
+            raise ValueError(f"there is no friction cone {cone!r}: use 'pyramidal' or 'elliptic'")
+        spec.option.cone = cones[cone]
+    for sensor in sorted({ON_DEMAND[name] for name in fields if name in ON_DEMAND}, key=int):
+        body = spec.bodies[1]
+        if not body.name:
+            body.name = "lyceum_first_body"
+        name = f"lyceum_{sensor.name.removeprefix('mjSENS_').lower()}"
+        spec.add_sensor(name=name, type=sensor, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=body.name)
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise ValueError(f"MuJoCo refuses the model {spec.modelname!r}: {error}") from error

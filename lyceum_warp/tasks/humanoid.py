@@ -1,0 +1,130 @@
+"""Humanoid: walk forward on two legs without falling over (Gymnasium's Humanoid-v5).
+
+The contact forces are those that a sensor of the model sees. Under RK4, the model's integrator, sensors are
+computed in the first of a substep's four passes; Gymnasium computes ``cfrc_ext`` once more after the last. The
+two differ while feet touch the ground, everything else is equal. The model's PGS solver is replaced by Newton.
+"""
+
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    qvel: Row[float]
+    subtree_com: Row[wp.vec3]
+    cinert: Row[lw.vec10]
+    cvel: Row[wp.spatial_vector]
+    qfrc_actuator: Row[float]
+    cfrc_ext: Row[wp.spatial_vector]
+
+
+@wp.struct
+class Params:
+    dt: float
+    forward_reward_weight: float = 1.25
+    ctrl_cost_weight: float = 0.1
+    contact_cost_weight: float = 5e-7
+    contact_cost_range: wp.vec2 = wp.vec2(-wp.inf, 10.0)
+    healthy_reward: float = 5.0
+    terminate_when_unhealthy: bool = True
+    healthy_z_range: wp.vec2 = wp.vec2(1.0, 2.0)
+    reset_noise_scale: float = 1e-2
+    exclude_current_positions_from_observation: bool = True
+    include_cinert_in_observation: bool = True
+    include_cvel_in_observation: bool = True
+    include_qfrc_actuator_in_observation: bool = True
+    include_cfrc_ext_in_observation: bool = True
+
+
+@wp.func
+def healthy(s: World, p: Params) -> bool:
+    return p.healthy_z_range[0] < s.qpos[2] and s.qpos[2] < p.healthy_z_range[1]
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    k = int(0)
+    for i in range(2 * int(p.exclude_current_positions_from_observation), 24):
+        obs[k] = s.qpos[i]
+        k += 1
+    for i in range(23):
+        obs[k] = s.qvel[i]
+        k += 1
+    if p.include_cinert_in_observation:
+        for i in range(1, 14):
+            for j in range(10):
+                obs[k] = s.cinert[i][j]
+                k += 1
+    if p.include_cvel_in_observation:
+        for i in range(1, 14):
+            for j in range(6):
+                obs[k] = s.cvel[i][j]
+                k += 1
+    if p.include_qfrc_actuator_in_observation:
+        for i in range(6, 23):
+            obs[k] = s.qfrc_actuator[i]
+            k += 1
+    if p.include_cfrc_ext_in_observation:
+        for i in range(1, 14):
+            for j in range(6):
+                obs[k] = s.cfrc_ext[i][j]
+                k += 1
+
+
+@wp.func
+def contact_cost(s: World, p: Params) -> float:
+    cost = float(0.0)
+    for i in range(14):
+        cost += p.contact_cost_weight * wp.dot(s.cfrc_ext[i], s.cfrc_ext[i])
+    return wp.clamp(cost, p.contact_cost_range[0], p.contact_cost_range[1])
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    # the subtree of the world body is everything: its centre of mass is the robot's
+    r = p.forward_reward_weight * (s1.subtree_com[0][0] - s0.subtree_com[0][0]) / p.dt
+    if healthy(s1, p):
+        r += p.healthy_reward
+    for i in range(17):
+        r -= p.ctrl_cost_weight * action[i] * action[i]
+    return r - contact_cost(s1, p)
+
+
+@wp.func
+def evaluate(s: World, p: Params) -> float:
+    return s.qpos[0]
+
+
+@wp.func
+def terminated(s: World, p: Params) -> bool:
+    return p.terminate_when_unhealthy and not healthy(s, p)
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    for i in range(24):
+        s.qpos[i] += lw.uniform(rng, -p.reset_noise_scale, p.reset_noise_scale)
+    for i in range(23):
+        s.qvel[i] += lw.uniform(rng, -p.reset_noise_scale, p.reset_noise_scale)
+
+
+@lw.register
+class Humanoid(lw.Task):
+    model = "humanoid.xml"
+    frame_skip = 5
+    lagged = ("subtree_com", "cinert", "cvel")
+
+    @staticmethod
+    def obs(p: Params) -> dict[str, int]:
+        return {
+            "position": 24 - 2 * p.exclude_current_positions_from_observation,
+            "velocity": 23,
+            "inertia": 130 * p.include_cinert_in_observation,
+            "body_velocity": 78 * p.include_cvel_in_observation,
+            "actuator_force": 17 * p.include_qfrc_actuator_in_observation,
+            "contact_force": 78 * p.include_cfrc_ext_in_observation,
+        }

@@ -1,0 +1,60 @@
+"""Swimmer: swim forward through a viscous fluid (Gymnasium's Swimmer-v5)."""
+
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    qvel: Row[float]
+
+
+@wp.struct
+class Params:
+    dt: float
+    forward_reward_weight: float = 1.0
+    ctrl_cost_weight: float = 1e-4
+    reset_noise_scale: float = 0.1
+    exclude_current_positions_from_observation: bool = True
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    skip = 2 * int(p.exclude_current_positions_from_observation)
+    for i in range(skip, 5):
+        obs[i - skip] = s.qpos[i]
+    for i in range(5):
+        obs[5 - skip + i] = s.qvel[i]
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    r = p.forward_reward_weight * (s1.qpos[0] - s0.qpos[0]) / p.dt
+    for i in range(2):
+        r -= p.ctrl_cost_weight * action[i] * action[i]
+    return r
+
+
+@wp.func
+def evaluate(s: World, p: Params) -> float:
+    return s.qpos[0]
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    for i in range(5):
+        s.qpos[i] += lw.uniform(rng, -p.reset_noise_scale, p.reset_noise_scale)
+        s.qvel[i] += lw.uniform(rng, -p.reset_noise_scale, p.reset_noise_scale)
+
+
+@lw.register
+class Swimmer(lw.Task):
+    model = "swimmer.xml"
+    frame_skip = 4
+
+    @staticmethod
+    def obs(p: Params) -> dict[str, int]:
+        return {"position": 5 - 2 * p.exclude_current_positions_from_observation, "velocity": 5}

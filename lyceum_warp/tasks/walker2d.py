@@ -1,0 +1,78 @@
+"""Walker2d: walk forward on two legs (Gymnasium's Walker2d-v5)."""
+
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    qvel: Row[float]
+
+
+@wp.struct
+class Params:
+    dt: float
+    forward_reward_weight: float = 1.0
+    ctrl_cost_weight: float = 1e-3
+    healthy_reward: float = 1.0
+    terminate_when_unhealthy: bool = True
+    healthy_z_range: wp.vec2 = wp.vec2(0.8, 2.0)
+    healthy_angle_range: wp.vec2 = wp.vec2(-1.0, 1.0)
+    reset_noise_scale: float = 5e-3
+    exclude_current_positions_from_observation: bool = True
+
+
+@wp.func
+def healthy(s: World, p: Params) -> bool:
+    z, angle = s.qpos[1], s.qpos[2]
+    upright = p.healthy_angle_range[0] < angle and angle < p.healthy_angle_range[1]
+    return upright and p.healthy_z_range[0] < z and z < p.healthy_z_range[1]
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    skip = int(p.exclude_current_positions_from_observation)
+    for i in range(skip, 9):
+        obs[i - skip] = s.qpos[i]
+    for i in range(9):
+        obs[9 - skip + i] = wp.clamp(s.qvel[i], -10.0, 10.0)
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    r = p.forward_reward_weight * (s1.qpos[0] - s0.qpos[0]) / p.dt
+    if healthy(s1, p):
+        r += p.healthy_reward
+    for i in range(6):
+        r -= p.ctrl_cost_weight * action[i] * action[i]
+    return r
+
+
+@wp.func
+def evaluate(s: World, p: Params) -> float:
+    return s.qpos[0]
+
+
+@wp.func
+def terminated(s: World, p: Params) -> bool:
+    return p.terminate_when_unhealthy and not healthy(s, p)
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    for i in range(9):
+        s.qpos[i] += lw.uniform(rng, -p.reset_noise_scale, p.reset_noise_scale)
+        s.qvel[i] += lw.uniform(rng, -p.reset_noise_scale, p.reset_noise_scale)
+
+
+@lw.register
+class Walker2d(lw.Task):
+    model = "walker2d_v5.xml"
+    frame_skip = 4
+
+    @staticmethod
+    def obs(p: Params) -> dict[str, int]:
+        return {"position": 9 - p.exclude_current_positions_from_observation, "velocity": 9}
