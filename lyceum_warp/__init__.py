@@ -4,6 +4,10 @@ import warp as _wp
 
 _wp.config.log_level = _wp.LOG_WARNING
 
+from lyceum_warp.algos.npg import NPG, Iteration, NPGConfig
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.rollout import Episodes, Rollout, evaluate
+from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env, make
 from lyceum_warp.fields import vec10
 from lyceum_warp.kernels.faults import Done
@@ -14,6 +18,6 @@ from lyceum_warp.task import Row, Task, body, dof, geom, mocap, qpos, register, 
 __version__ = "0.1.0"
 
 __all__ = [
-    "Done", "Env", "Row", "Task", "body", "dof", "geom", "gymnasium_model", "make", "mocap", "normal", "qpos",
+    "NPG", "Done", "Env", "Episodes", "GaussianPolicy", "Iteration", "NPGConfig", "Rollout", "Row", "Task", "ValueFunction", "body", "dof", "evaluate", "geom", "gymnasium_model", "make", "mocap", "normal", "qpos",
     "register", "sensor", "site", "tasks", "uniform", "vec10",
 ]  # fmt: skip

@@ -102,8 +102,8 @@ class Env:
         if int(nworld) != nworld or nworld < 1:
             raise ValueError(f"nworld has to be a whole number of at least 1, not {nworld!r}")
         self._options = dict(
-            device=device, engine=engine, model=model, frame_skip=frame_skip, cone=cone, nthread=nthread,
-            nconmax=nconmax, njmax=njmax, **params,
+            device=device, engine=engine, record=record, model=model, frame_skip=frame_skip, cone=cone,
+            nthread=nthread, nconmax=nconmax, njmax=njmax,
         )  # fmt: skip
         self.nworld = int(nworld)
         self.device = find_device(device)
@@ -168,6 +168,7 @@ class Env:
         self._everyone, self._mask = wp.full(n, True, dtype=bool), wp.zeros(n, dtype=bool)
         self._restarting, self._no_memory = wp.zeros(n, dtype=bool), wp.zeros_like(self._memory)
         self._mask_view, self._time_view = torch_view(self._mask), torch_view(self.engine.field("time"))
+        self._step_view = torch_view(self._step)
         self._seed = wp.zeros(1, dtype=int)
 
         names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) or f"actuator_{i}" for i in range(model.nu)]
@@ -444,6 +445,11 @@ class Env:
         self.action.copy_(action)
 
     @property
+    def episode_step(self) -> torch.Tensor:
+        """Steps since the reset, (nworld,), int32."""
+        return self._step_view
+
+    @property
     def time(self) -> torch.Tensor:
         """Simulated seconds since the reset, (nworld,), float32."""
         return self._time_view
@@ -498,6 +504,16 @@ class Env:
         counts = self._fault_count.numpy()
         return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
 
+    def replicate(self, *, nworld: int | None = None, **changes: Any) -> "Env":
+        """Another environment of the same task with the same options, but for the given changes.
+
+        Raises:
+            ValueError: A parameter has one value a world, and the number of worlds changes.
+        """
+        options = self._options | {"horizon": self.horizon, "autoreset": self.autoreset}
+        params = {name: value for name, value in self.task.params.items() if name != "dt"}
+        return Env(self.task.task, nworld=nworld or self.nworld, **(options | params | changes))
+
     # helpers
 
     def _grow_state(self) -> None:
@@ -509,10 +525,9 @@ class Env:
     def _scratch_at(self, given: torch.Tensor) -> "Env":
         """Worlds of the same task for judging given states; made when first needed."""
         if self._scratch is None:
-            self._scratch = Env(self.task.task, nworld=self.nworld, horizon=self.horizon, **self._options)
-            for field in self.engine.fields.values():
-                self._scratch.field(field.name)
-            self._scratch.set_params(**{k: v for k, v in self.task.params.items() if k != "dt"})
+            self._scratch = self.replicate()
+            for name in self.engine.fields:
+                self._scratch.field(name)
         self._scratch.set_state(given)
         return self._scratch
 

@@ -1,0 +1,1 @@
+"""Algorithms: each knows Env and nothing below it."""

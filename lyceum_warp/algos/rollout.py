@@ -1,0 +1,160 @@
+"""Rollouts of a policy: recorded for learning, or summed up for evaluation."""
+
+import dataclasses
+
+import torch
+import warp as wp
+
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.engines import torch_view
+from lyceum_warp.env import Env
+from lyceum_warp.kernels import record
+from lyceum_warp.kernels.recorder import Recorder
+
+
+class Rollout:
+    """A record of a fixed number of steps of every world, allocated once.
+
+    Args:
+        env: The environment.
+        steps: Steps in a record.
+    """
+
+    obs: torch.Tensor
+    """Observations before each step, (steps, nworld, nobs)."""
+    action: torch.Tensor
+    """Actions, (steps, nworld, nact)."""
+    step: torch.Tensor
+    """Steps since the reset before each step, (steps, nworld)."""
+    final_obs: torch.Tensor
+    """Observations of the states that each step led to, before any reset, (steps, nworld, nobs)."""
+    reward: torch.Tensor
+    """Rewards, (steps, nworld)."""
+    eval: torch.Tensor
+    """Evaluation metric after each step, (steps, nworld)."""
+    terminated: torch.Tensor
+    """Whether the episode truly ended, (steps, nworld) bool."""
+    done: torch.Tensor
+    """Whether the episode ended for any reason, (steps, nworld) bool."""
+    success: torch.Tensor
+    """Whether the goal was met after each step, (steps, nworld) bool."""
+    episode_return: torch.Tensor
+    """Sum of the rewards of the episode so far, (steps, nworld)."""
+    episode_length: torch.Tensor
+    """Steps of the episode so far, (steps, nworld)."""
+
+    def __init__(self, env: Env, steps: int) -> None:
+        self.env = env
+        self.steps = steps
+        n, nobs, nact = env.nworld, env.obs_space.size, env.action_space.size
+        last = {"obs": (nobs,), "final_obs": (nobs,), "action": (nact,)}
+        flags = {"terminated", "done", "success"}
+        self._record = record.Record()
+        with wp.ScopedDevice(env.device):
+            for name in record.Record.vars:
+                shape = (steps, n, *last.get(name, ()))
+                array = wp.zeros(shape, dtype=bool if name in flags else float)
+                setattr(self._record, name, array)
+                setattr(self, name, torch_view(array))
+            self._index = wp.zeros(1, dtype=int)
+            self._return = wp.zeros(n, dtype=float)
+        self.running_return = torch_view(self._return)
+        self._recorder = Recorder(env.device)
+        self._inputs = [wp.from_torch(env.obs), wp.from_torch(env.action), wp.from_torch(env.episode_step)]
+        outputs = [env.final_obs, env.reward, env.eval, env.terminated, env.done, env.success]
+        self._outputs = [wp.from_torch(output) for output in outputs]
+
+    @torch.no_grad()
+    def collect(self, policy: GaussianPolicy, noise: torch.Tensor) -> None:
+        """Run the policy for ``steps`` steps from where the worlds are.
+
+        Args:
+            policy: The policy.
+            noise: Standard normal numbers, (steps, nworld, nact).
+        """
+        env = self.env
+        self._index.zero_()
+        for t in range(self.steps):
+            policy.sample(env.obs, noise[t], out=env.action)
+            self._recorder(self._before_step)
+            env.step()
+            self._recorder(self._after_step)
+
+    def restart(self) -> None:
+        """Begin new episodes in all worlds."""
+        self.env.rand_reset()
+        self.running_return.zero_()
+
+    def _before_step(self) -> None:
+        n, width = self.env.nworld, max(self.env.obs_space.size, self.env.action_space.size)
+        args = [self._index, *self._inputs, self._record]
+        wp.launch(record.record_inputs, (n, width), args, device=self.env.device)
+
+    def _after_step(self) -> None:
+        dim = (self.env.nworld, self.env.obs_space.size)
+        args = [self._index, *self._outputs, self._return, self._record]
+        wp.launch(record.record_outputs, dim, args, device=self.env.device)
+        wp.launch(record.advance_index, 1, [self._index], device=self.env.device)
+
+
+@dataclasses.dataclass(frozen=True)
+class Episodes:
+    """Finished episodes, one number each; all tensors have shape (episodes,) and lie on the CPU."""
+
+    returns: torch.Tensor
+    """Sums of rewards."""
+    lengths: torch.Tensor
+    """Steps."""
+    rewards: torch.Tensor
+    """Last rewards."""
+    evals: torch.Tensor
+    """The evaluation metric at the end."""
+    success: torch.Tensor
+    """Whether the goal was met at the end."""
+
+
+def finished(rollout: Rollout) -> Episodes:
+    """The episodes that ended within a rollout."""
+    ended = rollout.done
+    parts = (rollout.episode_return, rollout.episode_length, rollout.reward, rollout.eval, rollout.success)
+    return Episodes(*(part[ended].float().cpu() for part in parts))
+
+
+@torch.no_grad()
+def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | None = None) -> Episodes:
+    """Run a policy's mean action for whole episodes from random initial states.
+
+    Every world contributes the same number of episodes, its first ones, so that short episodes do not crowd
+    out long ones.
+
+    Args:
+        env: The environment; its worlds are reset.
+        policy: Called with observations (nworld, nobs), returns actions (nworld, nact).
+        episodes: How many; rounded up to a multiple of the number of worlds.
+        seed: Seed of the initial states; by default the worlds go on with their random streams.
+
+    Raises:
+        ValueError: The task never ends an episode.
+    """
+    if env.horizon == 0:
+        raise ValueError(f"episodes of {env.task.name!r} never end without a horizon: give make() a horizon")
+    each = -(-episodes // env.nworld)
+    env.rand_reset(seed)
+    results = torch.zeros(5, each, env.nworld, device=env.obs.device)
+    count = torch.zeros(env.nworld, dtype=torch.long, device=env.obs.device)
+    total = torch.zeros(env.nworld, device=env.obs.device)
+    worlds = torch.arange(env.nworld, device=env.obs.device)
+    for t in range(each * env.horizon):
+        length = env.episode_step + 1.0
+        env.action.copy_(policy(env.obs))
+        env.step()
+        total += env.reward
+        now = torch.stack([total, length, env.reward, env.eval, env.success.float()])
+        slot = count.clamp_max(each - 1)
+        wanted = env.done & (count < each)
+        results[:, slot, worlds] = torch.where(wanted, now, results[:, slot, worlds])
+        total.masked_fill_(env.done, 0.0)
+        count += wanted
+        if t % 50 == 49 and bool((count >= each).all()):
+            break
+    return Episodes(*results.reshape(5, -1).cpu())

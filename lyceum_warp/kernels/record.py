@@ -1,0 +1,69 @@
+"""Recording of rollouts: what a step read and gave, written at a running index that lives on the device."""
+
+import warp as wp
+
+
+@wp.struct
+class Record:
+    """What is kept of every step; arrays are (steps, nworld) with a last axis for vectors."""
+
+    obs: wp.array3d[float]
+    action: wp.array3d[float]
+    step: wp.array2d[float]
+    final_obs: wp.array3d[float]
+    reward: wp.array2d[float]
+    eval: wp.array2d[float]
+    terminated: wp.array2d[bool]
+    done: wp.array2d[bool]
+    success: wp.array2d[bool]
+    episode_return: wp.array2d[float]
+    episode_length: wp.array2d[float]
+
+
+@wp.kernel(enable_backward=False)
+def record_inputs(
+    index_in: wp.array[int], obs_in: wp.array2d[float], action_in: wp.array2d[float], step_in: wp.array[int],
+    out: Record,
+):  # fmt: skip
+    """Observation, action and step counter before a step; launched over (nworld, max(nobs, nact))."""
+    w, i = wp.tid()
+    t = index_in[0]
+    if i < obs_in.shape[1]:
+        out.obs[t, w, i] = obs_in[w, i]
+    if i < action_in.shape[1]:
+        out.action[t, w, i] = action_in[w, i]
+    if i == 0:
+        out.step[t, w] = float(step_in[w])
+
+
+@wp.kernel(enable_backward=False)
+def record_outputs(
+    index_in: wp.array[int],
+    final_obs_in: wp.array2d[float],
+    reward_in: wp.array[float],
+    eval_in: wp.array[float],
+    terminated_in: wp.array[bool],
+    done_in: wp.array[bool],
+    success_in: wp.array[bool],
+    return_inout: wp.array[float],
+    out: Record,
+):
+    """What a step gave, and the return of the episode so far; launched over (nworld, nobs)."""
+    w, i = wp.tid()
+    t = index_in[0]
+    out.final_obs[t, w, i] = final_obs_in[w, i]
+    if i == 0:
+        out.reward[t, w] = reward_in[w]
+        out.eval[t, w] = eval_in[w]
+        out.terminated[t, w] = terminated_in[w]
+        out.done[t, w] = done_in[w]
+        out.success[t, w] = success_in[w]
+        total = return_inout[w] + reward_in[w]
+        out.episode_return[t, w] = total
+        out.episode_length[t, w] = out.step[t, w] + 1.0
+        return_inout[w] = wp.where(done_in[w], 0.0, total)
+
+
+@wp.kernel(enable_backward=False)
+def advance_index(index_inout: wp.array[int]):
+    index_inout[0] = index_inout[0] + 1
