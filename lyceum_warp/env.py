@@ -10,11 +10,12 @@ import warp as wp
 from lyceum_warp.engines import EngineFactory, find_device, open_engine, torch_view
 from lyceum_warp.fields import STATE_FIELDS, Stage, elements
 from lyceum_warp.kernels import random, state, steps
-from lyceum_warp.kernels.faults import FAULTS, Done
+from lyceum_warp.kernels.faults import FAULTS
 from lyceum_warp.kernels.recorder import Recorder
 from lyceum_warp.models import ModelSource
 from lyceum_warp.spaces import Space
 from lyceum_warp.task import BoundTask, Task, find_task
+from lyceum_warp.validate import whole_number
 
 _COUNTERS = ("step", "key", "episode")
 
@@ -99,19 +100,16 @@ class Env:
         njmax: int | None = None,
         **params: Any,
     ) -> None:
-        if int(nworld) != nworld or nworld < 1:
-            raise ValueError(f"nworld has to be a whole number of at least 1, not {nworld!r}")
         self._options = dict(
             device=device, engine=engine, record=record, model=model, frame_skip=frame_skip, cone=cone,
             nthread=nthread, nconmax=nconmax, njmax=njmax,
         )  # fmt: skip
-        self.nworld = int(nworld)
+        self.nworld = whole_number("nworld", nworld, low=1)
         self.device = find_device(device)
-        self.task = BoundTask(
-            find_task(task), self.nworld, model=model, frame_skip=frame_skip, cone=cone, **params
-        )
-        self.horizon = self.task.task.horizon if horizon is None else int(horizon)
+        self.task = BoundTask(find_task(task), self.nworld, model=model, frame_skip=frame_skip, cone=cone, **params)
+        self.horizon = self.task.task.horizon if horizon is None else whole_number("horizon", horizon, low=0)
         self.autoreset = autoreset
+        whole_number("seed", seed, low=0)
         self.timestep: float = self.task.timestep
         """Seconds in a step."""
         self.model: mujoco.MjModel = self.task.model
@@ -207,8 +205,12 @@ class Env:
 
         Args:
             action: Copied into ``env.action`` first, if given; (nworld, nu).
+
+        Raises:
+            ValueError: The action has another shape or type.
         """
         if action is not None:
+            self._check(action, "action", self.action)
             self.action.copy_(action)
         if self.engine.recordable:
             self._record(self._whole_step)
@@ -289,9 +291,7 @@ class Env:
         """
         self._set_mask(mask)
         if seed is not None:
-            if int(seed) != seed or not 0 <= seed < 2**31:
-                raise ValueError(f"the seed has to be a whole number from 0 to 2**31 - 1, not {seed!r}")
-            self._seed.fill_(int(seed))
+            self._seed.fill_(whole_number("seed", seed, low=0))
             args = [self._mask, self._seed, self._key, self._episode]
             wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
         self._begin_episodes(mask, randomly=True)
@@ -311,6 +311,11 @@ class Env:
 
     def _judge_state(self) -> None:
         self._judge(self._mask, self._no_fault, self._no_fault, transition=False)
+
+    def _judge_given(self) -> None:
+        # a state that was set unchecked may be unfit: its world shows the last good observation, as after a step
+        self.engine.find_faults()
+        self._judge(self._mask, self.engine.fault, self._no_fault, transition=False)
 
     def _set_mask(self, mask: torch.Tensor | None) -> None:
         if mask is None:
@@ -345,11 +350,13 @@ class Env:
             ValueError: The state has another shape or type, or is not finite.
         """
         self._check(state, "state", self._state_view)
-        if check and not torch.isfinite(state if mask is None else state[mask]).all():
-            world, column = (~torch.isfinite(state)).nonzero()[0].tolist()
-            part = next(name for name, part in self.state_space.parts.items() if part.start <= column < part.stop)
-            raise ValueError(f"the state of world {world} has {state[world, column].item()} in its {part!r}")
         self._set_mask(mask)
+        if check and (bad := ~torch.isfinite(state) & self._mask_view[:, None]).any():
+            world, column = bad.nonzero()[0].tolist()
+            part = next(name for name, part in self.state_space.parts.items() if part.start <= column < part.stop)
+            raise ValueError(
+                f"the state of world {world} has {state[world, column].item()} in its {part!r}: it has to be finite"
+            )
         self._state_view.copy_(state)
         if self.engine.recordable:
             self._record(self._unpack)
@@ -370,7 +377,7 @@ class Env:
         size = self.engine.state_size
         self.engine.set_state(self._state[:, :size], self._mask)
         self._record(self._unpack_counters)
-        self._record(self._judge_state)
+        self._record(self._judge_given)
 
     def _unpack_counters(self) -> None:
         size = self.engine.state_size
@@ -545,4 +552,6 @@ class Env:
 def _described(value: object) -> str:
     if isinstance(value, torch.Tensor):
         return f"a {str(value.dtype).removeprefix('torch.')} tensor of shape {tuple(value.shape)}"
+    if hasattr(value, "shape"):
+        return f"a {type(value).__name__} of shape {tuple(value.shape)}"
     return f"{type(value).__name__} {value!r}"

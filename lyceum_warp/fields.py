@@ -119,6 +119,11 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field
         refresh, reset = Stage(0 if lagged else current), Stage(max(stages, default=0))
         snapshot = lagged or Stage.ACCELERATION in stages
     elif name in DERIVED_FIELDS:
+        if name in ON_DEMAND and not _demanded(model, name):
+            raise ValueError(
+                f"MuJoCo computes the field {name!r} only for a sensor, and the model has none that needs it: list "
+                "it in the task's World, which adds one"
+            )
         reset = DERIVED_FIELDS[name]
         lagged = lagged and reset < Stage.ACCELERATION
         snapshot = lagged or reset == Stage.ACCELERATION
@@ -132,6 +137,17 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field
     if template.ndim == 2:
         return Field(name, template.shape[:1], _TYPES[template.shape[1]], refresh, reset, lagged, snapshot)
     return Field(name, template.shape, wp.float32, refresh, reset, lagged, snapshot)
+
+
+def _demanded(model: mujoco.MjModel, name: str) -> bool:
+    """Whether a sensor of the model makes MuJoCo compute a field."""
+    kind = mujoco.mjtSensor
+    if ON_DEMAND[name] == kind.mjSENS_FRAMELINACC:  # one pass serves all of these
+        kinds = [kind.mjSENS_ACCELEROMETER, kind.mjSENS_FORCE, kind.mjSENS_TORQUE, kind.mjSENS_FRAMELINACC,
+                 kind.mjSENS_FRAMEANGACC]  # fmt: skip
+    else:
+        kinds = [kind.mjSENS_SUBTREELINVEL, kind.mjSENS_SUBTREEANGMOM]
+    return bool(np.isin(model.sensor_type, [int(k) for k in kinds]).any())
 
 
 def elements(model: mujoco.MjModel, name: str, element: str) -> slice:

@@ -4,6 +4,7 @@ import difflib
 import importlib.util
 import inspect
 import logging
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -107,6 +108,11 @@ def compile_model(spec: mujoco.MjSpec, fields: Iterable[str], *, cone: str | Non
         name = f"lyceum_{sensor.name.removeprefix('mjSENS_').lower()}"
         spec.add_sensor(name=name, type=sensor, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=body.name)
     try:
-        return spec.compile()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            model = spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo refuses the model {spec.modelname!r}: {error}") from error
+    for warning in caught:  # most are about Gymnasium's own XML, where a user can change nothing
+        log.info("%s: %s", spec.modelname, warning.message)
+    return model

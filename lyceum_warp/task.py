@@ -8,17 +8,17 @@ import pkgutil
 import re
 import sys
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
-
 
 import numpy as np
 import warp as wp
 
 from lyceum_warp import models
 from lyceum_warp.fields import elements
+from lyceum_warp.validate import whole_number
 
 if TYPE_CHECKING:
     T = TypeVar("T")
@@ -144,15 +144,35 @@ _tasks: dict[str, type[Task]] = {}
 def register(task: type[Task]) -> type[Task]:
     """Class decorator: make a task known by its name, the class name in snake_case.
 
+    A class of the same file may take the place of the one before: a file is run again in a notebook, or both
+    imported and given as a path.
+
     Raises:
         ValueError: Another task has the name.
     """
     name = task_name(task)
     known = _tasks.get(name)
-    if known is not None and known.__module__ != task.__module__:
-        raise ValueError(f"the task name {name!r} is taken by {known.__module__}.{known.__qualname__}: rename yours")
-    _tasks[name] = task
-    return task
+    if known is None and not task.__module__.startswith(_PACKAGE) and name in _package_tasks():
+        owner = f"{_PACKAGE}{name}"
+    elif known is not None and known.__module__ != task.__module__ and _file(known) != _file(task):
+        owner = f"{known.__module__}.{known.__qualname__}"
+    else:
+        _tasks[name] = task
+        return task
+    raise ValueError(f"the task name {name!r} is taken by {owner}: rename yours")
+
+
+_PACKAGE = "lyceum_warp.tasks."
+
+
+def _package_tasks() -> list[str]:
+    package = importlib.import_module("lyceum_warp.tasks")
+    return [module.name for module in pkgutil.iter_modules(package.__path__)]
+
+
+def _file(task: type[Task]) -> str | None:
+    file = getattr(sys.modules.get(task.__module__), "__file__", None)
+    return file and str(Path(file).resolve())
 
 
 def task_name(task: type[Task]) -> str:
@@ -162,8 +182,7 @@ def task_name(task: type[Task]) -> str:
 
 def tasks() -> list[str]:
     """Names of all tasks: those of the package and those registered by the user."""
-    package = importlib.import_module("lyceum_warp.tasks")
-    return sorted({*_tasks, *(module.name for module in pkgutil.iter_modules(package.__path__))})
+    return sorted({*_tasks, *_package_tasks()})
 
 
 def find_task(task: str | type[Task]) -> type[Task]:
@@ -221,6 +240,9 @@ def _task_of_file(path: Path, attribute: str) -> type[Task]:
 # from a class to kernels
 
 
+_MISSING = {"obs": 'the parts of its observation, as obs = {"position": 5}', "model": 'a model, as model = "robot.xml"'}
+
+
 class BoundTask:
     """A task with its parameters, its compiled model and its kernels.
 
@@ -261,10 +283,13 @@ class BoundTask:
             if name not in self.fields:
                 raise ValueError(f"the task {self.name!r} wants {name!r} lagged but does not list it in World")
 
+        for name in ("obs", "model"):
+            if not hasattr(task, name) and (name == "obs" or model is None):
+                raise ValueError(f"the task {self.name!r} has no {name}: add {_MISSING[name]} to its class")
         source = model if model is not None else task.model() if callable(task.model) else task.model
         engine_fields = [name for name in self.fields if name != "memory"]
         self.model = models.compile_model(models.load_spec(source, task), engine_fields, cone=cone)
-        self.frame_skip = _positive("frame_skip", task.frame_skip if frame_skip is None else frame_skip)
+        self.frame_skip = whole_number("frame_skip", task.frame_skip if frame_skip is None else frame_skip, low=1)
         self.timestep = self.model.opt.timestep * self.frame_skip
         self.nworld = nworld
         self.params = self._default_params()
@@ -338,6 +363,8 @@ class BoundTask:
         if array.shape == tuple(width):
             if not is_number:
                 return kind(*array.ravel())
+            if kind in (wp.bool, wp.int32) and not (array == np.round(array)).all():
+                raise ValueError(f"the parameter {name}={value!r} of {self.name!r} has to be a whole number")
             return {wp.bool: bool, wp.int32: int}.get(kind, float)(array.item())
         if array.shape == (self.nworld, *width):
             return array
@@ -368,16 +395,10 @@ class _NoParams:
     dt: float
 
 
-def _positive(name: str, value: int) -> int:
-    if int(value) != value or value < 1:
-        raise ValueError(f"{name} has to be a whole number of at least 1, not {value!r}")
-    return int(value)
-
-
 # The functions of a task see one world. What follows is the batch around them: a struct of the same fields
 # with one more axis, and a view of world w in it. Both have to be source text, because Warp compiles source.
 
-_VIEW = '''
+_VIEW = """
 @wp.struct
 class Batch:
 {batch}
@@ -423,7 +444,7 @@ def no_advance(s0: World, action: wp.array[float], s1: World, p: Params, rng: wp
 @wp.func
 def no_control(s: World, action: wp.array[float], p: Params, ctrl: wp.array[float]):
     pass
-'''
+"""
 
 _DEFAULTS = {
     "reward": "no_reward",
@@ -448,9 +469,7 @@ def kernels_of(bound: BoundTask) -> Any:
     key = (bound.world_struct, bound.params_struct, functions)
     if key not in _cache:
         scope = _batched(bound)
-        filled = {
-            name: bound.functions[name] or scope[_DEFAULTS[name]] for name in FUNCTIONS if name in _DEFAULTS
-        }
+        filled = {name: bound.functions[name] or scope[_DEFAULTS[name]] for name in FUNCTIONS if name in _DEFAULTS}
         _cache[key] = steps.make_kernels(
             scope["Batch"],
             scope["view"],
@@ -488,7 +507,7 @@ def _batched(bound: BoundTask) -> dict[str, Any]:
     file = f"<lyceum_warp {bound.task.__module__}.{bound.task.__qualname__}>"
     linecache.cache[file] = (len(source), None, source.splitlines(keepends=True), file)
     scope["__name__"] = f"lyceum_warp.generated.{bound.name}"
-    exec(compile(source, file, "exec"), scope)  # noqa: S102
+    exec(compile(source, file, "exec"), scope)
     return scope
 
 

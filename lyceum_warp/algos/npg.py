@@ -5,7 +5,10 @@ Control"): generalised advantages, the vanilla gradient, conjugate gradient on t
 step of a fixed length in the metric of the Fisher information.
 """
 
+import contextlib
+import copy
 import dataclasses
+import logging
 import math
 import time
 from collections.abc import Iterator
@@ -20,6 +23,8 @@ from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import returns
 
+log = logging.getLogger(__name__)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NPGConfig:
@@ -27,9 +32,9 @@ class NPGConfig:
 
     samples: int = 10_000
     """Samples in an iteration; rounded up to whole steps of all worlds."""
-    rollout: Literal["episodes", "segments"] = "episodes"
-    """"episodes" begins new episodes in every iteration, as in the paper; "segments" goes on with those of the
-    last iteration, for many worlds and few steps of each."""
+    rollout: Literal["segments", "episodes"] = "segments"
+    """"segments" goes on with the episodes of the last iteration, for many worlds and few steps of each;
+    "episodes" begins new ones in every iteration, as in the paper, and wants samples / worlds >= horizon."""
     gamma: float = 0.995
     """Discount."""
     lam: float = 0.97
@@ -166,6 +171,11 @@ class NPG:
         self.value.to(device)
         self.optimizer = torch.optim.Adam(self.value.parameters(), lr=config.value_rate, fused=True)
         self.rollout = Rollout(env, -(-config.samples // env.nworld))
+        if config.rollout == "episodes" and self.rollout.steps < env.horizon:
+            log.warning(
+                "%d samples of %d worlds are %d steps: no episode will reach its horizon of %d; take fewer worlds, "
+                "more samples, or rollout='segments'", config.samples, env.nworld, self.rollout.steps, env.horizon,
+            )  # fmt: skip
         self.noise = torch.empty_like(self.rollout.action)
         self.generator = torch.Generator(device).manual_seed(seed)
         self.iteration = 0
@@ -186,7 +196,8 @@ class NPG:
         if config.rollout == "episodes":
             rollout.restart()
         self.noise.normal_(generator=self.generator)
-        rollout.collect(self.policy, self.noise)
+        with _one_thread():
+            rollout.collect(self.policy, self.noise)
         time_sample = clock.lap()
 
         # 2. Advantages, from the value function as it was while the samples were drawn.
@@ -288,12 +299,13 @@ class NPG:
         with torch.no_grad():
             features = self.value.features(obs, step)
             target = (target / self.value.scale).unsqueeze(-1)
-        for _ in range(config.value_epochs):
-            order = torch.randperm(len(features), generator=self.generator, device=features.device)
-            for batch in order.split(config.value_batch):
-                self.optimizer.zero_grad(set_to_none=False)
-                torch.nn.functional.mse_loss(self.value.network(features[batch]), target[batch]).backward()
-                self.optimizer.step()
+        with _one_thread():
+            for _ in range(config.value_epochs):
+                order = torch.randperm(len(features), generator=self.generator, device=features.device)
+                for batch in order.split(config.value_batch):
+                    self.optimizer.zero_grad(set_to_none=False)
+                    torch.nn.functional.mse_loss(self.value.network(features[batch]), target[batch]).backward()
+                    self.optimizer.step()
 
     def _evaluate_mean(self) -> dict[str, float | None]:
         config = self.config
@@ -309,7 +321,7 @@ class NPG:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next iteration depends on."""
-        return {
+        state = {
             "policy": self.policy.state_dict(),
             "value": self.value.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -319,6 +331,7 @@ class NPG:
             "iteration": self.iteration,
             "samples": self.samples,
         }
+        return copy.deepcopy(state)  # a module's own state_dict shares memory with its parameters
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on exactly where ``state_dict`` was taken."""
@@ -425,6 +438,20 @@ def _check(config: NPGConfig) -> None:
         value = getattr(config, name)
         if not (value >= low and (high is None or value <= high)):
             raise ValueError(f"{name} has to be {f'from {low} to {high}' if high else f'at least {low}'}, not {value}")
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Keep torch to one CPU thread: operations on a step or a mini-batch are too small to share out.
+
+    On a busy machine torch's threads would wait for each other much longer than they compute.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 class _Clock:

@@ -7,6 +7,7 @@ import warp as wp
 
 from lyceum_warp.engines.base import Engine, EngineFactory, torch_view
 from lyceum_warp.fields import Field, Stage, describe, elements
+from lyceum_warp.validate import whole_number
 
 _ENGINES = {
     "mujoco": ("lyceum_warp.engines.c", "MujocoEngine"),
@@ -20,14 +21,17 @@ def find_device(device: str | None) -> wp.Device:
     Raises:
         ValueError: There is no such device on this machine.
     """
-    try:
-        return wp.get_device(device or "cpu")
-    except (ValueError, RuntimeError) as error:
-        names = ", ".join(repr(d.alias) for d in wp.get_devices())
-        raise ValueError(
-            f"there is no device {device!r} on this machine; it has {names} (for a GPU, check that nvidia-smi "
-            "shows it and that its driver is recent enough for Warp)"
-        ) from error
+    name, error = str(device or "cpu"), None
+    if wp.is_cuda_available() or not name.startswith("cuda"):  # without a driver, Warp would print before it fails
+        try:
+            return wp.get_device(name)
+        except (ValueError, RuntimeError) as cause:
+            error = cause
+    names = ", ".join(repr(d.alias) for d in wp.get_devices())
+    raise ValueError(
+        f"there is no device {name!r} on this machine; it has {names} (for a GPU, check that nvidia-smi shows it "
+        "and that its driver is recent enough for Warp)"
+    ) from error
 
 
 def open_engine(
@@ -49,16 +53,20 @@ def open_engine(
     """
     if engine == "auto":
         engine = "mujoco" if device.is_cpu else "warp"
-    if isinstance(engine, str):
+    given = {
+        key: whole_number(key, value, low=0 if key == "nthread" else 1)
+        for key, value in options.items()
+        if value is not None
+    }
+    if not callable(engine):
         if engine not in _ENGINES:
             raise ValueError(f"there is no engine {engine!r}: use one of 'auto', {', '.join(map(repr, _ENGINES))}")
         module, attribute = _ENGINES[engine]
         known = {"mujoco": {"nthread"}, "warp": {"nconmax", "njmax"}}[engine]
-        given = {key: value for key, value in options.items() if value is not None}
         if unknown := given.keys() - known:
             raise ValueError(f"the {engine} engine takes no {', '.join(sorted(unknown))}; it takes {sorted(known)}")
         return getattr(importlib.import_module(module), attribute)(model, nworld, device, **given)
-    return engine(model, nworld, device)
+    return engine(model, nworld, device, **given)
 
 
 __all__ = [

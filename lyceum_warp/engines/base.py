@@ -37,7 +37,11 @@ class Engine(abc.ABC):
 
     name: str
     recordable: bool
-    """Whether every call is made of Warp launches, so that a whole step can be recorded as one graph."""
+    """Whether every call is made of Warp launches, so that a whole step can be recorded as one graph.
+
+    Otherwise the launches between two calls of ``step``, ``refresh`` or ``set_state`` are recorded; so the methods
+    that say so have to be made of launches on every engine, and an engine keeps what they touch in Warp arrays.
+    """
 
     ctrl: wp.array
     """Controls of the next step, (nworld, nu), float32."""
@@ -110,7 +114,10 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def find_faults(self) -> None:
-        """Write ``fault``: not-a-number or absurd state, overflows and warnings since the last call."""
+        """Write ``fault``: not-a-number or absurd state, overflows and warnings since the last call.
+
+        Made of Warp launches on every engine.
+        """
 
     @abc.abstractmethod
     def reset(self, mask: wp.array) -> None:
@@ -176,7 +183,7 @@ class Engine(abc.ABC):
 
 
 EngineFactory = Callable[..., Engine]
-"""Called with (model, nworld, device=..., **options); returns an engine."""
+"""Called with (model, nworld, device, **options), the options being those that were given; returns an engine."""
 
 
 def torch_view(array: wp.array) -> torch.Tensor:

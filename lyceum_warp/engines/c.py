@@ -2,11 +2,13 @@
 
 import copy
 import logging
+from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import numpy as np
 import warp as wp
-from mujoco.batch import Batch
+from mujoco.batch import Batch, SimulationError
 
 from lyceum_warp.engines.base import Engine, flat
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage
@@ -19,6 +21,14 @@ def _quiet(message: str) -> None:
     # MuJoCo would print every warning and append it to MUJOCO_LOG.TXT in the current folder; here warnings
     # are counted per world and become done reasons
     log.debug("MuJoCo: %s", message)
+
+
+# a world in trouble may hold more than a float32 does
+_overflow_ignored = np.errstate(over="ignore")
+
+
+# where errors are counted as well: a kind of warning that no other done reason stands for
+_OTHER_WARNING = mujoco.mjtWarning.mjWARN_INERTIA.value
 
 
 class MujocoEngine(Engine):
@@ -73,12 +83,12 @@ class MujocoEngine(Engine):
             for known in self.fields.values():
                 self._connect(known)
             if old_stage > Stage.NONE:
-                self.batch.forward(stage=int(old_stage))
+                self._contained(self.batch.forward, stage=int(old_stage))
         array = wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
         self.arrays[field.name] = array
         self._connect(field)
         if field.reset > Stage.NONE:
-            self.batch.forward(stage=int(field.reset))
+            self._contained(self.batch.forward, stage=int(field.reset))
         self._copy(field)
         return array
 
@@ -94,25 +104,31 @@ class MujocoEngine(Engine):
 
     def _copy(self, field: Field, mask: np.ndarray | None = None) -> None:
         target = self.arrays[field.name].numpy()
-        if mask is None:
-            np.copyto(target, self._sources[field.name], casting="unsafe")
-        else:
-            where = mask.reshape(-1, *[1] * (target.ndim - 1))
-            np.copyto(target, self._sources[field.name], casting="unsafe", where=where)
+        where = True if mask is None else mask.reshape(-1, *[1] * (target.ndim - 1))
+        np.copyto(target, self._sources[field.name], casting="unsafe", where=where)
 
     # physics
 
+    def _contained(self, call: Callable[..., None], **arguments: Any) -> None:
+        """Run a call that may fail in some worlds: MuJoCo leaves those as they were and finishes the others."""
+        try:
+            call(**arguments)
+        except SimulationError as error:
+            log.debug("MuJoCo: %s", error)
+            self.batch.warning[error.ids, _OTHER_WARNING, 1] += 1
+
+    @_overflow_ignored
     def step(self, nstep: int) -> None:
         np.copyto(self.batch.ctrl, self.ctrl.numpy(), casting="unsafe")
         stage = self.stage
         lagged = [field for field in self.fields.values() if field.lagged]
         if lagged and stage > Stage.NONE:
-            self.batch.step(nstep=nstep)
+            self._contained(self.batch.step, nstep=nstep)
             for field in lagged:
                 self._copy(field)
-            self.batch.forward(stage=int(stage))
+            self._contained(self.batch.forward, stage=int(stage))
         else:
-            self.batch.step(nstep=nstep, stage=int(stage))
+            self._contained(self.batch.step, nstep=nstep, stage=int(stage))
             for field in lagged:
                 self._copy(field)
         for field in self.fields.values():
@@ -142,10 +158,11 @@ class MujocoEngine(Engine):
         for name, column in self._columns.items():
             self._launch(state.narrow, column.shape, [mask, column, flat(self.arrays[name])])
 
+    @_overflow_ignored
     def _forward(self, mask: wp.array, stage: Stage, fields: list[Field]) -> None:
         chosen = mask.numpy()
         if stage > Stage.NONE and chosen.any():
-            self.batch.forward(ids=chosen, stage=int(stage))
+            self._contained(self.batch.forward, ids=chosen, stage=int(stage))
             for field in fields:
                 if field.name not in STATE_FIELDS:
                     self._copy(field, chosen)

@@ -5,8 +5,8 @@ import mujoco_warp as mjw
 import warp as wp
 
 from lyceum_warp.engines.base import Engine, flat
-from lyceum_warp.fields import Field, Stage
 from lyceum_warp.engines.sizes import probe_sizes
+from lyceum_warp.fields import Field, Stage
 from lyceum_warp.kernels import faults, state
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
@@ -146,6 +146,3 @@ class WarpEngine(Engine):
         self._launch(state.narrow, self._state.shape, [mask, state_in, self._state])
         with wp.ScopedDevice(self.device):
             mjw.set_state(self.m, self.d, self._state, _SPEC, mask)
-
-
-

@@ -157,8 +157,10 @@ def make_kernels(
         if wp.static(has_evaluate):
             if fault == 0:
                 out.eval[w] = evaluate(s1, p)
-            else:
-                out.eval[w] = evaluate(s0, p)
+            elif transition:
+                last = evaluate(s0, p)
+                if not faults.is_absurd(last):  # else the state before was itself unfit: keep what was known
+                    out.eval[w] = last
         else:
             out.eval[w] = gain
         out.reward[w] = gain

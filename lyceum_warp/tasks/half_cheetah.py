@@ -54,7 +54,4 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class HalfCheetah(lw.Task):
     model = "half_cheetah.xml"
     frame_skip = 5
-
-    @staticmethod
-    def obs(p: Params) -> dict[str, int]:
-        return {"position": 9 - p.exclude_current_positions_from_observation, "velocity": 9}
+    obs = staticmethod(lambda p: {"position": 9 - p.exclude_current_positions_from_observation, "velocity": 9})

@@ -34,10 +34,8 @@ def inside(x: float, bounds: wp.vec2) -> bool:
 @wp.func
 def healthy(s: World, p: Params) -> bool:
     ok = inside(s.qpos[1], p.healthy_z_range) and inside(s.qpos[2], p.healthy_angle_range)
-    for i in range(2, 6):
-        ok = ok and inside(s.qpos[i], p.healthy_state_range)
     for i in range(6):
-        ok = ok and inside(s.qvel[i], p.healthy_state_range)
+        ok = ok and inside(s.qvel[i], p.healthy_state_range) and (i < 2 or inside(s.qpos[i], p.healthy_state_range))
     return ok
 
 
@@ -53,8 +51,7 @@ def observe(s: World, p: Params, obs: Row[float]):
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
     r = p.forward_reward_weight * (s1.qpos[0] - s0.qpos[0]) / p.dt
-    if healthy(s1, p):
-        r += p.healthy_reward
+    r += wp.where(healthy(s1, p), p.healthy_reward, 0.0)
     for i in range(3):
         r -= p.ctrl_cost_weight * action[i] * action[i]
     return r
@@ -81,7 +78,4 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class Hopper(lw.Task):
     model = "hopper.xml"
     frame_skip = 4
-
-    @staticmethod
-    def obs(p: Params) -> dict[str, int]:
-        return {"position": 6 - p.exclude_current_positions_from_observation, "velocity": 6}
+    obs = staticmethod(lambda p: {"position": 6 - p.exclude_current_positions_from_observation, "velocity": 6})

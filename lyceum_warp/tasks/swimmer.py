@@ -54,7 +54,4 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class Swimmer(lw.Task):
     model = "swimmer.xml"
     frame_skip = 4
-
-    @staticmethod
-    def obs(p: Params) -> dict[str, int]:
-        return {"position": 5 - 2 * p.exclude_current_positions_from_observation, "velocity": 5}
+    obs = staticmethod(lambda p: {"position": 5 - 2 * p.exclude_current_positions_from_observation, "velocity": 5})

@@ -44,8 +44,7 @@ def observe(s: World, p: Params, obs: Row[float]):
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
     r = p.forward_reward_weight * (s1.qpos[0] - s0.qpos[0]) / p.dt
-    if healthy(s1, p):
-        r += p.healthy_reward
+    r += wp.where(healthy(s1, p), p.healthy_reward, 0.0)
     for i in range(6):
         r -= p.ctrl_cost_weight * action[i] * action[i]
     return r
@@ -72,7 +71,4 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class Walker2d(lw.Task):
     model = "walker2d_v5.xml"
     frame_skip = 4
-
-    @staticmethod
-    def obs(p: Params) -> dict[str, int]:
-        return {"position": 9 - p.exclude_current_positions_from_observation, "velocity": 9}
+    obs = staticmethod(lambda p: {"position": 9 - p.exclude_current_positions_from_observation, "velocity": 9})

@@ -1,0 +1,107 @@
+"""What the command line shows: progress, the learning curve's table, the curve and the video."""
+
+import math
+import sys
+from pathlib import Path
+
+import rich.box
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from lyceum_warp.algos.npg import Iteration
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.env import Env
+from lyceum_warp.runs import Run
+
+_TABLE_ROWS = 15
+
+
+def make_console() -> Console:
+    """A wide one where the output goes into a file, so that tables stay whole."""
+    return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=120)
+
+
+class Display:
+    """Progress: a live bar on a terminal, of at most 80 columns, and a line an iteration elsewhere."""
+
+    def __init__(self, console: Console, done: int, total: int) -> None:
+        self.console, self.total, self.mean = console, total, math.nan
+        self.progress = Progress(
+            BarColumn(bar_width=8), MofNCompleteColumn(), TextColumn("{task.fields[text]}"),
+            TimeElapsedColumn(), TimeRemainingColumn(compact=True), TextColumn("left"),
+            console=console, disable=not console.is_terminal,
+        )  # fmt: skip
+        self.bar = self.progress.add_task("", total=total, completed=done, text="")
+
+    def __enter__(self) -> "Display":
+        self.progress.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.progress.stop()
+
+    def __call__(self, record: Iteration) -> None:
+        """Show an iteration."""
+        if record.mean_return is not None:
+            self.mean = record.mean_return
+        mean = "" if math.isnan(self.mean) else f" (mean policy {self.mean:.4g})"
+        text = f"return {record.return_mean:.4g}{mean} {record.samples_per_second / 1000:.3g}k"
+        if self.console.is_terminal:
+            self.progress.update(self.bar, completed=record.iteration, text=f"{text}/s")
+        else:
+            line = f"iteration {record.iteration:4d}/{self.total}  {text} samples/s"
+            self.console.print(line, soft_wrap=True)
+            sys.stdout.flush()
+
+
+def curve_table(rows: list[dict[str, float | None]]) -> Table:
+    """A run's iterations, at most 15 of them."""
+    columns = [("iter", "iteration", "d"), ("samples", "samples", ",d"), ("return", "return_mean", ".1f"),
+               ("± std", "return_std", ".1f"), ("mean\npolicy", "mean_return", ".1f"), ("length", "length_mean", ".0f"),
+               ("eval", "eval_mean", ".3g"), ("success", "success", ".0%"), ("KL", "kl", ".3f"),
+               ("samples/s", "samples_per_second", ",.0f")]  # fmt: skip
+    table = Table(box=rich.box.SIMPLE, padding=0, pad_edge=False)  # whole on 80 columns
+    for heading, _, _ in columns:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in _spread(rows):
+        cells = []
+        for _, name, form in columns:
+            value = row.get(name)
+            if value is None or math.isnan(value):
+                cells.append("")
+            else:
+                cells.append(format(int(value) if form.endswith("d") else value, form))
+        table.add_row(*cells)
+    return table
+
+
+def _spread(rows: list[dict[str, float | None]]) -> list[dict[str, float | None]]:
+    """At most 15 rows, the first and the last among them; those with an evaluation if they are enough."""
+    if sum(row.get("mean_return") is not None for row in rows) >= 5:
+        ends = (0, len(rows) - 1)
+        rows = [row for i, row in enumerate(rows) if i in ends or row["mean_return"] is not None]
+    if len(rows) <= _TABLE_ROWS:
+        return rows
+    return [rows[round(i * (len(rows) - 1) / (_TABLE_ROWS - 1))] for i in range(_TABLE_ROWS)]
+
+
+def plotted(run: Run) -> str:
+    """Draw a run's learning curve; the picture's path, or why there is none."""
+    try:
+        from lyceum_warp.viz.plot import learning_curve
+
+        return str(learning_curve(run))
+    except ImportError as error:
+        return f"none: {error}"
+
+
+def filmed(env: Env, policy: GaussianPolicy, path: Path, seed: int) -> str:
+    """Film an episode of a policy; the video's path, or why there is none."""
+    from lyceum_warp.viz import video
+
+    try:
+        one = env.replicate(nworld=1, autoreset=False)
+        return str(video.record(one, video.episode(one, policy, seed=seed), path))
+    except (video.NoVideoError, ValueError) as error:
+        return f"none: {error}"

@@ -1,0 +1,329 @@
+"""Runs: a folder with a training run's configuration, versions, metrics and checkpoint."""
+
+import csv
+import importlib.metadata
+import json
+import os
+import platform
+import shutil
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from lyceum_warp.algos.policy import GaussianPolicy
+
+FORMAT = 1
+"""Format of the folder; one more whenever an older release could no longer read it."""
+
+_CONFIG, _VERSIONS, _METRICS, _CHECKPOINT = "config.json", "versions.json", "metrics.csv", "checkpoint.pt"
+_PACKAGES = ("lyceum-warp", "mujoco", "mujoco-warp", "warp-lang", "torch", "numpy", "gymnasium")
+
+
+class Run:
+    """A training run's folder.
+
+    =================== ======================================================================================
+    ``config.json``     the task, its parameters, the engine, the seed and every hyperparameter
+    ``versions.json``   what it ran with: packages, Python, machine, commit
+    ``metrics.csv``     one row an iteration
+    ``checkpoint.pt``   the policy, and all that is needed to continue exactly
+    =================== ======================================================================================
+
+    Args:
+        folder: Where the files lie.
+        config: What ``config.json`` holds.
+    """
+
+    def __init__(self, folder: Path, config: dict[str, Any]) -> None:
+        self.folder = folder
+        self.config = config
+
+    @property
+    def metrics(self) -> Path:
+        """The table of iterations."""
+        return self.folder / _METRICS
+
+    @property
+    def checkpoint(self) -> Path:
+        """The file to continue from."""
+        return self.folder / _CHECKPOINT
+
+    @staticmethod
+    def check_free(folder: str | Path) -> None:
+        """Refuse a folder that a new run can't have.
+
+        Raises:
+            ValueError: There is something in it already.
+        """
+        folder = Path(folder)
+        if (folder / _CONFIG).exists():
+            raise ValueError(f"{folder} holds a run: continue it with --resume {folder}, or give another --out")
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise ValueError(f"{folder} exists and is not an empty folder: give another --out")
+
+    @classmethod
+    def create(cls, folder: str | Path, config: Mapping[str, Any], *, device: str = "cpu") -> "Run":
+        """Begin a run: make its folder, with the configuration and the versions.
+
+        Args:
+            folder: A new or empty folder.
+            config: What JSON can hold.
+            device: The device that it runs on, for the record.
+
+        Raises:
+            ValueError: There is something in the folder already.
+        """
+        folder = Path(folder)
+        cls.check_free(folder)
+        run = cls(folder, {"format": FORMAT, **config})
+        text = json.dumps(run.config, indent=2)  # before the folder is made, in case it can't be written
+        folder.mkdir(parents=True, exist_ok=True)
+        _write(folder / _VERSIONS, json.dumps(versions(device), indent=2))
+        _write(folder / _CONFIG, text)
+        return run
+
+    @classmethod
+    def open(cls, folder: str | Path) -> "Run":
+        """A run that is there.
+
+        Raises:
+            FileNotFoundError: There is no run in the folder.
+            ValueError: Its configuration can't be read, or a newer release wrote it.
+        """
+        folder = Path(folder)
+        path = folder / _CONFIG
+        if not path.is_file():
+            raise FileNotFoundError(f"there is no run in {folder}: it has no {_CONFIG}")
+        try:
+            config = json.loads(path.read_text())
+            number = config["format"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} is not the configuration of a run of lyceum_warp ({error!r})") from error
+        _check_format(path, number)
+        return cls(folder, config)
+
+    def amend(self, **changes: Any) -> None:
+        """Change entries of the configuration, in the file, too."""
+        self.config = {**self.config, **changes}
+        _write(self.folder / _CONFIG, json.dumps(self.config, indent=2))
+
+    def changed(self, now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+        """Packages, Python and processors that are not those that the run began with, as (then, now).
+
+        They are also noted in ``versions.json``, under "resumed".
+        """
+        path = self.folder / _VERSIONS
+        try:
+            then = json.loads(path.read_text())
+        except (OSError, ValueError):
+            then = {}
+        changed = {name: (then.get(name), value) for name, value in now.items() if then.get(name) != value}
+        if changed:
+            then.setdefault("resumed", []).append({name: value for name, (_, value) in changed.items()})
+            _write(path, json.dumps(then, indent=2))
+        return changed
+
+    # the table
+
+    def write(self, record: Mapping[str, Any]) -> None:
+        """Append an iteration to the table. None is an empty cell; floats are written with all their digits."""
+        exists = self.metrics.exists() and self.metrics.stat().st_size > 0
+        with self.metrics.open("a", newline="") as file:
+            writer = csv.writer(file)
+            if not exists:
+                writer.writerow(record)
+            writer.writerow(["" if value is None else value for value in record.values()])
+
+    def rows(self) -> list[dict[str, float | None]]:
+        """The table; None where a cell is empty.
+
+        Raises:
+            FileNotFoundError: There is none yet.
+            ValueError: It can't be read.
+        """
+        if not self.metrics.exists():
+            raise FileNotFoundError(f"{self.metrics} is not there: the run has no complete iteration")
+        return read_metrics(self.metrics)
+
+    def cut(self, iteration: int) -> None:
+        """Drop the rows after an iteration, and a last row that was written only in part.
+
+        Rows count from 1. An interrupted run may have written a row without the checkpoint that belongs to it.
+        """
+        if not self.metrics.exists():
+            return
+        lines = self.metrics.read_text().splitlines(keepends=True)
+        kept = [line for line in lines[: iteration + 1] if line.endswith("\n")]
+        if kept != lines:
+            _write(self.metrics, "".join(kept))
+
+    # the checkpoint
+
+    def save(self, iteration: int, policy: GaussianPolicy, state: Mapping[str, Any]) -> None:
+        """Replace the checkpoint, in one go: a reader finds the old one or the new one, never a part.
+
+        Args:
+            iteration: Number of complete iterations.
+            policy: The policy that ``load`` will give back.
+            state: What the algorithm continues from; tensors, numbers, strings and containers of them.
+        """
+        widths = [layer.out_features for layer in policy.network if isinstance(layer, nn.Linear)]
+        shape = {
+            "nobs": next(layer.in_features for layer in policy.network if isinstance(layer, nn.Linear)),
+            "nact": widths[-1],
+            "hidden": widths[:-1],
+            "normalize": not isinstance(policy.normalizer, nn.Identity),
+        }
+        content = {
+            "lyceum_warp": FORMAT,
+            "iteration": iteration,
+            "policy": {"shape": shape, "state": policy.state_dict()},
+            "state": dict(state),
+        }
+        temporary = self.checkpoint.with_suffix(".tmp")
+        try:
+            torch.save(content, temporary)
+            os.replace(temporary, self.checkpoint)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    def read(self, device: str | torch.device = "cpu") -> dict[str, Any]:
+        """The checkpoint: ``iteration``, ``policy``, and ``state`` as it was saved.
+
+        Raises:
+            FileNotFoundError: There is none.
+            ValueError: It is broken, foreign, or of a newer release.
+        """
+        return read_checkpoint(self.checkpoint, device)
+
+
+def load(run: str | Path | Run, *, device: str | torch.device = "cpu") -> GaussianPolicy:
+    """The policy of a run, its observation normaliser included, for use: ``action = policy(obs)`` is the mean action.
+
+    Args:
+        run: A run's folder, or a checkpoint file.
+        device: Where its parameters go.
+
+    Raises:
+        FileNotFoundError: There is no run, or it has no checkpoint.
+        ValueError: The checkpoint is broken, foreign, or of a newer release.
+    """
+    if isinstance(run, (str, Path)) and Path(run).is_file():
+        path = Path(run)
+    else:
+        path = (run if isinstance(run, Run) else Run.open(run)).checkpoint
+    saved = read_checkpoint(path, device)["policy"]
+    try:
+        policy = GaussianPolicy(**saved["shape"])
+        policy.load_state_dict(saved["state"])
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"{path} holds no policy of lyceum_warp ({_line(error)}): {_MEND}") from error
+    return policy.to(device).eval().requires_grad_(False)
+
+
+_MEND = "restore the file from a copy, or train again with another --out"
+
+
+def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str, Any]:
+    """A checkpoint's content. Nothing in the file is run.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is broken, foreign, or of a newer release.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no checkpoint {path}: train the run first")
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+    except Exception as error:  # torch raises many kinds, depending on where the file ends
+        raise ValueError(
+            f"the checkpoint {path} is cut off, or was not written by lyceum_warp ({_line(error)}): {_MEND}"
+        ) from error
+    if not isinstance(content, dict) or "lyceum_warp" not in content:
+        raise ValueError(f"the checkpoint {path} was not written by lyceum_warp: {_MEND}")
+    _check_format(path, content["lyceum_warp"])
+    if missing := {"iteration", "policy", "state"} - content.keys():
+        raise ValueError(f"the checkpoint {path} lacks {', '.join(sorted(missing))}: {_MEND}")
+    return content
+
+
+def read_metrics(path: Path) -> list[dict[str, float | None]]:
+    """The rows of a table of metrics; None where a cell is empty.
+
+    Raises:
+        ValueError: A cell is no number, or a row has another number of cells than the first.
+    """
+    with path.open(newline="") as file:
+        reader = csv.DictReader(file, strict=True)
+        try:
+            return [{key: float(cell) if cell else None for key, cell in row.items()} for row in reader]
+        except (ValueError, TypeError, csv.Error) as error:
+            raise ValueError(f"{path} is no table of metrics: line {reader.line_num}: {error}") from error
+
+
+def versions(device: str = "cpu") -> dict[str, Any]:
+    """What a run depends on: packages, Python, the machine, and the commit if this is a checkout of git."""
+    found: dict[str, Any] = {}
+    for package in _PACKAGES:
+        try:
+            found[package.replace("-", "_")] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package.replace("-", "_")] = None
+    found["torch"] = torch.__version__  # with the build, such as +cpu
+    found["python"] = platform.python_version()
+    found["platform"] = platform.platform()
+    found["cpu"] = _cpu_name()
+    found["cores"] = os.cpu_count()
+    if device.startswith("cuda") and torch.cuda.is_available():
+        found["gpu"] = torch.cuda.get_device_name(device)
+        found["cuda"] = torch.version.cuda
+    if commit := _commit():
+        found["commit"] = commit
+    return found
+
+
+def _cpu_name() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def _commit() -> str | None:
+    root = Path(__file__).resolve().parent.parent
+    git = shutil.which("git")
+    # an installed package may lie in somebody else's checkout: only our own counts
+    if git is None or not (root / ".git").exists():
+        return None
+    command = [git, "describe", "--always", "--dirty", "--abbrev=40"]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
+    return done.stdout.strip() or None
+
+
+def _check_format(path: Path, number: Any) -> None:
+    if not isinstance(number, int) or number < 1:
+        raise ValueError(f"{path} was not written by lyceum_warp: its format is {number!r}")
+    if number > FORMAT:
+        raise ValueError(
+            f"{path} was written by a newer lyceum_warp (format {number}, this one reads up to {FORMAT}): "
+            "pip install --upgrade lyceum-warp"
+        )
+
+
+def _write(path: Path, text: str) -> None:
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(text)
+    os.replace(temporary, path)
+
+
+def _line(error: BaseException) -> str:
+    """The first sentence of an error's message: torch's go on for a page."""
+    text = str(error).strip() or type(error).__name__
+    return text.splitlines()[0].split(". ")[0][:200]

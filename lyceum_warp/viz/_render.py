@@ -1,0 +1,66 @@
+"""Draws states into a video; a program of its own: ``python _render.py job.npz model.mjb out.mp4``.
+
+MuJoCo chooses its graphics library once, when it is imported, and a driver that fails may end the process.
+``video.py`` therefore starts this file for each library that it tries. It imports nothing of the package.
+Exit code 3 means that this machine can't draw with this library; the last line on stderr says why.
+"""
+
+import sys
+from typing import Any
+
+import numpy as np
+
+CANNOT_DRAW = 3
+
+
+def camera(mujoco: Any, model: Any) -> Any:
+    """One that tracks, else one that is fixed to the world, else a free one that follows the first body."""
+    modes = list(model.cam_mode)
+    tracking = (mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
+    for i, mode in enumerate(modes):
+        if mode in tracking:
+            return i
+    for i, body in enumerate(model.cam_bodyid):
+        if body == 0:
+            return i
+    view = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, view)
+    if model.nbody > 1:
+        view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, 1
+    return view
+
+
+def main(job_path: str, model_path: str, out: str) -> int:
+    """Draw the rows of qpos (and of the mocap poses) of the job, one frame each."""
+    try:
+        import mujoco
+
+        model = mujoco.MjModel.from_binary_path(model_path)
+        job = np.load(job_path)
+        width, height = (int(size) for size in job["size"])
+        model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
+        model.vis.global_.offheight = max(model.vis.global_.offheight, height)
+        renderer = mujoco.Renderer(model, height, width)
+    except Exception as error:  # each library fails in its own way
+        print(str(error).strip() or type(error).__name__, file=sys.stderr)
+        return CANNOT_DRAW
+    import imageio.v2 as imageio
+
+    data, view = mujoco.MjData(model), camera(mujoco, model)
+    options: Any = dict(fps=float(job["fps"]), codec="libx264", pixelformat="yuv420p", quality=8, macro_block_size=2)
+    writer: Any = imageio.get_writer(out, format="FFMPEG", **options)
+    with writer:
+        for i in range(len(job["qpos"])):
+            data.qpos[:] = job["qpos"][i]
+            if model.nmocap:
+                data.mocap_pos[:] = job["mocap_pos"][i].reshape(-1, 3)
+                data.mocap_quat[:] = job["mocap_quat"][i].reshape(-1, 4)
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, view)
+            writer.append_data(renderer.render())
+    renderer.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

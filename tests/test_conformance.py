@@ -1,0 +1,121 @@
+"""Every task of the package keeps the rules of an environment on every engine, and a third engine does, too."""
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from toy_engine import ToyEngine
+
+import lyceum_warp as lw
+from lyceum_warp import testing
+from lyceum_warp.engines.c import MujocoEngine
+from lyceum_warp.kernels.recorder import Recorder
+from lyceum_warp.task import find_task
+from lyceum_warp.testing import CHECKS, check_task
+
+PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
+
+
+@pytest.mark.parametrize("task", PACKAGE)
+def test_mujoco_engine(task: str) -> None:
+    report = check_task(task, engine="mujoco", steps=1000)
+    assert list(report.seconds) == [check.__name__.removeprefix("check_") for check in CHECKS]
+
+
+@pytest.mark.parametrize("task", PACKAGE)
+def test_warp_engine(task: str) -> None:
+    # fewer steps where one takes milliseconds: on the CPU this engine is there for tests
+    check_task(task, engine="warp", steps=150 if task == "humanoid" else 1000)
+
+
+@pytest.mark.parametrize("task", ["hopper", "point_mass", "humanoid"])
+def test_toy_engine(task: str) -> None:
+    assert f"{task} on the toy engine" in str(check_task(task, engine=ToyEngine, steps=200))
+
+
+# every check can fail: an environment is broken in one place, and the check has to see it
+
+Method = Callable[..., Any]
+
+
+def then(extra: Callable[[Any], object]) -> Callable[[Method], Method]:
+    """Do something more after every call of a method."""
+
+    def wrap(method: Method) -> Method:
+        def longer(self: Any, *args: Any, **kwargs: Any) -> Any:
+            result = method(self, *args, **kwargs)
+            extra(self)
+            return result
+
+        return longer
+
+    return wrap
+
+
+def nothing(method: Method) -> Method:
+    return lambda *args, **kwargs: None
+
+
+counter = itertools.count(1)
+leak: list[bytes] = []
+
+
+def skip_some(method: Method) -> Method:
+    def call(self: Recorder, function: Method, *args: Any) -> None:
+        if not self.enabled or next(counter) % 10:
+            method(self, function, *args)
+
+    return call
+
+
+def keep_warm_start(engine: MujocoEngine) -> None:
+    start, size = engine.batch._component(mujoco.mjtState.mjSTATE_WARMSTART)
+    engine._initial.numpy()[start : start + size] = np.nan
+
+
+BREAKS: list[tuple[str, type, str, Callable[[Method], Method]]] = [
+    ("spaces", lw.Env, "_allocate", then(lambda env: setattr(env, "obs_space", env.action_space))),
+    ("addresses", lw.Env, "step", then(lambda env: setattr(env, "obs", env.obs.clone()))),
+    ("getters", lw.Env, "_given", lambda method: lambda self, values, out: values),
+    ("time", lw.Env, "_allocate", then(lambda env: setattr(env, "timestep", 1.5 * env.timestep))),
+    ("round_trip", lw.Env, "_unpack_counters", nothing),
+    ("restoring", MujocoEngine, "_set_integration", nothing),
+    ("masked_restoring", lw.Env, "set_state", lambda method: lambda self, state, mask=None: method(self, state)),
+    ("set_state_shows", lw.Env, "_judge_given", nothing),
+    ("purity", lw.Env, "_scratch_at", lambda method: lambda self, state: self.set_state(state) or self),
+    ("determinism", lw.Env, "step", then(lambda env: env.reward.add_(1e-6 * next(counter)))),
+    ("reset", lw.Env, "reset", then(lambda env: env.action.fill_(0.1))),
+    ("masked_reset", lw.Env, "reset", lambda method: lambda self, mask=None: method(self)),
+    ("rand_reset", lw.Env, "rand_reset", lambda method: lambda self, seed=None, mask=None: method(self, None, mask)),
+    ("world_count", lw.Env, "rand_reset", then(lambda env: env.obs.add_(env.nworld))),
+    ("saved_stream", lw.Env, "_unpack_counters", nothing),
+    ("truncation", lw.Env, "step", then(lambda env: env.final_obs.copy_(env.obs))),
+    ("truncation", lw.Env, "step", then(lambda env: env.terminated.copy_(env.done))),
+    ("no_autoreset", lw.Env, "step", then(lambda env: env.done.zero_())),
+    ("recording", Recorder, "__call__", skip_some),
+    ("memory", lw.Env, "step", then(lambda env: leak.append(bytes(1000)))),
+    ("memory", lw.Env, "get_state", then(lambda env: env.__dict__.setdefault("kept", []).append(env.obs.clone()))),
+    ("bad_state", MujocoEngine, "find_faults", nothing),
+    ("bad_action", lw.Env, "_judge", lambda method: lambda self, mask, fault, action_fault, *, transition: method(
+        self, mask, fault, self._no_fault, transition=transition)),
+    ("bad_warmstart", MujocoEngine, "_open", then(keep_warm_start)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("rule", "owner", "name", "wrap"), BREAKS, ids=[f"{b[0]}-{b[2]}" for b in BREAKS])
+def test_every_check_can_fail(
+    rule: str, owner: type, name: str, wrap: Callable[[Method], Method], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    check = getattr(testing, f"check_{rule}")
+    assert check in CHECKS
+    monkeypatch.setattr(owner, name, wrap(getattr(owner, name)))
+    with pytest.raises(AssertionError, match=f"hopper on the mujoco engine breaks the rule '{rule}': "):
+        check_task("hopper", engine="mujoco", steps=100, checks=[check])
+
+
+def test_every_check_is_tried() -> None:
+    rules = {f"check_{rule}" for rule, *_ in BREAKS} | {"check_observation_size"}  # the latter in test_user_task
+    assert rules == {check.__name__ for check in CHECKS}

@@ -1,0 +1,364 @@
+"""A world's trouble stays in that world, and whatever does not fit is refused with the value and the mend.
+
+The conformance suite covers not-a-number, infinite and absurd states and actions for every task and engine. Here
+are the faults that need a particular model. Both engines can produce each kind; on the C engine contacts have no
+shared pool, so that only the Warp engine's contact overflow reaches other worlds.
+"""
+
+import gc
+import importlib.util
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Done
+from lyceum_warp.engines import find_device, open_engine
+from lyceum_warp.kernels.faults import FAULTS
+from lyceum_warp.testing import OUTCOMES
+
+ENGINES = ["mujoco", "warp"]
+N, BAD = 4, 1
+
+
+def hopper(engine: str, **options: Any) -> lw.Env:
+    env = lw.make("hopper", engine=engine, nworld=N, terminate_when_unhealthy=False, **options)
+    env.reset()
+    return env
+
+
+def lay_down(env: lw.Env, world: int) -> None:
+    """Put a hopper on the floor, with five contacts where a standing one has none."""
+    state, start = env.get_state(), env.state_space.parts["qpos"].start
+    state[world, start + 1 : start + 3] = torch.tensor([0.05, 1.5], dtype=state.dtype)
+    env.set_state(state, torch.arange(N) == world)
+
+
+def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
+    """Step an environment with trouble and one without; the other worlds have to be the same to the bit."""
+    others, found = torch.arange(N) != BAD, Done(0)
+    generator = torch.Generator().manual_seed(0)
+    for i in range(steps):
+        action = 2 * torch.rand(env.action.shape, generator=generator) - 1
+        before = env.obs[BAD].clone()
+        env.step(action)
+        clean.step(action)
+        for name in OUTCOMES:
+            assert torch.equal(getattr(env, name)[others], getattr(clean, name)[others]), f"{name} at step {i}"
+        assert torch.equal(env.get_state()[others], clean.get_state()[others]), f"the state at step {i}"
+        reason = Done(int(env.done_reason[BAD]))
+        if reason & FAULTS:
+            assert env.terminated[BAD] and env.done[BAD] and env.reward[BAD] == 0 and env.time[BAD] == 0
+            assert torch.equal(env.final_obs[BAD], before), "final_obs is not the last good observation"
+        found |= reason
+        assert torch.isfinite(env.get_state()).all() and torch.isfinite(env.obs).all()
+    return found
+
+
+# faults that need a model of their own
+
+
+def test_c_engine_runs_out_of_memory() -> None:
+    """With less and less memory MuJoCo drops constraints, then contacts; in between it gives up with an error.
+
+    Which of the three a size leads to depends on the version; each has to turn up, and none may get away.
+    """
+    found = Done(0)
+    for memory in range(3000, 14_000, 1000):
+        spec = lw.gymnasium_model("hopper.xml")
+        spec.memory = memory
+        env, clean = hopper("mujoco", model=spec), hopper("mujoco")
+        lay_down(env, BAD)
+        reason = step_both(env, clean, 3)
+        assert reason & FAULTS, f"nothing was seen with {memory} bytes"
+        assert sum(env.fault_counts.values()) >= 1
+        found |= reason
+    assert Done.CONTACT_OVERFLOW in found
+    assert Done.CONSTRAINT_OVERFLOW in found
+    assert Done.ENGINE_WARNING in found
+
+
+def test_warp_engine_constraint_overflow() -> None:
+    env, clean = (hopper("warp", nconmax=16, njmax=8) for _ in range(2))
+    lay_down(env, BAD)
+    assert step_both(env, clean, 5) == Done.CONSTRAINT_OVERFLOW
+    assert env.fault_counts.pop("constraint_overflow") == sum(env.fault_counts.values()) == 1
+
+
+def test_warp_engine_contact_overflow_reaches_every_world_that_it_touched() -> None:
+    """Contacts of all worlds share one pool: whoever found no room is flagged, the others can't be told apart."""
+    env = hopper("warp", nconmax=1, njmax=64)
+    lay_down(env, BAD)
+    before = env.obs.clone()
+    env.step()
+    flagged = env.done_reason == int(Done.CONTACT_OVERFLOW)
+    assert flagged[BAD] and (env.done_reason[~flagged] == 0).all()
+    assert (env.reward[flagged] == 0).all() and env.terminated[flagged].all()
+    assert torch.equal(env.final_obs[flagged], before[flagged])
+    assert env.fault_counts["contact_overflow"] == int(flagged.sum())
+    for _ in range(5):
+        env.step()
+        assert not (env.done_reason & int(FAULTS)).any(), "the overflow outlived the reset"
+        assert torch.isfinite(env.get_state()).all()
+
+
+def test_warp_engine_warning() -> None:
+    """Trouble of other kinds: a contact sensor with more matches than it has room for."""
+
+    def make() -> lw.Env:
+        spec = lw.gymnasium_model("hopper.xml")
+        sensor = spec.add_sensor(
+            name="touch", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=mujoco.mjtObj.mjOBJ_GEOM, objname="floor"
+        )
+        sensor.intprm[:] = [1, 0, 1]
+        env = hopper("warp", model=spec, nconmax=16, njmax=64)
+        env.engine.m.opt.contact_sensor_maxmatch = 1  # type: ignore[attr-defined]
+        return env
+
+    env, clean = make(), make()
+    lay_down(env, BAD)
+    assert step_both(env, clean, 4) == Done.ENGINE_WARNING
+    assert env.fault_counts["engine_warning"] == 1
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_nothing_is_printed_over_300_steps_of_trouble(
+    engine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """One of the worlds gets a not-a-number every five steps: the rest never notices, nor does the console."""
+    monkeypatch.chdir(tmp_path)
+    env, clean = (lw.make("hopper", engine=engine, nworld=N) for _ in range(2))
+    start, only = env.state_space.parts["qvel"].start, torch.arange(N) == BAD
+    capfd.readouterr()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for i in range(60):
+            state = env.get_state()
+            state[BAD, start + i % 6] = (np.nan, np.inf, 1e200, -1e15)[i % 4]
+            env.set_state(state, only, check=False)
+            assert torch.isfinite(env.obs).all() and env.done_reason[BAD] == int(Done.NAN)
+            assert Done.NAN in step_both(env, clean, 5)  # with whatever an engine makes of such a state
+    assert env.fault_counts["nan"] == 60
+    assert sum(clean.fault_counts.values()) == 0
+    printed = capfd.readouterr()
+    assert printed.out == "" and printed.err == ""
+    assert not list(tmp_path.iterdir()), "a log was written"
+
+
+@pytest.mark.parametrize("autoreset", [True, False])
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_spoiled_warm_start_does_not_outlive_its_episode(engine: str, autoreset: bool) -> None:
+    """Writing good positions and velocities alone would leave it: the world would die again at every step."""
+    env, clean = (hopper(engine, autoreset=autoreset) for _ in range(2))
+    for each in (env, clean):
+        lay_down(each, BAD)
+    state = env.get_state()
+    state[BAD, env.state_space.parts["qacc_warmstart"]] = np.nan
+    env.set_state(state, check=False)
+    assert step_both(env, clean, 1) == Done.NAN
+    for _ in range(5):
+        env.step()
+        assert torch.isfinite(env.get_state()).all()
+    assert env.fault_counts["nan"] == 1
+    assert env.done.tolist() == [not autoreset and w == BAD for w in range(N)]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_only_a_fault_restarts_a_world_without_automatic_resets(engine: str) -> None:
+    env = lw.make("hopper", engine=engine, nworld=N, autoreset=False, horizon=3)
+    for _ in range(5):
+        env.step()
+    assert env.truncated.all() and not env.terminated.any()
+    env.action[BAD, 2] = np.inf
+    env.step()
+    assert env.done_reason[BAD] == int(Done.TRUNCATED | Done.ACTION)
+    assert env.time[BAD] == 0 and (env.time[[0, 2, 3]] > 0).all()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_bad_action_is_applied_as_zero(engine: str) -> None:
+    """Without the reset that follows, the controls would be those of a zero action."""
+    env, clean = (lw.make("hopper", engine=engine, nworld=N) for _ in range(2))
+    env.action[:] = 0.5
+    env.action[BAD, 0] = np.nan
+    clean.action[:] = 0.5
+    clean.action[BAD] = 0
+    # the controls as a step sees them, before it resets the world
+    for each in (env, clean):
+        each._begin()
+    assert torch.equal(wp.to_torch(env.engine.ctrl), wp.to_torch(clean.engine.ctrl))
+
+
+# what does not fit
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"task": "hoper"}, "no task 'hoper': did you mean hopper"),
+        ({"task": "zzz"}, "no task 'zzz': there are .*humanoid"),
+        ({"task": 3}, "a name, a file or a subclass of lw.Task, not 3"),
+        ({"task": "nowhere/mine.py"}, "no task file 'nowhere/mine.py'"),
+        ({"ctrl_cost_wieght": 1.0}, "'hopper' has no parameter 'ctrl_cost_wieght': did you mean ctrl_cost_weight"),
+        ({"dt": 1.0}, "no parameter 'dt'"),
+        ({"ctrl_cost_weight": float("nan")}, "ctrl_cost_weight=nan of 'hopper' is not a number"),
+        ({"ctrl_cost_weight": "much"}, "ctrl_cost_weight='much' of 'hopper' is no number"),
+        ({"ctrl_cost_weight": [1.0, 2.0]}, r"shape \(2,\); it takes one number, or one a world, \(4,\)"),
+        ({"healthy_z_range": 1.0}, r"healthy_z_range of 'hopper' has shape \(\); it takes \(2,\)"),
+        ({"terminate_when_unhealthy": 0.5}, "terminate_when_unhealthy=0.5 of 'hopper' has to be a whole number"),
+        ({"nworld": 0}, "nworld has to be a whole number from 1 to .*, not 0"),
+        ({"nworld": 2.5}, "nworld .* not 2.5"),
+        ({"nworld": "many"}, "nworld .* not 'many'"),
+        ({"frame_skip": -1}, "frame_skip has to be a whole number from 1 to .*, not -1"),
+        ({"frame_skip": float("inf")}, "frame_skip .* not inf"),
+        ({"horizon": -5}, "horizon has to be a whole number from 0 to .*, not -5"),
+        ({"horizon": 1.5}, "horizon .* not 1.5"),
+        ({"seed": -1}, "seed has to be a whole number from 0 to 2147483647, not -1"),
+        ({"seed": 2**31}, "seed .* not 2147483648"),
+        ({"seed": "lucky"}, "seed .* not 'lucky'"),
+        ({"cone": "round"}, "no friction cone 'round': use 'pyramidal' or 'elliptic'"),
+        ({"device": "tpu"}, "no device 'tpu' on this machine; it has 'cpu'"),
+        ({"device": "cuda:77"}, "no device 'cuda:77' on this machine; it has 'cpu'.*nvidia-smi"),
+        ({"engine": "bullet"}, "no engine 'bullet': use one of 'auto', 'mujoco', 'warp'"),
+        ({"engine": None}, "no engine None"),
+        ({"engine": "mujoco", "njmax": 64}, r"the mujoco engine takes no njmax; it takes \['nthread'\]"),
+        ({"engine": "warp", "nthread": 2}, r"the warp engine takes no nthread; it takes \['nconmax', 'njmax'\]"),
+        ({"engine": "warp", "njmax": -3}, "njmax has to be a whole number from 1 to .*, not -3"),
+        ({"engine": "mujoco", "nthread": -3}, "nthread has to be a whole number from 0 to .*, not -3"),
+        ({"model": "hoper.xml"}, "no model file 'hoper.xml' in .*; it has hopper.xml"),
+        ({"model": "/nowhere/hopper.xml"}, "no model file '/nowhere/hopper.xml'"),
+    ],
+    ids=lambda value: "-".join(f"{k}={v}" for k, v in value.items()) if isinstance(value, dict) else "",
+)  # fmt: skip
+def test_making_refuses(options: dict[str, Any], message: str) -> None:
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        lw.make(**{"task": "hopper", "nworld": N, **options})
+
+
+def test_devices_by_other_names() -> None:
+    assert find_device(None).is_cpu
+    assert find_device(torch.device("cpu")).is_cpu  # type: ignore[arg-type]
+
+
+def test_models_that_mujoco_refuses(tmp_path: Path) -> None:
+    file = tmp_path / "broken.xml"
+    file.write_text("<mujoco><worldbody><body></worldbody></mujoco>")
+    with pytest.raises(ValueError, match=r"MuJoCo can't read the model .*broken.xml: "):
+        lw.make("hopper", model=file)
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_body(name="massless").add_joint()
+    with pytest.raises(ValueError, match="MuJoCo refuses the model .*mass"):
+        lw.make("hopper", model=spec)
+    with pytest.raises(ValueError, match="not a compiled MjModel: give its MjSpec"):
+        lw.make("hopper", model=lw.gymnasium_model("hopper.xml").compile())
+
+
+def test_a_model_that_mujoco_warp_refuses() -> None:
+    spec = lw.gymnasium_model("hopper.xml")
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    for i in range(60):
+        bead = spec.worldbody.add_body(pos=(0, 3, 1 + i))
+        bead.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, limited=False)
+        bead.add_geom(size=(0.1, 0, 0), contype=0, conaffinity=0)
+    with pytest.raises(ValueError, match="MuJoCo Warp refuses the model: .*; change the model, or use engine='mujoco'"):
+        lw.make("hopper", engine="warp", model=spec)
+    lw.make("hopper", engine="mujoco", model=spec).step()
+
+
+def test_the_c_engine_refuses_a_gpu() -> None:
+    gpu = SimpleNamespace(is_cpu=False, alias="cuda:0")
+    model = lw.gymnasium_model("hopper.xml").compile()
+    with pytest.raises(ValueError, match="runs on the CPU, not on 'cuda:0': use device='cpu' or engine='warp'"):
+        open_engine("mujoco", model, 1, gpu)  # type: ignore[arg-type]
+
+
+def test_gymnasium_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "gymnasium" else find(name, *a))
+    with pytest.raises(FileNotFoundError, match="not installed: pip install 'gymnasium"):
+        lw.gymnasium_model("hopper.xml")
+
+
+@pytest.fixture(scope="module")
+def env() -> lw.Env:
+    return lw.make("hopper", engine="mujoco", nworld=N)
+
+
+@pytest.mark.parametrize("method", ["step", "set_action"])
+def test_actions_that_do_not_fit(env: lw.Env, method: str) -> None:
+    call = getattr(env, method)
+    wanted = r"action has to be a float32 tensor of shape \(4, 3\), not "
+    with pytest.raises(ValueError, match=wanted + r"a float32 tensor of shape \(3,\)"):
+        call(torch.zeros(3))
+    with pytest.raises(ValueError, match=wanted + r"a float64 tensor of shape \(4, 3\)"):
+        call(torch.zeros(4, 3, dtype=torch.float64))
+    with pytest.raises(ValueError, match=wanted + r"a ndarray of shape \(4, 3\)"):
+        call(np.zeros((4, 3), np.float32))
+    with pytest.raises(ValueError, match=wanted + r"float 1.0"):
+        call(1.0)
+
+
+def test_an_action_that_is_not_finite(env: lw.Env) -> None:
+    action = torch.zeros(N, 3)
+    action[2, 1] = np.nan
+    with pytest.raises(ValueError, match="the action 'actuator_1' of world 2 is nan: it has to be finite"):
+        env.set_action(action)
+
+
+def test_states_that_do_not_fit(env: lw.Env) -> None:
+    state = env.get_state()
+    wanted = r"state has to be a float64 tensor of shape \(4, \d+\), not a "
+    with pytest.raises(ValueError, match=wanted + r"float64 tensor of shape \(2, \d+\)"):
+        env.set_state(state[:2])
+    with pytest.raises(ValueError, match=wanted + "float32"):
+        env.set_state(state.float())
+    bad = state.clone()
+    bad[1, env.state_space.parts["qpos"].start] = np.nan
+    bad[2, env.state_space.parts["qvel"].start] = -np.inf
+    for call in (env.set_state, env.get_obs, env.get_eval, env.get_terminated):
+        with pytest.raises(ValueError, match="the state of world 1 has nan in its 'qpos': it has to be finite"):
+            call(bad)
+    mask = torch.tensor([True, False, True, False])
+    with pytest.raises(ValueError, match="the state of world 2 has -inf in its 'qvel'"):
+        env.set_state(bad, mask)
+    assert torch.equal(env.get_state(), state), "a refused state has left traces"
+    env.set_state(bad, ~mask & (torch.arange(N) != 1))  # what is wrong is not taken
+    assert torch.equal(env.get_state(), state)
+
+
+def test_masks_and_outputs_that_do_not_fit(env: lw.Env) -> None:
+    state = env.get_state()
+    calls = (env.reset, lambda mask: env.rand_reset(mask=mask), lambda mask: env.set_state(state, mask))
+    for mask in (torch.ones(3, dtype=torch.bool), torch.ones(N), np.ones(N, bool), [True] * N):
+        for call in calls:
+            with pytest.raises(ValueError, match=r"a mask has to be a bool tensor of shape \(4,\), not "):
+                call(mask)
+    for out in (torch.zeros(N, 10), torch.zeros(N, 11, dtype=torch.float64), np.zeros((N, 11))):
+        with pytest.raises(ValueError, match=r"out has to be a float32 tensor of shape \(4, 11\), not a "):
+            env.get_obs(out=out)
+    with pytest.raises(ValueError, match="give before, action and after, or none of them"):
+        env.get_reward(env.get_state())
+    with pytest.raises(ValueError, match="action has to be"):
+        env.get_reward(env.get_state(), torch.zeros(3), env.get_state())
+    with pytest.raises(ValueError, match="seed has to be"):
+        env.rand_reset(-3)
+
+
+def test_environments_are_freed() -> None:
+    """Making and dropping environments leaves nothing behind."""
+    made = []
+    for _ in range(3):
+        env = lw.make("point_mass", nworld=2)
+        env.step()
+        env.get_reward(env.get_state(), env.action, env.get_state())
+        del env
+        gc.collect()
+        made.append(sum(issubclass(type(thing), (lw.Env, wp.array)) for thing in gc.get_objects()))
+    assert made[1] == made[2]

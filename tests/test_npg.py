@@ -1,0 +1,211 @@
+"""NPG: each piece of the mathematics against a plain version of it, and the whole on a task that it can learn."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp.algos.npg import FisherProduct, conjugate_gradient
+from lyceum_warp.algos.policy import Normalizer
+from lyceum_warp.kernels import returns
+
+SMALL = lw.NPGConfig(samples=320, hidden=(8, 8), value_hidden=(16,), mean_every=2, mean_episodes=2)
+
+
+@pytest.fixture(scope="module")
+def policy() -> lw.GaussianPolicy:
+    torch.manual_seed(1)
+    policy = lw.GaussianPolicy(5, 2, (6, 4))
+    for parameter in policy.parameters():
+        parameter.data += 0.3 * torch.randn_like(parameter)
+    return policy
+
+
+def test_log_prob_is_torchs(policy: lw.GaussianPolicy) -> None:
+    obs, action = torch.randn(20, 5), torch.randn(20, 2)
+    expected = torch.distributions.Normal(policy(obs), policy.log_std.exp()).log_prob(action).sum(-1)
+    torch.testing.assert_close(policy.log_prob(obs, action), expected)
+
+
+def test_samples_have_the_mean_and_the_spread_of_the_policy(policy: lw.GaussianPolicy) -> None:
+    obs = torch.randn(1, 5).expand(20_000, 5)
+    generator = torch.Generator().manual_seed(0)
+    out = torch.empty(20_000, 2)
+    policy.sample(obs, torch.randn(20_000, 2, generator=generator), out=out)
+    torch.testing.assert_close(out.mean(0), policy(obs[0]), atol=0.03, rtol=0)
+    torch.testing.assert_close(out.std(0), policy.log_std.exp(), atol=0.03, rtol=0)
+
+
+def test_fisher_product_is_the_covariance_of_the_score(policy: lw.GaussianPolicy) -> None:
+    """F = E[score score^T], whose expectation over actions is taken exactly by a quadrature of each action."""
+    obs = torch.randn(7, 5)
+    size = sum(p.numel() for p in policy.parameters())
+    nodes, weights = np.polynomial.hermite_e.hermegauss(6)
+    fisher = torch.zeros(size, size)
+    for o in obs:
+        mean, std = policy(o).detach(), policy.log_std.exp().detach()
+        for i, x in enumerate(nodes):
+            for j, y in enumerate(nodes):
+                action = mean + std * torch.tensor([x, y], dtype=torch.float32)
+                grads = torch.autograd.grad(policy.log_prob(o, action), list(policy.parameters()))
+                score = torch.cat([g.flatten() for g in grads])
+                fisher += weights[i] * weights[j] / (2 * math.pi) / len(obs) * score.outer(score)
+    vector = torch.randn(size)
+    product = FisherProduct(policy, obs, damping=0.1)
+    torch.testing.assert_close(product(vector), fisher @ vector + 0.1 * vector, atol=2e-4, rtol=2e-4)
+
+
+def test_conjugate_gradient_solves_and_stays_put_once_it_has() -> None:
+    generator = torch.Generator().manual_seed(3)
+    root = torch.randn(12, 12, generator=generator, dtype=torch.float64)
+    matrix, target = root @ root.T + torch.eye(12), torch.randn(12, generator=generator, dtype=torch.float64)
+    expected = torch.linalg.solve(matrix, target)
+    torch.testing.assert_close(conjugate_gradient(lambda v: matrix @ v, target, 12), expected, rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close(conjugate_gradient(lambda v: matrix @ v, target, 40), expected, rtol=1e-6, atol=1e-8)
+    zero = torch.zeros_like(target)
+    assert torch.equal(conjugate_gradient(lambda v: matrix @ v, zero, 5), zero)
+
+
+def test_advantages_and_returns_bootstrap_at_time_limits_only() -> None:
+    """Against the definition, world by world, with ends of both kinds at known places."""
+    steps, worlds, gamma, lam = 9, 3, 0.9, 0.8
+    rng = np.random.default_rng(0)
+    reward, value, next_value = rng.normal(size=(3, steps, worlds)).astype(np.float32)
+    terminated, done = np.zeros((steps, worlds), bool), np.zeros((steps, worlds), bool)
+    done[3, 0] = done[5, 1] = True
+    terminated[5, 1] = True
+    expected, total = np.zeros((steps, worlds)), np.zeros((steps, worlds))
+    for w in range(worlds):
+        for t in range(steps):
+            factor, discount = 1.0, 1.0
+            for k in range(t, steps):
+                after = 0.0 if terminated[k, w] else next_value[k, w]
+                expected[t, w] += factor * (reward[k, w] + gamma * after - value[k, w])
+                total[t, w] += discount * reward[k, w]
+                factor, discount = factor * gamma * lam, discount * gamma
+                if done[k, w] or k == steps - 1:
+                    total[t, w] += discount * after
+                    break
+    arrays = [wp.array(a, device="cpu") for a in (reward, value, next_value, terminated, done)]
+    advantage, rest = wp.zeros((steps, worlds), device="cpu"), wp.zeros((steps, worlds), device="cpu")
+    wp.launch(returns.advantages, worlds, [*arrays, gamma, lam, advantage, rest], device="cpu")
+    np.testing.assert_allclose(advantage.numpy(), expected, atol=1e-5)
+    np.testing.assert_allclose(rest.numpy(), total, atol=1e-5)
+
+
+def test_normalizer_gathers_mean_and_variance_in_any_portions() -> None:
+    obs = torch.randn(1000, 4) * torch.tensor([1.0, 10.0, 0.1, 3.0]) + torch.tensor([0.0, 5.0, -2.0, 100.0])
+    normalizer = Normalizer(4)
+    torch.testing.assert_close(normalizer(obs[:5, :1].expand(5, 4)), obs[:5, :1].expand(5, 4).clamp(-10, 10))
+    for part in obs.split([10, 700, 290]):
+        normalizer.update(part)
+    normalized = normalizer(obs)
+    torch.testing.assert_close(normalized.mean(0), torch.zeros(4), atol=1e-3, rtol=0)
+    torch.testing.assert_close(normalized.std(0), torch.ones(4), atol=1e-2, rtol=0)
+
+
+@pytest.fixture(scope="module")
+def env() -> lw.Env:
+    return lw.make("point_mass", nworld=16, horizon=12, nthread=1)
+
+
+def test_a_step_has_the_length_that_was_asked_for(env: lw.Env) -> None:
+    env.rand_reset(0)
+    npg = lw.NPG(env, config=dataclasses.replace(SMALL, delta=0.01, cg_iterations=30), seed=0)
+    before = torch.cat([p.detach().flatten() for p in npg.policy.parameters()])
+    it = next(npg)
+    after = torch.cat([p.detach().flatten() for p in npg.policy.parameters()])
+    # KL = step.F.step / 2 to second order
+    assert it.kl == pytest.approx(0.005, rel=0.1)
+    assert (after - before).norm().item() == pytest.approx(it.step_norm, rel=1e-4)
+
+
+@pytest.mark.parametrize("rollout", ["episodes", "segments"])
+def test_a_run_is_reproducible_and_resumes_to_the_bit(env: lw.Env, rollout: str) -> None:
+    config = dataclasses.replace(SMALL, rollout=rollout, time_orders=2, normalize=True)
+
+    def numbers(it: lw.Iteration) -> dict[str, object]:
+        skipped = {"samples_per_second", "faults"}
+        values = dataclasses.asdict(it).items()
+        return {k: v for k, v in values if not k.startswith("time_") and k not in skipped}
+
+    def fresh(seed: int) -> lw.NPG:
+        env.rand_reset(7)
+        return lw.NPG(env, config=config, seed=seed)
+
+    npg = fresh(1)
+    first = [numbers(next(npg)) for _ in range(2)]
+    saved = npg.state_dict()
+    rest = [numbers(next(npg)) for _ in range(2)]
+    again = fresh(1)
+    np.testing.assert_equal([numbers(next(again)) for _ in range(4)], first + rest)
+    resumed = fresh(2)
+    resumed.load_state_dict(saved)
+    np.testing.assert_equal([numbers(next(resumed)) for _ in range(2)], rest)
+
+
+def test_segments_go_on_where_the_last_ones_ended(env: lw.Env) -> None:
+    env.rand_reset(0)
+    npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=16 * 5, rollout="segments", mean_every=0))
+    lengths = [next(npg).length_mean for _ in range(5)]
+    assert math.isnan(lengths[0]) and math.isnan(lengths[1])  # 12 steps need three segments of 5
+    assert lengths[2] == 12.0
+    steps = npg.rollout.step[:, 0].tolist()
+    assert steps == [(20 + t) % 12 for t in range(5)]
+
+
+def test_gradient_that_is_not_finite_leaves_the_policy_alone(env: lw.Env) -> None:
+    env.rand_reset(0)
+    npg = lw.NPG(env, config=SMALL)
+    before = [p.clone() for p in npg.policy.parameters()]
+    with torch.no_grad():
+        npg.value.network[0].weight.fill_(math.nan)
+    with pytest.raises(FloatingPointError, match="gradient of iteration 1 is not finite"):
+        next(npg)
+    assert all(torch.equal(a, b) for a, b in zip(before, npg.policy.parameters(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("gamma", 1.5), ("samples", 0), ("delta", -1.0), ("value_batch", 0), ("gamma", math.nan)]
+)
+def test_bad_hyperparameters_are_named(env: lw.Env, name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=rf"{name} has to be .*, not {value}"):
+        lw.NPG(env, config=dataclasses.replace(SMALL, **{name: value}))
+
+
+def test_evaluation_counts_the_same_number_of_episodes_of_every_world() -> None:
+    """Short episodes do not crowd out long ones, and the numbers are those of a plain loop."""
+    env = lw.make("hopper", nworld=4, horizon=60)
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
+    got = lw.evaluate(env, policy, 8, seed=3)
+    env.rand_reset(3)
+    total, lengths, expected = torch.zeros(4), [0] * 4, [[] for _ in range(4)]
+    while min(map(len, expected)) < 2:
+        with torch.no_grad():
+            env.step(policy(env.obs))
+        total += env.reward
+        for w in range(4):
+            lengths[w] += 1
+            if env.done[w]:
+                expected[w].append((total[w].item(), lengths[w], env.eval[w].item()))
+                total[w], lengths[w] = 0.0, 0
+    flat = [episodes[i] for i in range(2) for episodes in expected]
+    np.testing.assert_allclose(got.returns, [e[0] for e in flat], rtol=1e-5)
+    np.testing.assert_array_equal(got.lengths, [e[1] for e in flat])
+    np.testing.assert_allclose(got.evals, [e[2] for e in flat], rtol=1e-5)
+
+
+def test_point_mass_learns_to_reach_the_target() -> None:
+    """A short run with the original's own settings for this task; its full run is in the README's figures."""
+    env = lw.make("point_mass", nworld=16)
+    config = lw.NPGConfig(
+        samples=16 * 256, gamma=0.97, lam=0.95, delta=0.02, hidden=(16, 16), value_hidden=(32, 32), mean_every=0
+    )
+    npg = lw.NPG(env, config=config, seed=0)
+    rewards = [next(npg).terminal_reward for _ in range(25)]
+    assert np.mean(rewards[:3]) < 0.4
+    assert np.mean(rewards[-3:]) > 0.7, rewards

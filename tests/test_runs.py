@@ -1,0 +1,187 @@
+"""A run's folder: what it refuses, what it survives, and what comes back from it."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.runs import FORMAT, Run, load
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    run = Run.create(tmp_path / "run", {"task": "hopper", "seed": 0, "scale": float("inf")})
+    run.save(0, GaussianPolicy(3, 2, (8, 4), normalize=True), {"counter": 5, "tensor": torch.arange(3)})
+    return run
+
+
+def test_create_and_open(run: Run) -> None:
+    again = Run.open(run.folder)
+    assert again.config == {"format": FORMAT, "task": "hopper", "seed": 0, "scale": float("inf")}
+    versions = json.loads((run.folder / "versions.json").read_text())
+    assert versions["torch"] == torch.__version__
+    assert {
+        "lyceum_warp",
+        "mujoco",
+        "mujoco_warp",
+        "warp_lang",
+        "numpy",
+        "python",
+        "platform",
+        "cpu",
+    } <= versions.keys()
+    state = again.read()["state"]
+    assert state["counter"] == 5
+    assert state["tensor"].tolist() == [0, 1, 2]
+    assert {path.name for path in run.folder.iterdir()} == {"config.json", "versions.json", "checkpoint.pt"}
+
+
+def test_create_refuses_what_is_there(run: Run, tmp_path: Path) -> None:
+    before = {path: path.read_bytes() for path in run.folder.iterdir()}
+    with pytest.raises(ValueError, match=r"holds a run: continue it with --resume .*, or give another --out"):
+        Run.create(run.folder, {})
+    assert before == {path: path.read_bytes() for path in run.folder.iterdir()}
+    (tmp_path / "file").write_text("mine")
+    for place in (tmp_path, tmp_path / "file"):
+        with pytest.raises(ValueError, match="is not an empty folder: give another --out"):
+            Run.create(place, {})
+
+
+def test_create_leaves_no_folder_when_the_configuration_is_bad(tmp_path: Path) -> None:
+    with pytest.raises(TypeError):
+        Run.create(tmp_path / "run", {"task": object()})
+    assert not (tmp_path / "run").exists()
+
+
+def test_open_refuses(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"there is no run in .*: it has no config\.json"):
+        Run.open(tmp_path)
+    for text in ("{", "[]", "{}", '"text"'):
+        (tmp_path / "config.json").write_text(text)
+        with pytest.raises(ValueError, match=r"config\.json is not the configuration of a run"):
+            Run.open(tmp_path)
+    (tmp_path / "config.json").write_text('{"format": "one"}')
+    with pytest.raises(ValueError, match="was not written by lyceum_warp: its format is 'one'"):
+        Run.open(tmp_path)
+    (tmp_path / "config.json").write_text(json.dumps({"format": FORMAT + 1}))
+    with pytest.raises(ValueError, match=r"newer lyceum_warp \(format 2, this one reads up to 1\): pip install --up"):
+        Run.open(tmp_path)
+
+
+def test_metrics(run: Run) -> None:
+    with pytest.raises(FileNotFoundError, match="the run has no complete iteration"):
+        run.rows()
+    rows = [{"iteration": i, "value": i / 3, "mean": None if i % 2 else 1e-30, "bad": float("nan")} for i in (1, 2, 3)]
+    for row in rows:
+        run.write(row)
+    with run.metrics.open(newline="") as file:
+        table = list(csv.reader(file))
+    assert table[0] == ["iteration", "value", "mean", "bad"]
+    assert table[1] == ["1", repr(1 / 3), "", "nan"]
+    read = run.rows()
+    assert [row["value"] for row in read] == [row["value"] for row in rows]  # every digit
+    assert [row["mean"] for row in read] == [None, 1e-30, None]
+
+
+def test_cut_drops_rows_without_a_checkpoint(run: Run) -> None:
+    run.cut(2)  # nothing there yet
+    for i in (1, 2, 3):
+        run.write({"iteration": i, "value": 0.5})
+    with run.metrics.open("a") as file:
+        file.write("4,0.")  # a row that the end of the process cut off
+    whole = run.metrics.read_text()
+    run.cut(2)
+    assert [row["iteration"] for row in run.rows()] == [1, 2]
+    run.metrics.write_text(whole)
+    run.cut(9)
+    assert [row["iteration"] for row in run.rows()] == [1, 2, 3]
+    run.cut(0)
+    run.write({"iteration": 1, "value": 0.5})
+    assert [row["iteration"] for row in run.rows()] == [1]
+
+
+def test_metrics_that_are_none(run: Run) -> None:
+    run.metrics.write_text("iteration,value\n1,apple\n")
+    with pytest.raises(ValueError, match=r"metrics\.csv is no table of metrics: line 2"):
+        run.rows()
+    run.metrics.write_text("iteration,value\n1,2,3\n")
+    with pytest.raises(ValueError, match="line 2"):
+        run.rows()
+
+
+def test_load_gives_the_same_policy(run: Run) -> None:
+    policy = GaussianPolicy(3, 2, (8, 4), normalize=True)
+    policy.normalizer.update(3.0 + 2.0 * torch.randn(100, 3))  # type: ignore[operator]
+    run.save(1, policy, {})
+    for given in (run, run.folder, str(run.folder), run.checkpoint):
+        loaded = load(given)
+        obs = torch.randn(5, 3)
+        assert torch.equal(loaded(obs), policy(obs))
+        assert not loaded.training
+        assert not loaded(obs).requires_grad
+
+
+def test_a_failed_save_keeps_the_old_checkpoint(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(content: object, path: Path) -> None:
+        path.write_bytes(b"PK half")
+        raise OSError("no space left on device")
+
+    before = run.checkpoint.read_bytes()
+    monkeypatch.setattr(torch, "save", broken)
+    with pytest.raises(OSError, match="no space"):
+        run.save(1, GaussianPolicy(3, 2), {})
+    assert run.checkpoint.read_bytes() == before
+    assert not list(run.folder.glob("*.tmp"))
+
+
+class Foreign:
+    """Something that a checkpoint must never bring to life."""
+
+
+@pytest.mark.parametrize("kind", ["empty", "truncated", "text", "foreign", "code", "list", "newer", "partial", "shape"])
+def test_broken_and_foreign_checkpoints(run: Run, kind: str) -> None:
+    path, whole = run.checkpoint, run.checkpoint.read_bytes()
+    content = run.read()
+    mend = "restore the file from a copy, or train again with another --out"
+    match kind:
+        case "empty":
+            path.write_bytes(b"")
+        case "truncated":
+            path.write_bytes(whole[: len(whole) // 2])
+        case "text":
+            path.write_text("weights: 1, 2, 3\n")
+        case "foreign":
+            torch.save({"model": torch.zeros(2)}, path)
+        case "code":
+            torch.save({"lyceum_warp": FORMAT, "policy": Foreign()}, path)
+        case "list":
+            torch.save([1, 2], path)
+        case "newer":
+            torch.save(content | {"lyceum_warp": FORMAT + 1}, path)
+            mend = "pip install --upgrade lyceum-warp"
+        case "partial":
+            del content["policy"]
+            torch.save(content, path)
+        case "shape":
+            content["policy"]["shape"]["nobs"] = 4
+            torch.save(content, path)
+    with pytest.raises(ValueError, match=mend) as caught:
+        load(run)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_checkpoint(run: Run) -> None:
+    run.checkpoint.unlink()
+    with pytest.raises(FileNotFoundError, match=r"there is no checkpoint .*checkpoint\.pt: train the run first"):
+        load(run)
+
+
+def test_changed_versions_are_told_and_noted(run: Run) -> None:
+    now = json.loads((run.folder / "versions.json").read_text())
+    assert run.changed(now) == {}
+    assert run.changed(now | {"torch": "9.9"}) == {"torch": (torch.__version__, "9.9")}
+    assert json.loads((run.folder / "versions.json").read_text())["resumed"] == [{"torch": "9.9"}]

@@ -1,0 +1,491 @@
+"""A user's own task in the user's own file: all that a task may use, on both engines, with the package as it is."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+import lyceum_warp as lw
+from lyceum_warp.testing import check_task
+
+ENGINES = ["mujoco", "warp"]
+
+SOURCE = '''
+"""An arm of two joints that follows a target, with everything that a task may use."""
+
+import mujoco
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+XML = """
+<mujoco model="arm">
+  <option timestep="0.005"/>
+  <size nuserdata="1"/>
+  <worldbody>
+    <geom type="plane" size="2 2 .1" pos="0 0 -.35"/>
+    <body name="target" mocap="true" pos=".3 0 .2"><geom size=".02" contype="0" conaffinity="0"/></body>
+    <body name="upper" pos="0 0 .2">
+      <joint name="shoulder" axis="0 1 0" damping=".1"/>
+      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/>
+      <body name="lower" pos=".3 0 0">
+        <joint name="elbow" axis="0 1 0" damping=".1" range="-150 150" limited="true"/>
+        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/>
+        <site name="tip" pos=".3 0 0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="shoulder" joint="shoulder" ctrlrange="-2 3" ctrllimited="true"/>
+    <motor name="elbow" joint="elbow" ctrlrange="-1 1" ctrllimited="true"/>
+  </actuator>
+  <sensor>
+    <accelerometer name="shock" site="tip"/>
+    <framepos name="tip_position" objtype="site" objname="tip"/>
+    <framelinvel name="tip_velocity" objtype="site" objname="tip"/>
+  </sensor>
+</mujoco>
+"""
+
+
+@wp.struct
+class World:
+    time: float
+    qpos: Row[float]
+    qvel: Row[float]
+    xpos: Row[wp.vec3]
+    xmat: Row[wp.mat33]
+    site_xpos: Row[wp.vec3]
+    cvel: Row[wp.spatial_vector]
+    sensordata: Row[float]
+    mocap_pos: Row[wp.vec3]
+    userdata: Row[float]
+    memory: Row[float]
+
+
+@wp.struct
+class Params:
+    dt: float
+    gain: float = 1.0
+    offset: wp.vec3 = wp.vec3(0.0, 0.0, 0.01)
+    cost: float = 0.01
+    distance: float = 0.05
+    limit: int = 3
+    tip: int = lw.site("tip")
+    lower: int = lw.body("lower")
+    target: int = lw.mocap("target")
+    elbow: int = lw.qpos("elbow")
+    velocity: int = lw.sensor("tip_velocity")
+    shock: int = lw.sensor("shock")
+
+
+@wp.func
+def distance(s: World, p: Params) -> float:
+    return wp.length(s.site_xpos[p.tip] - s.mocap_pos[p.target])
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    gap = s.mocap_pos[p.target] - s.site_xpos[p.tip]
+    for i in range(2):
+        obs[i] = s.qpos[i]
+        obs[2 + i] = s.qvel[i]
+    for i in range(3):
+        obs[4 + i] = gap[i]
+        obs[7 + i] = s.sensordata[p.velocity + i]
+        obs[10 + i] = s.cvel[p.lower][i]
+        obs[13 + i] = s.xmat[p.lower][0, i]
+    obs[16] = s.userdata[0]
+    obs[17] = s.memory[0]
+    obs[18] = s.memory[1]
+    obs[19] = s.qpos[p.elbow] + s.xpos[p.lower][0]
+    obs[20] = 1.0e-3 * s.sensordata[p.shock]
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    effort = action[0] * action[0] + action[1] * action[1]
+    return distance(s0, p) - distance(s1, p) - p.cost * effort + s1.memory[1] - s0.memory[1]
+
+
+@wp.func
+def evaluate(s: World, p: Params) -> float:
+    return distance(s, p)
+
+
+@wp.func
+def success(s: World, p: Params) -> bool:
+    return distance(s, p) < p.distance
+
+
+@wp.func
+def terminated(s: World, p: Params) -> bool:
+    return wp.abs(s.qpos[0]) > float(p.limit)
+
+
+@wp.func
+def servo(s: World, action: Row[float], p: Params, ctrl: Row[float]):
+    for i in range(2):
+        ctrl[i] = p.gain * action[i] - 0.1 * s.qvel[i]
+
+
+@wp.func
+def initialize(s: World, p: Params):
+    s.qpos[1] = 0.5
+    s.mocap_pos[p.target] = wp.vec3(0.4, 0.0, 0.3) + p.offset
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    for i in range(2):
+        s.qpos[i] += 0.1 * lw.normal(rng)
+    s.mocap_pos[p.target] += wp.vec3(lw.uniform(rng, -0.1, 0.1), 0.0, lw.uniform(rng, -0.1, 0.1))
+    s.userdata[0] = lw.uniform(rng, 1.0, 2.0)
+    s.memory[0] = -1.0
+
+
+@wp.func
+def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
+    s1.memory[0] = s0.memory[0] + action[0]
+    s1.memory[1] = lw.uniform(rng, 0.0, 1.0)
+
+
+PARTS = {"joints": 4, "gap": 3, "speed": 3, "turn": 3, "axis": 3, "rest": 5}
+
+
+@lw.register
+class FollowTarget(lw.Task):
+    model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))
+    frame_skip = 4
+    obs = PARTS
+    horizon = 50
+    memory = 2
+    control = servo
+
+
+class ScaledActions(lw.Task):
+    model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))
+    frame_skip = 2
+    obs = PARTS
+    memory = 2
+    action_range = (-1.0, 1.0)
+'''
+
+
+def load(path: Path, name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("task") / "follow_target.py"
+    file.write_text(SOURCE)
+    return file
+
+
+@pytest.fixture(scope="module")
+def module(path: Path) -> ModuleType:
+    return load(path, "user_follow_target")
+
+
+def random_steps(env: lw.Env, n: int, seed: int = 0) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(n):
+        env.step(2 * torch.rand(env.action.shape, generator=generator) - 1)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_keeps_the_rules(module: ModuleType, engine: str) -> None:
+    check_task("follow_target", engine=engine, steps=300, gain=np.array([0.5, 1.0, 1.5, 2.0]))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_keeps_the_rules_under_rk4_with_scaled_actions(module: ModuleType, path: Path, engine: str) -> None:
+    spec = mujoco.MjSpec.from_string(module.XML)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    check_task(f"{path}:ScaledActions", engine=engine, steps=200, model=spec, nworld=3)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_current_fields_are_those_of_mj_forward(module: ModuleType, engine: str) -> None:
+    """After a step, an automatic reset, set_state and rand_reset; the accelerometer is one substep behind."""
+    env = lw.make("follow_target", engine=engine, nworld=3, horizon=5)
+    late = env.field("xipos")
+    parts = env.state_space.parts
+
+    def compare(when: str, accelerations: bool = False) -> None:
+        state = env.get_state().numpy()
+        for w in range(env.nworld):
+            data = mujoco.MjData(env.model)
+            data.qpos[:], data.qvel[:] = state[w, parts["qpos"]], state[w, parts["qvel"]]
+            data.mocap_pos[:] = state[w, parts["mocap_pos"]].reshape(-1, 3)
+            mujoco.mj_forward(env.model, data)
+            for name in ("xpos", "xmat", "site_xpos", "cvel"):
+                found, wanted = env.field(name)[w].numpy(), getattr(data, name)
+                np.testing.assert_allclose(found.reshape(wanted.shape), wanted, atol=2e-5, err_msg=f"{name} {when}")
+            np.testing.assert_allclose(late[w].numpy(), data.xipos, atol=2e-5, err_msg=f"xipos {when}")
+            first = 0 if accelerations else 3
+            np.testing.assert_allclose(
+                env.field("sensordata")[w, first:].numpy(), data.sensordata[first:], atol=2e-4, rtol=1e-4, err_msg=when
+            )
+
+    compare("after construction", accelerations=True)
+    random_steps(env, 4)
+    compare("after steps")
+    state = env.get_state()
+    random_steps(env, 1, 1)
+    assert env.truncated.all()
+    compare("after an automatic reset", accelerations=True)
+    random_steps(env, 2, 2)
+    env.set_state(state, torch.tensor([True, False, True]))
+    compare("after set_state")
+    env.rand_reset(7)
+    compare("after rand_reset", accelerations=True)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_acceleration_sensors_are_those_of_the_last_substep(module: ModuleType, engine: str) -> None:
+    env = lw.make("follow_target", engine=engine, nworld=2, frame_skip=1)
+    random_steps(env, 3)
+    parts, before = env.state_space.parts, env.get_state().numpy()
+    random_steps(env, 1, 1)
+    for w in range(2):
+        data = mujoco.MjData(env.model)
+        mujoco.mj_setState(
+            env.model, data, before[w, : env.engine.integration_size], mujoco.mjtState.mjSTATE_INTEGRATION.value
+        )
+        data.ctrl[:] = env.get_state()[w, parts["ctrl"]].numpy()
+        mujoco.mj_forward(env.model, data)
+        np.testing.assert_allclose(env.field("sensordata", "shock")[w], data.sensor("shock").data, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_named_elements(module: ModuleType, engine: str) -> None:
+    env = lw.make("follow_target", engine=engine, nworld=2)
+    random_steps(env, 3)
+    for name, element, where in [
+        ("qpos", "elbow", np.s_[:, 1:2]), ("qvel", "shoulder", np.s_[:, 0:1]), ("site_xpos", "tip", np.s_[:, 0]),
+        ("xpos", "lower", np.s_[:, 3]), ("sensordata", "tip_position", np.s_[:, 3:6]),
+        ("mocap_pos", "target", np.s_[:, 0]), ("geom_xpos", None, np.s_[:]), ("ctrl", "elbow", np.s_[:, 1:2]),
+    ]:  # fmt: skip
+        view = env.field(name, element)
+        torch.testing.assert_close(view, env.field(name)[where], rtol=0, atol=0)
+        assert view.data_ptr() == env.field(name)[where].data_ptr(), f"{name} is no view"
+    for element, place in (("tip", 0), ("lower", 3), ("target", 0), ("elbow", 1), ("velocity", 6)):
+        assert env.task.params[element] == place
+    with pytest.raises(ValueError, match="no site 'hand' for the field 'site_xpos'; it has: tip"):
+        env.field("site_xpos", "hand")
+    with pytest.raises(ValueError, match="no field 'site_xpoz': did you mean site_xpos"):
+        env.field("site_xpoz")
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_field_asked_for_later_joins_the_state(module: ModuleType, engine: str) -> None:
+    env = lw.make("follow_target", engine=engine, nworld=2)
+    size = env.state_space.size
+    random_steps(env, 4)
+    acceleration = env.field("qacc")
+    assert env.state_space.size == size + 2
+    random_steps(env, 2)
+    state, kept = env.get_state(), acceleration.clone()
+    assert kept.abs().min() > 0
+    random_steps(env, 2, 1)
+    assert not torch.equal(acceleration, kept)
+    env.set_state(state)
+    assert torch.equal(acceleration, kept)
+    assert torch.equal(env.get_state(), state)
+    torch.testing.assert_close(env.get_obs(state), env.obs, rtol=0, atol=0)
+    with pytest.raises(ValueError, match="'cfrc_ext' only for a sensor"):
+        lw.make("hopper", engine=engine).field("cfrc_ext")
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_controls(module: ModuleType, path: Path, engine: str) -> None:
+    env = lw.make("follow_target", engine=engine, nworld=2, gain=[1.0, 10.0])
+    env.reset()
+    env.step(torch.full((2, 2), 0.5))
+    wanted = torch.tensor([[0.5, 0.5], [3.0, 1.0]])  # the second world's gain leads beyond the ranges
+    torch.testing.assert_close(env.field("ctrl"), wanted)
+    np.testing.assert_array_equal(env.action_space.high, [3, 1])
+
+    env = lw.make(f"{path}:ScaledActions", engine=engine, nworld=3)
+    np.testing.assert_array_equal(env.action_space.low, [-1, -1])
+    env.step(torch.tensor([[-1.0, 0.0], [1.0, 0.5], [0.0, 2.0]]))
+    torch.testing.assert_close(env.field("ctrl"), torch.tensor([[-2.0, 0.0], [3.0, 0.5], [0.5, 1.0]]))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_memory(module: ModuleType, engine: str) -> None:
+    env = lw.make("follow_target", engine=engine, nworld=2, horizon=3, seed=4)
+    first = []
+    for i in range(2):
+        env.step(torch.full((2, 2), 0.5))
+        torch.testing.assert_close(env.obs[:, 17], torch.full((2,), -1.0 + 0.5 * (i + 1)))
+        first.append(env.obs[:, 18].clone())
+    assert first[0][0] != first[0][1] and first[0][0] != first[1][0], "draws repeat over worlds or steps"
+    env.step()
+    assert env.truncated.all() and (env.obs[:, 17] == -1).all(), "the reset did not clear the memory"
+    assert (env.final_obs[:, 17] == 0.5).all()
+    env.rand_reset(4)
+    env.step(torch.full((2, 2), 0.5))
+    assert torch.equal(env.obs[:, 18], first[0])
+    env.reset()
+    assert (env.obs[:, 16:19] == 0).all()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_set_params_in_place(module: ModuleType, engine: str) -> None:
+    env, other = (lw.make("follow_target", engine=engine, nworld=2, seed=1, cost=cost) for cost in (0.0, 2.0))
+    action = torch.full((2, 2), 0.5)
+    for _ in range(3):
+        env.step(action)
+        other.step(action)
+    torch.testing.assert_close(other.reward, env.reward - 1.0)
+    env.set_params(cost=2.0)
+    for _ in range(3):
+        env.step(action)
+        other.step(action)
+        assert torch.equal(other.reward, env.reward)
+    env.set_params(cost=[2.0, 4.0])
+    for _ in range(3):
+        env.step(action)
+        other.step(action)
+        torch.testing.assert_close(other.reward - env.reward, torch.tensor([0.0, 1.0]))
+    state = env.get_state()
+    env.step(action)
+    torch.testing.assert_close(env.get_reward(state, action, env.get_state()), env.reward, rtol=0, atol=0)
+    env.set_params(offset=(0, 0, 0.1), distance=100)
+    env.reset()
+    np.testing.assert_allclose(env.field("mocap_pos")[:, 0], [[0.4, 0, 0.4]] * 2, atol=1e-6)
+    assert env.success.all()
+    with pytest.raises(ValueError, match=r"parameter 'costs': did you mean cost"):
+        env.set_params(costs=1.0)
+    with pytest.raises(ValueError, match="offset of 'follow_target' has shape"):
+        env.set_params(offset=1.0)
+    with pytest.raises(ValueError, match="limit=2.5 of 'follow_target' has to be a whole number"):
+        env.set_params(limit=2.5)
+    hopper = lw.make("hopper", engine=engine)
+    with pytest.raises(ValueError, match="would change the observation's parts"):
+        hopper.set_params(exclude_current_positions_from_observation=False)
+    assert hopper.task.params["exclude_current_positions_from_observation"]
+
+
+def test_terminated(module: ModuleType) -> None:
+    env = lw.make("follow_target", nworld=2, limit=1)
+    state = env.get_state()
+    state[0, env.state_space.parts["qpos"].start] = 1.2
+    env.set_state(state)
+    assert env.terminated.tolist() == [True, False]
+    assert env.done_reason.tolist() == [int(lw.Done.TERMINATED), 0]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_model_frame_skip_and_cone(module: ModuleType, path: Path, engine: str, tmp_path: Path) -> None:
+    xml = tmp_path / "light.xml"
+    xml.write_text(module.XML.replace('size=".03"', 'size=".02"'))
+    env = lw.make("follow_target", engine=engine, model=xml, frame_skip=3, cone="elliptic")
+    assert env.model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert (env.model.geom_size[:, 0] == 0.02).sum() == 3
+    assert env.timestep == pytest.approx(0.015) == env.task.params["dt"]
+    env.step()
+    assert env.time.item() == pytest.approx(0.015)
+    torch.testing.assert_close(env.get_obs(env.get_state()), env.obs, rtol=0, atol=0)  # the scratch worlds, too
+
+
+def test_found_by_name_by_path_and_as_a_class(module: ModuleType, path: Path) -> None:
+    assert "follow_target" in lw.task_names()
+    assert lw.make("follow_target").task.task.__name__ == "FollowTarget"
+    assert lw.make(module.ScaledActions).task.name == "scaled_actions"
+    # the file is imported already, and registers its task again
+    assert lw.make(f"{path}:FollowTarget").task.name == "follow_target"
+    with pytest.raises(ValueError, match=r"2 tasks \(FollowTarget, ScaledActions\): name one"):
+        lw.make(str(path))
+    with pytest.raises(ValueError, match="no task 'Arm'; it has FollowTarget, ScaledActions"):
+        lw.make(f"{path}:Arm")
+    with pytest.raises(ValueError, match="no task 'follow_targt': did you mean follow_target"):
+        lw.make("follow_targt")
+
+
+def test_names_that_are_taken(module: ModuleType, tmp_path: Path) -> None:
+    clash = tmp_path / "other.py"
+    clash.write_text("import lyceum_warp as lw\n@lw.register\nclass FollowTarget(lw.Task):\n    pass\n")
+    with pytest.raises(ValueError, match=r"'follow_target' is taken by .*FollowTarget: rename yours"):
+        load(clash, "user_other")
+    clash.write_text("import lyceum_warp as lw\n@lw.register\nclass Walker2d(lw.Task):\n    pass\n")
+    with pytest.raises(ValueError, match=r"'walker2d' is taken by lyceum_warp.tasks.walker2d.*: rename yours"):
+        load(clash, "user_other")
+    assert lw.make("walker2d").task.task.__module__ == "lyceum_warp.tasks.walker2d"
+
+
+TINY = """
+import warp as wp
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+@wp.struct
+class World:
+    qpos: Row[float]
+
+@wp.struct
+class Params:
+    dt: float
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    obs[0] = s.qpos[0]
+
+class Tiny(lw.Task):
+    model = "hopper.xml"
+    obs = {"x": 1}
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("qpos: Row[float]", "qpos: Row[float]\n    qpoz: Row[float]", "no field 'qpoz': did you mean qpos"),
+        ("qpos: Row[float]", "qpos: Row[wp.vec3]", r"World.qpos of the task 'tiny' has to be declared as Row\[float"),
+        ("qpos: Row[float]", "qpos: Row[float]\n    xpos: Row[float]", r"World.xpos .* declared as Row\[vec"),
+        ("qpos: Row[float]", "qpos: Row[float]\n    time: Row[float]", "World.time .* declared as float"),
+        ("def observe", "def look", r"'tiny' has no observe\(s, p, obs\)"),
+        ("    obs = {", "    parts = {", "'tiny' has no obs: add"),
+        ("    model = ", "    file = ", "'tiny' has no model: add"),
+        ('"hopper.xml"', '"hoper.xml"', "no model file 'hoper.xml' in .*; it has hopper.xml"),
+        ('"hopper.xml"', '"/nowhere/hopper.xml"', "no model file '/nowhere/hopper.xml'"),
+        ("@wp.func\n", "", "observe of the task 'tiny' has to be a @wp.func"),
+        ("    obs = {", "    memory = 1\n    obs = {", "memory in World"),
+        ("    obs = {", "    lagged = ('qvel',)\n    obs = {", "wants 'qvel' lagged but does not list it in World"),
+        ("    obs = {", "    frame_skip = 0\n    obs = {", "frame_skip has to be a whole number from 1 to .*, not 0"),
+    ],
+)  # fmt: skip
+def test_a_broken_task_says_what_to_mend(old: str, new: str, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "tiny.py"
+    assert old in TINY
+    file.write_text(TINY.replace(old, new, 1))
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        lw.make(str(file))
+
+
+def test_the_suite_finds_an_observation_of_another_size(tmp_path: Path) -> None:
+    from lyceum_warp import testing
+
+    file = tmp_path / "tiny.py"
+    file.write_text(TINY.replace("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0]\n    obs[2] = 1.0"))
+    checks = [testing.check_observation_size]
+    with pytest.raises(AssertionError, match="tiny on the mujoco engine .* writes up to place 2, obs declares 1"):
+        check_task(str(file), checks=checks)
+    file = tmp_path / "tiny_two.py"
+    file.write_text(TINY.replace('{"x": 1}', '{"x": 2}'))
+    with pytest.raises(AssertionError, match=r"leaves places \[1\] of 2 unwritten"):
+        check_task(str(file), checks=checks)

@@ -1,0 +1,126 @@
+"""A third engine, written against the contract in ``lyceum_warp.engines.base`` alone: one MjData a world, one loop."""
+
+import copy
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from lyceum_warp.engines.base import Engine, flat
+from lyceum_warp.fields import STATE_FIELDS, Field, Stage
+from lyceum_warp.kernels import faults, state
+
+_SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
+
+
+class ToyEngine(Engine):
+    """The state lies in float64 rows; a world's MjData takes it from there and gives it back.
+
+    What a step launches between two calls of the engine is recorded, so that ``reset``, ``commit``,
+    ``find_faults`` and getting the state are Warp launches on those rows.
+    """
+
+    name = "toy"
+    recordable = False
+
+    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device) -> None:
+        super().__init__(model, nworld, device)
+        mujoco.set_mju_user_warning(lambda message: None)
+        self._model = copy.copy(model)
+        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.worlds = [mujoco.MjData(self._model) for _ in range(nworld)]
+        rows = np.empty((nworld, self.integration_size))
+        for data, row in zip(self.worlds, rows, strict=True):
+            mujoco.mj_getState(self._model, data, row, _SPEC)
+        self._rows = wp.array(rows, dtype=wp.float64, device=device)
+        self._initial = wp.array(rows[0], dtype=wp.float64, device=device)
+        self._warning = wp.zeros((nworld, len(self.worlds[0].warning.number), 2), dtype=int, device=device)
+        self.ctrl = wp.zeros((nworld, model.nu), dtype=float, device=device)
+        self._columns: dict[str, wp.array] = {}
+
+    # fields
+
+    def _bind(self, field: Field) -> wp.array:
+        array = wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
+        self.arrays[field.name] = array
+        if field.name in STATE_FIELDS:
+            bit = STATE_FIELDS[field.name].value
+            start = mujoco.mj_stateSize(self._model, _SPEC & (bit - 1))
+            self._columns[field.name] = self._rows[:, start : start + field.size]
+        for w in range(self.nworld):
+            self._load(w)
+            self._compute(w, field.reset)
+            self._show(w, [field])
+        return array
+
+    def _load(self, w: int) -> None:
+        mujoco.mj_setState(self._model, self.worlds[w], self._rows.numpy()[w], _SPEC)
+
+    def _show(self, w: int, fields: list[Field]) -> None:
+        for field in fields:
+            target = self.arrays[field.name].numpy()[w : w + 1]
+            target[...] = np.reshape(getattr(self.worlds[w], field.name), target.shape)
+
+    def _compute(self, w: int, stage: Stage) -> None:
+        model, data = self._model, self.worlds[w]
+        if stage == Stage.ACCELERATION:
+            mujoco.mj_forward(model, data)
+        elif stage > Stage.NONE:
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_sensorPos(model, data)
+            if stage == Stage.VELOCITY:
+                mujoco.mj_fwdVelocity(model, data)
+                mujoco.mj_sensorVel(model, data)
+
+    # physics
+
+    def step(self, nstep: int) -> None:
+        fields = list(self.fields.values())
+        for w, data in enumerate(self.worlds):
+            self._load(w)
+            data.ctrl[:] = self.ctrl.numpy()[w]
+            for _ in range(nstep):
+                mujoco.mj_step(self._model, data)
+            mujoco.mj_getState(self._model, data, self._rows.numpy()[w], _SPEC)
+            self._show(w, [field for field in fields if field.lagged])
+            self._compute(w, self.stage)
+            self._show(w, [field for field in fields if not field.lagged])
+            self._warning.numpy()[w, :, 1] += data.warning.number
+            data.warning.number[:] = 0
+
+    def find_faults(self) -> None:
+        nphysics = 1 + self.model.nq + self.model.nv + self.model.na
+        self._launch(faults.faults_of_rows, self.nworld, [self._rows, nphysics, self._warning, self.fault])
+
+    def reset(self, mask: wp.array) -> None:
+        self._launch(state.fill_rows64, self._rows.shape, [mask, self._initial, self._rows])
+        self._read_state_fields(mask)
+
+    def _read_state_fields(self, mask: wp.array) -> None:
+        for name, column in self._columns.items():
+            self._launch(state.narrow, column.shape, [mask, column, flat(self.arrays[name])])
+
+    def commit(self, mask: wp.array) -> None:
+        for name, column in self._columns.items():
+            self._launch(state.widen, column.shape, [mask, flat(self.arrays[name]), column])
+
+    def refresh(self, mask: wp.array) -> None:
+        self._forward(mask, self.reset_stage, list(self.fields.values()))
+
+    def _refresh_current(self, mask: wp.array) -> None:
+        self._forward(mask, self.stage, [field for field in self.fields.values() if not field.snapshot])
+        self._read_state_fields(mask)
+
+    def _forward(self, mask: wp.array, stage: Stage, fields: list[Field]) -> None:
+        for w in mask.numpy().nonzero()[0]:
+            self._load(w)
+            self._compute(w, stage)
+            self._show(w, [field for field in fields if field.name not in STATE_FIELDS])
+
+    # state
+
+    def _get_integration(self, state_out: wp.array) -> None:
+        self._launch(state.copy_rows64, self._rows.shape, [self._everyone, self._rows, state_out])
+
+    def _set_integration(self, state_in: wp.array, mask: wp.array) -> None:
+        self._launch(state.copy_rows64, self._rows.shape, [mask, state_in, self._rows])
