@@ -1,6 +1,6 @@
 """Learning curves of NPG over several seeds, each in a process of its own.
 
-    python bench/learning.py hopper --seeds 0 1 2 --iterations 100 --out curves
+python bench/learning.py hopper --seeds 0 1 2 --iterations 100 --out curves
 """
 
 import concurrent.futures

@@ -13,12 +13,38 @@ from lyceum_warp.fields import vec10
 from lyceum_warp.kernels.faults import Done
 from lyceum_warp.kernels.random import normal, uniform
 from lyceum_warp.models import gymnasium_model
-from lyceum_warp.task import Row, Task, body, dof, geom, mocap, qpos, register, sensor, site
-from lyceum_warp.task import tasks as task_names  # `lyceum_warp.tasks` is the folder, once it is imported
+from lyceum_warp.registry import register, task_names
+from lyceum_warp.runs import load
+from lyceum_warp.task import Row, Task, body, dof, geom, mocap, qpos, sensor, site
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "NPG", "Done", "Env", "Episodes", "GaussianPolicy", "Iteration", "NPGConfig", "Rollout", "Row", "Task", "ValueFunction", "body", "dof", "evaluate", "geom", "gymnasium_model", "make", "mocap", "normal", "qpos",
-    "register", "sensor", "site", "task_names", "uniform", "vec10",
-]  # fmt: skip
+    "NPG",
+    "Done",
+    "Env",
+    "Episodes",
+    "GaussianPolicy",
+    "Iteration",
+    "NPGConfig",
+    "Rollout",
+    "Row",
+    "Task",
+    "ValueFunction",
+    "body",
+    "dof",
+    "evaluate",
+    "geom",
+    "gymnasium_model",
+    "load",
+    "make",
+    "mocap",
+    "normal",
+    "qpos",
+    "register",
+    "sensor",
+    "site",
+    "task_names",
+    "uniform",
+    "vec10",
+]

@@ -21,10 +21,11 @@ from rich.table import Table
 from lyceum_warp.algos.npg import NPG, NPGConfig
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.rollout import Episodes, evaluate
+from lyceum_warp.bound import BoundTask
 from lyceum_warp.env import Env
+from lyceum_warp.registry import find_task, task_name, task_names
 from lyceum_warp.report import Display, curve_table, filmed, make_console, plotted
 from lyceum_warp.runs import Run, load, versions
-from lyceum_warp.task import BoundTask, find_task, task_name, tasks
 
 _FINAL_EPISODES = 32
 
@@ -62,7 +63,7 @@ class Train:
     """mujoco (C, on CPU cores), warp, or auto: warp on CUDA and mujoco on the CPU."""
     device: str = "cpu"
     """cpu, or a CUDA device such as cuda:0."""
-    nworld: int = 10
+    nworld: int = 64
     """Worlds that step at once. With --rollout episodes each takes samples / nworld steps in an iteration, so
     episodes longer than that are cut; many worlds go with --rollout segments."""
     threads: int = 1
@@ -193,7 +194,7 @@ def _tasks() -> int:
     for heading, side in [("task", "left"), ("obs", "right"), ("action", "right"), ("substeps", "right"),
                           ("timestep", "right"), ("horizon", "right"), ("", "left")]:  # fmt: skip
         table.add_column(heading, justify=side, no_wrap=bool(heading))  # type: ignore[arg-type]
-    for name in tasks():
+    for name in task_names():
         task = BoundTask(find_task(name))
         about = (inspect.getdoc(sys.modules[find_task(name).__module__]) or "").splitlines()[0]
         about = (about.partition(": ")[2] or about).rstrip(".")
@@ -211,7 +212,7 @@ def _tasks() -> int:
 
 def _train(options: Train) -> int:
     if options.task is None:
-        raise ValueError(f"train needs a task: one of {', '.join(tasks())}, or path/to/file.py")
+        raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
     _check_iterations(options.iterations)
     task = find_task(options.task)
     out = options.out or Path("runs", f"{task_name(task)}-{datetime.datetime.now():%Y%m%d-%H%M%S}")

@@ -3,21 +3,21 @@
 from typing import Any
 
 import mujoco
-import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.engines import EngineFactory, find_device, open_engine, torch_view
-from lyceum_warp.fields import STATE_FIELDS, Stage, elements
+from lyceum_warp.bound import BoundTask
+from lyceum_warp.engines import EngineFactory, find_device, open_engine
+from lyceum_warp.fields import Stage, elements
 from lyceum_warp.kernels import random, state, steps
+from lyceum_warp.kernels.arrays import torch_view
 from lyceum_warp.kernels.faults import FAULTS
 from lyceum_warp.kernels.recorder import Recorder
 from lyceum_warp.models import ModelSource
-from lyceum_warp.spaces import Space
-from lyceum_warp.task import BoundTask, Task, find_task
-from lyceum_warp.validate import whole_number
-
-_COUNTERS = ("step", "key", "episode")
+from lyceum_warp.registry import find_task
+from lyceum_warp.spaces import Space, action_space, control_map, state_space
+from lyceum_warp.task import Task
+from lyceum_warp.validate import check_tensor, described, whole_number
 
 
 def make(task: str | type[Task], **options: Any) -> "Env":
@@ -100,7 +100,7 @@ class Env:
         njmax: int | None = None,
         **params: Any,
     ) -> None:
-        self._options = dict(
+        self._options: dict[str, Any] = dict(
             device=device, engine=engine, record=record, model=model, frame_skip=frame_skip, cone=cone,
             nthread=nthread, nconmax=nconmax, njmax=njmax,
         )  # fmt: skip
@@ -123,80 +123,51 @@ class Env:
         self.rand_reset(seed)
 
     def _allocate(self) -> None:
-        n, model, kernels = self.nworld, self.model, self.task.kernels
-        self._memory = wp.zeros((n, self.task.task.memory), dtype=float)
+        n, nu, task, kernels = self.nworld, self.model.nu, self.task.task, self.task.kernels
+        self._memory, self._no_memory = wp.zeros((n, task.memory), dtype=float), wp.zeros((n, task.memory), dtype=float)
         self._params = self.task.params_array(self.device)
         # the fields of the state that a step leads to, live, and copies of those that it came from
-        self._after, self._before, self._pairs = kernels.Batch(), kernels.Batch(), []
-        for name, kind in self.task.fields.items():
-            live = self._memory if name == "memory" else self.engine.field(name, lagged=name in self.task.task.lagged)
-            self._check_type(name, kind, live)
+        self._after, self._before = kernels.Batch(), kernels.Batch()
+        self._pairs: list[tuple[wp.array, wp.array]] = []
+        for name in self.task.fields:
+            live = self._memory if name == "memory" else self.engine.field(name, lagged=name in task.lagged)
+            self.task.check_field(name, live)
             copy = wp.zeros_like(live)
             setattr(self._after, name, live)
             setattr(self._before, name, copy)
             self._pairs.append((copy, live))
+        self._time_view = torch_view(self.engine.field("time"))
 
-        nobs = sum(self.task.obs_layout.values())
+        self.action_space = action_space(self.model, task.action_range)
+        self.obs_space = Space.of(self.task.obs_layout)
+        self.reward_space = self.eval_space = Space()
+
         self._out = steps.Outcome()
-        for name, dtype in [("reward", float), ("eval", float), ("terminated", bool), ("truncated", bool),
-                            ("success", bool), ("done", bool), ("done_reason", int)]:  # fmt: skip
-            setattr(self._out, name, wp.zeros(n, dtype=dtype))
-        self._out.obs, self._out.final_obs = wp.zeros((n, nobs), dtype=float), wp.zeros((n, nobs), dtype=float)
-        for name in self._out._cls.vars:
-            setattr(self, name, torch_view(getattr(self._out, name)))
-
-        ranges = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf))
-        low, high = self.task.task.action_range or (None, None)
-        if low is None:
-            scale = np.tile((1.0, 0.0), (model.nu, 1))
-            bounds = ranges
-        else:
-            gain = (ranges[:, 1] - ranges[:, 0]) / (high - low)
-            scale = np.stack([gain, ranges[:, 0] - gain * low], axis=1)
-            bounds = np.tile((low, high), (model.nu, 1))
-        self._ranges = wp.array(ranges, dtype=float)
-        self._scale = wp.array(scale, dtype=float)
-        self._action, self._safe_action = wp.zeros((n, model.nu), dtype=float), wp.zeros((n, model.nu), dtype=float)
+        for name, dtype in steps.OUTCOMES.items():
+            shape = (n, self.obs_space.size) if name in ("obs", "final_obs") else n
+            array: wp.array = wp.zeros(shape, dtype=dtype)
+            setattr(self._out, name, array)
+            setattr(self, name, torch_view(array))
+        self._action, self._safe_action = wp.zeros((n, nu), dtype=float), wp.zeros((n, nu), dtype=float)
         self.action = torch_view(self._action)
+        ranges, scale = control_map(self.model, task.action_range)
+        self._ranges: wp.array = wp.array(ranges, dtype=float)
+        self._scale: wp.array = wp.array(scale, dtype=float)
 
         self._step, self._episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
         self._key, self._rng = wp.zeros(n, dtype=wp.uint32), wp.zeros((n, 1), dtype=wp.uint32)
+        self._seed = wp.zeros(1, dtype=int)
         self._action_fault, self._no_fault = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
         self._fault_count = wp.zeros(int(FAULTS).bit_length(), dtype=int)
         self._everyone, self._mask = wp.full(n, True, dtype=bool), wp.zeros(n, dtype=bool)
-        self._restarting, self._no_memory = wp.zeros(n, dtype=bool), wp.zeros_like(self._memory)
-        self._mask_view, self._time_view = torch_view(self._mask), torch_view(self.engine.field("time"))
-        self._step_view = torch_view(self._step)
-        self._seed = wp.zeros(1, dtype=int)
+        self._restarting = wp.zeros(n, dtype=bool)
+        self._mask_view, self._step_view = torch_view(self._mask), torch_view(self._step)
+        self._allocate_state()
 
-        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) or f"actuator_{i}" for i in range(model.nu)]
-        limits = bounds.astype(np.float32)
-        self.action_space = Space.of(dict.fromkeys(names, 1), low=limits[:, 0], high=limits[:, 1])
-        self.obs_space = Space.of(self.task.obs_layout)
-        self.reward_space = self.eval_space = Space()
-        self.state_space = Space.of(self._state_layout(), dtype=torch.float64)
-        self._state = wp.zeros((n, self.state_space.size), dtype=wp.float64)
+    def _allocate_state(self) -> None:
+        self.state_space = state_space(self.model, self.engine.snapshots, self.task.task.memory)
+        self._state = wp.zeros((self.nworld, self.state_space.size), dtype=wp.float64, device=self.device)
         self._state_view = torch_view(self._state)
-
-    def _check_type(self, name: str, kind: Any, live: wp.array) -> None:
-        rows = hasattr(kind, "ndim")
-        dtype, ndim = (kind.dtype, kind.ndim) if rows else (kind, 0)
-        if not wp.types.types_equal(dtype, live.dtype) or ndim != live.ndim - 1:
-            wanted = live.dtype.__name__ if live.ndim == 1 else f"Row[{wp.types.type_repr(live.dtype)}]"
-            raise ValueError(f"World.{name} of the task {self.task.name!r} has to be declared as {wanted}")
-
-    def _state_layout(self) -> dict[str, int]:
-        sizes = {}
-        spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
-        for bit in range(32):
-            if spec >> bit & 1:
-                name = next((k for k, v in STATE_FIELDS.items() if v.value == 1 << bit), None)
-                name = name or mujoco.mjtState(1 << bit).name.removeprefix("mjSTATE_").lower()
-                if size := mujoco.mj_stateSize(self.model, 1 << bit):
-                    sizes[name] = size
-        sizes |= {field.name: field.size for field in self.engine.snapshots}
-        sizes |= dict.fromkeys(_COUNTERS, 1)
-        return sizes | ({"memory": self.task.task.memory} if self.task.task.memory else {})
 
     # the step
 
@@ -210,7 +181,7 @@ class Env:
             ValueError: The action has another shape or type.
         """
         if action is not None:
-            self._check(action, "action", self.action)
+            check_tensor(action, "action", self.action)
             self.action.copy_(action)
         if self.engine.recordable:
             self._record(self._whole_step)
@@ -262,7 +233,7 @@ class Env:
     def _restart(self, mask: wp.array, randomly: bool) -> None:
         self.engine.reset(mask)
         if self.task.task.memory:
-            wp.launch(state.copy_rows, self._memory.shape, [mask, self._no_memory, self._memory], device=self.device)
+            state.launch_rows(state.copy_rows, mask, self._no_memory, self._memory)
         wp.launch(self.task.kernels.restart, self.nworld, [
             mask, randomly, self._after, self._params, self._key, self._rng, self._step, self._episode,
         ], device=self.device)  # fmt: skip
@@ -322,7 +293,7 @@ class Env:
             self._mask_view.fill_(True)
             return
         if not isinstance(mask, torch.Tensor) or mask.dtype != torch.bool or mask.shape != (self.nworld,):
-            raise ValueError(f"a mask has to be a bool tensor of shape ({self.nworld},), not {_described(mask)}")
+            raise ValueError(f"a mask has to be a bool tensor of shape ({self.nworld},), not {described(mask)}")
         self._mask_view.copy_(mask)
 
     # the state
@@ -349,7 +320,7 @@ class Env:
         Raises:
             ValueError: The state has another shape or type, or is not finite.
         """
-        self._check(state, "state", self._state_view)
+        check_tensor(state, "state", self._state_view)
         self._set_mask(mask)
         if check and (bad := ~torch.isfinite(state) & self._mask_view[:, None]).any():
             world, column = bad.nonzero()[0].tolist()
@@ -369,9 +340,7 @@ class Env:
         counters = [self._step, self._key, self._episode, self._state[:, size : size + 3]]
         wp.launch(state.pack_counters, self.nworld, counters, device=self.device)
         if self.task.task.memory:
-            memory = self._state[:, size + 3 :]
-            args = [self._everyone, self._memory, memory]
-            wp.launch(state.widen, self._memory.shape, args, device=self.device)
+            state.launch_rows(state.widen, self._everyone, self._memory, self._state[:, size + 3 :])
 
     def _unpack(self) -> None:
         size = self.engine.state_size
@@ -384,8 +353,7 @@ class Env:
         counters = [self._mask, self._state[:, size : size + 3], self._step, self._key, self._episode]
         wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)
         if self.task.task.memory:
-            args = [self._mask, self._state[:, size + 3 :], self._memory]
-            wp.launch(state.narrow, self._memory.shape, args, device=self.device)
+            state.launch_rows(state.narrow, self._mask, self._state[:, size + 3 :], self._memory)
 
     # getters and setters of the paper's interface
 
@@ -425,7 +393,7 @@ class Env:
             return self._given(self.reward, out)
         if before is None or action is None or after is None:
             raise ValueError("a reward belongs to a transition: give before, action and after, or none of them")
-        self._check(action, "action", self.action)
+        check_tensor(action, "action", self.action)
         scratch = self._scratch_at(before)
         for copy, live in scratch._pairs:
             wp.copy(copy, live)
@@ -444,7 +412,7 @@ class Env:
         Raises:
             ValueError: The action has another shape or type, or is not finite.
         """
-        self._check(action, "action", self.action)
+        check_tensor(action, "action", self.action)
         if not torch.isfinite(action).all():
             world, i = (~torch.isfinite(action)).nonzero()[0].tolist()
             name = list(self.action_space.parts)[i]
@@ -478,7 +446,8 @@ class Env:
         view = torch_view(self.engine.field(name))
         if not known:
             if self.engine.fields[name].snapshot:
-                self._grow_state()
+                self._allocate_state()
+                self._scratch = None
             self._record.forget()
         if element is None:
             return view
@@ -523,12 +492,6 @@ class Env:
 
     # helpers
 
-    def _grow_state(self) -> None:
-        self.state_space = Space.of(self._state_layout(), dtype=torch.float64)
-        self._state = wp.zeros((self.nworld, self.state_space.size), dtype=wp.float64, device=self.device)
-        self._state_view = torch_view(self._state)
-        self._scratch = None
-
     def _scratch_at(self, given: torch.Tensor) -> "Env":
         """Worlds of the same task for judging given states; made when first needed."""
         if self._scratch is None:
@@ -541,17 +504,5 @@ class Env:
     def _given(self, values: torch.Tensor, out: torch.Tensor | None) -> torch.Tensor:
         if out is None:
             return values.clone()
-        self._check(out, "out", values)
+        check_tensor(out, "out", values)
         return out.copy_(values)
-
-    def _check(self, value: torch.Tensor, name: str, like: torch.Tensor) -> None:
-        if not isinstance(value, torch.Tensor) or value.shape != like.shape or value.dtype != like.dtype:
-            raise ValueError(f"{name} has to be {_described(like)}, not {_described(value)}")
-
-
-def _described(value: object) -> str:
-    if isinstance(value, torch.Tensor):
-        return f"a {str(value.dtype).removeprefix('torch.')} tensor of shape {tuple(value.shape)}"
-    if hasattr(value, "shape"):
-        return f"a {type(value).__name__} of shape {tuple(value.shape)}"
-    return f"{type(value).__name__} {value!r}"

@@ -75,6 +75,19 @@ _OBJECTS = {
 }
 
 
+_COUNTS = {
+    mujoco.mjtObj.mjOBJ_ACTUATOR: "nu",
+    mujoco.mjtObj.mjOBJ_BODY: "nbody",
+    mujoco.mjtObj.mjOBJ_CAMERA: "ncam",
+    mujoco.mjtObj.mjOBJ_GEOM: "ngeom",
+    mujoco.mjtObj.mjOBJ_JOINT: "njnt",
+    mujoco.mjtObj.mjOBJ_LIGHT: "nlight",
+    mujoco.mjtObj.mjOBJ_SENSOR: "nsensor",
+    mujoco.mjtObj.mjOBJ_SITE: "nsite",
+    mujoco.mjtObj.mjOBJ_TENDON: "ntendon",
+}
+
+
 @dataclasses.dataclass(frozen=True)
 class Field:
     """One field of one model, and the way in which it is wanted."""
@@ -133,10 +146,10 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field
         close = difflib.get_close_matches(name, known, 3)
         hint = f"did you mean {' or '.join(close)}?" if close else f"the fields are {', '.join(sorted(known))}"
         raise ValueError(f"there is no field {name!r}: {hint}")
-    template = np.asarray(getattr(mujoco.MjData(model), name)) if name != "time" else np.zeros(())
-    if template.ndim == 2:
-        return Field(name, template.shape[:1], _TYPES[template.shape[1]], refresh, reset, lagged, snapshot)
-    return Field(name, template.shape, wp.float32, refresh, reset, lagged, snapshot)
+    shape: tuple[int, ...] = np.shape(getattr(mujoco.MjData(model), name))
+    if len(shape) == 2:
+        return Field(name, shape[:1], _TYPES[shape[1]], refresh, reset, lagged, snapshot)
+    return Field(name, shape, wp.float32, refresh, reset, lagged, snapshot)
 
 
 def _demanded(model: mujoco.MjModel, name: str) -> bool:
@@ -163,10 +176,7 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
     def find(kind: mujoco.mjtObj) -> int:
         index = mujoco.mj_name2id(model, kind, element)
         if index < 0:
-            count = {mujoco.mjtObj.mjOBJ_JOINT: model.njnt, mujoco.mjtObj.mjOBJ_SENSOR: model.nsensor}.get(kind)
-            if count is None:
-                count = getattr(model, f"n{kind.name.removeprefix('mjOBJ_').lower()}".replace("actuator", "u"), 0)
-            names = [mujoco.mj_id2name(model, kind, i) for i in range(count)]
+            names = [mujoco.mj_id2name(model, kind, i) for i in range(getattr(model, _COUNTS[kind]))]
             kind_name = kind.name.removeprefix("mjOBJ_").lower()
             known = ", ".join(sorted(n for n in names if n)) or "none that are named"
             raise ValueError(f"the model has no {kind_name} {element!r} for the field {name!r}; it has: {known}")

@@ -7,6 +7,7 @@ import logging
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import mujoco
 
@@ -14,7 +15,7 @@ from lyceum_warp.fields import ON_DEMAND
 
 log = logging.getLogger(__name__)
 
-ModelSource = str | Path | mujoco.MjSpec | mujoco.MjModel
+ModelSource: TypeAlias = str | Path | Any
 
 
 def gymnasium_model(name: str) -> mujoco.MjSpec:

@@ -1,10 +1,13 @@
 """Shapes, parts and bounds of what an environment takes and gives."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
+import mujoco
 import numpy as np
 import torch
+
+from lyceum_warp.fields import STATE_FIELDS, Field
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,3 +47,43 @@ class Space:
     def split(self, values: torch.Tensor) -> dict[str, torch.Tensor]:
         """Views of the parts of (..., size) values, by name."""
         return {name: values[..., part] for name, part in self.parts.items()}
+
+
+COUNTERS = ("step", "key", "episode")
+"""Parts of a state that count: steps since the reset, the world's random streams, and its episodes."""
+
+
+def action_space(model: mujoco.MjModel, action_range: tuple[float, float] | None) -> Space:
+    """Actions: one number for each control, by the actuators' names, within their control ranges or one's own."""
+    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) or f"actuator_{i}" for i in range(model.nu)]
+    bounds = control_ranges(model) if action_range is None else np.tile(action_range, (model.nu, 1))
+    low, high = np.ascontiguousarray(bounds.T, dtype=np.float32)
+    return Space.of(dict.fromkeys(names, 1), low=low, high=high)
+
+
+def control_map(model: mujoco.MjModel, action_range: tuple[float, float] | None) -> tuple[np.ndarray, np.ndarray]:
+    """The controls' ranges, (nu, 2), and the scale and offset that map actions to controls, (nu, 2)."""
+    ranges = control_ranges(model)
+    if action_range is None:
+        return ranges, np.tile((1.0, 0.0), (model.nu, 1))
+    low, high = action_range
+    gain = (ranges[:, 1] - ranges[:, 0]) / (high - low)
+    return ranges, np.stack([gain, ranges[:, 0] - gain * low], axis=1)
+
+
+def control_ranges(model: mujoco.MjModel) -> np.ndarray:
+    """Lower and upper bound of each control, (nu, 2); infinite where the model sets none."""
+    return np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf))
+
+
+def state_space(model: mujoco.MjModel, snapshots: Iterable[Field], memory: int) -> Space:
+    """States: the integration state in MuJoCo's order, fields saved with it, counters, and task memory."""
+    sizes = {}
+    names = {component.value: name for name, component in STATE_FIELDS.items()}
+    components = mujoco.mjtState.mjSTATE_INTEGRATION.value
+    for component in (1 << bit for bit in range(components.bit_length())):
+        if components & component and (size := mujoco.mj_stateSize(model, component)):
+            fallback = mujoco.mjtState(component).name.removeprefix("mjSTATE_").lower()
+            sizes[names.get(component, fallback)] = size
+    sizes |= {field.name: field.size for field in snapshots} | dict.fromkeys(COUNTERS, 1)
+    return Space.of(sizes | ({"memory": memory} if memory else {}), dtype=torch.float64)

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import torch
+
 
 def whole_number(name: str, value: Any, *, low: int, high: int = 2**31 - 1) -> int:
     """A whole number within bounds, from whatever type of number it comes as.
@@ -17,3 +19,22 @@ def whole_number(name: str, value: Any, *, low: int, high: int = 2**31 - 1) -> i
     if not fits:
         raise ValueError(f"{name} has to be a whole number from {low} to {high}, not {value!r}")
     return number
+
+
+def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:
+    """Compare something given with the buffer that it is meant for.
+
+    Raises:
+        ValueError: It is no tensor of the same shape and type.
+    """
+    if not isinstance(value, torch.Tensor) or value.shape != like.shape or value.dtype != like.dtype:
+        raise ValueError(f"{name} has to be {described(like)}, not {described(value)}")
+
+
+def described(value: Any) -> str:
+    """A value in a few words, for messages."""
+    if isinstance(value, torch.Tensor):
+        return f"a {str(value.dtype).removeprefix('torch.')} tensor of shape {tuple(value.shape)}"
+    if hasattr(value, "shape"):
+        return f"a {type(value).__name__} of shape {tuple(value.shape)}"
+    return f"{type(value).__name__} {value!r}"

@@ -4,9 +4,13 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+import torch
 import warp as wp
 
 import lyceum_warp as lw
+
+# the tests' batches are too small to share out, and on a busy machine torch's threads wait for each other
+torch.set_num_threads(1)
 
 SharedEnv = Callable[..., lw.Env]
 

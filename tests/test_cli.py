@@ -15,8 +15,8 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp import cli, report
+from lyceum_warp.registry import find_task, task_names
 from lyceum_warp.runs import Run, load
-from lyceum_warp.task import find_task, tasks
 
 TINY = ["--samples", "512", "--nworld", "2", "--hidden", "8", "--value-hidden", "8", "--mean-every", "2",
         "--mean-episodes", "2"]  # fmt: skip
@@ -56,7 +56,7 @@ def test_tasks(capsys: pytest.CaptureFixture[str]) -> None:
     line = next(line for line in out.splitlines() if "hopper" in line)
     assert line.split()[:7] == ["hopper", "11", "3", "4", "0.008", "s", "1000"]
     assert "hop forward on one leg" in line
-    assert all(name in out for name in tasks())
+    assert all(name in out for name in task_names())
 
 
 @pytest.mark.parametrize("command", [[], ["train"], ["eval"]])

@@ -115,12 +115,12 @@ def env() -> lw.Env:
 
 def test_a_step_has_the_length_that_was_asked_for(env: lw.Env) -> None:
     env.rand_reset(0)
-    npg = lw.NPG(env, config=dataclasses.replace(SMALL, delta=0.01, cg_iterations=30), seed=0)
+    npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=3200, delta=1e-3), seed=0)
     before = torch.cat([p.detach().flatten() for p in npg.policy.parameters()])
     it = next(npg)
     after = torch.cat([p.detach().flatten() for p in npg.policy.parameters()])
     # KL = step.F.step / 2 to second order
-    assert it.kl == pytest.approx(0.005, rel=0.1)
+    assert it.kl == pytest.approx(0.0005, rel=0.1)
     assert (after - before).norm().item() == pytest.approx(it.step_norm, rel=1e-4)
 
 

@@ -12,6 +12,7 @@ import torch
 
 import lyceum_warp as lw
 from lyceum_warp.testing import check_task
+from lyceum_warp.testing.buffers import check_observation_size
 
 ENGINES = ["mujoco", "warp"]
 
@@ -478,11 +479,9 @@ def test_a_broken_task_says_what_to_mend(old: str, new: str, message: str, tmp_p
 
 
 def test_the_suite_finds_an_observation_of_another_size(tmp_path: Path) -> None:
-    from lyceum_warp import testing
-
     file = tmp_path / "tiny.py"
     file.write_text(TINY.replace("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0]\n    obs[2] = 1.0"))
-    checks = [testing.check_observation_size]
+    checks = [check_observation_size]
     with pytest.raises(AssertionError, match="tiny on the mujoco engine .* writes up to place 2, obs declares 1"):
         check_task(str(file), checks=checks)
     file = tmp_path / "tiny_two.py"

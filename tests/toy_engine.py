@@ -90,19 +90,19 @@ class ToyEngine(Engine):
 
     def find_faults(self) -> None:
         nphysics = 1 + self.model.nq + self.model.nv + self.model.na
-        self._launch(faults.faults_of_rows, self.nworld, [self._rows, nphysics, self._warning, self.fault])
+        wp.launch(faults.faults_of_rows, self.nworld, [self._rows, nphysics, self._warning, self.fault])
 
     def reset(self, mask: wp.array) -> None:
-        self._launch(state.fill_rows64, self._rows.shape, [mask, self._initial, self._rows])
+        state.launch_rows(state.fill_rows64, mask, self._initial, self._rows)
         self._read_state_fields(mask)
 
     def _read_state_fields(self, mask: wp.array) -> None:
         for name, column in self._columns.items():
-            self._launch(state.narrow, column.shape, [mask, column, flat(self.arrays[name])])
+            state.launch_rows(state.narrow, mask, column, flat(self.arrays[name]))
 
     def commit(self, mask: wp.array) -> None:
         for name, column in self._columns.items():
-            self._launch(state.widen, column.shape, [mask, flat(self.arrays[name]), column])
+            state.launch_rows(state.widen, mask, flat(self.arrays[name]), column)
 
     def refresh(self, mask: wp.array) -> None:
         self._forward(mask, self.reset_stage, list(self.fields.values()))
@@ -120,7 +120,7 @@ class ToyEngine(Engine):
     # state
 
     def _get_integration(self, state_out: wp.array) -> None:
-        self._launch(state.copy_rows64, self._rows.shape, [self._everyone, self._rows, state_out])
+        state.launch_rows(state.copy_rows64, self._everyone, self._rows, state_out)
 
     def _set_integration(self, state_in: wp.array, mask: wp.array) -> None:
-        self._launch(state.copy_rows64, self._rows.shape, [mask, state_in, self._rows])
+        state.launch_rows(state.copy_rows64, mask, state_in, self._rows)

@@ -18,7 +18,7 @@ import torch
 import warp as wp
 
 from lyceum_warp.algos.policy import GaussianPolicy, Normalizer
-from lyceum_warp.algos.rollout import Rollout, evaluate, finished
+from lyceum_warp.algos.rollout import Episodes, Rollout, evaluate, finished
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import returns
@@ -286,7 +286,7 @@ class NPG:
         start = 0
         for parameter in self.policy.parameters():
             if parameter.requires_grad:
-                parameter += step[start : start + parameter.numel()].view_as(parameter)
+                parameter.add_(step[start : start + parameter.numel()].view_as(parameter))
                 start += parameter.numel()
         self.policy.log_std.clamp_(min=self.config.min_log_std)
         log_std = self.policy.log_std
@@ -307,7 +307,7 @@ class NPG:
                     torch.nn.functional.mse_loss(self.value.network(features[batch]), target[batch]).backward()
                     self.optimizer.step()
 
-    def _evaluate_mean(self) -> dict[str, float | None]:
+    def _evaluate_mean(self) -> dict[str, Any]:
         config = self.config
         names = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")
         if not config.mean_every or self.iteration % config.mean_every:
@@ -369,6 +369,7 @@ class FisherProduct:
         self.pulled = torch.autograd.grad(self.mean, self.network, self.probe, create_graph=True)
 
     def __call__(self, vector: torch.Tensor) -> torch.Tensor:
+        """(F + damping) vector, both (parameters,)."""
         parts = [
             part.view_as(p)
             for part, p in zip(vector.split([p.numel() for p in self.parameters]), self.parameters, strict=True)
@@ -413,7 +414,7 @@ def _thinned(obs: torch.Tensor, fraction: float) -> torch.Tensor:
     return obs if fraction >= 1.0 else obs[:: max(1, round(1.0 / fraction))]
 
 
-def _summary(episodes: Any) -> dict[str, float]:
+def _summary(episodes: Episodes) -> dict[str, float]:
     nan = math.nan
     some = len(episodes.returns) > 0
     return {

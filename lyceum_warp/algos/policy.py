@@ -1,5 +1,6 @@
 """Policies: a diagonal Gaussian around a small network."""
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -10,7 +11,7 @@ from torch import nn
 def mlp(sizes: Sequence[int], *, last_scale: float = 1.0, generator: torch.Generator | None = None) -> nn.Sequential:
     """A tanh network with Glorot-uniform weights and zero biases; the last layer's weights are scaled."""
     layers: list[nn.Module] = []
-    for i, (n, m) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+    for i, (n, m) in enumerate(itertools.pairwise(sizes)):
         linear = nn.Linear(n, m)
         nn.init.xavier_uniform_(linear.weight, gain=1.0, generator=generator)
         nn.init.zeros_(linear.bias)
@@ -18,7 +19,7 @@ def mlp(sizes: Sequence[int], *, last_scale: float = 1.0, generator: torch.Gener
         if i < len(sizes) - 2:
             layers.append(nn.Tanh())
     with torch.no_grad():
-        layers[-1].weight.mul_(last_scale)
+        linear.weight.mul_(last_scale)
     return nn.Sequential(*layers)
 
 
@@ -29,6 +30,12 @@ class Normalizer(nn.Module):
         size: Numbers in an observation.
         limit: Normalised values are clipped to plus and minus this.
     """
+
+    count: torch.Tensor
+    mean: torch.Tensor
+    square: torch.Tensor
+    shift: torch.Tensor
+    scale: torch.Tensor
 
     def __init__(self, size: int, limit: float = 10.0) -> None:
         super().__init__()

@@ -6,9 +6,9 @@ import torch
 import warp as wp
 
 from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.engines import torch_view
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import record
+from lyceum_warp.kernels.arrays import torch_view
 from lyceum_warp.kernels.recorder import Recorder
 
 
@@ -51,7 +51,7 @@ class Rollout:
         flags = {"terminated", "done", "success"}
         self._record = record.Record()
         with wp.ScopedDevice(env.device):
-            for name in record.Record.vars:
+            for name in Rollout.__annotations__:
                 shape = (steps, n, *last.get(name, ()))
                 array = wp.zeros(shape, dtype=bool if name in flags else float)
                 setattr(self._record, name, array)

@@ -23,6 +23,8 @@ class ValueFunction(nn.Module):
         generator: Draws the initial weights.
     """
 
+    orders: torch.Tensor
+
     def __init__(
         self,
         nobs: int,

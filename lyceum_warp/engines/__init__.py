@@ -5,7 +5,7 @@ import importlib
 import mujoco
 import warp as wp
 
-from lyceum_warp.engines.base import Engine, EngineFactory, torch_view
+from lyceum_warp.engines.base import Engine, EngineFactory
 from lyceum_warp.fields import Field, Stage, describe, elements
 from lyceum_warp.validate import whole_number
 
@@ -78,5 +78,4 @@ __all__ = [
     "elements",
     "find_device",
     "open_engine",
-    "torch_view",
 ]

@@ -4,20 +4,11 @@ import abc
 from collections.abc import Callable
 
 import mujoco
-import numpy as np
-import torch
 import warp as wp
 
 from lyceum_warp.fields import Field, Stage, describe
-from lyceum_warp.kernels import state as kernels
-
-
-def flat(array: wp.array) -> wp.array:
-    """The same memory as a (nworld, n) array of float32, for copies that do not care about types."""
-    n = array.size * wp.types.type_size_in_bytes(array.dtype) // 4 // max(array.shape[0], 1)
-    alias = wp.array(ptr=array.ptr, dtype=wp.float32, shape=(array.shape[0], n), device=array.device)
-    alias.owner = array  # keeps the memory alive as long as the alias
-    return alias
+from lyceum_warp.kernels.arrays import flat
+from lyceum_warp.kernels.state import launch_rows, narrow, widen
 
 
 class Engine(abc.ABC):
@@ -146,7 +137,7 @@ class Engine(abc.ABC):
         for field in self.snapshots:
             source = flat(self.arrays[field.name])
             target = state[:, start : start + field.size]
-            self._launch(kernels.widen, source.shape, [self._everyone, source, target])
+            launch_rows(widen, self._everyone, source, target)
             start += field.size
 
     def set_state(self, state: wp.array, mask: wp.array) -> None:
@@ -157,7 +148,7 @@ class Engine(abc.ABC):
         for field in self.snapshots:
             target = flat(self.arrays[field.name])
             source = state[:, start : start + field.size]
-            self._launch(kernels.narrow, target.shape, [mask, source, target])
+            launch_rows(narrow, mask, source, target)
             start += field.size
 
     @abc.abstractmethod
@@ -177,15 +168,6 @@ class Engine(abc.ABC):
             self._all = wp.full(self.nworld, True, dtype=bool, device=self.device)
         return self._all
 
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], args: list) -> None:
-        if np.prod(dim) > 0:
-            wp.launch(kernel, dim, args, device=self.device)
-
 
 EngineFactory = Callable[..., Engine]
 """Called with (model, nworld, device, **options), the options being those that were given; returns an engine."""
-
-
-def torch_view(array: wp.array) -> torch.Tensor:
-    """The torch tensor that shares an array's memory."""
-    return wp.to_torch(array, requires_grad=False)

@@ -10,9 +10,11 @@ import numpy as np
 import warp as wp
 from mujoco.batch import Batch, SimulationError
 
-from lyceum_warp.engines.base import Engine, flat
+from lyceum_warp.engines.base import Engine
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage
-from lyceum_warp.kernels import faults, state
+from lyceum_warp.kernels import faults
+from lyceum_warp.kernels.arrays import flat
+from lyceum_warp.kernels.state import copy_rows64, fill_rows64, launch_rows, narrow, widen
 
 log = logging.getLogger(__name__)
 
@@ -63,9 +65,9 @@ class MujocoEngine(Engine):
 
     def _open(self, *, persistent: bool) -> None:
         self.batch = Batch(self._model, self.nworld, self.nthread, persistent)
-        self._initial = wp.array(self.batch.state[0].copy(), dtype=wp.float64, device=self.device)
+        self._initial: wp.array = wp.array(self.batch.state[0].copy(), dtype=wp.float64, device=self.device)
         self._rows = self._alias(self.batch.state)
-        self._warning = wp.array(self.batch.warning, dtype=int, device=self.device, copy=False)
+        self._warning: wp.array = wp.array(self.batch.warning, dtype=int, device=self.device, copy=False)
         self._sources: dict[str, np.ndarray] = {}
         self._columns: dict[str, wp.array] = {}
 
@@ -141,13 +143,13 @@ class MujocoEngine(Engine):
         wp.launch(faults.faults_of_rows, self.nworld, args, device=self.device)
 
     def reset(self, mask: wp.array) -> None:
-        self._launch(state.fill_rows64, self._rows.shape, [mask, self._initial, self._rows])
+        launch_rows(fill_rows64, mask, self._initial, self._rows)
         for name, column in self._columns.items():
-            self._launch(state.narrow, column.shape, [mask, column, flat(self.arrays[name])])
+            launch_rows(narrow, mask, column, flat(self.arrays[name]))
 
     def commit(self, mask: wp.array) -> None:
         for name, column in self._columns.items():
-            self._launch(state.widen, column.shape, [mask, flat(self.arrays[name]), column])
+            launch_rows(widen, mask, flat(self.arrays[name]), column)
 
     def refresh(self, mask: wp.array) -> None:
         self._forward(mask, self.reset_stage, list(self.fields.values()))
@@ -156,7 +158,7 @@ class MujocoEngine(Engine):
         current = [field for field in self.fields.values() if not field.snapshot]
         self._forward(mask, self.stage, current)
         for name, column in self._columns.items():
-            self._launch(state.narrow, column.shape, [mask, column, flat(self.arrays[name])])
+            launch_rows(narrow, mask, column, flat(self.arrays[name]))
 
     @_overflow_ignored
     def _forward(self, mask: wp.array, stage: Stage, fields: list[Field]) -> None:
@@ -170,7 +172,7 @@ class MujocoEngine(Engine):
     # state
 
     def _get_integration(self, state_out: wp.array) -> None:
-        self._launch(state.copy_rows64, self._rows.shape, [self._everyone, self._rows, state_out])
+        launch_rows(copy_rows64, self._everyone, self._rows, state_out)
 
     def _set_integration(self, state_in: wp.array, mask: wp.array) -> None:
-        self._launch(state.copy_rows64, self._rows.shape, [mask, state_in, self._rows])
+        launch_rows(copy_rows64, mask, state_in, self._rows)

@@ -25,7 +25,7 @@ def probe_sizes(model: mujoco.MjModel) -> tuple[int, int]:
     """
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
-    key = hashlib.sha256(buffer).hexdigest()
+    key = hashlib.sha256(buffer.tobytes()).hexdigest()
     if key not in _known:
         _known[key] = _probe(model)
     return _known[key]

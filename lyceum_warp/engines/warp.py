@@ -4,10 +4,12 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
-from lyceum_warp.engines.base import Engine, flat
+from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.sizes import probe_sizes
 from lyceum_warp.fields import Field, Stage
-from lyceum_warp.kernels import faults, state
+from lyceum_warp.kernels import faults
+from lyceum_warp.kernels.arrays import flat
+from lyceum_warp.kernels.state import copy_rows, launch_rows, narrow, widen
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
@@ -54,6 +56,7 @@ class WarpEngine(Engine):
             contacts, constraints = probe_sizes(model)
             nconmax, njmax = nconmax or contacts, njmax or constraints
         self.nconmax, self.njmax = nconmax, njmax
+        self._own: dict[str, wp.array] = {}
         with wp.ScopedDevice(device):
             try:
                 self.m = mjw.put_model(model)
@@ -72,22 +75,20 @@ class WarpEngine(Engine):
     def _bind(self, field: Field) -> wp.array:
         source = getattr(self.d, field.name)
         # the same memory under the types of `fields`, which differ from MuJoCo Warp's in name alone
-        own = wp.array(ptr=source.ptr, dtype=field.dtype, shape=(self.nworld, *field.shape), device=self.device)
-        own.owner = source
+        own: wp.array = wp.array(
+            ptr=source.ptr, dtype=field.dtype, shape=(self.nworld, *field.shape), device=self.device
+        )
+        self._own[field.name] = own
         if field.reset > Stage.NONE:
             self._forward([field], field.reset)
         if not field.snapshot:
             return own
-        staged = wp.clone(own)
-        staged.owner = own
-        return staged
+        return wp.clone(own)
 
     def _copy_snapshots(self, mask: wp.array, *, lagged: bool | None = None) -> None:
         for field in self.snapshots:
             if lagged is None or field.lagged == lagged:
-                staged = self.arrays[field.name]
-                source, target = flat(staged.owner), flat(staged)
-                self._launch(state.copy_rows, target.shape, [mask, source, target])
+                launch_rows(copy_rows, mask, flat(self._own[field.name]), flat(self.arrays[field.name]))
 
     # physics
 
@@ -140,9 +141,9 @@ class WarpEngine(Engine):
     def _get_integration(self, state_out: wp.array) -> None:
         with wp.ScopedDevice(self.device):
             mjw.get_state(self.m, self.d, self._state, _SPEC)
-        self._launch(state.widen, self._state.shape, [self._everyone, self._state, state_out])
+        launch_rows(widen, self._everyone, self._state, state_out)
 
     def _set_integration(self, state_in: wp.array, mask: wp.array) -> None:
-        self._launch(state.narrow, self._state.shape, [mask, state_in, self._state])
+        launch_rows(narrow, mask, state_in, self._state)
         with wp.ScopedDevice(self.device):
             mjw.set_state(self.m, self.d, self._state, _SPEC, mask)

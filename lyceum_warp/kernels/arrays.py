@@ -1,5 +1,7 @@
 """Views of the same memory under another shape or in torch."""
 
+from typing import Any
+
 import torch
 import warp as wp
 
@@ -7,7 +9,7 @@ import warp as wp
 def flat(array: wp.array) -> wp.array:
     """The same memory as a (nworld, n) array of float32, for copies that do not care about types."""
     n = array.size * wp.types.type_size_in_bytes(array.dtype) // 4 // max(array.shape[0], 1)
-    alias = wp.array(ptr=array.ptr, dtype=wp.float32, shape=(array.shape[0], n), device=array.device)
+    alias: Any = wp.array(ptr=array.ptr, dtype=wp.float32, shape=(array.shape[0], n), device=array.device)
     alias.owner = array  # keeps the memory alive as long as the alias
     return alias
 

@@ -26,6 +26,7 @@ class Recorder:
         self._recording = False
 
     def __call__(self, function: Callable[..., None], *args: Hashable) -> None:
+        """Run a function, or replay its recording; one recording is kept for each set of arguments."""
         if not self.enabled or self._recording:
             function(*args)
             return

@@ -1,45 +1,63 @@
 """Casts and masked copies between the arrays of an environment and of an engine.
 
-All arrays are (nworld, n) and every kernel is launched over (nworld, n). The float64 side is often a strided
-alias of an engine's own rows, where an unmasked write would round the other worlds.
+The float64 side is often a strided alias of an engine's own rows, where an unmasked write would round the other
+worlds. Most masks are nearly empty, and most rows short: ``launch_rows`` gives each world as many threads as pay
+off on the device, one on the CPU and a warp on a GPU.
 """
 
 import warp as wp
 
 
 @wp.kernel(enable_backward=False)
-def widen(mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[wp.float64]):
-    w, i = wp.tid()
+def widen(mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[wp.float64], lanes: int):
+    w, lane = wp.tid()
     if mask_in[w]:
-        target_out[w, i] = wp.float64(source_in[w, i])
+        for i in range(lane, target_out.shape[1], lanes):
+            target_out[w, i] = wp.float64(source_in[w, i])
 
 
 @wp.kernel(enable_backward=False)
-def narrow(mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[float]):
-    w, i = wp.tid()
+def narrow(mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[float], lanes: int):
+    w, lane = wp.tid()
     if mask_in[w]:
-        target_out[w, i] = float(source_in[w, i])
+        for i in range(lane, target_out.shape[1], lanes):
+            target_out[w, i] = float(source_in[w, i])
 
 
 @wp.kernel(enable_backward=False)
-def copy_rows(mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[float]):
-    w, i = wp.tid()
+def copy_rows(mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[float], lanes: int):
+    w, lane = wp.tid()
     if mask_in[w]:
-        target_out[w, i] = source_in[w, i]
+        for i in range(lane, target_out.shape[1], lanes):
+            target_out[w, i] = source_in[w, i]
 
 
 @wp.kernel(enable_backward=False)
-def copy_rows64(mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[wp.float64]):
-    w, i = wp.tid()
+def copy_rows64(
+    mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[wp.float64], lanes: int
+):
+    w, lane = wp.tid()
     if mask_in[w]:
-        target_out[w, i] = source_in[w, i]
+        for i in range(lane, target_out.shape[1], lanes):
+            target_out[w, i] = source_in[w, i]
 
 
 @wp.kernel(enable_backward=False)
-def fill_rows64(mask_in: wp.array[bool], row_in: wp.array[wp.float64], target_out: wp.array2d[wp.float64]):
-    w, i = wp.tid()
+def fill_rows64(
+    mask_in: wp.array[bool], source_in: wp.array[wp.float64], target_out: wp.array2d[wp.float64], lanes: int
+):
+    w, lane = wp.tid()
     if mask_in[w]:
-        target_out[w, i] = row_in[i]
+        for i in range(lane, target_out.shape[1], lanes):
+            target_out[w, i] = source_in[i]
+
+
+def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.array) -> None:
+    """Launch one of the kernels above over the masked rows of the target, (nworld, n)."""
+    if target.size == 0:
+        return
+    lanes = min(32, target.shape[1]) if wp.get_device(target.device).is_cuda else 1
+    wp.launch(kernel, (target.shape[0], lanes), [mask, source, target, lanes], device=target.device)
 
 
 @wp.kernel(enable_backward=False)

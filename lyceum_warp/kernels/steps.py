@@ -27,6 +27,20 @@ class Outcome:
     final_obs: wp.array2d[float]
 
 
+OUTCOMES = {
+    "reward": wp.float32,
+    "eval": wp.float32,
+    "terminated": wp.bool,
+    "truncated": wp.bool,
+    "success": wp.bool,
+    "done": wp.bool,
+    "done_reason": wp.int32,
+    "obs": wp.float32,
+    "final_obs": wp.float32,
+}
+"""The fields of Outcome and the types of their elements."""
+
+
 @wp.kernel(enable_backward=False)
 def count_faults(fault_in: wp.array[int], count_out: wp.array[int]):
     """Count each kind of fault, by the place of its bit in Done."""

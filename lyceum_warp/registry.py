@@ -1,0 +1,110 @@
+"""Tasks by name: those of the package, and those that a user registers."""
+
+import difflib
+import importlib
+import importlib.util
+import pkgutil
+import re
+import sys
+import zlib
+from pathlib import Path
+
+from lyceum_warp.task import Task
+
+_tasks: dict[str, type[Task]] = {}
+
+
+def register(task: type[Task]) -> type[Task]:
+    """Class decorator: make a task known by its name, the class name in snake_case.
+
+    A class of the same file may take the place of the one before: a file is run again in a notebook, or both
+    imported and given as a path.
+
+    Raises:
+        ValueError: Another task has the name.
+    """
+    name = task_name(task)
+    known = _tasks.get(name)
+    if known is None and not task.__module__.startswith(_PACKAGE) and name in _package_tasks():
+        owner = f"{_PACKAGE}{name}"
+    elif known is not None and known.__module__ != task.__module__ and _file(known) != _file(task):
+        owner = f"{known.__module__}.{known.__qualname__}"
+    else:
+        _tasks[name] = task
+        return task
+    raise ValueError(f"the task name {name!r} is taken by {owner}: rename yours")
+
+
+_PACKAGE = "lyceum_warp.tasks."
+
+
+def _package_tasks() -> list[str]:
+    package = importlib.import_module("lyceum_warp.tasks")
+    return [module.name for module in pkgutil.iter_modules(package.__path__)]
+
+
+def _file(task: type[Task]) -> str | None:
+    file = getattr(sys.modules.get(task.__module__), "__file__", None)
+    return file and str(Path(file).resolve())
+
+
+def task_name(task: type[Task]) -> str:
+    """The name under which a task is registered: HalfCheetah is half_cheetah."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", task.__name__).lower()
+
+
+def task_names() -> list[str]:
+    """Names of all tasks: those of the package and those registered by the user."""
+    return sorted({*_tasks, *_package_tasks()})
+
+
+def find_task(task: str | type[Task]) -> type[Task]:
+    """The class of a task, by name, by file (``path/to/file.py`` or ``path/to/file.py:Class``), or itself.
+
+    Raises:
+        ValueError: There is no such task.
+        FileNotFoundError: There is no such file.
+    """
+    if isinstance(task, type) and issubclass(task, Task):
+        return task
+    if not isinstance(task, str):
+        raise ValueError(f"a task is a name, a file or a subclass of lw.Task, not {task!r}")
+    path, _, attribute = task.partition(":")
+    if path.endswith(".py"):
+        return _task_of_file(Path(path), attribute)
+    if task not in _tasks and importlib.util.find_spec(f"lyceum_warp.tasks.{task}") is not None:
+        importlib.import_module(f"lyceum_warp.tasks.{task}")
+    if task not in _tasks:
+        close = difflib.get_close_matches(task, task_names(), 3)
+        hint = f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(task_names())}"
+        raise ValueError(f"there is no task {task!r}: {hint} (a task of your own is given as path/to/file.py)")
+    return _tasks[task]
+
+
+def _task_of_file(path: Path, attribute: str) -> type[Task]:
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no task file {str(path)!r}")
+    name = f"lyceum_task_{path.stem}_{zlib.crc32(str(path.resolve()).encode()):08x}"
+    module = sys.modules.get(name)
+    if module is None:
+        spec = importlib.util.spec_from_file_location(name, path)
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[name] = module
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            del sys.modules[name]
+            raise
+    found = {
+        key: value
+        for key, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, Task) and value.__module__ == name
+    }
+    if attribute:
+        if attribute not in found:
+            raise ValueError(f"{path} has no task {attribute!r}; it has {', '.join(found) or 'none'}")
+        return found[attribute]
+    if len(found) != 1:
+        raise ValueError(f"{path} has {len(found)} tasks ({', '.join(found)}): name one, as in {path}:Name")
+    return next(iter(found.values()))

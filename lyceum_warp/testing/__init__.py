@@ -1,0 +1,121 @@
+"""The rules that hold for every task on every engine, as checks: run them on your own with ``check_task``.
+
+Each check is one rule. It takes the environments under test, fails with an AssertionError that names the task,
+the engine, the rule and the values, and leaves the environments usable for the next.
+"""
+
+import dataclasses
+import logging
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from lyceum_warp.engines import EngineFactory
+from lyceum_warp.env import Env
+from lyceum_warp.task import Task
+from lyceum_warp.testing import buffers, episodes, state, trouble
+from lyceum_warp.testing.context import OUTCOMES, Context
+
+log = logging.getLogger(__name__)
+
+CHECKS: tuple[Callable[[Context], None], ...] = (
+    buffers.check_spaces,
+    buffers.check_observation_size,
+    buffers.check_addresses,
+    buffers.check_getters,
+    buffers.check_time,
+    state.check_round_trip,
+    state.check_restoring,
+    state.check_masked_restoring,
+    state.check_set_state_shows,
+    state.check_purity,
+    state.check_determinism,
+    state.check_reset,
+    state.check_masked_reset,
+    state.check_rand_reset,
+    state.check_world_count,
+    state.check_saved_stream,
+    episodes.check_truncation,
+    episodes.check_no_autoreset,
+    episodes.check_recording,
+    episodes.check_memory,
+    trouble.check_bad_state,
+    trouble.check_bad_action,
+    trouble.check_bad_warmstart,
+)
+"""All checks, in the order in which ``check_task`` runs them."""
+
+
+@dataclasses.dataclass
+class Report:
+    """What ``check_task`` has checked."""
+
+    task: str
+    engine: str
+    device: str
+    nworld: int
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    """How long each check took, by its name."""
+
+    def __str__(self) -> str:
+        head = f"{self.task} on the {self.engine} engine ({self.device}, {self.nworld} worlds) keeps the rules:"
+        return "\n".join([head, *(f"  {name:<20} {value:6.2f} s" for name, value in self.seconds.items())])
+
+
+def check_task(
+    task: str | type[Task],
+    *,
+    engine: str | EngineFactory = "auto",
+    device: str | None = None,
+    nworld: int = 4,
+    steps: int = 1000,
+    seed: int = 0,
+    checks: Sequence[Callable[[Context], None]] = CHECKS,
+    **options: Any,
+) -> Report:
+    """Check that a task keeps every rule of an environment on an engine.
+
+    Args:
+        task: Name of a task, a file with one, or its class.
+        engine: As for ``make``; also an engine of your own.
+        device: As for ``make``.
+        nworld: Number of worlds, at least 2.
+        steps: Steps of the long checks (determinism, memory).
+        seed: Of the worlds and of the random actions.
+        checks: Which rules to check, out of ``CHECKS``.
+        options: Other options of ``make`` and parameters of the task.
+
+    Returns:
+        What was checked; print it.
+
+    Raises:
+        AssertionError: Rules are broken; the message names all of them.
+
+    Example:
+        >>> print(check_task("hopper", engine="mujoco"))
+    """
+    if nworld < 2:
+        raise ValueError(f"the checks compare worlds with one another: nworld has to be at least 2, not {nworld}")
+
+    def make(**changes: Any) -> Env:
+        return Env(task, **{"nworld": nworld, "device": device, "engine": engine, "seed": seed, **options, **changes})
+
+    a = make()
+    ctx = Context(a, make(), make, steps, seed, a.task.name, a.engine.name)
+    report = Report(ctx.task, ctx.engine, a.device.alias, nworld)
+    broken = []
+    for check in checks:
+        ctx.rule = check.__name__.removeprefix("check_")
+        start = time.perf_counter()
+        try:
+            check(ctx)
+        except AssertionError as error:
+            broken.append(str(error))
+        report.seconds[ctx.rule] = time.perf_counter() - start
+    if broken:
+        raise AssertionError("\n".join(broken))
+    log.info("%s", report)
+    return report
+
+
+__all__ = ["CHECKS", "OUTCOMES", "Context", "Report", "check_task"]

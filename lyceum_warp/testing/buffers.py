@@ -1,0 +1,116 @@
+"""Rules about what the buffers are."""
+
+import numpy as np
+import torch
+import warp as wp
+
+from lyceum_warp.kernels.arrays import torch_view
+from lyceum_warp.kernels.faults import FAULTS
+from lyceum_warp.testing.context import COUNTERS, OUTCOMES, SHORT, Context
+
+
+def check_spaces(ctx: Context) -> None:
+    """Every space agrees with its buffer in shape and type, its parts cover it, and bounds are ordered."""
+    env = ctx.a
+    pairs = {
+        "obs": (env.obs_space, env.obs), "action": (env.action_space, env.action),
+        "reward": (env.reward_space, env.reward), "eval": (env.eval_space, env.eval),
+        "state": (env.state_space, env.get_state()), "final_obs": (env.obs_space, env.final_obs),
+    }  # fmt: skip
+    for name, (space, buffer) in pairs.items():
+        ctx.that(
+            buffer.shape == (env.nworld, *space.shape) and buffer.dtype == space.dtype,
+            f"{name} is {buffer.dtype} {tuple(buffer.shape)}, its space {space.dtype} {space.shape}",
+        )
+        ends = [0, *(part.stop for part in space.parts.values())]
+        starts = [part.start for part in space.parts.values()]
+        ctx.that(starts == ends[:-1], f"the parts of the {name} space leave gaps: {dict(space.parts)}")
+        if space.low is not None and space.high is not None:
+            ctx.that(space.low.shape == space.high.shape == space.shape, f"bounds of {name} have another shape")
+            ctx.that(bool((space.low <= space.high).all()), f"bounds of {name} cross: {space.low}, {space.high}")
+    for name in ("terminated", "truncated", "success", "done"):
+        ctx.that(getattr(env, name).dtype == torch.bool, f"{name} is {getattr(env, name).dtype}")
+    for name in (*OUTCOMES, "action", "time"):
+        device = getattr(env, name).device
+        ctx.that(device.type == ("cpu" if env.device.is_cpu else "cuda"), f"{name} lies on {device}")
+    for part in ("time", "qpos", "qvel", *COUNTERS):
+        ctx.that(part in env.state_space.parts, f"the state has no {part}; it has {list(env.state_space.parts)}")
+
+
+def check_observation_size(ctx: Context) -> None:
+    """``observe`` writes all of the declared observation and nothing behind it."""
+    env, nobs = ctx.a, ctx.a.obs_space.size
+    wide = wp.full((env.nworld, nobs + 64), np.nan, dtype=float, device=env.device)
+    wp.launch(env.task.kernels.look, env.nworld, [env._everyone, env._after, env._params, wide], device=env.device)
+    written = ~torch.isnan(torch_view(wide))
+    ctx.that(
+        not written[:, nobs:].any(),
+        f"observe writes up to place {int(written.nonzero()[:, 1].max())}, obs declares {nobs} numbers",
+    )
+    missing = (~written[:, :nobs]).nonzero()[:, 1].unique().tolist()
+    ctx.that(not missing, f"observe leaves places {missing} of {nobs} unwritten, or they are not-a-number")
+
+
+def check_addresses(ctx: Context) -> None:
+    """Every buffer stays the same object at the same address, over steps, resets and setting states."""
+    env = ctx.a
+    ctx.restart()
+    names = (*OUTCOMES, "action", "time")
+    before = {name: (id(getattr(env, name)), getattr(env, name).data_ptr()) for name in names}
+    fields = {name: array.ptr for name, array in env.engine.arrays.items()}
+    state = env.get_state()
+    for action in ctx.actions(SHORT):
+        env.step(action)
+    env.reset()
+    env.rand_reset()
+    env.set_state(state)
+    for name in names:
+        ctx.that(id(getattr(env, name)) == before[name][0], f"env.{name} has become another object")
+        ctx.that(getattr(env, name).data_ptr() == before[name][1], f"env.{name} has moved")
+    for name, pointer in fields.items():
+        ctx.that(env.engine.arrays[name].ptr == pointer, f"the field {name} has moved")
+
+
+def check_getters(ctx: Context) -> None:
+    """``get_x(out=)`` writes what ``get_x()`` returns, which is a copy of ``env.x``."""
+    env = ctx.a
+    ctx.restart()
+    for action in ctx.actions(3):
+        env.step(action)
+    for name in ("obs", "reward", "eval", "terminated", "action", "state"):
+        getter = getattr(env, f"get_{name}")
+        value = getter()
+        out = torch.zeros_like(value) if value.dtype == torch.bool else torch.full_like(value, 7)
+        returned = getter(out=out)
+        ctx.that(returned is out, f"get_{name}(out=) does not return out")
+        ctx.equal(out, value, f"get_{name}(out=)")
+        if name != "state":
+            ctx.equal(value, getattr(env, name), f"get_{name}()")
+            ctx.that(value.data_ptr() != getattr(env, name).data_ptr(), f"get_{name}() is no copy")
+    state = env.get_state()
+    for name in ("obs", "eval", "terminated"):
+        getter = getattr(env, f"get_{name}")
+        out = torch.zeros_like(getter())
+        ctx.equal(getter(state, out=out), getter(state), f"get_{name}(state, out=)")
+    action = ctx.actions(1, 1)[0]
+    env.set_action(action)
+    ctx.equal(env.action, action, "the action after set_action")
+
+
+def check_time(ctx: Context) -> None:
+    """``env.time`` is 0 after a reset, grows by ``env.timestep`` a step, and asking for it changes nothing."""
+    env = ctx.a
+    with ctx.changed(env, autoreset=False, horizon=0):
+        for reset in (env.reset, env.rand_reset):
+            reset()
+            ctx.that((env.time == 0).all(), f"time is {env.time.tolist()} after {reset.__name__}")
+            for i, action in enumerate(ctx.actions(SHORT), 1):
+                env.step(action)
+                wanted = torch.full_like(env.time, i * env.timestep)
+                ctx.that(
+                    torch.allclose(env.time, wanted, rtol=1e-5) or (env.done_reason & int(FAULTS)).any(),
+                    f"time is {env.time.tolist()} after {i} steps of {env.timestep} s",
+                )
+                again = env.time.clone()
+                env.get_state()
+                ctx.equal(env.time, again, "time, asked for twice")

@@ -1,0 +1,127 @@
+"""What the checks work on."""
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import torch
+
+from lyceum_warp.env import Env
+from lyceum_warp.kernels.arrays import torch_view
+
+OUTCOMES = (
+    "obs", "final_obs", "reward", "eval", "terminated", "truncated", "success", "done", "done_reason",
+)  # fmt: skip
+"""The buffers that a step fills."""
+
+SHORT = 8
+"""Steps of a check that needs only a few."""
+
+COUNTERS = ("step", "key", "episode")
+"""Parts of the state that count."""
+
+_SETTINGS = ("horizon", "autoreset", "record")
+
+
+@dataclasses.dataclass
+class Context:
+    """What a check works on: two environments made alike, and the choices they were made with."""
+
+    a: Env
+    b: Env
+    make: Callable[..., Env]
+    """Makes another environment with the same options, but for those that are given."""
+    steps: int
+    """Steps of the checks that look at a long run."""
+    seed: int
+    task: str
+    engine: str
+    rule: str = ""
+    """The rule that is being checked."""
+    recordings: dict[tuple[object, ...], dict[Any, Any]] = dataclasses.field(default_factory=dict)
+    """Recorded steps, by the environment and the settings that they hold."""
+
+    def fail(self, problem: str) -> None:
+        """Raise the AssertionError for a problem."""
+        raise AssertionError(f"{self.task} on the {self.engine} engine breaks the rule {self.rule!r}: {problem}")
+
+    def that(self, holds: bool | torch.Tensor, problem: str) -> None:
+        """Fail unless something holds."""
+        if not bool(holds):
+            self.fail(problem)
+
+    def equal(self, found: torch.Tensor, wanted: torch.Tensor, what: str) -> None:
+        """Fail unless two tensors have the same shape, type and values to the bit (not-a-number equals itself)."""
+        if found.shape != wanted.shape or found.dtype != wanted.dtype:
+            self.fail(f"{what}: {found.dtype} {tuple(found.shape)} instead of {wanted.dtype} {tuple(wanted.shape)}")
+        differ = ~((found == wanted) | ((found != found) & (wanted != wanted)))
+        if differ.any():
+            first = tuple(differ.nonzero()[0].tolist())
+            self.fail(
+                f"{what}: {int(differ.sum())} of {differ.numel()} values differ, the first at {first}: "
+                f"{found[first].item()!r} instead of {wanted[first].item()!r}"
+            )
+
+    def restart(self, seed: int | None = None) -> None:
+        """Put both environments into the same random initial states."""
+        for env in (self.a, self.b):
+            env.rand_reset(self.seed if seed is None else seed)
+
+    def actions(self, steps: int, salt: int = 0) -> torch.Tensor:
+        """Random actions within their bounds (-1 to 1 where there are none), (steps, nworld, nu)."""
+        env = self.a
+        assert env.action_space.low is not None and env.action_space.high is not None
+        low = torch.as_tensor(np.where(np.isfinite(env.action_space.low), env.action_space.low, -1.0))
+        high = torch.as_tensor(np.where(np.isfinite(env.action_space.high), env.action_space.high, 1.0))
+        generator = torch.Generator().manual_seed(self.seed + 1000 * salt + 1)
+        draws = torch.rand(steps, *env.action.shape, generator=generator)
+        return (low + draws * (high - low)).to(env.action)
+
+    def run(self, env: Env, actions: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Step through actions and collect what every step gave, (steps, nworld, ...)."""
+        record: dict[str, list[torch.Tensor]] = {name: [] for name in ("state", *OUTCOMES)}
+        for action in actions:
+            env.step(action)
+            record["state"].append(env.get_state())
+            for name in OUTCOMES:
+                record[name].append(getattr(env, name).clone())
+        return {name: torch.stack(values) for name, values in record.items()}
+
+    def same_runs(self, found: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], what: str) -> None:
+        """Fail unless two runs are the same to the bit."""
+        for name in wanted:
+            self.equal(found[name], wanted[name], f"{name} {what} (step, world, ...)")
+
+    @contextlib.contextmanager
+    def changed(self, *envs: Env, **options: Any) -> Iterator[None]:
+        """For a while, give environments another ``horizon``, ``autoreset`` or ``record``.
+
+        A recorded step holds these, so that each setting has its own recordings.
+        """
+        kept = [(env.horizon, env.autoreset, env._record.enabled) for env in envs]
+        try:
+            for env, values in zip(envs, kept, strict=True):
+                chosen = [options.get(name, value) for name, value in zip(_SETTINGS, values, strict=True)]
+                self._set(env, *chosen)
+            yield
+        finally:
+            for env, values in zip(envs, kept, strict=True):
+                self._set(env, *values)
+
+    def _set(self, env: Env, horizon: int, autoreset: bool, record: bool) -> None:
+        self.recordings[id(env), env.horizon, env.autoreset] = env._record._graphs
+        env.horizon, env.autoreset, env._record.enabled = horizon, autoreset, record
+        env._record._graphs = self.recordings.get((id(env), horizon, autoreset), {})
+
+    def buffers(self, env: Env) -> dict[str, torch.Tensor]:
+        """Copies of everything that an environment shows."""
+        shown = {name: getattr(env, name).clone() for name in (*OUTCOMES, "action", "time")}
+        fields = {f"field {name}": torch_view(array).clone() for name, array in env.engine.arrays.items()}
+        return shown | fields | {"state": env.get_state()}
+
+    def finite(self, env: Env, when: str) -> None:
+        """Fail unless the state and everything computed from it are finite."""
+        for name, values in {"state": env.get_state(), **{k: getattr(env, k) for k in OUTCOMES}}.items():
+            self.that(torch.isfinite(values).all(), f"{name} is not finite {when}: {values}")

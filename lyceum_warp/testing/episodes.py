@@ -1,0 +1,128 @@
+"""Rules about the end of an episode, and about how steps run."""
+
+import gc
+import tracemalloc
+
+import torch
+import warp as wp
+
+from lyceum_warp.env import Env
+from lyceum_warp.kernels.faults import FAULTS, Done
+from lyceum_warp.testing.context import Context
+
+_PYTHON_BYTES = 16_384  # tracemalloc's tolerance: interned numbers, caches of the interpreter
+
+
+def _check_flags(ctx: Context, env: Env) -> None:
+    reason = env.done_reason
+    ctx.equal(env.truncated, (reason & int(Done.TRUNCATED)) != 0, "truncated against done_reason")
+    ctx.equal(env.terminated, (reason & ~int(Done.TRUNCATED)) != 0, "terminated against done_reason")
+    ctx.equal(env.done, env.terminated | env.truncated, "done against terminated and truncated")
+
+
+def check_truncation(ctx: Context) -> None:
+    """At the horizon an episode is truncated; ``final_obs`` is its last observation, ``obs`` the first of the next.
+
+    A truncated episode is not terminated on that account, and worlds that go on have both observations the same.
+    """
+    a, b, horizon = ctx.a, ctx.b, 4
+    with ctx.changed(a, horizon=horizon, autoreset=True), ctx.changed(b, horizon=horizon, autoreset=False):
+        ctx.restart()
+        steps = torch.zeros_like(a.done_reason)
+        alive = torch.ones_like(a.done)
+        for action in ctx.actions(2 * horizon + 1):
+            a.step(action)
+            b.step(action)
+            steps += 1
+            _check_flags(ctx, a)
+            ctx.equal(a.truncated, steps >= horizon, f"truncated after {steps.tolist()} steps of an episode")
+            # until its first end, a world without automatic resets has the same life
+            ctx.equal(a.final_obs[alive], b.obs[alive], "final_obs against obs without automatic resets")
+            ctx.equal(a.reward[alive], b.reward[alive], "reward against the one without automatic resets")
+            ctx.equal(a.terminated[alive], b.terminated[alive], "terminated with and without automatic resets")
+            alive &= ~a.done
+            ctx.equal(a.final_obs[~a.done], a.obs[~a.done], "final_obs of worlds that go on")
+            ctx.equal(a.get_obs(a.get_state()), a.obs, "obs against the state, after automatic resets")
+            ctx.that((a.time[a.done] == 0).all(), f"time is {a.time.tolist()} where done is {a.done.tolist()}")
+            count = a.get_state()[:, a.state_space.parts["step"]].squeeze(1)
+            steps[a.done] = 0
+            ctx.equal(count, steps.to(count.dtype), "the state's step counter")
+
+
+def check_no_autoreset(ctx: Context) -> None:
+    """Without automatic resets ``done`` stays set, the world steps on, and ``final_obs`` equals ``obs``."""
+    env, horizon = ctx.a, 3
+    with ctx.changed(env, horizon=horizon, autoreset=False):
+        ctx.restart()
+        ended = torch.zeros_like(env.done)
+        for i, action in enumerate(ctx.actions(3 * horizon), 1):
+            env.step(action)
+            _check_flags(ctx, env)
+            ctx.that((env.done | ~ended).all(), f"done was {ended.tolist()} and is {env.done.tolist()}")
+            ended |= env.done
+            ctx.that(i < horizon or env.truncated.all(), f"truncated is {env.truncated.tolist()} after {i} steps")
+            if not (env.done_reason & int(FAULTS)).any():
+                ctx.that((env.time > (i - 0.5) * env.timestep).all(), f"time is {env.time.tolist()} after {i} steps")
+                ctx.equal(env.final_obs, env.obs, "final_obs without automatic resets")
+        mask = torch.zeros_like(env.done)
+        mask[0] = True
+        env.rand_reset(mask=mask)
+        ctx.that(not env.truncated[0] and env.truncated[1:].all(), "a masked reset did not clear just its world's end")
+
+
+def check_recording(ctx: Context) -> None:
+    """A recorded step gives the same as an unrecorded one, to the bit, resets included."""
+    a, b, n = ctx.a, ctx.b, 20
+    with ctx.changed(a, horizon=6, record=True), ctx.changed(b, horizon=6, record=False):
+        ctx.restart()
+        actions = ctx.actions(n)
+        ctx.same_runs(ctx.run(b, actions), ctx.run(a, actions), "unrecorded")
+        for _ in range(3):
+            a.rand_reset(ctx.seed)
+            b.rand_reset(ctx.seed)
+            ctx.equal(b.get_state(), a.get_state(), "the state after an unrecorded rand_reset")
+
+
+def _memory(device: wp.Device) -> dict[str, int]:
+    gc.collect()
+    found = {"Python bytes": tracemalloc.get_traced_memory()[0]}
+    # by type: isinstance would wake lazily loaded modules
+    found["arrays"] = sum(issubclass(type(thing), (wp.array, torch.Tensor)) for thing in gc.get_objects())
+    if device.is_cuda:
+        found["Warp bytes"] = wp.get_mempool_used_mem_current(device)
+        found["torch bytes"] = torch.cuda.memory_allocated(wp.device_to_torch(device))
+    return found
+
+
+def check_memory(ctx: Context) -> None:
+    """Steps, resets, getting and setting states allocate nothing that stays."""
+    env = ctx.a
+    ctx.restart()
+    actions, state = ctx.actions(32), env.get_state()
+    mask = torch.arange(env.nworld, device=env.action.device) % 2 == 0
+
+    def steps(n: int) -> None:
+        for i in range(n):
+            env.step(actions[i % 32])
+            if i % 16 == 0:
+                env.get_state(out=state)
+                env.rand_reset(mask=mask)
+                env.set_state(state, mask)
+                env.reset(mask)
+
+    steps(64)
+    tracing = tracemalloc.is_tracing()
+    if not tracing:
+        tracemalloc.start()
+    try:
+        steps(64)
+        before = _memory(env.device)
+        steps(ctx.steps)
+        after = _memory(env.device)
+    finally:
+        if not tracing:
+            tracemalloc.stop()
+    for name in before:
+        allowed = _PYTHON_BYTES if name == "Python bytes" else 0
+        growth = after[name] - before[name]
+        ctx.that(growth <= allowed, f"{growth} more {name} after {ctx.steps} steps")

@@ -1,0 +1,206 @@
+"""Rules about the state, resets and randomness."""
+
+import numpy as np
+import torch
+
+from lyceum_warp.env import Env
+from lyceum_warp.kernels.faults import FAULTS
+from lyceum_warp.testing.context import COUNTERS, SHORT, Context
+
+
+def check_round_trip(ctx: Context) -> None:
+    """Getting a state, setting it and getting it again gives the same numbers."""
+    env = ctx.a
+    ctx.restart()
+    ctx.run(env, ctx.actions(5))
+    state = env.get_state()
+    ctx.run(env, ctx.actions(SHORT, 1))
+    env.set_state(state)
+    ctx.equal(env.get_state(), state, "the state after set_state (world, column)")
+    out = torch.empty_like(state)
+    ctx.equal(env.get_state(out=out), state, "the state after set_state, with out= (world, column)")
+
+
+def check_restoring(ctx: Context) -> None:
+    """Steps after setting a state equal those that followed it before, in the same worlds or in others."""
+    a, b = ctx.a, ctx.b
+    ctx.restart()
+    ctx.run(a, ctx.actions(7))
+    state, actions = a.get_state(), ctx.actions(2 * SHORT, 1)
+    first = ctx.run(a, actions)
+    a.set_state(state)
+    ctx.same_runs(ctx.run(a, actions), first, "after restoring")
+    ctx.run(b, ctx.actions(3, 2))
+    b.set_state(state)
+    ctx.same_runs(ctx.run(b, actions), first, "after restoring in another environment")
+
+
+def check_masked_restoring(ctx: Context) -> None:
+    """Setting the states of some worlds only leaves the others as they are, to the bit."""
+    a, b = ctx.a, ctx.b
+    ctx.restart()
+    mask = torch.arange(a.nworld, device=a.action.device) % 2 == 0
+    state, early, late = a.get_state(), ctx.actions(SHORT), ctx.actions(SHORT, 1)
+    first = ctx.run(a, early)
+    ctx.run(b, early)
+    before = ctx.buffers(a)
+    a.set_state(state, mask)
+    for name, values in ctx.buffers(a).items():
+        ctx.equal(values[~mask], before[name][~mask], f"{name} of the worlds that were not set (world, ...)")
+    ctx.equal(a.get_state()[mask], state[mask], "the state of the worlds that were set")
+    found = ctx.run(a, torch.where(mask[None, :, None], early, late))
+    undisturbed = ctx.run(b, torch.where(mask[None, :, None], early, late))
+    for name in found:
+        ctx.equal(found[name][:, mask], first[name][:, mask], f"{name} of the restored worlds")
+        ctx.equal(found[name][:, ~mask], undisturbed[name][:, ~mask], f"{name} of the other worlds")
+
+
+def check_set_state_shows(ctx: Context) -> None:
+    """After ``set_state`` every getter tells of the state that was set."""
+    a, b = ctx.a, ctx.b
+    has_evaluate = a.task.functions["evaluate"] is not None
+    with ctx.changed(a, autoreset=False, horizon=0):
+        ctx.restart()
+        for action in ctx.actions(10):
+            a.step(action)
+            state, shown = a.get_state(), ctx.buffers(a)
+            b.set_state(state)
+            found = ctx.buffers(b)
+            for name in shown:
+                if name in ("obs", "success", "time", "state") or name.startswith("field "):
+                    ctx.equal(found[name], shown[name], f"{name} after set_state")
+            ctx.equal(b.final_obs, a.obs, "final_obs after set_state")
+            if has_evaluate:
+                ctx.equal(b.eval, a.eval, "eval after set_state")
+            ctx.that((b.reward == 0).all(), f"the reward after set_state is {b.reward.tolist()}")
+            # in a, an end stays set once it has come
+            ctx.that((a.terminated | ~b.terminated).all(), "terminated after set_state is set where it was not")
+            ctx.equal(b.terminated, a.get_terminated(state), "terminated after set_state")
+
+
+def check_purity(ctx: Context) -> None:
+    """Functions of old arguments give what the live step gave, whenever they are asked, and change nothing."""
+    env = ctx.a
+    has_evaluate = env.task.functions["evaluate"] is not None
+    with ctx.changed(env, autoreset=False, horizon=0):
+        ctx.restart()
+        actions = ctx.actions(6)
+        states = [env.get_state()]
+        live = ctx.run(env, actions)
+        states += list(live["state"])
+        ended = torch.zeros_like(env.done)
+        for pause in range(2):
+            for i, action in enumerate(actions):
+                before = ctx.buffers(env)
+                fine = (live["done_reason"][i] & int(FAULTS)) == 0
+                reward = env.get_reward(states[i], action, states[i + 1])
+                ctx.equal(reward[fine], live["reward"][i][fine], f"get_reward of step {i}, {20 * pause} steps later")
+                state = states[i + 1]
+                ctx.equal(env.get_obs(state), live["obs"][i], f"get_obs of step {i}")
+                if has_evaluate:
+                    ctx.equal(env.get_eval(state)[fine], live["eval"][i][fine], f"get_eval of step {i}")
+                ended = env.get_terminated(state) | (ended if i else torch.zeros_like(ended))
+                ctx.equal(ended[fine], live["terminated"][i][fine], f"get_terminated up to step {i}")
+                for name, values in ctx.buffers(env).items():
+                    ctx.equal(values, before[name], f"{name} of the live worlds after asking about old ones")
+            ctx.run(env, ctx.actions(20, 1))
+
+
+def check_determinism(ctx: Context) -> None:
+    """Two environments made alike and given the same actions stay the same to the bit, through all resets."""
+    ctx.restart()
+    for i, action in enumerate(ctx.actions(ctx.steps)):
+        ctx.a.step(action)
+        ctx.b.step(action)
+        for name in ("reward", "eval", "done_reason", "obs", "final_obs"):
+            ctx.equal(getattr(ctx.b, name), getattr(ctx.a, name), f"{name} at step {i}")
+        if i % 10 == 0 or i == ctx.steps - 1:
+            ctx.equal(ctx.b.get_state(), ctx.a.get_state(), f"the state at step {i}")
+    ctx.finite(ctx.a, f"after {ctx.steps} random steps")
+
+
+def _physics(env: Env, state: torch.Tensor) -> torch.Tensor:
+    counters = [env.state_space.parts[name].start for name in COUNTERS]
+    return torch.stack([column for i, column in enumerate(state.T) if i not in counters], dim=1)
+
+
+def check_reset(ctx: Context) -> None:
+    """``reset`` leads to one and the same state whatever happened before, with zero actions."""
+    env = ctx.a
+    env.reset()
+    state, obs = _physics(env, env.get_state()), env.obs.clone()
+    ctx.equal(obs, obs[:1].expand_as(obs).contiguous(), "the worlds' observations after reset") if not any(
+        isinstance(value, np.ndarray) for value in env.task.params.values()
+    ) else None
+    for action in ctx.actions(100):
+        env.step(action)
+    env.reset()
+    ctx.equal(_physics(env, env.get_state()), state, "the state after reset, without its counters")
+    ctx.equal(env.obs, obs, "obs after reset")
+    ctx.equal(env.final_obs, obs, "final_obs after reset")
+    ctx.that((env.action == 0).all(), f"the actions after reset are {env.action.tolist()}")
+    ctx.that((env.reward == 0).all(), f"the rewards after reset are {env.reward.tolist()}")
+    ctx.equal(env.get_obs(env.get_state()), obs, "get_obs of the state after reset")
+
+
+def check_masked_reset(ctx: Context) -> None:
+    """Resetting some worlds only leaves the others as they are, to the bit."""
+    env = ctx.a
+    mask = torch.arange(env.nworld, device=env.action.device) % 2 == 1
+    for reset in (env.reset, env.rand_reset):
+        ctx.restart()
+        ctx.run(env, ctx.actions(SHORT))
+        before = ctx.buffers(env)
+        reset(mask=mask)
+        for name, values in ctx.buffers(env).items():
+            ctx.equal(values[~mask], before[name][~mask], f"{name} of the worlds left out of {reset.__name__}")
+        ctx.that((env.time[mask] == 0).all() and (env.action[mask] == 0).all(), f"{reset.__name__} left out a world")
+
+
+def check_rand_reset(ctx: Context) -> None:
+    """``rand_reset(seed)`` can be repeated; draws, worlds and seeds differ; actions are zero."""
+    a, b = ctx.a, ctx.b
+    ctx.run(a, ctx.actions(5))
+    ctx.restart()
+    state = a.get_state()
+    ctx.equal(b.get_state(), state, "the state after rand_reset with the same seed")
+    ctx.equal(b.obs, a.obs, "obs after rand_reset with the same seed")
+    ctx.that((a.action == 0).all(), f"the actions after rand_reset are {a.action.tolist()}")
+    a.rand_reset()
+    second = a.get_state()
+    b.rand_reset()
+    ctx.equal(b.get_state(), second, "the second draw")
+    a.rand_reset(ctx.seed + 1)
+    other = a.get_state()
+    if a.task.functions["randomize"] is not None:
+        first = _physics(a, state)
+        ctx.that((_physics(a, second) != first).any(dim=1).all(), "two consecutive draws are the same")
+        ctx.that((_physics(a, other) != first).any(dim=1).all(), "two seeds give the same worlds")
+        if a.nworld > 1:
+            ctx.that((first[1:] != first[:1]).any(dim=1).all(), "worlds of one draw are the same")
+    a.rand_reset(ctx.seed)
+    ctx.equal(a.get_state(), state, "the state after the seed was given again")
+
+
+def check_world_count(ctx: Context) -> None:
+    """A seed gives world i the same initial state however many worlds there are."""
+    n = ctx.a.nworld
+    doubled = {k: np.concatenate([v, v]) for k, v in ctx.a.task.params.items() if isinstance(v, np.ndarray)}
+    more = ctx.make(nworld=2 * n, seed=ctx.seed, **doubled)
+    ctx.restart()
+    ctx.equal(more.get_state()[:n], ctx.a.get_state(), f"the states of {n} of {2 * n} worlds")
+    ctx.equal(more.obs[:n], ctx.a.obs, f"the observations of {n} of {2 * n} worlds")
+
+
+def check_saved_stream(ctx: Context) -> None:
+    """A saved state goes on with its own random stream: later automatic resets lead to the same states."""
+    a, b = ctx.a, ctx.b
+    with ctx.changed(a, b, horizon=3):
+        ctx.restart()
+        ctx.run(a, ctx.actions(4))
+        state, actions = a.get_state(), ctx.actions(8, 1)
+        first = ctx.run(a, actions)
+        b.rand_reset(ctx.seed + 5)
+        ctx.run(b, actions[:2])
+        b.set_state(state)
+        ctx.same_runs(ctx.run(b, actions), first, "after restoring, through automatic resets")

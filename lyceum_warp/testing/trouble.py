@@ -1,0 +1,88 @@
+"""Rules about worlds in trouble."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from lyceum_warp.env import Env
+from lyceum_warp.kernels.faults import FAULTS, Done
+from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
+
+
+def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, what: str) -> None:
+    """Spoil one world of env a and compare with env b, which is left alone."""
+    a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
+    ctx.restart()
+    others = torch.arange(a.nworld, device=a.action.device) != bad
+    for action in ctx.actions(5):
+        a.step(action)
+        b.step(action)
+    good, counts, actions = a.obs[bad].clone(), a.fault_counts, ctx.actions(SHORT, 1)
+    for env in (a, b):
+        env.action.copy_(actions[0])
+    spoil(a, bad)
+    a.step()
+    b.step()
+    found = Done(int(a.done_reason[bad]))
+    ctx.that(reason in found, f"{what}: done_reason is {found!r}")
+    ctx.that(a.terminated[bad] and a.done[bad], f"{what}: terminated is {a.terminated.tolist()}")
+    ctx.that(a.reward[bad] == 0, f"{what}: the reward is {a.reward[bad].item()}")
+    ctx.that(not a.success[bad], f"{what}: it counts as a success")
+    ctx.that(torch.isfinite(a.eval[bad]), f"{what}: eval is {a.eval[bad].item()}")
+    ctx.equal(a.final_obs[bad], good, f"{what}: final_obs against the last good observation")
+    ctx.that(a.time[bad] == 0, f"{what}: the world was not reset, its time is {a.time[bad].item()}")
+    assert reason.name is not None
+    name = reason.name.lower()
+    ctx.that(a.fault_counts[name] == counts[name] + 1, f"{what}: counted {counts} before, {a.fault_counts} after")
+    ctx.finite(a, f"after {what}")
+    for i, action in enumerate(actions[1:]):
+        for key in OUTCOMES:
+            ctx.equal(getattr(a, key)[others], getattr(b, key)[others], f"{what}: {key} of other worlds, step {i}")
+        ctx.equal(a.get_state()[others], b.get_state()[others], f"{what}: the state of other worlds, step {i}")
+        a.step(action)
+        b.step(action)
+        ctx.finite(a, f"{i + 1} steps after {what}")
+        ctx.that(not int(a.done_reason[bad]) & int(FAULTS), f"{what}: the world is in trouble again")
+
+
+def check_bad_state(ctx: Context) -> None:
+    """A state that is not a number, infinite or absurd ends the episode of its world and touches no other."""
+    for part, value in (("qpos", np.nan), ("qvel", np.nan), ("qvel", np.inf), ("qpos", 1e11), ("qvel", -1e11)):
+
+        def spoil(env: Env, world: int, part: str = part, value: float = value) -> None:
+            state = env.get_state()
+            state[world, env.state_space.parts[part].start] = value
+            env.set_state(state, torch.arange(env.nworld, device=state.device) == world, check=False)
+
+        _check_fault(ctx, spoil, Done.NAN, f"{value} in {part}")
+
+
+def check_bad_action(ctx: Context) -> None:
+    """An action that is not finite counts as zero and ends the episode of its world; it touches no other."""
+    for value in (np.nan, np.inf, -np.inf):
+
+        def spoil(env: Env, world: int, value: float = value) -> None:
+            env.action[world, 0] = value
+
+        _check_fault(ctx, spoil, Done.ACTION, f"an action of {value}")
+
+
+def check_bad_warmstart(ctx: Context) -> None:
+    """A warm start that is not a number neither spoils other worlds nor outlives the reset of its own."""
+    a, b, bad = ctx.a, ctx.b, 0
+    if "qacc_warmstart" not in a.state_space.parts:
+        return
+    ctx.restart()
+    state = a.get_state()
+    state[bad, a.state_space.parts["qacc_warmstart"]] = np.nan
+    a.set_state(state, check=False)
+    for i, action in enumerate(ctx.actions(4)):
+        a.step(action)
+        b.step(action)
+        if i == 0 and (a.done_reason[bad] & int(FAULTS)) == 0:
+            # nothing touches anything in this state, so that the solver has not looked at it
+            ctx.that(torch.isfinite(a.obs[bad]).all(), "the observation is not finite, and no fault was seen")
+        ctx.that(i == 0 or not int(a.done_reason[bad]) & int(FAULTS), f"the world is in trouble again at step {i}")
+        ctx.equal(a.get_state()[bad + 1 :], b.get_state()[bad + 1 :], f"the state of other worlds at step {i}")
+    ctx.finite(a, "after a warm start that was not a number")
