@@ -2,9 +2,9 @@
 
     python bench/throughput.py --tasks hopper humanoid --nworld 256
 
-Environment and bare engine take turns: before each step the state that the environment is about to leave is
-copied into the bare engine outside the clock, so that both step the same states, resets included, on a machine
-of the same mood. The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the
+Environment and bare engine take turns of ten steps: the bare engine is given each state that the environment
+has left, by a copy outside the clock, so that both step the same states, resets included, on a machine of the
+same mood. The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the
 same model, controls and number of substeps. ``kept`` is bare time by environment time; ``added`` the difference.
 """
 
@@ -52,10 +52,8 @@ class Options:
     """Engine."""
     device: str = "cpu"
     """Device."""
-    steps: int = 50
-    """Steps in a repetition."""
-    repeat: int = 5
-    """Repetitions; medians are printed."""
+    blocks: int = 50
+    """Blocks of ten steps; medians over them are printed."""
     gymnasium: bool = True
     """Whether to measure Gymnasium's vector environments, too."""
     npg: bool = True
@@ -72,12 +70,14 @@ class BareC:
         assert isinstance(engine, MujocoEngine)
         self.rows = engine.batch.state
         self.batch = Batch(engine.batch.model, env.nworld, engine.nthread)
+        self.bounds = env.action_space.low, env.action_space.high
 
-    def load(self) -> None:
-        """Take over states and actions before the environment's step; not part of the measurement."""
-        self.batch.state[:] = self.rows
-        low, high = self.env.action_space.low, self.env.action_space.high
-        self.batch.ctrl[:] = np.clip(self.env.action.numpy(), low, high)
+    def snapshot(self) -> tuple[np.ndarray, np.ndarray]:
+        """States and controls of the environment's next step."""
+        return self.rows.copy(), np.clip(self.env.action.numpy(), *self.bounds)
+
+    def load(self, snapshot: tuple[np.ndarray, np.ndarray]) -> None:
+        self.batch.state[:], self.batch.ctrl[:] = snapshot
 
     def step(self) -> None:
         self.batch.step(nstep=self.env.task.frame_skip)
@@ -89,27 +89,30 @@ class BareWarp:
     def __init__(self, env: lw.Env) -> None:
         self.env, engine = env, env.engine
         assert isinstance(engine, WarpEngine)
+        self.engine = engine
         self.spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
         with wp.ScopedDevice(env.device):
             self.m = mjw.put_model(env.model)
             self.m.opt.warn_overflow = 0
             self.d = mjw.make_data(env.model, nworld=env.nworld, nconmax=engine.nconmax, njmax=engine.njmax)
-            self.state = wp.zeros((env.nworld, engine.integration_size), dtype=float)
             mjw.step(self.m, self.d)
             with wp.ScopedCapture() as capture:
                 for _ in range(env.task.frame_skip):
                     mjw.step(self.m, self.d)
         self.graph = capture.graph
-        low, high = env.action_space.low, env.action_space.high
-        self.low, self.high = (torch.as_tensor(x, device=env.obs.device) for x in (low, high))
+        self.bounds = [torch.as_tensor(x, device=env.obs.device) for x in (env.action_space.low, env.action_space.high)]
 
-    def load(self) -> None:
-        engine = self.env.engine
-        assert isinstance(engine, WarpEngine)
+    def snapshot(self) -> tuple[wp.array, torch.Tensor]:
+        """States and controls of the environment's next step."""
         with wp.ScopedDevice(self.env.device):
-            mjw.get_state(engine.m, engine.d, self.state, self.spec)
-            mjw.set_state(self.m, self.d, self.state, self.spec)
-        wp.to_torch(self.d.ctrl).copy_(self.env.action.clamp(self.low, self.high))
+            state = wp.zeros((self.env.nworld, self.engine.integration_size), dtype=float)
+            mjw.get_state(self.engine.m, self.engine.d, state, self.spec)
+        return state, self.env.action.clamp(*self.bounds)
+
+    def load(self, snapshot: tuple[wp.array, torch.Tensor]) -> None:
+        with wp.ScopedDevice(self.env.device):
+            mjw.set_state(self.m, self.d, snapshot[0], self.spec)
+        wp.to_torch(self.d.ctrl).copy_(snapshot[1])
         synchronize(self.env)
 
     def step(self) -> None:
@@ -145,62 +148,73 @@ class Row:
     added_microseconds: float
 
 
+BLOCK = 10
+"""Steps after which environment and bare engine change places."""
+
+
+def measure(env: lw.Env, name: str, options: Options, act: Callable[[int], None], block: Callable[[], None]) -> Row:
+    """Time an environment and the bare engine on the same states.
+
+    Args:
+        env: The environment.
+        name: What the row is called.
+        options: How often.
+        act: Sets the actions of step t of a block.
+        block: Makes the steps of a block, with those actions.
+    """
+    bare = bare_engine(env)
+    whole, alone = [], []
+    warm = max(2, env.horizon // 500)  # recordings, and states that are no longer the first ones
+    for repetition in range(warm + options.blocks):
+        start = env.get_state()
+        time_env = seconds(env, block)
+        env.set_state(start)
+        snapshots = []
+        for t in range(BLOCK):
+            act(t)
+            snapshots.append(bare.snapshot())
+            env.step()
+        time_bare = 0.0
+        for snapshot in snapshots:
+            bare.load(snapshot)
+            time_bare += seconds(env, bare.step)
+        if repetition >= warm:
+            whole.append(time_env / BLOCK)
+            alone.append(time_bare / BLOCK)
+    kept = statistics.median(b / a for a, b in zip(whole, alone, strict=True))
+    step, step_alone = statistics.median(whole), statistics.median(alone)
+    added = statistics.median(a - b for a, b in zip(whole, alone, strict=True)) * 1e6
+    return Row(name, env.engine.name, env.nworld, env.nworld / step, env.nworld / step_alone, kept, added)
+
+
 def measure_env(task: str, nworld: int, options: Options) -> Row:
     env = lw.make(task, nworld=nworld, engine=options.engine, device=options.device)
-    bare = bare_engine(env)
     generator = torch.Generator(env.obs.device).manual_seed(0)
     low, high = (torch.as_tensor(x, device=env.obs.device) for x in (env.action_space.low, env.action_space.high))
-    uniform = torch.empty_like(env.action)
+    draws = torch.rand(BLOCK, *env.action.shape, generator=generator, device=env.obs.device)
+    actions = draws * (high - low) + low
 
-    turn = 0
+    def act(t: int) -> None:
+        env.action.copy_(actions[t])
 
-    def one_step() -> tuple[float, float]:
-        nonlocal turn
-        env.action.copy_(uniform.uniform_(generator=generator) * (high - low) + low)
-        bare.load()
-        turn += 1  # whoever goes second finds the caches warm
-        if turn % 2:
-            return seconds(env, env.step), seconds(env, bare.step)
-        alone = seconds(env, bare.step)
-        return seconds(env, env.step), alone
+    def block() -> None:
+        for t in range(BLOCK):
+            act(t)
+            env.step()
 
-    for _ in range(max(20, env.horizon // 50)):  # recordings, and states that are no longer the first ones
-        one_step()
-    whole, alone = [], []
-    for _ in range(options.repeat):
-        times = [one_step() for _ in range(options.steps)]
-        whole.append(sum(t[0] for t in times) / options.steps)
-        alone.append(sum(t[1] for t in times) / options.steps)
-    kept = statistics.median(b / a for a, b in zip(whole, alone, strict=True))
-    added = statistics.median(a - b for a, b in zip(whole, alone, strict=True)) * 1e6
-    rates = nworld / statistics.median(whole), nworld / statistics.median(alone)
-    return Row(task, env.engine.name, nworld, *rates, kept, added)
+    return measure(env, task, options, act, block)
 
 
 def measure_sampling(task: str, nworld: int, options: Options) -> Row:
-    """NPG's sampling with the policy's forward passes, beside the bare engine on the same states."""
+    """NPG's sampling: the policy's forward passes, the noise and the record are part of it."""
     env = lw.make(task, nworld=nworld, engine=options.engine, device=options.device)
-    npg = lw.NPG(env, config=lw.NPGConfig(samples=options.steps * nworld, mean_every=0))
-    bare = bare_engine(env)
-    noise = npg.noise
-    whole, alone = [], []
-    for _ in range(options.repeat + 1):
-        noise.normal_(generator=npg.generator)
-        start = env.get_state()
-        whole.append(seconds(env, lambda: npg.rollout.collect(npg.policy, noise)) / options.steps)
-        env.set_state(start)
-        total = 0.0
-        for t in range(options.steps):
-            npg.policy.sample(env.obs, noise[t], out=env.action)
-            bare.load()
-            total += seconds(env, bare.step)
-            env.step()
-        alone.append(total / options.steps)
-    whole, alone = whole[1:], alone[1:]  # the first repetition makes the recordings
-    kept = statistics.median(b / a for a, b in zip(whole, alone, strict=True))
-    added = statistics.median(a - b for a, b in zip(whole, alone, strict=True)) * 1e6
-    rates = nworld / statistics.median(whole), nworld / statistics.median(alone)
-    return Row(f"{task}, sampling of NPG", env.engine.name, nworld, *rates, kept, added)
+    npg = lw.NPG(env, config=lw.NPGConfig(samples=BLOCK * nworld, mean_every=0))
+    npg.noise.normal_(generator=npg.generator)
+
+    def act(t: int) -> None:
+        npg.policy.sample(env.obs, npg.noise[t], out=env.action)
+
+    return measure(env, f"{task}, sampling of NPG", options, act, npg.sample)
 
 
 def measure_gymnasium(name: str, steps: int) -> tuple[str, float]:

@@ -118,6 +118,7 @@ class Env:
         )
         self._record = Recorder(self.device, record)
         self._scratch: Env | None = None
+        self._views: dict[str, torch.Tensor] = {}
         with wp.ScopedDevice(self.device):
             self._allocate()
         self.rand_reset(seed)
@@ -136,7 +137,6 @@ class Env:
             setattr(self._after, name, live)
             setattr(self._before, name, copy)
             self._pairs.append((copy, live))
-        self._time_view = torch_view(self.engine.field("time"))
 
         self.action_space = action_space(self.model, task.action_range)
         self.obs_space = Space.of(self.task.obs_layout)
@@ -427,7 +427,7 @@ class Env:
     @property
     def time(self) -> torch.Tensor:
         """Simulated seconds since the reset, (nworld,), float32."""
-        return self._time_view
+        return self.field("time")
 
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
         """A live view of one of the engine's fields, by MuJoCo's name.
@@ -442,13 +442,15 @@ class Env:
         Raises:
             ValueError: There is no such field or element.
         """
-        known = name in self.engine.fields
-        view = torch_view(self.engine.field(name))
-        if not known:
-            if self.engine.fields[name].snapshot:
-                self._allocate_state()
-                self._scratch = None
-            self._record.forget()
+        if name not in self._views:
+            known = name in self.engine.fields
+            self._views[name] = torch_view(self.engine.field(name))
+            if not known:
+                if self.engine.fields[name].snapshot:
+                    self._allocate_state()
+                    self._scratch = None
+                self._record.forget()
+        view = self._views[name]
         if element is None:
             return view
         where = elements(self.model, name, element)

@@ -32,9 +32,10 @@ class NPGConfig:
 
     samples: int = 10_000
     """Samples in an iteration; rounded up to whole steps of all worlds."""
-    rollout: Literal["segments", "episodes"] = "segments"
-    """"segments" goes on with the episodes of the last iteration, for many worlds and few steps of each;
-    "episodes" begins new ones in every iteration, as in the paper, and wants samples / worlds >= horizon."""
+    rollout: Literal["auto", "episodes", "segments"] = "auto"
+    """"episodes" begins new episodes in every iteration, as in the paper; "segments" goes on with those of the
+    last iteration, for many worlds and few steps of each; "auto" takes episodes where whole ones fit, that is
+    where samples / worlds >= horizon."""
     gamma: float = 0.995
     """Discount."""
     lam: float = 0.97
@@ -171,7 +172,9 @@ class NPG:
         self.value.to(device)
         self.optimizer = torch.optim.Adam(self.value.parameters(), lr=config.value_rate, fused=True)
         self.rollout = Rollout(env, -(-config.samples // env.nworld))
-        if config.rollout == "episodes" and self.rollout.steps < env.horizon:
+        whole = 0 < env.horizon <= self.rollout.steps
+        self.segments = config.rollout == "segments" or (config.rollout == "auto" and not whole)
+        if not self.segments and not whole:
             log.warning(
                 "%d samples of %d worlds are %d steps: no episode will reach its horizon of %d; take fewer worlds, "
                 "more samples, or rollout='segments'", config.samples, env.nworld, self.rollout.steps, env.horizon,
@@ -184,6 +187,8 @@ class NPG:
         self._return = torch.empty_like(self.rollout.reward)
         self._mean_env: Env | None = None
         self.rollout.restart()
+        if self.segments:
+            self.rollout.stagger(self.generator)
 
     def __iter__(self) -> Iterator[Iteration]:
         return self
@@ -193,11 +198,10 @@ class NPG:
         clock = _Clock(self.env.obs.device)
 
         # 1. Samples of the current policy.
-        if config.rollout == "episodes":
+        if not self.segments:
             rollout.restart()
         self.noise.normal_(generator=self.generator)
-        with _one_thread():
-            rollout.collect(self.policy, self.noise)
+        self.sample()
         time_sample = clock.lap()
 
         # 2. Advantages, from the value function as it was while the samples were drawn.
@@ -256,6 +260,11 @@ class NPG:
             time_mean=clock.lap(),
             samples_per_second=obs.shape[0] / time_sample,
         )
+
+    def sample(self) -> None:
+        """Fill the record with steps of the current policy under the current noise."""
+        with _one_thread():
+            self.rollout.collect(self.policy, self.noise)
 
     @torch.no_grad()
     def advantages(self) -> tuple[torch.Tensor, torch.Tensor, list[torch.Tensor]]:

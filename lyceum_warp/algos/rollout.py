@@ -85,6 +85,22 @@ class Rollout:
         self.env.rand_reset()
         self.running_return.zero_()
 
+    def stagger(self, generator: torch.Generator) -> None:
+        """Set the worlds' step counters to random steps of an episode, so that time limits fall at all times.
+
+        Worlds that began together and never terminate would otherwise all end together, too, most records would
+        hold no end at all, and those that do would be all alike. Returns of these first, shortened episodes are
+        not counted.
+        """
+        env = self.env
+        if env.horizon == 0:
+            return
+        state = env.get_state()
+        first = torch.randint(env.horizon, (env.nworld,), generator=generator, device=state.device)
+        state[:, env.state_space.parts["step"]] = first.unsqueeze(-1).double()
+        env.set_state(state)
+        self.running_return.masked_fill_(first > 0, torch.nan)
+
     def _before_step(self) -> None:
         n, width = self.env.nworld, max(self.env.obs_space.size, self.env.action_space.size)
         args = [self._index, *self._inputs, self._record]
@@ -115,7 +131,7 @@ class Episodes:
 
 def finished(rollout: Rollout) -> Episodes:
     """The episodes that ended within a rollout."""
-    ended = rollout.done
+    ended = rollout.done & ~rollout.episode_return.isnan()
     parts = (rollout.episode_return, rollout.episode_length, rollout.reward, rollout.eval, rollout.success)
     return Episodes(*(part[ended].float().cpu() for part in parts))
 

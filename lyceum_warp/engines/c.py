@@ -28,6 +28,7 @@ def _quiet(message: str) -> None:
 # a world in trouble may hold more than a float32 does
 _overflow_ignored = np.errstate(over="ignore")
 
+_INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 # where errors are counted as well: a kind of warning that no other done reason stands for
 _OTHER_WARNING = mujoco.mjtWarning.mjWARN_INERTIA.value
@@ -60,15 +61,16 @@ class MujocoEngine(Engine):
         # a world in trouble is to be seen, not silently reset in the middle of a step
         self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.nthread = nthread
-        self._open(persistent=False)
         self.ctrl = wp.zeros((nworld, model.nu), dtype=float, device=device)
+        self._open(persistent=False)
 
     def _open(self, *, persistent: bool) -> None:
         self.batch = Batch(self._model, self.nworld, self.nthread, persistent)
         self._initial: wp.array = wp.array(self.batch.state[0].copy(), dtype=wp.float64, device=self.device)
         self._rows = self._alias(self.batch.state)
         self._warning: wp.array = wp.array(self.batch.warning, dtype=int, device=self.device, copy=False)
-        self._sources: dict[str, np.ndarray] = {}
+        self._controls = self.batch.bind("ctrl"), self.ctrl.numpy()
+        self._copies: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         self._columns: dict[str, wp.array] = {}
 
     def _alias(self, rows: np.ndarray) -> wp.array:
@@ -97,17 +99,21 @@ class MujocoEngine(Engine):
     def _connect(self, field: Field) -> None:
         """Find the engine's own float64 array behind a field."""
         if field.name in STATE_FIELDS:
-            offset, size = self.batch._component(STATE_FIELDS[field.name])
-            source = self.batch.state[:, offset : offset + size]
+            component = STATE_FIELDS[field.name].value
+            start = mujoco.mj_stateSize(self.model, _INTEGRATION & (component - 1))
+            source = self.batch.state[:, start : start + mujoco.mj_stateSize(self.model, component)]
             self._columns[field.name] = self._alias(source)
         else:
             source = self.batch.bind(field.name)
-        self._sources[field.name] = source.reshape(self.arrays[field.name].numpy().shape)
+        target = self.arrays[field.name].numpy()
+        self._copies[field.name] = target, source.reshape(target.shape)
 
     def _copy(self, field: Field, mask: np.ndarray | None = None) -> None:
-        target = self.arrays[field.name].numpy()
-        where = True if mask is None else mask.reshape(-1, *[1] * (target.ndim - 1))
-        np.copyto(target, self._sources[field.name], casting="unsafe", where=where)
+        target, source = self._copies[field.name]
+        if mask is None:
+            np.copyto(target, source, "unsafe")
+        else:
+            np.copyto(target, source, "unsafe", where=mask.reshape(-1, *[1] * (target.ndim - 1)))
 
     # physics
 
@@ -121,7 +127,7 @@ class MujocoEngine(Engine):
 
     @_overflow_ignored
     def step(self, nstep: int) -> None:
-        np.copyto(self.batch.ctrl, self.ctrl.numpy(), casting="unsafe")
+        np.copyto(*self._controls)
         stage = self.stage
         lagged = [field for field in self.fields.values() if field.lagged]
         if lagged and stage > Stage.NONE:
