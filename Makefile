@@ -11,7 +11,7 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constrain
 .PHONY: demo test lint clean
 
 demo: $(VENV)/installed-viz
-	$(BIN)/lyceum-warp train hopper --iterations 60 --out runs/demo-$$(date +%Y%m%d-%H%M%S) --require-return 1000
+	$(BIN)/lyceum-warp train hopper --iterations 80 --out runs/demo-$$(date +%Y%m%d-%H%M%S) --require-return 1000
 
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest

@@ -1,5 +1,6 @@
 """Env: one task in many worlds."""
 
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import mujoco
@@ -17,15 +18,11 @@ from lyceum_warp.models import ModelSource
 from lyceum_warp.registry import find_task
 from lyceum_warp.spaces import Space, action_space, control_map, state_space
 from lyceum_warp.task import Task
-from lyceum_warp.validate import check_tensor, described, whole_number
+from lyceum_warp.validate import check_tensor, whole_number
 
 
 def make(task: str | type[Task], **options: Any) -> "Env":
-    """Make an environment: see ``Env`` for the options; all others are parameters of the task.
-
-    Example:
-        >>> env = make("hopper", nworld=64, ctrl_cost_weight=1e-2)
-    """
+    """Make an environment: ``make("hopper", nworld=64, ctrl_cost_weight=1e-2)``; see ``Env`` for the options."""
     return Env(task, **options)
 
 
@@ -109,9 +106,8 @@ class Env:
         self.task = BoundTask(find_task(task), self.nworld, model=model, frame_skip=frame_skip, cone=cone, **params)
         self.horizon = self.task.task.horizon if horizon is None else whole_number("horizon", horizon, low=0)
         self.autoreset = autoreset
-        whole_number("seed", seed, low=0)
-        self.timestep: float = self.task.timestep
-        """Seconds in a step."""
+        whole_number("seed", seed, low=0)  # before anything large is made
+        self.timestep: float = self.task.timestep  # seconds in a step
         self.model: mujoco.MjModel = self.task.model
         self.engine = open_engine(
             engine, self.model, self.nworld, self.device, nthread=nthread, nconmax=nconmax, njmax=njmax
@@ -183,10 +179,14 @@ class Env:
         if action is not None:
             check_tensor(action, "action", self.action)
             self.action.copy_(action)
+        self._run(self._whole_step)
+
+    def _run(self, function: Callable[..., None], *args: Hashable) -> None:
+        """Call a function that calls the engine: as one recording where the engine can be recorded."""
         if self.engine.recordable:
-            self._record(self._whole_step)
+            self._record(function, *args)
         else:
-            self._whole_step()
+            function(*args)
 
     def _whole_step(self) -> None:
         self._record(self._begin)
@@ -251,7 +251,8 @@ class Env:
         Args:
             mask: Which worlds, (nworld,) bool; all by default.
         """
-        self._begin_episodes(mask, randomly=False)
+        self._set_mask(mask)
+        self._begin_episodes(randomly=False)
 
     def rand_reset(self, seed: int | None = None, mask: torch.Tensor | None = None) -> None:
         """Put worlds into random initial states, with zero actions.
@@ -265,15 +266,11 @@ class Env:
             self._seed.fill_(whole_number("seed", seed, low=0))
             args = [self._mask, self._seed, self._key, self._episode]
             wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
-        self._begin_episodes(mask, randomly=True)
+        self._begin_episodes(randomly=True)
 
-    def _begin_episodes(self, mask: torch.Tensor | None, *, randomly: bool) -> None:
-        self._set_mask(mask)
+    def _begin_episodes(self, *, randomly: bool) -> None:
         self.action.masked_fill_(self._mask_view[:, None], 0.0)
-        if self.engine.recordable:
-            self._record(self._whole_reset, randomly)
-        else:
-            self._whole_reset(randomly)
+        self._run(self._whole_reset, randomly)
 
     def _whole_reset(self, randomly: bool) -> None:
         self._record(self._restart, self._mask, randomly)
@@ -281,9 +278,6 @@ class Env:
         self._record(self._judge_state)
 
     def _judge_state(self) -> None:
-        self._judge(self._mask, self._no_fault, self._no_fault, transition=False)
-
-    def _judge_given(self) -> None:
         # a state that was set unchecked may be unfit: its world shows the last good observation, as after a step
         self.engine.find_faults()
         self._judge(self._mask, self.engine.fault, self._no_fault, transition=False)
@@ -291,10 +285,9 @@ class Env:
     def _set_mask(self, mask: torch.Tensor | None) -> None:
         if mask is None:
             self._mask_view.fill_(True)
-            return
-        if not isinstance(mask, torch.Tensor) or mask.dtype != torch.bool or mask.shape != (self.nworld,):
-            raise ValueError(f"a mask has to be a bool tensor of shape ({self.nworld},), not {described(mask)}")
-        self._mask_view.copy_(mask)
+        else:
+            check_tensor(mask, "a mask", self._mask_view)
+            self._mask_view.copy_(mask)
 
     # the state
 
@@ -329,10 +322,7 @@ class Env:
                 f"the state of world {world} has {state[world, column].item()} in its {part!r}: it has to be finite"
             )
         self._state_view.copy_(state)
-        if self.engine.recordable:
-            self._record(self._unpack)
-        else:
-            self._unpack()
+        self._run(self._unpack)
 
     def _pack(self) -> None:
         size = self.engine.state_size
@@ -346,7 +336,7 @@ class Env:
         size = self.engine.state_size
         self.engine.set_state(self._state[:, :size], self._mask)
         self._record(self._unpack_counters)
-        self._record(self._judge_given)
+        self._record(self._judge_state)
 
     def _unpack_counters(self) -> None:
         size = self.engine.state_size

@@ -1,0 +1,37 @@
+"""The README's Python runs as it stands."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import lyceum_warp as lw
+
+README = Path(__file__).parent.parent / "README.md"
+
+
+def test_the_readmes_python_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    assert len(blocks) == 3
+    # Warp compiles the source of functions: it has to lie in a file, as a user's does
+    file = tmp_path / "my_hopper.py"
+    file.write_text(blocks[0])
+    env = lw.make(str(file), nworld=2)
+    assert env.task.name == "my_hopper"
+    scope = {"lw": lw, "MyHopper": env.task.task}
+    for block in blocks[1:]:
+        exec(block, scope)
+    out = capsys.readouterr().out
+    assert "my_hopper on the mujoco engine" in out
+    returns = [float(line) for line in out.splitlines()[-3:]]
+    assert all(0 < value < 200 for value in returns)
+
+
+def test_the_readmes_task_is_shorter_than_the_papers() -> None:
+    """The paper's appendix takes 39 lines for Hopper without its comments."""
+    source = re.search(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    assert source is not None
+    lines = [line for line in source[1].splitlines() if line.strip() and not line.strip().startswith("#")]
+    assert len(lines) < 39
