@@ -64,8 +64,8 @@ class Train:
     device: str = "cpu"
     """cpu, or a CUDA device such as cuda:0."""
     nworld: int = 64
-    """Worlds that step at once. With --rollout episodes each takes samples / nworld steps in an iteration, so
-    episodes longer than that are cut; many worlds go with --rollout segments."""
+    """Worlds that step at once, each samples / nworld steps in an iteration: whole episodes where those fit (the
+    paper's way: 10 worlds for 10,000 samples and episodes of 1,000 steps), segments of them elsewhere."""
     threads: int = 1
     """Threads of torch on the CPU. Small networks gain little from more, and a number that is the same everywhere
     keeps runs the same to the bit. The mujoco engine uses all cores in any case."""

@@ -114,7 +114,7 @@ class Iteration:
     explained_variance: float
     """Share of the returns' variance that the value function explained before the fit."""
     faults: int
-    """Faults since the beginning."""
+    """Faults of worlds in this iteration."""
     time_sample: float
     """Seconds of sampling."""
     time_gradient: float
@@ -195,6 +195,7 @@ class NPG:
 
     def __next__(self) -> Iteration:
         config, rollout = self.config, self.rollout
+        faults_before = sum(self.env.fault_counts.values())
         clock = _Clock(self.env.obs.device)
 
         # 1. Samples of the current policy.
@@ -252,7 +253,7 @@ class NPG:
             std_mean=numbers[4],
             value_error=numbers[5],
             explained_variance=numbers[6],
-            faults=sum(self.env.fault_counts.values()),
+            faults=sum(self.env.fault_counts.values()) - faults_before,
             time_sample=time_sample,
             time_gradient=time_gradient,
             time_solve=time_solve,

@@ -70,6 +70,10 @@ def cartpole() -> mujoco.MjSpec:
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     geom, joint = mujoco.mjtGeom, mujoco.mjtJoint
     world = spec.worldbody
+    spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=(0.5, 0.6, 0.8), rgb2=(0.9, 0.9, 0.9), width=64, height=384,
+    )  # fmt: skip
     world.add_light(pos=(0, 0, 6))
     world.add_camera(name="side", pos=(0, -4, 1), quat=(2**-0.5, 2**-0.5, 0, 0))
     world.add_geom(type=geom.mjGEOM_CAPSULE, fromto=(-2, 0.07, 1, 2, 0.07, 1), size=(0.02, 0, 0))

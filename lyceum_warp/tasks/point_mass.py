@@ -64,6 +64,10 @@ def point_mass() -> mujoco.MjSpec:
     spec.modelname = "point_mass"
     spec.option.timestep = 0.02
     spec.option.gravity = (0, 0, 0)
+    spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=(0.5, 0.6, 0.8), rgb2=(0.9, 0.9, 0.9), width=64, height=384,
+    )  # fmt: skip
     spec.worldbody.add_light(pos=(0, 0, 3))
     spec.worldbody.add_camera(name="above", pos=(0, 0, 4))
     for name, colour in (("agent", (0.2, 0.4, 0.8, 1)), ("target", (0.2, 0.7, 0.3, 1))):
