@@ -2,7 +2,8 @@
 
 import warp as _wp
 
-_wp.config.log_level = _wp.LOG_WARNING
+if _wp.config.log_level == _wp.LOG_INFO:  # Warp's default, at which it greets and reports every kernel
+    _wp.config.log_level = _wp.LOG_WARNING
 
 from lyceum_warp.algos.npg import NPG, Iteration, NPGConfig
 from lyceum_warp.algos.policy import GaussianPolicy

@@ -12,24 +12,32 @@ import numpy as np
 import warp as wp
 
 from lyceum_warp import models
-from lyceum_warp.fields import elements
+from lyceum_warp.fields import elements, vec10
 from lyceum_warp.kernels import steps
 from lyceum_warp.registry import task_name
-from lyceum_warp.task import Element, Task
+from lyceum_warp.task import FUNCTIONS, Element, Task
 from lyceum_warp.validate import whole_number
 
-FUNCTIONS = (
-    "observe",
-    "control",
-    "reward",
-    "evaluate",
-    "terminated",
-    "success",
-    "initialize",
-    "randomize",
-    "advance",
-)
+_SIGNATURES = {
+    "observe": ("observe(s: World, p: Params, obs: Row[float])", "WPr", None),
+    "control": ("control(s: World, action: Row[float], p: Params, ctrl: Row[float])", "WrPr", None),
+    "reward": ("reward(s0: World, action: Row[float], s1: World, p: Params) -> float", "WrWP", float),
+    "evaluate": ("evaluate(s: World, p: Params) -> float", "WP", float),
+    "terminated": ("terminated(s: World, p: Params) -> bool", "WP", bool),
+    "success": ("success(s: World, p: Params) -> bool", "WP", bool),
+    "initialize": ("initialize(s: World, p: Params)", "WP", None),
+    "randomize": ("randomize(s: World, p: Params, rng: Row[wp.uint32])", "WPu", None),
+    "advance": ("advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32])", "WrWPu", None),
+}
+"""How each function is written, the kinds of its arguments, and its result."""
 
+_OPTIONS = ("nworld", "device", "engine", "seed", "autoreset", "horizon", "record", "model", "frame_skip", "cone")
+_OTHER_WORDS = {"num_envs": ["nworld"], "n_envs": ["nworld"], "xml_file": ["model"], "max_episode_steps": ["horizon"]}
+
+_SPELLED = {
+    "float32": "float", "int32": "int", "vec3f": "wp.vec3", "quatf": "wp.quat", "mat33f": "wp.mat33",
+    "spatial_vectorf": "wp.spatial_vector",
+}  # fmt: skip
 
 _MISSING = {"obs": 'the parts of its observation, as obs = {"position": 5}', "model": 'a model, as model = "robot.xml"'}
 
@@ -67,6 +75,7 @@ class BoundTask:
         self.functions = {name: self._function(name) for name in FUNCTIONS}
         if self.functions["observe"] is None:
             raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), the one function it needs")
+        self._check_names()
         self.fields = {name: variable.type for name, variable in self.world_struct.vars.items()}
         if ("memory" in self.fields) != (task.memory > 0):
             raise ValueError(f"the task {self.name!r} needs both, memory = ... in the class and memory in World")
@@ -80,11 +89,14 @@ class BoundTask:
         source = model if model is not None else task.model() if callable(task.model) else task.model
         engine_fields = [name for name in self.fields if name != "memory"]
         self.model = models.compile_model(models.load_spec(source, task), engine_fields, cone=cone)
+        if self.model.nu == 0:
+            raise ValueError(f"the model of the task {self.name!r} has no actuators, so there is nothing to act on")
+        whole_number(f"horizon of the task {self.name!r}", task.horizon, low=0)
         self.frame_skip = whole_number("frame_skip", task.frame_skip if frame_skip is None else frame_skip, low=1)
         self.timestep = self.model.opt.timestep * self.frame_skip
         self.nworld = nworld
         self.params = self._default_params()
-        self.params.update(self._checked_params(params))
+        self.params.update(self.checked_params(params))
         self.obs_layout = self.layout()
         self.kernels = kernels_of(self)
 
@@ -92,23 +104,64 @@ class BoundTask:
         """The observation's parts and their sizes, for the parameters as they are."""
         params = SimpleNamespace(**self.params)
         layout = self.task.obs(params) if callable(self.task.obs) else self.task.obs
+        if not isinstance(layout, Mapping):
+            raise ValueError(f"obs of the task {self.name!r} is {layout!r}: add {_MISSING['obs']}")
         return {name: int(size) for name, size in layout.items() if size}
 
+    def _written(self, name: str) -> Any:
+        """What the user calls by a name: in the class, in its module, or in those of the classes it extends."""
+        owners: Any = self.task.__mro__[: self.task.__mro__.index(Task)]
+        for owner in owners:
+            found = vars(owner).get(name, owner.scope.get(name, vars(sys.modules[owner.__module__]).get(name)))
+            if found is not None:
+                return found.__func__ if isinstance(found, staticmethod) else found
+        return None
+
     def _struct(self, name: str) -> Any:
-        struct = getattr(self.task, name, None) or getattr(self.module, name, None)
+        struct = self._written(name)
         if not hasattr(struct, "vars"):
             raise ValueError(f"the task {self.name!r} needs a @wp.struct named {name} in its module")
         return struct
 
     def _function(self, name: str) -> wp.Function | None:
-        function = vars(self.task).get(name, getattr(self.module, name, None))
-        if isinstance(function, staticmethod):
-            function = function.__func__
+        function = self._written(name)
         if function is None:
             return None
+        signature, kinds, result = _SIGNATURES[name]
         if not isinstance(function, wp.Function):
             raise ValueError(f"{name} of the task {self.name!r} has to be a @wp.func, not {function!r}")
+        types = list(function.input_types.values())
+        structs = [kind for kind in types if hasattr(kind, "vars")]
+        if structs and self.world_struct not in structs and self.params_struct not in structs:
+            return None  # another task's, left over in a notebook
+        found = "".join(map(self._kind, types))
+        returned = function.func.__annotations__.get("return")
+        if found != kinds or (returned is not None and returned is not result):
+            raise ValueError(f"{name} of the task {self.name!r} has to be written as {signature}")
         return function
+
+    def _kind(self, argument: Any) -> str:
+        if argument is self.world_struct:
+            return "W"
+        if argument is self.params_struct:
+            return "P"
+        element: Any = getattr(argument, "dtype", None) if getattr(argument, "ndim", 0) == 1 else None
+        return {wp.float32: "r", wp.uint32: "u"}.get(element, "?")
+
+    def _check_names(self) -> None:
+        """Refuse what looks like a slip of the pen: nobody would ever call it."""
+        attributes = [name for name in vars(Task) if not name.startswith("_")]
+        for name in vars(self.task):
+            if name.startswith("_") or name in (*attributes, "World", "Params", *FUNCTIONS):
+                continue
+            if close := difflib.get_close_matches(name, (*attributes, *FUNCTIONS), 1, 0.75):
+                raise ValueError(f"the task {self.name!r} has {name!r} in its class: did you mean {close[0]}?")
+        for name, value in vars(self.module).items():
+            if isinstance(value, wp.Function) and name not in FUNCTIONS:
+                own = self._kind(next(iter(value.input_types.values()), None)) == "W"
+                close = difflib.get_close_matches(name, [f for f in FUNCTIONS if self.functions[f] is None], 1, 0.85)
+                if own and close:
+                    raise ValueError(f"the task {self.name!r} has a function {name!r}: did you mean {close[0]}?")
 
     # parameters
 
@@ -122,12 +175,13 @@ class BoundTask:
                 values[name] = getattr(self.params_struct.cls, name)
         return values
 
-    def _checked_params(self, given: Mapping[str, Any]) -> dict[str, Any]:
+    def checked_params(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """All parameters, with those that are given, as what their fields hold."""
         known = self.params_struct.vars
         for name in given:
             if name not in known or name == "dt":
                 names = sorted(set(known) - {"dt"})
-                close = difflib.get_close_matches(name, names, 3)
+                close = difflib.get_close_matches(name, [*names, *_OPTIONS], 3) or _OTHER_WORDS.get(name, [])
                 hint = f"did you mean {' or '.join(close)}?" if close else f"it has {', '.join(names) or 'none'}"
                 raise ValueError(f"the task {self.name!r} has no parameter {name!r}: {hint}")
         missing = [name for name in known if name not in self.params and name not in given]
@@ -172,6 +226,14 @@ class BoundTask:
             setattr(instance, name, value)
         return instance
 
+    def explained(self, error: Exception) -> Exception:
+        """What went wrong when the functions were compiled, in one line, where that is what went wrong."""
+        text = str(error)
+        if "while parsing function" not in text and not type(error).__module__.startswith("warp"):
+            return error
+        lines = [line.strip() for line in text.splitlines() if line.strip()]
+        return ValueError(f"Warp can't compile the functions of the task {self.name!r}: {' '.join(lines[-3:])}")
+
     def check_field(self, name: str, array: wp.array) -> None:
         """Compare the declaration of a field in World with the array that it will be bound to, (nworld, ...).
 
@@ -181,8 +243,28 @@ class BoundTask:
         kind = self.fields[name]
         dtype, ndim = (kind.dtype, kind.ndim) if hasattr(kind, "ndim") else (kind, 0)
         if not wp.types.types_equal(dtype, array.dtype) or ndim != array.ndim - 1:
-            wanted = array.dtype.__name__ if array.ndim == 1 else f"Row[{wp.types.type_repr(array.dtype)}]"
+            element = "lw.vec10" if array.dtype is vec10 else wp.types.type_repr(array.dtype)
+            wanted = _SPELLED.get(element, element) if array.ndim == 1 else f"Row[{_SPELLED.get(element, element)}]"
             raise ValueError(f"World.{name} of the task {self.name!r} has to be declared as {wanted}")
+
+    def check_observation(self, batch: Any, params: wp.array) -> None:
+        """Let ``observe`` write into a row with room to spare, where otherwise it would spoil other memory unseen.
+
+        Raises:
+            ValueError: It writes more or less than ``obs`` declares.
+        """
+        nobs = sum(self.obs_layout.values())
+        device = params.device
+        row = wp.full((1, nobs + 64), float("nan"), dtype=float, device=device)
+        mask = wp.full(1, True, dtype=bool, device=device)
+        wp.launch(self.kernels.look, 1, [mask, batch, params, row], device=device)
+        written = ~np.isnan(row.numpy()[0])
+        if written[nobs:].any():
+            last = int(np.flatnonzero(written).max()) + 1
+            raise ValueError(f"observe of the task {self.name!r} writes {last} numbers, but obs declares {nobs}")
+        if not written[:nobs].all():
+            places = np.flatnonzero(~written[:nobs]).tolist()
+            raise ValueError(f"observe of the task {self.name!r} leaves the places {places} of obs unwritten")
 
     def params_array(self, device: wp.Device) -> wp.array:
         """The parameters as the kernels read them: one entry, or one a world where any differs."""

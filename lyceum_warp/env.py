@@ -4,6 +4,7 @@ from collections.abc import Callable, Hashable
 from typing import Any
 
 import mujoco
+import numpy as np
 import torch
 import warp as wp
 
@@ -16,7 +17,7 @@ from lyceum_warp.kernels.faults import FAULTS
 from lyceum_warp.kernels.recorder import Recorder
 from lyceum_warp.models import ModelSource
 from lyceum_warp.registry import find_task
-from lyceum_warp.spaces import Space, action_space, control_map, state_space
+from lyceum_warp.spaces import COUNTERS, Space, action_space, control_map, state_space
 from lyceum_warp.task import Task
 from lyceum_warp.validate import check_tensor, whole_number
 
@@ -104,20 +105,31 @@ class Env:
         self.nworld = whole_number("nworld", nworld, low=1)
         self.device = find_device(device)
         self.task = BoundTask(find_task(task), self.nworld, model=model, frame_skip=frame_skip, cone=cone, **params)
-        self.horizon = self.task.task.horizon if horizon is None else whole_number("horizon", horizon, low=0)
-        self.autoreset = autoreset
+        self._horizon = self.task.task.horizon if horizon is None else whole_number("horizon", horizon, low=0)
+        self._autoreset = autoreset
+        self._given_params = dict(params)
         whole_number("seed", seed, low=0)  # before anything large is made
         self.timestep: float = self.task.timestep  # seconds in a step
         self.model: mujoco.MjModel = self.task.model
         self.engine = open_engine(
             engine, self.model, self.nworld, self.device, nthread=nthread, nconmax=nconmax, njmax=njmax
         )
+        self.record = record
         self._record = Recorder(self.device, record)
         self._scratch: Env | None = None
         self._views: dict[str, torch.Tensor] = {}
         with wp.ScopedDevice(self.device):
             self._allocate()
-        self.rand_reset(seed)
+        try:
+            self.rand_reset(seed)
+        except Exception as error:
+            raise self.task.explained(error) from None
+        self.task.check_observation(self._after, self._params)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in self.__dict__ and name in (*steps.OUTCOMES, "action"):
+            raise AttributeError(f"env.{name} is a buffer of fixed address: write into it, as env.{name}.copy_(...)")
+        super().__setattr__(name, value)
 
     def _allocate(self) -> None:
         n, nu, task, kernels = self.nworld, self.model.nu, self.task.task, self.task.kernels
@@ -165,6 +177,16 @@ class Env:
         self._state = wp.zeros((self.nworld, self.state_space.size), dtype=wp.float64, device=self.device)
         self._state_view = torch_view(self._state)
 
+    @property
+    def horizon(self) -> int:
+        """Steps after which an episode is truncated; 0 for never."""
+        return self._horizon
+
+    @property
+    def autoreset(self) -> bool:
+        """Whether finished worlds begin a new episode within the same step."""
+        return self._autoreset
+
     # the step
 
     def step(self, action: torch.Tensor | None = None) -> None:
@@ -178,7 +200,7 @@ class Env:
         """
         if action is not None:
             check_tensor(action, "action", self.action)
-            self.action.copy_(action)
+            self.action.copy_(action.detach())
         self._run(self._whole_step)
 
     def _run(self, function: Callable[..., None], *args: Hashable) -> None:
@@ -213,18 +235,20 @@ class Env:
 
     def _judge_and_restart(self) -> None:
         kernels = self.task.kernels
-        self.engine.find_faults()
+        self.engine.find_faults(self._everyone)
         if kernels.remember is not None:
             wp.launch(kernels.remember, self.nworld, [
                 self._before, self._after, self._params, self._safe_action, self._step, self._key, self._episode,
                 self._rng,
             ], device=self.device)  # fmt: skip
-        self._judge(self._everyone, self.engine.fault, self._action_fault, transition=True)
+        sticky = not self.autoreset
+        self._judge(self._everyone, self.engine.fault, self._action_fault, transition=True, sticky=sticky)
         wp.launch(steps.count_faults, self.nworld, [self.engine.fault, self._fault_count], device=self.device)
         self._restart(self._restarting, True)
 
-    def _judge(self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool) -> None:
-        sticky = transition and not self.autoreset
+    def _judge(
+        self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, sticky: bool = False
+    ) -> None:
         wp.launch(self.task.kernels.judge, self.nworld, [
             mask, self._before, self._after, self._params, self._safe_action, self._step, self.horizon, transition,
             sticky, fault, action_fault, self._out, self._restarting,
@@ -277,10 +301,10 @@ class Env:
         self.engine.refresh(self._mask)
         self._record(self._judge_state)
 
-    def _judge_state(self) -> None:
+    def _judge_state(self, sticky: bool = False) -> None:
         # a state that was set unchecked may be unfit: its world shows the last good observation, as after a step
-        self.engine.find_faults()
-        self._judge(self._mask, self.engine.fault, self._no_fault, transition=False)
+        self.engine.find_faults(self._mask)
+        self._judge(self._mask, self.engine.fault, self._no_fault, transition=False, sticky=sticky)
 
     def _set_mask(self, mask: torch.Tensor | None) -> None:
         if mask is None:
@@ -327,23 +351,25 @@ class Env:
     def _pack(self) -> None:
         size = self.engine.state_size
         self.engine.get_state(self._state[:, :size])
-        counters = [self._step, self._key, self._episode, self._state[:, size : size + 3]]
+        # with automatic resets an end is over with the step that it came in, without it stays
+        ended = self._no_fault if self.autoreset else self._out.done_reason
+        counters = [self._step, self._key, self._episode, ended, self._state[:, size:]]
         wp.launch(state.pack_counters, self.nworld, counters, device=self.device)
         if self.task.task.memory:
-            state.launch_rows(state.widen, self._everyone, self._memory, self._state[:, size + 3 :])
+            state.launch_rows(state.widen, self._everyone, self._memory, self._state[:, size + len(COUNTERS) :])
 
     def _unpack(self) -> None:
         size = self.engine.state_size
         self.engine.set_state(self._state[:, :size], self._mask)
         self._record(self._unpack_counters)
-        self._record(self._judge_state)
+        self._record(self._judge_state, not self.autoreset)
 
     def _unpack_counters(self) -> None:
         size = self.engine.state_size
-        counters = [self._mask, self._state[:, size : size + 3], self._step, self._key, self._episode]
+        counters = [self._mask, self._state[:, size:], self._step, self._key, self._episode, self._out.done_reason]
         wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)
         if self.task.task.memory:
-            state.launch_rows(state.narrow, self._mask, self._state[:, size + 3 :], self._memory)
+            state.launch_rows(state.narrow, self._mask, self._state[:, size + len(COUNTERS) :], self._memory)
 
     # getters and setters of the paper's interface
 
@@ -384,6 +410,8 @@ class Env:
         if before is None or action is None or after is None:
             raise ValueError("a reward belongs to a transition: give before, action and after, or none of them")
         check_tensor(action, "action", self.action)
+        if not torch.isfinite(action).all():
+            raise ValueError("an action is not finite: such a transition is a fault, and has no reward")
         scratch = self._scratch_at(before)
         for copy, live in scratch._pairs:
             wp.copy(copy, live)
@@ -407,7 +435,7 @@ class Env:
             world, i = (~torch.isfinite(action)).nonzero()[0].tolist()
             name = list(self.action_space.parts)[i]
             raise ValueError(f"the action {name!r} of world {world} is {action[world, i].item()}: it has to be finite")
-        self.action.copy_(action)
+        self.action.copy_(action.detach())
 
     @property
     def episode_step(self) -> torch.Tensor:
@@ -431,6 +459,9 @@ class Env:
 
         Raises:
             ValueError: There is no such field or element.
+
+        Asking late costs new recordings, and a field of the acceleration stage becomes part of the state from
+        then on: states that were taken before no longer fit.
         """
         if name not in self._views:
             known = name in self.engine.fields
@@ -453,11 +484,16 @@ class Env:
         Raises:
             ValueError: There is no such parameter, or the observation would change its size.
         """
-        previous = dict(self.task.params)
-        self.task.params.update(self.task._checked_params(params))
-        if self.task.layout() != self.task.obs_layout:
+        previous = self.task.params
+        self.task.params = previous | self.task.checked_params(params)
+        try:
+            same = self.task.layout() == self.task.obs_layout
+        except ValueError:  # one value a world, where the layout wants a single one
+            same = False
+        if not same:
             self.task.params = previous
             raise ValueError(f"{', '.join(params)} would change the observation's parts: make a new environment")
+        self._given_params |= params
         changed = self.task.params_array(self.device)
         if changed.shape == self._params.shape:
             wp.copy(self._params, changed)
@@ -466,6 +502,10 @@ class Env:
             self._record.forget()
         self._scratch = None
 
+    def follow(self, other: "Env") -> None:
+        """Take over the parameters of another environment of the same task, as ``replicate`` does."""
+        self.set_params(**other._params_for(self.nworld))
+
     @property
     def fault_counts(self) -> dict[str, int]:
         """How often each kind of fault has happened since construction; waits for the device."""
@@ -473,14 +513,20 @@ class Env:
         return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
 
     def replicate(self, *, nworld: int | None = None, **changes: Any) -> "Env":
-        """Another environment of the same task with the same options, but for the given changes.
+        """Another environment of the same task with the same options and parameters, but for the given changes.
 
-        Raises:
-            ValueError: A parameter has one value a world, and the number of worlds changes.
+        Where a parameter has one value a world and the number of worlds differs, the values go round.
         """
+        nworld = self.nworld if nworld is None else nworld
         options = self._options | {"horizon": self.horizon, "autoreset": self.autoreset}
-        params = {name: value for name, value in self.task.params.items() if name != "dt"}
-        return Env(self.task.task, nworld=nworld or self.nworld, **(options | params | changes))
+        return Env(self.task.task, nworld=nworld, **(options | self._params_for(nworld) | changes))
+
+    def _params_for(self, nworld: int) -> dict[str, Any]:
+        params = {}
+        for name, given in self._given_params.items():
+            value = self.task.params[name]
+            params[name] = value[np.arange(nworld) % self.nworld] if isinstance(value, np.ndarray) else given
+        return params
 
     # helpers
 

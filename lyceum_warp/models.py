@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 import mujoco
 
 from lyceum_warp.fields import ON_DEMAND
+from lyceum_warp.quiet import quiet
 
 log = logging.getLogger(__name__)
 
@@ -108,6 +109,7 @@ def compile_model(spec: mujoco.MjSpec, fields: Iterable[str], *, cone: str | Non
             body.name = "lyceum_first_body"
         name = f"lyceum_{sensor.name.removeprefix('mjSENS_').lower()}"
         spec.add_sensor(name=name, type=sensor, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=body.name)
+    quiet()
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")

@@ -27,6 +27,9 @@ def register(task: type[Task]) -> type[Task]:
     known = _tasks.get(name)
     if known is None and not task.__module__.startswith(_PACKAGE) and name in _package_tasks():
         owner = f"{_PACKAGE}{name}"
+    elif task.__module__.startswith(_FILE) and (known is None or known.__module__.startswith(_FILE)):
+        _tasks[name] = task  # tasks that are given as files are told apart by them
+        return task
     elif known is not None and known.__module__ != task.__module__ and _file(known) != _file(task):
         owner = f"{known.__module__}.{known.__qualname__}"
     else:
@@ -36,6 +39,7 @@ def register(task: type[Task]) -> type[Task]:
 
 
 _PACKAGE = "lyceum_warp.tasks."
+_FILE = "lyceum_task_"
 
 
 def _package_tasks() -> list[str]:
@@ -58,7 +62,7 @@ def task_names() -> list[str]:
     return sorted({*_tasks, *_package_tasks()})
 
 
-def find_task(task: str | type[Task]) -> type[Task]:
+def find_task(task: str | Path | type[Task]) -> type[Task]:
     """The class of a task, by name, by file (``path/to/file.py`` or ``path/to/file.py:Class``), or itself.
 
     Raises:
@@ -67,12 +71,14 @@ def find_task(task: str | type[Task]) -> type[Task]:
     """
     if isinstance(task, type) and issubclass(task, Task):
         return task
+    if isinstance(task, Path):
+        task = str(task)
     if not isinstance(task, str):
         raise ValueError(f"a task is a name, a file or a subclass of lw.Task, not {task!r}")
     path, _, attribute = task.partition(":")
     if path.endswith(".py"):
         return _task_of_file(Path(path), attribute)
-    if task not in _tasks and importlib.util.find_spec(f"lyceum_warp.tasks.{task}") is not None:
+    if task not in _tasks and task in _package_tasks():
         importlib.import_module(f"lyceum_warp.tasks.{task}")
     if task not in _tasks:
         close = difflib.get_close_matches(task, task_names(), 3)
@@ -84,7 +90,7 @@ def find_task(task: str | type[Task]) -> type[Task]:
 def _task_of_file(path: Path, attribute: str) -> type[Task]:
     if not path.is_file():
         raise FileNotFoundError(f"there is no task file {str(path)!r}")
-    name = f"lyceum_task_{path.stem}_{zlib.crc32(str(path.resolve()).encode()):08x}"
+    name = f"{_FILE}{path.stem}_{zlib.crc32(str(path.resolve()).encode()):08x}"
     module = sys.modules.get(name)
     if module is None:
         spec = importlib.util.spec_from_file_location(name, path)

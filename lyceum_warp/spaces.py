@@ -49,8 +49,8 @@ class Space:
         return {name: values[..., part] for name, part in self.parts.items()}
 
 
-COUNTERS = ("step", "key", "episode")
-"""Parts of a state that count: steps since the reset, the world's random streams, and its episodes."""
+COUNTERS = ("step", "key", "episode", "done_reason")
+"""Parts of a state that count: steps since the reset, the world's random streams, its episodes, why it ended."""
 
 
 def action_space(model: mujoco.MjModel, action_range: tuple[float, float] | None) -> Space:
@@ -66,6 +66,12 @@ def control_map(model: mujoco.MjModel, action_range: tuple[float, float] | None)
     ranges = control_ranges(model)
     if action_range is None:
         return ranges, np.tile((1.0, 0.0), (model.nu, 1))
+    if not np.isfinite(ranges).all():
+        unlimited = np.flatnonzero(~np.isfinite(ranges).all(axis=1)).tolist()
+        raise ValueError(
+            f"action_range maps actions to the controls' ranges, but the model gives none to the controls {unlimited}: "
+            "set their ctrlrange, or leave action_range out"
+        )
     low, high = action_range
     gain = (ranges[:, 1] - ranges[:, 0]) / (high - low)
     return ranges, np.stack([gain, ranges[:, 0] - gain * low], axis=1)

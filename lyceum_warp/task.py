@@ -1,5 +1,6 @@
 """Task: what a user writes."""
 
+import sys
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import warp as wp
@@ -17,6 +18,20 @@ if TYPE_CHECKING:
         def __len__(self) -> int: ...
 else:
     Row = wp.array
+
+
+FUNCTIONS = (
+    "observe",
+    "control",
+    "reward",
+    "evaluate",
+    "terminated",
+    "success",
+    "initialize",
+    "randomize",
+    "advance",
+)
+"""The functions of a task."""
 
 
 class Element(int):
@@ -88,7 +103,8 @@ class Task:
 
     Controls are clipped to the model's ranges; costs see the action as given. ``rng`` is drawn from with
     ``uniform`` and ``normal``. ``initialize`` and ``randomize`` may write qpos, qvel, act, mocap_pos,
-    mocap_quat, userdata and memory where ``World`` lists them.
+    mocap_quat, userdata and memory where ``World`` lists them; positions and the like (``xpos``, ``site_xpos``,
+    ``sensordata``) are computed only after them, so that these two must not read any.
     """
 
     model: ClassVar[Any]
@@ -107,3 +123,12 @@ class Task:
     action_range: ClassVar[tuple[float, float] | None] = None
     """The range of an action that the default ``control`` maps to the model's control ranges; None: actions
     are controls."""
+
+    scope: ClassVar[dict[str, Any]] = {}
+    """What the class's module held by the names above when the class was made."""
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        # now: another task, in a later cell of the same notebook, has the same names
+        module = vars(sys.modules[cls.__module__])
+        cls.scope = {name: module[name] for name in ("World", "Params", *FUNCTIONS) if name in module}

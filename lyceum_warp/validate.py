@@ -29,6 +29,8 @@ def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:
     """
     if not isinstance(value, torch.Tensor) or value.shape != like.shape or value.dtype != like.dtype:
         raise ValueError(f"{name} has to be {described(like)}, not {described(value)}")
+    if value.device != like.device:
+        raise ValueError(f"{name} lies on {value.device}, but belongs on {like.device}: move it with .to()")
 
 
 def described(value: Any) -> str:

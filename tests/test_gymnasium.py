@@ -126,9 +126,10 @@ class Pair:
 
         state = self.ours.get_state()
         parts = self.ours.state_space.split(state[0])
-        for name in parts.keys() - {"step", "key", "episode"}:
+        for name in parts.keys() - {"step", "key", "episode", "done_reason"}:
             # fields that are kept as the last substep left them are the ones of the forward pass above
             parts[name].copy_(torch.from_numpy(np.ravel(getattr(data, name))))
+        parts["done_reason"].zero_()  # nothing has ended yet in the common state
         self.ours.set_state(state)
 
     def action(self) -> np.ndarray:

@@ -6,9 +6,10 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from lyceum_warp.engines.base import Engine, flat
+from lyceum_warp.engines.base import Engine
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage
 from lyceum_warp.kernels import faults, state
+from lyceum_warp.kernels.arrays import flat
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
@@ -33,10 +34,10 @@ class ToyEngine(Engine):
         for data, row in zip(self.worlds, rows, strict=True):
             mujoco.mj_getState(self._model, data, row, _SPEC)
         self._rows = wp.array(rows, dtype=wp.float64, device=device)
-        self._initial = wp.array(rows[0], dtype=wp.float64, device=device)
+        self._initial = wp.array(rows[0].astype(np.float32).astype(float), dtype=wp.float64, device=device)
         self._warning = wp.zeros((nworld, len(self.worlds[0].warning.number), 2), dtype=int, device=device)
-        self.ctrl = wp.zeros((nworld, model.nu), dtype=float, device=device)
         self._columns: dict[str, wp.array] = {}
+        self.ctrl = self.field("ctrl")
 
     # fields
 
@@ -88,9 +89,9 @@ class ToyEngine(Engine):
             self._warning.numpy()[w, :, 1] += data.warning.number
             data.warning.number[:] = 0
 
-    def find_faults(self) -> None:
+    def find_faults(self, mask: wp.array) -> None:
         nphysics = 1 + self.model.nq + self.model.nv + self.model.na
-        wp.launch(faults.faults_of_rows, self.nworld, [self._rows, nphysics, self._warning, self.fault])
+        wp.launch(faults.faults_of_rows, self.nworld, [mask, self._rows, nphysics, self._warning, self.fault])
 
     def reset(self, mask: wp.array) -> None:
         state.launch_rows(state.fill_rows64, mask, self._initial, self._rows)

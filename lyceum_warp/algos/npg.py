@@ -25,6 +25,9 @@ from lyceum_warp.kernels import returns
 
 log = logging.getLogger(__name__)
 
+MEAN_SEED = 2**31 - 1
+"""Seed of the initial states from which the mean policy is evaluated."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NPGConfig:
@@ -159,6 +162,8 @@ class NPG:
         self.env = env
         self.config = config = config or NPGConfig()
         _check(config)
+        if not env.autoreset:
+            raise ValueError("NPG needs an environment that resets by itself: make it with autoreset=True")
         device = env.obs.device
         nobs, nact = env.obs_space.size, env.action_space.size
         init = torch.Generator().manual_seed(seed)
@@ -180,7 +185,8 @@ class NPG:
                 "more samples, or rollout='segments'", config.samples, env.nworld, self.rollout.steps, env.horizon,
             )  # fmt: skip
         self.noise = torch.empty_like(self.rollout.action)
-        self.generator = torch.Generator(device).manual_seed(seed)
+        # a seed of its own: the same numbers should not make both the weights and the noise
+        self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
         self.iteration = 0
         self.samples = 0
         self._advantage = torch.empty_like(self.rollout.reward)
@@ -219,8 +225,12 @@ class NPG:
         fisher = FisherProduct(self.policy, _thinned(obs, config.fisher_fraction), config.damping)
         direction = conjugate_gradient(fisher, gradient, config.cg_iterations)
         step = direction * torch.sqrt(config.delta / (gradient @ direction + 1e-20))
-        finite = torch.isfinite(step).all()
-        kl = self.move(torch.where(finite, step, 0.0), obs)
+        if not torch.isfinite(step).all():
+            raise FloatingPointError(
+                f"the policy gradient of iteration {self.iteration + 1} is not finite; the policy was left as it "
+                "was. Check the task's rewards and observations, or make the step (delta) smaller"
+            )
+        kl = self.move(step, obs)
         time_solve = clock.lap()
 
         # 5. The value function, on the returns of these samples.
@@ -232,12 +242,7 @@ class NPG:
 
         # One copy brings all numbers to the host.
         spread = self.policy.log_std.detach().exp().mean()
-        numbers = torch.stack([finite.float(), kl, step.norm(), gradient.norm(), spread, *statistics]).tolist()
-        if not numbers[0]:
-            raise FloatingPointError(
-                f"the policy gradient of iteration {self.iteration + 1} is not finite; the policy was left as it "
-                "was. Check the task's rewards and observations, or make the step (delta) smaller"
-            )
+        numbers = torch.stack([kl, step.norm(), gradient.norm(), spread, *statistics]).tolist()
         self.iteration += 1
         self.samples += obs.shape[0]
         episodes = finished(rollout)
@@ -247,12 +252,12 @@ class NPG:
             samples=self.samples,
             **_summary(episodes),
             **mean,
-            kl=numbers[1],
-            step_norm=numbers[2],
-            gradient_norm=numbers[3],
-            std_mean=numbers[4],
-            value_error=numbers[5],
-            explained_variance=numbers[6],
+            kl=numbers[0],
+            step_norm=numbers[1],
+            gradient_norm=numbers[2],
+            std_mean=numbers[3],
+            value_error=numbers[4],
+            explained_variance=numbers[5],
             faults=sum(self.env.fault_counts.values()) - faults_before,
             time_sample=time_sample,
             time_gradient=time_gradient,
@@ -324,8 +329,9 @@ class NPG:
             return dict.fromkeys(names)
         if self._mean_env is None:
             self._mean_env = self.env.replicate(nworld=config.mean_episodes)
-        # the same initial states each time: what changes is the policy
-        episodes = evaluate(self._mean_env, self.policy, config.mean_episodes, seed=0)
+        # the same initial states each time, and none of those that are trained on: what changes is the policy
+        self._mean_env.follow(self.env)
+        episodes = evaluate(self._mean_env, self.policy, config.mean_episodes, seed=MEAN_SEED)
         parts = (episodes.returns, episodes.lengths, episodes.rewards, episodes.evals, episodes.success)
         return {name: part.mean().item() for name, part in zip(names, parts, strict=True)}
 

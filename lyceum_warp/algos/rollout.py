@@ -59,7 +59,7 @@ class Rollout:
             self._index = wp.zeros(1, dtype=int)
             self._return = wp.zeros(n, dtype=float)
         self.running_return = torch_view(self._return)
-        self._recorder = Recorder(env.device)
+        self._recorder = Recorder(env.device, env.record)
         self._inputs = [wp.from_torch(env.obs), wp.from_torch(env.action), wp.from_torch(env.episode_step)]
         outputs = [env.final_obs, env.reward, env.eval, env.terminated, env.done, env.success]
         self._outputs = [wp.from_torch(output) for output in outputs]
@@ -154,6 +154,8 @@ def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | No
     """
     if env.horizon == 0:
         raise ValueError(f"episodes of {env.task.name!r} never end without a horizon: give make() a horizon")
+    if not env.autoreset:
+        raise ValueError("whole episodes need an environment that resets by itself: make it with autoreset=True")
     each = -(-episodes // env.nworld)
     env.rand_reset(seed)
     results = torch.zeros(5, each, env.nworld, device=env.obs.device)

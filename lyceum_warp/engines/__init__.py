@@ -3,6 +3,7 @@
 import importlib
 
 import mujoco
+import torch
 import warp as wp
 
 from lyceum_warp.engines.base import Engine, EngineFactory
@@ -24,9 +25,16 @@ def find_device(device: str | None) -> wp.Device:
     name, error = str(device or "cpu"), None
     if wp.is_cuda_available() or not name.startswith("cuda"):  # without a driver, Warp would print before it fails
         try:
-            return wp.get_device(name)
+            found = wp.get_device(name)
         except (ValueError, RuntimeError) as cause:
             error = cause
+        else:
+            if found.is_cuda and not torch.cuda.is_available():
+                raise ValueError(
+                    f"Warp has the device {name!r}, but torch {torch.__version__} is built without CUDA or does not "
+                    "see it: install a CUDA build of torch"
+                )
+            return found
     names = ", ".join(repr(d.alias) for d in wp.get_devices())
     raise ValueError(
         f"there is no device {name!r} on this machine; it has {names} (for a GPU, check that nvidia-smi shows it "

@@ -35,7 +35,7 @@ class Engine(abc.ABC):
     """
 
     ctrl: wp.array
-    """Controls of the next step, (nworld, nu), float32."""
+    """Controls of the next step, (nworld, nu), float32: the field of that name, reset and restored with the state."""
     fault: wp.array
     """Bits of ``Done`` for each world, (nworld,), int32; set by ``find_faults``."""
 
@@ -46,6 +46,7 @@ class Engine(abc.ABC):
         self.fields: dict[str, Field] = {}
         self.arrays: dict[str, wp.array] = {}
         self.fault = wp.zeros(nworld, dtype=int, device=device)
+        self._everyone = wp.full(nworld, True, dtype=bool, device=device)
         spec = mujoco.mjtState.mjSTATE_INTEGRATION
         self.integration_size = mujoco.mj_stateSize(model, spec.value)
 
@@ -104,8 +105,8 @@ class Engine(abc.ABC):
         """Advance every world by ``nstep`` substeps under ``ctrl`` and bring the fields up to date."""
 
     @abc.abstractmethod
-    def find_faults(self) -> None:
-        """Write ``fault``: not-a-number or absurd state, overflows and warnings since the last call.
+    def find_faults(self, mask: wp.array) -> None:
+        """Write the masked worlds' ``fault``: a state that is not finite, and what was in their way since last time.
 
         Made of Warp launches on every engine.
         """
@@ -159,14 +160,6 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def _refresh_current(self, mask: wp.array) -> None: ...
-
-    # helpers
-
-    @property
-    def _everyone(self) -> wp.array:
-        if not hasattr(self, "_all"):
-            self._all = wp.full(self.nworld, True, dtype=bool, device=self.device)
-        return self._all
 
 
 EngineFactory = Callable[..., Engine]

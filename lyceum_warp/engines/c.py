@@ -15,14 +15,9 @@ from lyceum_warp.fields import STATE_FIELDS, Field, Stage
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.arrays import flat
 from lyceum_warp.kernels.state import copy_rows64, fill_rows64, launch_rows, narrow, widen
+from lyceum_warp.quiet import quiet
 
 log = logging.getLogger(__name__)
-
-
-def _quiet(message: str) -> None:
-    # MuJoCo would print every warning and append it to MUJOCO_LOG.TXT in the current folder; here warnings
-    # are counted per world and become done reasons
-    log.debug("MuJoCo: %s", message)
 
 
 # a world in trouble may hold more than a float32 does
@@ -56,20 +51,21 @@ class MujocoEngine(Engine):
                 f"the mujoco engine runs on the CPU, not on {device.alias!r}: use device='cpu' or engine='warp'"
             )
         super().__init__(model, nworld, device)
-        mujoco.set_mju_user_warning(_quiet)
+        quiet()
         self._model = copy.copy(model)
         # a world in trouble is to be seen, not silently reset in the middle of a step
         self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.nthread = nthread
-        self.ctrl = wp.zeros((nworld, model.nu), dtype=float, device=device)
         self._open(persistent=False)
+        self.ctrl = self.field("ctrl")
 
     def _open(self, *, persistent: bool) -> None:
         self.batch = Batch(self._model, self.nworld, self.nthread, persistent)
-        self._initial: wp.array = wp.array(self.batch.state[0].copy(), dtype=wp.float64, device=self.device)
+        # as the float32 fields show it, so that who asked for which fields makes no difference
+        initial = self.batch.state[0].astype(np.float32).astype(np.float64)
+        self._initial: wp.array = wp.array(initial, dtype=wp.float64, device=self.device)
         self._rows = self._alias(self.batch.state)
         self._warning: wp.array = wp.array(self.batch.warning, dtype=int, device=self.device, copy=False)
-        self._controls = self.batch.bind("ctrl"), self.ctrl.numpy()
         self._copies: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         self._columns: dict[str, wp.array] = {}
 
@@ -127,7 +123,8 @@ class MujocoEngine(Engine):
 
     @_overflow_ignored
     def step(self, nstep: int) -> None:
-        np.copyto(*self._controls)
+        ctrl, rows = self._copies["ctrl"]
+        np.copyto(rows, ctrl)
         stage = self.stage
         lagged = [field for field in self.fields.values() if field.lagged]
         if lagged and stage > Stage.NONE:
@@ -140,12 +137,12 @@ class MujocoEngine(Engine):
             for field in lagged:
                 self._copy(field)
         for field in self.fields.values():
-            if not field.lagged:
+            if not field.lagged and field.name != "ctrl":
                 self._copy(field)
 
-    def find_faults(self) -> None:
+    def find_faults(self, mask: wp.array) -> None:
         nphysics = 1 + self.model.nq + self.model.nv + self.model.na
-        args = [self._rows, nphysics, self._warning, self.fault]
+        args = [mask, self._rows, nphysics, self._warning, self.fault]
         wp.launch(faults.faults_of_rows, self.nworld, args, device=self.device)
 
     def reset(self, mask: wp.array) -> None:

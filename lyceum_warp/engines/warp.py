@@ -1,5 +1,8 @@
 """The Warp engine: MuJoCo Warp, float32, on a CUDA device or on the CPU."""
 
+from collections.abc import Iterable
+from typing import Any
+
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
@@ -75,12 +78,11 @@ class WarpEngine(Engine):
     def _bind(self, field: Field) -> wp.array:
         source = getattr(self.d, field.name)
         # the same memory under the types of `fields`, which differ from MuJoCo Warp's in name alone
-        own: wp.array = wp.array(
-            ptr=source.ptr, dtype=field.dtype, shape=(self.nworld, *field.shape), device=self.device
-        )
+        own: Any = wp.array(ptr=source.ptr, dtype=field.dtype, shape=(self.nworld, *field.shape), device=self.device)
+        own.owner = source  # a view of this memory may outlive the engine
         self._own[field.name] = own
         if field.reset > Stage.NONE:
-            self._forward([field], field.reset)
+            self._forward([field.name], field.reset)
         if not field.snapshot:
             return own
         return wp.clone(own)
@@ -97,16 +99,16 @@ class WarpEngine(Engine):
             for _ in range(nstep):
                 mjw.step(self.m, self.d)
             self._copy_snapshots(self._everyone, lagged=True)
-            self._forward(list(self.fields.values()), self.stage)
+            self._refresh_current()
             self._copy_snapshots(self._everyone, lagged=False)
 
-    def _forward(self, fields: list[Field], stage: Stage) -> None:
-        """Run the part of a forward pass that the fields need; it covers every world."""
+    def _forward(self, names: Iterable[str], stage: Stage) -> None:
+        """Run the part of a forward pass that the named fields need; it covers every world."""
         m, d = self.m, self.d
         with wp.ScopedDevice(self.device):
             if stage == Stage.ACCELERATION:
                 mjw.forward(m, d)
-            elif stage == Stage.POSITION and _KINEMATIC.issuperset(f.name for f in fields if f.refresh > Stage.NONE):
+            elif stage == Stage.POSITION and _KINEMATIC.issuperset(names):
                 mjw.kinematics(m, d)
                 mjw.com_pos(m, d)
             elif stage > Stage.NONE:
@@ -116,10 +118,13 @@ class WarpEngine(Engine):
                     mjw.fwd_velocity(m, d)
                     mjw.sensor_vel(m, d)
 
-    def find_faults(self) -> None:
+    def _refresh_current(self, mask: wp.array | None = None) -> None:
+        self._forward([field.name for field in self.fields.values() if field.refresh > Stage.NONE], self.stage)
+
+    def find_faults(self, mask: wp.array) -> None:
         d = self.d
         bits = [_CONTACT_BITS, _CONSTRAINT_BITS, _IGNORED_BITS]
-        args = [d.qpos, d.qvel, d.act, d.overflow, *bits, self.fault]
+        args = [mask, d.qpos, d.qvel, d.act, d.overflow, *bits, self.fault]
         wp.launch(faults.faults_of_fields, self.nworld, args, device=self.device)
 
     def reset(self, mask: wp.array) -> None:
@@ -130,11 +135,8 @@ class WarpEngine(Engine):
         """Nothing to do: the fields are the engine's own arrays."""
 
     def refresh(self, mask: wp.array) -> None:
-        self._forward(list(self.fields.values()), self.reset_stage)
+        self._forward([field.name for field in self.fields.values() if field.reset > Stage.NONE], self.reset_stage)
         self._copy_snapshots(mask)
-
-    def _refresh_current(self, mask: wp.array) -> None:
-        self._forward([field for field in self.fields.values() if not field.snapshot], self.stage)
 
     # state
 

@@ -45,6 +45,7 @@ def is_absurd(x: float) -> bool:
 
 @wp.kernel(enable_backward=False)
 def faults_of_rows(
+    mask_in: wp.array[bool],
     state_in: wp.array2d[wp.float64],
     nphysics: int,
     warning_inout: wp.array3d[int],
@@ -56,6 +57,8 @@ def faults_of_rows(
     6 bad control. A counter is cleared once seen.
     """
     w = wp.tid()
+    if not mask_in[w]:
+        return
     fault = int(0)
     for i in range(nphysics):
         if not (wp.abs(state_in[w, i]) < wp.float64(ABSURD)):
@@ -76,6 +79,7 @@ def faults_of_rows(
 
 @wp.kernel(enable_backward=False)
 def faults_of_fields(
+    mask_in: wp.array[bool],
     qpos_in: wp.array2d[float],
     qvel_in: wp.array2d[float],
     act_in: wp.array2d[float],
@@ -87,6 +91,8 @@ def faults_of_fields(
 ):
     """Faults of the Warp engine: its state fields, and its own overflow bits sorted into ours."""
     w = wp.tid()
+    if not mask_in[w]:
+        return
     fault = int(0)
     for i in range(qpos_in.shape[1]):
         if is_absurd(qpos_in[w, i]):

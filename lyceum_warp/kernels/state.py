@@ -65,13 +65,15 @@ def pack_counters(
     step_in: wp.array[int],
     key_in: wp.array[wp.uint32],
     episode_in: wp.array[int],
+    done_reason_in: wp.array[int],
     state_out: wp.array2d[wp.float64],
 ):
-    """Step, stream key and episode into three columns; float64 holds every 32-bit integer exactly."""
+    """Step, stream key, episode and done reason into four columns; float64 holds every 32-bit integer exactly."""
     w = wp.tid()
     state_out[w, 0] = wp.float64(step_in[w])
     state_out[w, 1] = wp.float64(key_in[w])
     state_out[w, 2] = wp.float64(episode_in[w])
+    state_out[w, 3] = wp.float64(done_reason_in[w])
 
 
 @wp.kernel(enable_backward=False)
@@ -81,9 +83,11 @@ def unpack_counters(
     step_out: wp.array[int],
     key_out: wp.array[wp.uint32],
     episode_out: wp.array[int],
+    done_reason_out: wp.array[int],
 ):
     w = wp.tid()
     if mask_in[w]:
         step_out[w] = int(state_in[w, 0])
         key_out[w] = wp.uint32(state_in[w, 1])
         episode_out[w] = int(state_in[w, 2])
+        done_reason_out[w] = int(state_in[w, 3])

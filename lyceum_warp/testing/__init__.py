@@ -20,7 +20,6 @@ log = logging.getLogger(__name__)
 
 CHECKS: tuple[Callable[[Context], None], ...] = (
     buffers.check_spaces,
-    buffers.check_observation_size,
     buffers.check_addresses,
     buffers.check_getters,
     buffers.check_time,

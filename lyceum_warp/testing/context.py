@@ -9,18 +9,14 @@ import numpy as np
 import torch
 
 from lyceum_warp.env import Env
+from lyceum_warp.kernels import steps
 from lyceum_warp.kernels.arrays import torch_view
 
-OUTCOMES = (
-    "obs", "final_obs", "reward", "eval", "terminated", "truncated", "success", "done", "done_reason",
-)  # fmt: skip
+OUTCOMES = tuple(steps.OUTCOMES)
 """The buffers that a step fills."""
 
 SHORT = 8
 """Steps of a check that needs only a few."""
-
-COUNTERS = ("step", "key", "episode")
-"""Parts of the state that count."""
 
 _SETTINGS = ("horizon", "autoreset", "record")
 
@@ -112,7 +108,7 @@ class Context:
 
     def _set(self, env: Env, horizon: int, autoreset: bool, record: bool) -> None:
         self.recordings[id(env), env.horizon, env.autoreset] = env._record._graphs
-        env.horizon, env.autoreset, env._record.enabled = horizon, autoreset, record
+        env._horizon, env._autoreset, env._record.enabled = horizon, autoreset, record
         env._record._graphs = self.recordings.get((id(env), horizon, autoreset), {})
 
     def buffers(self, env: Env) -> dict[str, torch.Tensor]:
