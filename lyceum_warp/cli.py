@@ -26,6 +26,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.registry import find_task, task_name, task_names
 from lyceum_warp.report import Display, curve_table, filmed, make_console, plotted
 from lyceum_warp.runs import Run, load, versions
+from lyceum_warp.viz.video import NoVideoError, check_video
 
 _FINAL_EPISODES = 32
 
@@ -140,7 +141,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if command.resume is not None:
                 return _resume(_parse(argv, _saved(Run.open(command.resume), command.resume)), command.resume)
             return _train(command)
-    except (ValueError, FileNotFoundError, FloatingPointError, ImportError) as error:
+    except (ValueError, FileNotFoundError, FloatingPointError, ImportError, NoVideoError) as error:
         print(f"lyceum-warp: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except Interrupted as signalled:
@@ -196,7 +197,7 @@ def _tasks() -> int:
         table.add_column(heading, justify=side, no_wrap=bool(heading))  # type: ignore[arg-type]
     for name in task_names():
         task = BoundTask(find_task(name))
-        about = (inspect.getdoc(sys.modules[find_task(name).__module__]) or "").splitlines()[0]
+        about = (inspect.getdoc(sys.modules[find_task(name).__module__]) or "").partition("\n")[0]
         about = (about.partition(": ")[2] or about).rstrip(".")
         sizes = (sum(task.obs_layout.values()), task.model.nu, task.frame_skip)
         horizon = str(task.task.horizon or "none")
@@ -312,7 +313,9 @@ def _learn(run: Run, npg: NPG, options: Train) -> int:
     engine = {"auto": "mujoco" if env.device.is_cpu else "warp"}.get(options.engine, options.engine)
     console.print(
         f"[bold]{env.task.name}[/]: {env.obs_space.size} observations, {env.action_space.size} actions; "
-        f"{env.nworld} worlds, {engine} engine on {options.device}; run in {run.folder}", soft_wrap=True
+        f"{env.nworld} worlds, {engine} engine on {options.device}, "
+        f"{'segments' if npg.segments else 'episodes'} of {npg.rollout.steps} steps; run in {run.folder}",
+        soft_wrap=True,
     )  # fmt: skip
     try:
         with Display(console, npg.iteration, options.iterations) as display:
@@ -378,6 +381,8 @@ def _warn_of_versions(run: Run) -> None:
 def _eval(options: Eval) -> int:
     if options.episodes < 1 or options.nworld < 1:
         raise ValueError(f"eval needs at least 1 episode and 1 world, not {options.episodes} and {options.nworld}")
+    if options.video:
+        check_video()
     run = Run.open(options.run)
     config = run.config
     nworld = min(options.nworld, options.episodes)
@@ -386,6 +391,12 @@ def _eval(options: Eval) -> int:
         config["task"], nworld=nworld, engine=options.engine or config["engine"], device=device, **config["params"]
     )
     policy = load(run, device=env.obs.device)
+    sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
+    if sizes != wanted:
+        raise ValueError(
+            f"the policy in {options.run} takes {sizes[0]} observations and gives {sizes[1]} actions, but the task "
+            f"{env.task.name!r} now has {wanted[0]} and {wanted[1]}: evaluate it with the task as it was"
+        )
     episodes = evaluate(env, policy, options.episodes, seed=options.seed)
     episodes = Episodes(*(getattr(episodes, f.name)[: options.episodes] for f in dataclasses.fields(episodes)))
     table = Table(box=rich.box.SIMPLE)
@@ -398,7 +409,8 @@ def _eval(options: Eval) -> int:
     console = make_console()
     console.print(f"{env.task.name}: {options.episodes} episodes of the mean policy in {options.run}", soft_wrap=True)
     console.print(table)
-    console.print(f"success: {episodes.success.mean().item():.0%}")
+    if env.task.functions["success"] is not None:
+        console.print(f"success: {episodes.success.mean().item():.0%}")
     if options.video:
         video = filmed(env, policy, run.folder / "eval.mp4", options.seed)
         console.print(f"video: {video}", soft_wrap=True, markup=False)

@@ -2,8 +2,8 @@
 
 import difflib
 import importlib.util
-import inspect
 import logging
+import sys
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
@@ -63,8 +63,8 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
     if isinstance(source, mujoco.MjSpec):
         return source.copy()
     folders = [Path()]
-    if owner is not None:
-        folders.append(Path(inspect.getfile(owner)).parent)
+    if owner is not None and (file := getattr(sys.modules.get(owner.__module__), "__file__", None)):
+        folders.append(Path(file).parent)
     for folder in folders:
         path = folder / Path(source).expanduser()
         if path.is_file():

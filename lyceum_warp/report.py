@@ -45,8 +45,10 @@ class Display:
         """Show an iteration."""
         if record.mean_return is not None:
             self.mean = record.mean_return
-        mean = "" if math.isnan(self.mean) else f" (mean policy {self.mean:.4g})"
-        text = f"return {record.return_mean:.4g}{mean} {record.samples_per_second / 1000:.3g}k"
+        shown = self.mean if self.console.is_terminal else math.nan if record.mean_return is None else self.mean
+        mean = "" if math.isnan(shown) else f" (mean policy {shown:.4g})"
+        ended = "-" if math.isnan(record.return_mean) else f"{record.return_mean:.4g}"
+        text = f"return {ended}{mean} {record.samples_per_second / 1000:.3g}k"
         if self.console.is_terminal:
             self.progress.update(self.bar, completed=record.iteration, text=f"{text}/s")
         else:

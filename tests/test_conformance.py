@@ -78,7 +78,7 @@ def keep_warm_start(engine: MujocoEngine) -> None:
 
 BREAKS: list[tuple[str, type, str, Callable[[Method], Method]]] = [
     ("spaces", lw.Env, "_allocate", then(lambda env: setattr(env, "obs_space", env.action_space))),
-    ("addresses", lw.Env, "step", then(lambda env: setattr(env, "obs", env.obs.clone()))),
+    ("addresses", lw.Env, "step", then(lambda env: env.__dict__.update(obs=env.obs.clone()))),
     ("getters", lw.Env, "_given", lambda method: lambda self, values, out: values),
     ("time", lw.Env, "_allocate", then(lambda env: setattr(env, "timestep", 1.5 * env.timestep))),
     ("round_trip", lw.Env, "_unpack_counters", nothing),

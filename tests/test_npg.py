@@ -215,3 +215,28 @@ def test_point_mass_learns_to_reach_the_target() -> None:
     rewards = [next(npg).terminal_reward for _ in range(25)]
     assert np.mean(rewards[:3]) < 0.4
     assert np.mean(rewards[-3:]) > 0.7, rewards
+
+
+def test_parameters_of_each_world_reach_the_mean_policys_worlds() -> None:
+    """And so do those that are changed later."""
+    env = lw.make("point_mass", nworld=4, horizon=12, success_distance=[0.0, 9.0, 0.0, 9.0])
+    npg = lw.NPG(env, config=dataclasses.replace(SMALL, mean_every=1, mean_episodes=6))
+    assert next(npg).mean_success == 0.5
+    env.set_params(success_distance=9.0)
+    it = next(npg)
+    assert it.mean_success == it.success == 1.0
+
+
+def test_weights_and_noise_are_drawn_apart(env: lw.Env) -> None:
+    env.rand_reset(0)
+    npg = lw.NPG(env, config=SMALL, seed=5)
+    same_seed = torch.Generator().manual_seed(5)
+    assert not torch.equal(npg.generator.get_state(), same_seed.get_state())
+
+
+def test_npg_wants_automatic_resets() -> None:
+    env = lw.make("point_mass", autoreset=False)
+    with pytest.raises(ValueError, match="autoreset=True"):
+        lw.NPG(env)
+    with pytest.raises(ValueError, match="autoreset=True"):
+        lw.evaluate(env, lw.GaussianPolicy(6, 2), 1)

@@ -86,6 +86,7 @@ class GaussianPolicy(nn.Module):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
+        self.nobs, self.nact = nobs, nact
         self.normalizer: nn.Module = Normalizer(nobs) if normalize else nn.Identity()
         # a last layer near zero starts every mean near the middle of its range (mjrl)
         self.network = mlp([nobs, *hidden, nact], last_scale=1e-2, generator=generator)

@@ -78,8 +78,7 @@ def record(
         raise ValueError(f"states have to be of shape (steps, {env.state_space.size}), not {tuple(states.shape)}")
     if any(pixels < 2 or pixels % 2 for pixels in size):
         raise ValueError(f"a video's width and height have to be even numbers, not {size}")
-    if missing := [name for name in ("imageio", "imageio_ffmpeg") if importlib.util.find_spec(name) is None]:
-        raise NoVideoError(f"videos need {' and '.join(missing)}: {EXTRA}")
+    check_video()
     rate = speed / env.timestep
     stride = max(1, math.ceil(rate / _MAX_RATE - 1e-9))
     parts = env.state_space.parts
@@ -92,6 +91,16 @@ def record(
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_bytes(video.read_bytes())
     return out
+
+
+def check_video() -> None:
+    """Find out whether the libraries that videos need are installed.
+
+    Raises:
+        NoVideoError: They are not.
+    """
+    if missing := [name for name in ("imageio", "imageio_ffmpeg") if importlib.util.find_spec(name) is None]:
+        raise NoVideoError(f"videos need {' and '.join(missing)}: {EXTRA}")
 
 
 def _libraries() -> list[str]:
