@@ -81,7 +81,11 @@ def main(options: Options) -> None:
     console.print(f"mean terminal reward of the last ten iterations, each seed: {[round(x, 3) for x in terminal]}")
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
-        record = {"versions": versions(), "options": str(options), "rows": [row for rows in runs for row in rows]}
+        record = {
+            "versions": versions(),
+            "options": dataclasses.asdict(options) | {"out": str(options.out)},
+            "rows": [row for rows in runs for row in rows],
+        }
         (options.out / f"{options.task}.json").write_text(json.dumps(record, indent=1) + "\n")
 
 

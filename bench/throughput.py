@@ -209,7 +209,6 @@ def measure_sampling(task: str, nworld: int, options: Options) -> Row:
     """NPG's sampling: the policy's forward passes, the noise and the record are part of it."""
     env = lw.make(task, nworld=nworld, engine=options.engine, device=options.device)
     npg = lw.NPG(env, config=lw.NPGConfig(samples=BLOCK * nworld, mean_every=0))
-    npg.noise.normal_(generator=npg.generator)
 
     def act(t: int) -> None:
         npg.policy.sample(env.obs, npg.noise[t], out=env.action)

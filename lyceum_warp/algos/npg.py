@@ -207,7 +207,6 @@ class NPG:
         # 1. Samples of the current policy.
         if not self.segments:
             rollout.restart()
-        self.noise.normal_(generator=self.generator)
         self.sample()
         time_sample = clock.lap()
 
@@ -268,8 +267,9 @@ class NPG:
         )
 
     def sample(self) -> None:
-        """Fill the record with steps of the current policy under the current noise."""
+        """Fill the record with steps of the current policy under fresh noise."""
         with _one_thread():
+            self.noise.normal_(generator=self.generator)
             self.rollout.collect(self.policy, self.noise)
 
     @torch.no_grad()
