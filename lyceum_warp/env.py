@@ -1,6 +1,5 @@
 """Env: one task in many worlds."""
 
-from collections.abc import Callable, Hashable
 from typing import Any
 
 import mujoco
@@ -10,16 +9,16 @@ import warp as wp
 
 from lyceum_warp.bound import BoundTask
 from lyceum_warp.engines import EngineFactory, find_device, open_engine
-from lyceum_warp.fields import Stage, elements
-from lyceum_warp.kernels import random, state, steps
+from lyceum_warp.fields import elements
+from lyceum_warp.kernels import random, steps
 from lyceum_warp.kernels.arrays import torch_view
 from lyceum_warp.kernels.faults import FAULTS
 from lyceum_warp.kernels.recorder import Recorder
 from lyceum_warp.models import ModelSource
 from lyceum_warp.registry import find_task
-from lyceum_warp.spaces import COUNTERS, Space, action_space, control_map, state_space
 from lyceum_warp.task import Task
 from lyceum_warp.validate import check_tensor, whole_number
+from lyceum_warp.worlds import Worlds
 
 
 def make(task: str | type[Task], **options: Any) -> "Env":
@@ -27,7 +26,7 @@ def make(task: str | type[Task], **options: Any) -> "Env":
     return Env(task, **options)
 
 
-class Env:
+class Env(Worlds):
     """One task in many worlds, with every array allocated once and shared with torch.
 
     Write ``action``, call ``step``, read ``obs``, ``reward``, ``eval``, ``terminated``, ``truncated``,
@@ -131,52 +130,6 @@ class Env:
             raise AttributeError(f"env.{name} is a buffer of fixed address: write into it, as env.{name}.copy_(...)")
         super().__setattr__(name, value)
 
-    def _allocate(self) -> None:
-        n, nu, task, kernels = self.nworld, self.model.nu, self.task.task, self.task.kernels
-        self._memory, self._no_memory = wp.zeros((n, task.memory), dtype=float), wp.zeros((n, task.memory), dtype=float)
-        self._params = self.task.params_array(self.device)
-        # the fields of the state that a step leads to, live, and copies of those that it came from
-        self._after, self._before = kernels.Batch(), kernels.Batch()
-        self._pairs: list[tuple[wp.array, wp.array]] = []
-        for name in self.task.fields:
-            live = self._memory if name == "memory" else self.engine.field(name, lagged=name in task.lagged)
-            self.task.check_field(name, live)
-            copy = wp.zeros_like(live)
-            setattr(self._after, name, live)
-            setattr(self._before, name, copy)
-            self._pairs.append((copy, live))
-
-        self.action_space = action_space(self.model, task.action_range)
-        self.obs_space = Space.of(self.task.obs_layout)
-        self.reward_space = self.eval_space = Space()
-
-        self._out = steps.Outcome()
-        for name, dtype in steps.OUTCOMES.items():
-            shape = (n, self.obs_space.size) if name in ("obs", "final_obs") else n
-            array: wp.array = wp.zeros(shape, dtype=dtype)
-            setattr(self._out, name, array)
-            setattr(self, name, torch_view(array))
-        self._action, self._safe_action = wp.zeros((n, nu), dtype=float), wp.zeros((n, nu), dtype=float)
-        self.action = torch_view(self._action)
-        ranges, scale = control_map(self.model, task.action_range)
-        self._ranges: wp.array = wp.array(ranges, dtype=float)
-        self._scale: wp.array = wp.array(scale, dtype=float)
-
-        self._step, self._episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
-        self._key, self._rng = wp.zeros(n, dtype=wp.uint32), wp.zeros((n, 1), dtype=wp.uint32)
-        self._seed = wp.zeros(1, dtype=int)
-        self._action_fault, self._no_fault = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
-        self._fault_count = wp.zeros(int(FAULTS).bit_length(), dtype=int)
-        self._everyone, self._mask = wp.full(n, True, dtype=bool), wp.zeros(n, dtype=bool)
-        self._restarting = wp.zeros(n, dtype=bool)
-        self._mask_view, self._step_view = torch_view(self._mask), torch_view(self._step)
-        self._allocate_state()
-
-    def _allocate_state(self) -> None:
-        self.state_space = state_space(self.model, self.engine.snapshots, self.task.task.memory)
-        self._state = wp.zeros((self.nworld, self.state_space.size), dtype=wp.float64, device=self.device)
-        self._state_view = torch_view(self._state)
-
     @property
     def horizon(self) -> int:
         """Steps after which an episode is truncated; 0 for never."""
@@ -203,70 +156,6 @@ class Env:
             self.action.copy_(action.detach())
         self._run(self._whole_step)
 
-    def _run(self, function: Callable[..., None], *args: Hashable) -> None:
-        """Call a function that calls the engine: as one recording where the engine can be recorded."""
-        if self.engine.recordable:
-            self._record(function, *args)
-        else:
-            function(*args)
-
-    def _whole_step(self) -> None:
-        self._record(self._begin)
-        self.engine.step(self.task.frame_skip)
-        if self.engine.reset_stage == Stage.NONE:
-            self._record(self._finish)
-        else:
-            self._record(self._judge_and_restart)
-            self.engine.refresh(self._restarting)
-            self._record(self._look)
-
-    def _begin(self) -> None:
-        kernels = self.task.kernels
-        for copy, live in self._pairs:
-            wp.copy(copy, live)
-        wp.launch(kernels.act, self.nworld, [
-            self._after, self._params, self._action, self._ranges, self._scale, self._step, self._safe_action,
-            self._action_fault, self.engine.ctrl,
-        ], device=self.device)  # fmt: skip
-
-    def _finish(self) -> None:
-        self._judge_and_restart()
-        self._look()
-
-    def _judge_and_restart(self) -> None:
-        kernels = self.task.kernels
-        self.engine.find_faults(self._everyone)
-        if kernels.remember is not None:
-            wp.launch(kernels.remember, self.nworld, [
-                self._before, self._after, self._params, self._safe_action, self._step, self._key, self._episode,
-                self._rng,
-            ], device=self.device)  # fmt: skip
-        sticky = not self.autoreset
-        self._judge(self._everyone, self.engine.fault, self._action_fault, transition=True, sticky=sticky)
-        wp.launch(steps.count_faults, self.nworld, [self.engine.fault, self._fault_count], device=self.device)
-        self._restart(self._restarting, True)
-
-    def _judge(
-        self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, sticky: bool = False
-    ) -> None:
-        wp.launch(self.task.kernels.judge, self.nworld, [
-            mask, self._before, self._after, self._params, self._safe_action, self._step, self.horizon, transition,
-            sticky, fault, action_fault, self._out, self._restarting,
-        ], device=self.device)  # fmt: skip
-
-    def _restart(self, mask: wp.array, randomly: bool) -> None:
-        self.engine.reset(mask)
-        if self.task.task.memory:
-            state.launch_rows(state.copy_rows, mask, self._no_memory, self._memory)
-        wp.launch(self.task.kernels.restart, self.nworld, [
-            mask, randomly, self._after, self._params, self._key, self._rng, self._step, self._episode,
-        ], device=self.device)  # fmt: skip
-        self.engine.commit(mask)
-
-    def _look(self) -> None:
-        args = [self._restarting, self._after, self._params, self._out.obs]
-        wp.launch(self.task.kernels.look, self.nworld, args, device=self.device)
-
     # resets
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
@@ -291,27 +180,6 @@ class Env:
             args = [self._mask, self._seed, self._key, self._episode]
             wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
         self._begin_episodes(randomly=True)
-
-    def _begin_episodes(self, *, randomly: bool) -> None:
-        self.action.masked_fill_(self._mask_view[:, None], 0.0)
-        self._run(self._whole_reset, randomly)
-
-    def _whole_reset(self, randomly: bool) -> None:
-        self._record(self._restart, self._mask, randomly)
-        self.engine.refresh(self._mask)
-        self._record(self._judge_state)
-
-    def _judge_state(self, sticky: bool = False) -> None:
-        # a state that was set unchecked may be unfit: its world shows the last good observation, as after a step
-        self.engine.find_faults(self._mask)
-        self._judge(self._mask, self.engine.fault, self._no_fault, transition=False, sticky=sticky)
-
-    def _set_mask(self, mask: torch.Tensor | None) -> None:
-        if mask is None:
-            self._mask_view.fill_(True)
-        else:
-            check_tensor(mask, "a mask", self._mask_view)
-            self._mask_view.copy_(mask)
 
     # the state
 
@@ -347,29 +215,6 @@ class Env:
             )
         self._state_view.copy_(state)
         self._run(self._unpack)
-
-    def _pack(self) -> None:
-        size = self.engine.state_size
-        self.engine.get_state(self._state[:, :size])
-        # with automatic resets an end is over with the step that it came in, without it stays
-        ended = self._no_fault if self.autoreset else self._out.done_reason
-        counters = [self._step, self._key, self._episode, ended, self._state[:, size:]]
-        wp.launch(state.pack_counters, self.nworld, counters, device=self.device)
-        if self.task.task.memory:
-            state.launch_rows(state.widen, self._everyone, self._memory, self._state[:, size + len(COUNTERS) :])
-
-    def _unpack(self) -> None:
-        size = self.engine.state_size
-        self.engine.set_state(self._state[:, :size], self._mask)
-        self._record(self._unpack_counters)
-        self._record(self._judge_state, not self.autoreset)
-
-    def _unpack_counters(self) -> None:
-        size = self.engine.state_size
-        counters = [self._mask, self._state[:, size:], self._step, self._key, self._episode, self._out.done_reason]
-        wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)
-        if self.task.task.memory:
-            state.launch_rows(state.narrow, self._mask, self._state[:, size + len(COUNTERS) :], self._memory)
 
     # getters and setters of the paper's interface
 

@@ -15,12 +15,13 @@ LEVELS = {
     "engines": 2, "task": 2, "models": 2,
     "registry": 3, "spaces": 3,
     "bound": 4,
-    "env": 5,
-    "algos": 6, "testing": 6,
-    "runs": 7,
-    "viz": 8,
-    "report": 9,
-    "cli": 10,
+    "worlds": 5,
+    "env": 6,
+    "algos": 7, "testing": 7,
+    "runs": 8,
+    "viz": 9,
+    "report": 10,
+    "cli": 11,
 }  # fmt: skip
 """Every room's floor; a room imports from lower floors, or from itself."""
 
@@ -62,7 +63,7 @@ def used_names(path: Path) -> set[str]:
 
 
 def test_no_file_is_too_long_to_read() -> None:
-    long = {str(path): n for path in ROOT.rglob("*.py") if (n := len(path.read_text().splitlines())) > 550}
+    long = {str(path): n for path in ROOT.rglob("*.py") if (n := len(path.read_text().splitlines())) > 500}
     assert not long
 
 
