@@ -4,6 +4,7 @@ import ast
 import contextlib
 import dataclasses
 import datetime
+import importlib.metadata
 import inspect
 import os
 import signal
@@ -131,6 +132,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         0; 1 if --require-return was not met; 2 for bad input; 130 or 143 after Ctrl-C or SIGTERM.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
+    if argv == ["--version"]:
+        print(f"lyceum-warp {importlib.metadata.version('lyceum-warp')}")
+        return 0
     try:
         with _signals():
             command = _parse(argv)

@@ -34,6 +34,9 @@ class Env(Worlds):
     addresses and change in place. A world whose episode ends begins a new, random one within the same step;
     ``obs`` is then the first observation of the new episode, ``final_obs`` the last one of the old.
 
+    On a GPU, torch's work on these tensors belongs on torch's default stream, which waits for Warp's and is
+    waited for; work on other streams has to be synchronised by whoever puts it there.
+
     Args:
         task: Name of a task, a file with one, or its class.
         nworld: Number of worlds.
@@ -183,14 +186,22 @@ class Env(Worlds):
 
     # the state
 
-    def get_state(self, out: torch.Tensor | None = None) -> torch.Tensor:
+    def get_state(self, out: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> torch.Tensor:
         """Everything that the future depends on, (nworld, state_space.size), float64.
 
         The engine's integration state, fields that are as the last substep left them, the step counter, the
         random stream and the task's memory; ``state_space.parts`` says where each lies.
+
+        Args:
+            out: Where to write the states.
+            mask: Which worlds' rows of ``out`` to write, (nworld,) bool; all by default.
         """
         self._record(self._pack)
-        return self._given(self._state_view, out)
+        if mask is None or out is None:
+            return self._given(self._state_view, out)
+        check_tensor(out, "out", self._state_view)
+        self._set_mask(mask)
+        return torch.where(self._mask_view[:, None], self._state_view, out, out=out)
 
     def set_state(self, state: torch.Tensor, mask: torch.Tensor | None = None, *, check: bool = True) -> None:
         """Put worlds into states from ``get_state``, exactly; every getter reflects them afterwards.

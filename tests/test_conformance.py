@@ -84,6 +84,7 @@ BREAKS: list[tuple[str, type, str, Callable[[Method], Method]]] = [
     ("round_trip", lw.Env, "_unpack_counters", nothing),
     ("restoring", MujocoEngine, "_set_integration", nothing),
     ("masked_restoring", lw.Env, "set_state", lambda method: lambda self, state, mask=None: method(self, state)),
+    ("masked_getting", lw.Env, "get_state", lambda method: lambda self, out=None, mask=None: method(self, out)),
     ("set_state_shows", lw.Env, "_judge_state", nothing),
     ("purity", lw.Env, "_scratch_at", lambda method: lambda self, state: self.set_state(state) or self),
     ("determinism", lw.Env, "step", then(lambda env: env.reward.add_(1e-6 * next(counter)))),

@@ -131,14 +131,18 @@ class Engine(abc.ABC):
 
     # state
 
-    def get_state(self, state: wp.array) -> None:
-        """Write every world's state into (nworld, state_size) float64. Made of Warp launches."""
-        self._get_integration(state[:, : self.integration_size])
+    def get_state(self, state: wp.array, mask: wp.array | None = None) -> None:
+        """Write the masked worlds' states, by default all, into (nworld, state_size) float64, exactly.
+
+        Made of Warp launches.
+        """
+        mask = self._everyone if mask is None else mask
+        self._get_integration(state[:, : self.integration_size], mask)
         start = self.integration_size
         for field in self.snapshots:
             source = flat(self.arrays[field.name])
             target = state[:, start : start + field.size]
-            launch_rows(widen, self._everyone, source, target)
+            launch_rows(widen, mask, source, target)
             start += field.size
 
     def set_state(self, state: wp.array, mask: wp.array) -> None:
@@ -153,7 +157,7 @@ class Engine(abc.ABC):
             start += field.size
 
     @abc.abstractmethod
-    def _get_integration(self, state: wp.array) -> None: ...
+    def _get_integration(self, state: wp.array, mask: wp.array) -> None: ...
 
     @abc.abstractmethod
     def _set_integration(self, state: wp.array, mask: wp.array) -> None: ...

@@ -174,8 +174,8 @@ class MujocoEngine(Engine):
 
     # state
 
-    def _get_integration(self, state_out: wp.array) -> None:
-        launch_rows(copy_rows64, self._everyone, self._rows, state_out)
+    def _get_integration(self, state_out: wp.array, mask: wp.array) -> None:
+        launch_rows(copy_rows64, mask, self._rows, state_out)
 
     def _set_integration(self, state_in: wp.array, mask: wp.array) -> None:
         launch_rows(copy_rows64, mask, state_in, self._rows)

@@ -140,10 +140,10 @@ class WarpEngine(Engine):
 
     # state
 
-    def _get_integration(self, state_out: wp.array) -> None:
+    def _get_integration(self, state_out: wp.array, mask: wp.array) -> None:
         with wp.ScopedDevice(self.device):
             mjw.get_state(self.m, self.d, self._state, _SPEC)
-        launch_rows(widen, self._everyone, self._state, state_out)
+        launch_rows(widen, mask, self._state, state_out)
 
     def _set_integration(self, state_in: wp.array, mask: wp.array) -> None:
         launch_rows(narrow, mask, state_in, self._state)

@@ -26,6 +26,7 @@ CHECKS: tuple[Callable[[Context], None], ...] = (
     state.check_round_trip,
     state.check_restoring,
     state.check_masked_restoring,
+    state.check_masked_getting,
     state.check_set_state_shows,
     state.check_purity,
     state.check_determinism,

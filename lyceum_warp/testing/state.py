@@ -56,6 +56,18 @@ def check_masked_restoring(ctx: Context) -> None:
         ctx.equal(found[name][:, ~mask], undisturbed[name][:, ~mask], f"{name} of the other worlds")
 
 
+def check_masked_getting(ctx: Context) -> None:
+    """``get_state`` with a mask writes the masked worlds' rows, exactly, and leaves the others."""
+    env = ctx.a
+    ctx.restart()
+    ctx.run(env, ctx.actions(SHORT))
+    mask = torch.arange(env.nworld, device=env.obs.device) % 2 == 0
+    whole, part = env.get_state(), torch.full_like(env.get_state(), -7.0)
+    env.get_state(out=part, mask=mask)
+    ctx.equal(part[mask], whole[mask], "the rows of masked worlds")
+    ctx.that((part[~mask] == -7.0).all(), "rows of worlds outside the mask were written")
+
+
 def check_set_state_shows(ctx: Context) -> None:
     """After ``set_state`` every getter tells of the state that was set."""
     a, b = ctx.a, ctx.b
