@@ -306,3 +306,8 @@ def test_train_on_a_gpu(tmp_path: Path) -> None:
     assert wp.is_cuda_available()
     assert train(tmp_path / "run", "--device", "cuda", "--iterations", "2") == 0
     assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2", "--device", "cpu"]) == 0
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"lyceum-warp {lw.__version__}\n"
