@@ -106,6 +106,10 @@ class BoundTask:
         layout = self.task.obs(params) if callable(self.task.obs) else self.task.obs
         if not isinstance(layout, Mapping):
             raise ValueError(f"obs of the task {self.name!r} is {layout!r}: add {_MISSING['obs']}")
+        if per_world := [name for name, size in layout.items() if np.ndim(size)]:
+            raise ValueError(
+                f"the parts {per_world} of {self.name!r}'s observation differ between worlds: give one value"
+            )
         return {name: int(size) for name, size in layout.items() if size}
 
     def _written(self, name: str) -> Any:

@@ -306,7 +306,9 @@ class Env(Worlds):
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
         """A live view of one of the engine's fields, by MuJoCo's name.
 
-        On the C engine it is a copy that every step renews: read it, and write through ``set_state``.
+        On the C engine it is a copy that every step renews: read it, and write through ``set_state``. Asking for a
+        field that the task does not read costs new recordings, and one of the acceleration stage becomes part of
+        the state from then on: states that were taken before no longer fit.
 
         Args:
             name: Attribute of MjData, for instance "qpos" or "site_xpos".
@@ -315,9 +317,6 @@ class Env(Worlds):
 
         Raises:
             ValueError: There is no such field or element.
-
-        Asking late costs new recordings, and a field of the acceleration stage becomes part of the state from
-        then on: states that were taken before no longer fit.
         """
         if name not in self._views:
             known = name in self.engine.fields

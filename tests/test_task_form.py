@@ -123,6 +123,17 @@ def test_other_librarys_words_are_understood() -> None:
         lw.make("hopper", num_envs=4)
 
 
+def test_an_observation_has_one_size_in_all_worlds() -> None:
+    flags = [True, False]
+    with pytest.raises(ValueError, match=r"obs of the task 'hopper' differs between worlds in \['position'\]"):
+        lw.make("hopper", nworld=2, exclude_current_positions_from_observation=flags)
+    env = lw.make("hopper", nworld=2)
+    with pytest.raises(ValueError, match="would change the observation's parts"):
+        env.set_params(exclude_current_positions_from_observation=flags)
+    env.step()  # goes on with the parameters that it had
+    assert env.get_obs().shape == (2, 11)
+
+
 def test_buffers_are_written_into() -> None:
     env = lw.make("hopper", nworld=2)
     with pytest.raises(AttributeError, match=r"env.action is a buffer of fixed address: write into it"):
