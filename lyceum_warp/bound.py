@@ -107,9 +107,7 @@ class BoundTask:
         if not isinstance(layout, Mapping):
             raise ValueError(f"obs of the task {self.name!r} is {layout!r}: add {_MISSING['obs']}")
         if per_world := [name for name, size in layout.items() if np.ndim(size)]:
-            raise ValueError(
-                f"the parts {per_world} of {self.name!r}'s observation differ between worlds: give one value"
-            )
+            raise ValueError(f"obs of the task {self.name!r} differs between worlds in {per_world}: give one value")
         return {name: int(size) for name, size in layout.items() if size}
 
     def _written(self, name: str) -> Any:
