@@ -5,6 +5,7 @@ import warp as _wp
 if _wp.config.log_level == _wp.LOG_INFO:  # Warp's default, at which it greets and reports every kernel
     _wp.config.log_level = _wp.LOG_WARNING
 
+from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.npg import NPG, Iteration, NPGConfig
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.rollout import Episodes, Rollout, evaluate
@@ -13,7 +14,8 @@ from lyceum_warp.env import Env, make
 from lyceum_warp.fields import vec10
 from lyceum_warp.kernels.faults import Done
 from lyceum_warp.kernels.random import normal, uniform
-from lyceum_warp.models import gymnasium_model
+from lyceum_warp.models import gymnasium_model, gymnasium_robotics_model
+from lyceum_warp.openloop import OpenLoop
 from lyceum_warp.registry import register, task_names
 from lyceum_warp.runs import load
 from lyceum_warp.task import Row, Task, body, dof, geom, mocap, qpos, sensor, site
@@ -21,6 +23,7 @@ from lyceum_warp.task import Row, Task, body, dof, geom, mocap, qpos, sensor, si
 __version__ = "0.1.0"
 
 __all__ = [
+    "MPPI",
     "NPG",
     "Done",
     "Env",
@@ -28,6 +31,7 @@ __all__ = [
     "GaussianPolicy",
     "Iteration",
     "NPGConfig",
+    "OpenLoop",
     "Rollout",
     "Row",
     "Task",
@@ -37,6 +41,7 @@ __all__ = [
     "evaluate",
     "geom",
     "gymnasium_model",
+    "gymnasium_robotics_model",
     "load",
     "make",
     "mocap",

@@ -1,5 +1,6 @@
 """Where a task's model comes from, and what is changed in it so that both engines run the same physics."""
 
+import dataclasses
 import difflib
 import importlib.util
 import logging
@@ -19,31 +20,52 @@ log = logging.getLogger(__name__)
 ModelSource: TypeAlias = str | Path | Any
 
 
+@dataclasses.dataclass(frozen=True)
+class _Shipped:
+    """A package that is there for the model files in it, and is never imported."""
+
+    package: str
+    folder: str
+    tasks: str
+    """Whose tasks have these models, for a message."""
+    install: str
+
+    def path(self, name: str) -> Path:
+        """Where a model file lies; FileNotFoundError if it is not there."""
+        package = importlib.util.find_spec(self.package)
+        if package is None or not package.submodule_search_locations:
+            raise FileNotFoundError(
+                f"the models of {self.tasks} tasks come with the package {self.package}, which is not installed: "
+                f"pip install '{self.install}'"
+            )
+        folder = Path(package.submodule_search_locations[0], self.folder)
+        if not (folder / name).is_file():
+            files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.xml"))
+            close = difflib.get_close_matches(name, files, 3) or files
+            raise FileNotFoundError(f"there is no model file {name!r} in {folder}; it has {', '.join(close)}")
+        return folder / name
+
+
+_GYMNASIUM = _Shipped("gymnasium", "envs/mujoco/assets", "Gymnasium's", "gymnasium>=1.0,<2")
+_GYMNASIUM_ROBOTICS = _Shipped("gymnasium_robotics", "envs/assets", "Gymnasium-Robotics'", "lyceum-warp[hand]")
+
+
 def gymnasium_model(name: str) -> mujoco.MjSpec:
     """A model that the gymnasium package ships, for changing; gymnasium itself is not imported.
 
     Raises:
         FileNotFoundError: gymnasium is not installed or has no such model.
     """
-    return mujoco.MjSpec.from_file(str(_gymnasium_assets() / _existing(name, _gymnasium_assets())))
+    return mujoco.MjSpec.from_file(str(_GYMNASIUM.path(name)))
 
 
-def _gymnasium_assets() -> Path:
-    package = importlib.util.find_spec("gymnasium")
-    if package is None or not package.submodule_search_locations:
-        raise FileNotFoundError(
-            "the models of Gymnasium's tasks come with the package gymnasium, which is not installed: "
-            "pip install 'gymnasium>=1.0,<2'"
-        )
-    return Path(package.submodule_search_locations[0], "envs", "mujoco", "assets")
+def gymnasium_robotics_model(name: str) -> mujoco.MjSpec:
+    """A model that the gymnasium-robotics package ships, as "adroit_hand/adroit_pen.xml"; it is not imported.
 
-
-def _existing(name: str, folder: Path) -> str:
-    if not (folder / name).is_file():
-        files = sorted(path.name for path in folder.glob("*.xml"))
-        close = difflib.get_close_matches(name, files, 3) or files
-        raise FileNotFoundError(f"there is no model file {name!r} in {folder}; it has {', '.join(close)}")
-    return name
+    Raises:
+        FileNotFoundError: gymnasium-robotics is not installed or has no such model.
+    """
+    return mujoco.MjSpec.from_file(str(_GYMNASIUM_ROBOTICS.path(name)))
 
 
 def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
@@ -70,10 +92,9 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         if path.is_file():
             break
     else:
-        assets = _gymnasium_assets()
         if Path(source).name != str(source):
             raise FileNotFoundError(f"there is no model file {str(source)!r}")
-        path = assets / _existing(str(source), assets)
+        path = _GYMNASIUM.path(str(source))
     try:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:

@@ -1,6 +1,7 @@
 """Task: what a user writes."""
 
 import sys
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import warp as wp
@@ -123,6 +124,8 @@ class Task:
     action_range: ClassVar[tuple[float, float] | None] = None
     """The range of an action that the default ``control`` maps to the model's control ranges; None: actions
     are controls."""
+    planning: ClassVar[Mapping[str, Any]] = {}
+    """What suits this task of MPPI's arguments: horizon, samples, temperature, noise, ..."""
 
     scope: ClassVar[dict[str, Any]] = {}
     """What the class's module held by the names above when the class was made."""

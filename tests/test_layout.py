@@ -17,11 +17,12 @@ LEVELS = {
     "bound": 4,
     "worlds": 5,
     "env": 6,
-    "algos": 7, "testing": 7,
-    "runs": 8,
-    "viz": 9,
-    "report": 10,
-    "cli": 11,
+    "openloop": 7, "testing": 7,
+    "algos": 8,
+    "runs": 9,
+    "viz": 10,
+    "report": 11,
+    "cli": 12,
 }  # fmt: skip
 """Every room's floor; a room imports from lower floors, or from itself."""
 

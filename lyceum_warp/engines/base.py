@@ -1,7 +1,7 @@
 """The contract between an environment and the physics behind it."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import mujoco
 import warp as wp
@@ -128,6 +128,32 @@ class Engine(abc.ABC):
 
         Worlds outside the mask keep the values that they have.
         """
+
+    # roll-outs
+
+    def rollout(self, state: wp.array, controls: wp.array, nstep: int, records: Mapping[str, wp.array]) -> None:
+        """Step every world from a given state under given controls, and record fields along the way.
+
+        ``fault`` then tells what stood in each world's way. Where the worlds are afterwards is left open.
+
+        Args:
+            state: States to start from, whose leading columns are those of ``get_state``; (nworld, ...) float64.
+            controls: Controls of each step, (steps, nworld, nu) float32.
+            nstep: Substeps in a step.
+            records: Where to record fields that were asked for, (steps + 1, nworld, ...): the first row is the start.
+        """
+        self.reset(self._everyone)  # whatever the last roll-out left behind
+        self.set_state(state, self._everyone)
+        self._keep(records, 0)
+        for t in range(len(controls)):
+            wp.copy(self.ctrl, controls[t])
+            self.step(nstep)
+            self._keep(records, t + 1)
+        self.find_faults(self._everyone)
+
+    def _keep(self, records: Mapping[str, wp.array], t: int) -> None:
+        for name, record in records.items():
+            wp.copy(record[t], self.arrays[name])
 
     # state
 

@@ -2,7 +2,7 @@
 
 import copy
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import mujoco
@@ -11,6 +11,7 @@ import warp as wp
 from mujoco.batch import Batch, SimulationError
 
 from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines.native import NativeRollout, is_exact
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.arrays import flat
@@ -52,15 +53,17 @@ class MujocoEngine(Engine):
             )
         super().__init__(model, nworld, device)
         quiet()
-        self._model = copy.copy(model)
+        self.native_model = copy.copy(model)
+        """The model as the batches run it."""
         # a world in trouble is to be seen, not silently reset in the middle of a step
-        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.nthread = nthread
+        self._rollouts: dict[Any, NativeRollout] = {}
         self._open(persistent=False)
         self.ctrl = self.field("ctrl")
 
     def _open(self, *, persistent: bool) -> None:
-        self.batch = Batch(self._model, self.nworld, self.nthread, persistent)
+        self.batch = Batch(self.native_model, self.nworld, self.nthread, persistent)
         # as the float32 fields show it, so that who asked for which fields makes no difference
         initial = self.batch.state[0].astype(np.float32).astype(np.float64)
         self._initial: wp.array = wp.array(initial, dtype=wp.float64, device=self.device)
@@ -83,12 +86,12 @@ class MujocoEngine(Engine):
             for known in self.fields.values():
                 self._connect(known)
             if old_stage > Stage.NONE:
-                self._contained(self.batch.forward, stage=int(old_stage))
+                self.contained(self.batch.forward, stage=int(old_stage))
         array = wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
         self.arrays[field.name] = array
         self._connect(field)
         if field.reset > Stage.NONE:
-            self._contained(self.batch.forward, stage=int(field.reset))
+            self.contained(self.batch.forward, stage=int(field.reset))
         self._copy(field)
         return array
 
@@ -113,7 +116,7 @@ class MujocoEngine(Engine):
 
     # physics
 
-    def _contained(self, call: Callable[..., None], **arguments: Any) -> None:
+    def contained(self, call: Callable[..., None], **arguments: Any) -> None:
         """Run a call that may fail in some worlds: MuJoCo leaves those as they were and finishes the others."""
         try:
             call(**arguments)
@@ -128,17 +131,30 @@ class MujocoEngine(Engine):
         stage = self.stage
         lagged = [field for field in self.fields.values() if field.lagged]
         if lagged and stage > Stage.NONE:
-            self._contained(self.batch.step, nstep=nstep)
+            self.contained(self.batch.step, nstep=nstep)
             for field in lagged:
                 self._copy(field)
-            self._contained(self.batch.forward, stage=int(stage))
+            self.contained(self.batch.forward, stage=int(stage))
         else:
-            self._contained(self.batch.step, nstep=nstep, stage=int(stage))
+            self.contained(self.batch.step, nstep=nstep, stage=int(stage))
             for field in lagged:
                 self._copy(field)
         for field in self.fields.values():
             if not field.lagged and field.name != "ctrl":
                 self._copy(field)
+
+    @_overflow_ignored
+    def rollout(self, state: wp.array, controls: wp.array, nstep: int, records: Mapping[str, wp.array]) -> None:
+        fields = [self.fields[name] for name in records]
+        if not is_exact(self.model, fields):
+            super().rollout(state, controls, nstep, records)
+            return
+        key = (len(controls), nstep, *fields)
+        if key not in self._rollouts:
+            self._rollouts[key] = NativeRollout(self, len(controls), nstep, records)
+        native = self._rollouts[key]
+        native.run(state.numpy(), controls.numpy(), {name: record.numpy() for name, record in records.items()})
+        native.find_faults(self._everyone, self.fault)
 
     def find_faults(self, mask: wp.array) -> None:
         nphysics = 1 + self.model.nq + self.model.nv + self.model.na
@@ -167,7 +183,7 @@ class MujocoEngine(Engine):
     def _forward(self, mask: wp.array, stage: Stage, fields: list[Field]) -> None:
         chosen = mask.numpy()
         if stage > Stage.NONE and chosen.any():
-            self._contained(self.batch.forward, ids=chosen, stage=int(stage))
+            self.contained(self.batch.forward, ids=chosen, stage=int(stage))
             for field in fields:
                 if field.name not in STATE_FIELDS:
                     self._copy(field, chosen)

@@ -231,6 +231,48 @@ def make_kernels(
         if mask_in[w]:
             observe(view(batch, w), params[w % params.shape[0]], obs_out[w])
 
+    # An open-loop roll-out records its fields for all steps: row t * nworld + w is world w after t steps. The
+    # transition of that row leads to the one nworld further, so `before` and `after` are the same arrays, shifted.
+
+    @wp.kernel(module=module, enable_backward=False)
+    def gains(
+        before: Batch,
+        after: Batch,
+        params: wp.array[Params],
+        action_in: wp.array2d[float],
+        reward_out: wp.array[float],
+        terminated_out: wp.array[bool],
+    ):
+        """Reward and termination of recorded transitions."""
+        row = wp.tid()
+        p = params[row % params.shape[0]]
+        s1 = view(after, row)
+        reward_out[row] = reward(view(before, row), action_in[row], s1, p)
+        terminated_out[row] = terminated(s1, p)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def recall(
+        before: Batch,
+        after: Batch,
+        params: wp.array[Params],
+        action_in: wp.array2d[float],
+        step_in: wp.array[int],
+        key_in: wp.array[wp.uint32],
+        episode_in: wp.array[int],
+        memory_inout: wp.array2d[float],
+        rng_inout: wp.array2d[wp.uint32],
+    ):
+        """Let the task write its memory along a recorded roll-out: one thread a world walks through its steps."""
+        w = wp.tid()
+        n = step_in.shape[0]
+        p = params[w % params.shape[0]]
+        for t in range(action_in.shape[0] // n):
+            row = t * n + w
+            for i in range(memory_inout.shape[1]):
+                memory_inout[row + n, i] = memory_inout[row, i]
+            rng_inout[w, 0] = stream(key_in[w], episode_in[w], step_in[w] + t + 1)
+            advance(view(before, row), action_in[row], view(after, row), p, rng_inout[w])
+
     return SimpleNamespace(
         Batch=Batch,
         act=act,
@@ -238,4 +280,6 @@ def make_kernels(
         judge=judge,
         restart=restart,
         look=look,
+        gains=gains,
+        recall=recall if has_advance else None,
     )

@@ -1,0 +1,209 @@
+"""Planning by sampling: from actions to controls, noise around a plan, weights, and the plan that they average to.
+
+Actions of samples are (horizon, nsample, nu), plans (horizon, nu).
+"""
+
+import warp as wp
+
+from lyceum_warp.kernels import faults
+from lyceum_warp.kernels.random import stream, world_key
+
+ACTION = wp.constant(int(faults.Done.ACTION))
+
+
+@wp.kernel(enable_backward=False)
+def broadcast(state_in: wp.array[wp.float64], state_out: wp.array2d[wp.float64]):
+    """The same state in every world; launched over (nworld, state_size)."""
+    w, i = wp.tid()
+    state_out[w, i] = state_in[i]
+
+
+@wp.kernel(enable_backward=False)
+def controls(
+    action_inout: wp.array3d[float],
+    range_in: wp.array2d[float],
+    scale_in: wp.array2d[float],
+    fault_out: wp.array[int],
+    ctrl_out: wp.array3d[float],
+):
+    """Map actions to controls, within their ranges; one that is not finite counts as zero. Over (steps, nworld)."""
+    t, w = wp.tid()
+    finite = bool(True)
+    for i in range(action_inout.shape[2]):
+        finite = finite and wp.isfinite(action_inout[t, w, i])
+    if not finite:
+        fault_out[w] = ACTION
+        for i in range(action_inout.shape[2]):
+            action_inout[t, w, i] = 0.0
+    for i in range(ctrl_out.shape[2]):
+        ctrl = action_inout[t, w, i] * scale_in[i, 0] + scale_in[i, 1]
+        ctrl_out[t, w, i] = wp.clamp(ctrl, range_in[i, 0], range_in[i, 1])
+
+
+@wp.kernel(enable_backward=False)
+def merge_faults(fault_in: wp.array[int], fault_inout: wp.array[int]):
+    w = wp.tid()
+    fault_inout[w] = fault_inout[w] | fault_in[w]
+
+
+@wp.kernel(enable_backward=False)
+def shift_plan(
+    plan_in: wp.array2d[float], steps_in: wp.array[int], fill_in: wp.array[float], repeat: bool,
+    nominal_out: wp.array2d[float],
+):  # fmt: skip
+    """Move a plan forward in time, and fill its end; launched over (horizon, nu)."""
+    t, i = wp.tid()
+    last = plan_in.shape[0] - 1
+    source = t + steps_in[0]
+    if source <= last:
+        nominal_out[t, i] = plan_in[source, i]
+    else:
+        nominal_out[t, i] = wp.where(repeat, plan_in[last, i], fill_in[i])
+
+
+@wp.kernel(enable_backward=False)
+def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.array3d[float]):
+    """Standard normal numbers that depend on (seed, sample, count, action, step); launched over (nsample, nu)."""
+    k, i = wp.tid()
+    rng = stream(world_key(seed_in[0], k), count_in[0], i)
+    for t in range(noise_out.shape[0]):
+        noise_out[t, k, i] = wp.randn(rng)
+
+
+@wp.kernel(enable_backward=False)
+def perturb(
+    nominal_in: wp.array2d[float],
+    noise_in: wp.array3d[float],
+    scale_in: wp.array2d[float],
+    diagonal: bool,
+    smoothing: wp.vec3,
+    low_in: wp.array[float],
+    high_in: wp.array[float],
+    action_out: wp.array3d[float],
+):
+    """Actions around a plan: coloured, smoothed noise on top of it, within bounds; launched over (nsample, nu).
+
+    ``scale`` is the lower Cholesky factor of the noise's covariance. Smoothing follows trajopt: from the third step
+    on, e_t <- b0 e_t + b1 e_(t-1) + b2 e_(t-2), with those before already smoothed.
+    """
+    k, i = wp.tid()
+    last, before_last = float(0.0), float(0.0)
+    first = wp.where(diagonal, i, 0)
+    for t in range(noise_in.shape[0]):
+        e = float(0.0)
+        for j in range(first, i + 1):
+            e += scale_in[i, j] * noise_in[t, k, j]
+        if t >= 2:
+            e = smoothing[0] * e + smoothing[1] * last + smoothing[2] * before_last
+        before_last = last
+        last = e
+        action_out[t, k, i] = wp.clamp(nominal_in[t, i] + e, low_in[i], high_in[i])
+
+
+@wp.kernel(enable_backward=False)
+def add_up(
+    reward_in: wp.array2d[float],
+    terminated_in: wp.array2d[bool],
+    fault_in: wp.array[int],
+    terminal_in: wp.array[float],
+    discount: float,
+    stop: bool,
+    return_out: wp.array[float],
+):
+    """Discounted returns of samples, minus infinity where one failed. A sample that ``stop``s at its end earns nothing
+    after it, the terminal value included.
+    """  # noqa: D205
+    k = wp.tid()
+    total = float(0.0)
+    weight = float(1.0)
+    going = bool(True)
+    for t in range(reward_in.shape[0]):
+        if going:
+            total += weight * reward_in[t, k]
+            weight *= discount
+            if stop and terminated_in[t, k]:
+                going = False
+    if going:
+        total += weight * terminal_in[k]
+    if fault_in[k] != 0 or not wp.isfinite(total):
+        total = -wp.inf
+    return_out[k] = total
+
+
+@wp.kernel(enable_backward=False)
+def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[float], summary_out: wp.array[float]):
+    """Weights of samples, exp((R - max R) / temperature) over their sum; all zero where every sample failed.
+
+    The summary holds the best return, the mean return, the effective number of samples 1 / sum w^2, and how many
+    failed. One block.
+    """
+    _, lane = wp.tid()
+    n = return_in.shape[0]
+    best = float(-wp.inf)
+    for k in range(lane, n, wp.block_dim()):
+        best = wp.max(best, return_in[k])
+    best = wp.tile_extract(wp.tile_max(wp.tile(best)), 0)
+    total, square, mean, good = float(0.0), float(0.0), float(0.0), float(0.0)
+    for k in range(lane, n, wp.block_dim()):
+        if return_in[k] > -wp.inf:
+            weight = wp.exp((return_in[k] - best) / temperature)
+            total += weight
+            square += weight * weight
+            mean += return_in[k]
+            good += 1.0
+    total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
+    square = wp.tile_extract(wp.tile_sum(wp.tile(square)), 0)
+    mean = wp.tile_extract(wp.tile_sum(wp.tile(mean)), 0)
+    good = wp.tile_extract(wp.tile_sum(wp.tile(good)), 0)
+    for k in range(lane, n, wp.block_dim()):
+        weight_out[k] = 0.0
+        if return_in[k] > -wp.inf:
+            weight_out[k] = wp.exp((return_in[k] - best) / temperature) / total
+    if lane == 0:
+        summary_out[0] = best
+        summary_out[1] = mean / good
+        summary_out[2] = total * total / square
+        summary_out[3] = float(n) - good
+
+
+@wp.kernel(enable_backward=False)
+def average(
+    weight_in: wp.array[float],
+    action_in: wp.array3d[float],
+    nominal_in: wp.array2d[float],
+    summary_in: wp.array[float],
+    plan_out: wp.array2d[float],
+):
+    """The weighted mean of the samples' actions; without one good sample the plan stays. A block for each number."""
+    number, lane = wp.tid()
+    t = number // plan_out.shape[1]
+    i = number % plan_out.shape[1]
+    total = float(0.0)
+    for k in range(lane, weight_in.shape[0], wp.block_dim()):
+        total += weight_in[k] * action_in[t, k, i]
+    total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
+    if lane == 0:
+        plan_out[t, i] = wp.where(summary_in[0] > -wp.inf, total, nominal_in[t, i])
+
+
+@wp.kernel(enable_backward=False)
+def count_up(count_inout: wp.array[int]):
+    count_inout[0] = count_inout[0] + 1
+
+
+def value_kernel(value: wp.Function) -> wp.Kernel:
+    """The kernel that calls a value function, ``value(obs: Row[float]) -> float``, for each sample.
+
+    Raises:
+        ValueError: The function has other arguments.
+    """
+    types = list(value.input_types.values())
+    if len(types) != 1 or getattr(types[0], "ndim", 0) != 1 or types[0].dtype is not wp.float32:
+        raise ValueError("a value function in Warp has to be written as value(obs: Row[float]) -> float")
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def values(obs_in: wp.array2d[float], value_out: wp.array[float]):
+        k = wp.tid()
+        value_out[k] = value(obs_in[k])
+
+    return values
