@@ -9,6 +9,8 @@ from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.random import stream, world_key
 
 ACTION = wp.constant(int(faults.Done.ACTION))
+NOISE = wp.constant(-2)
+"""In the place of an episode: with the same seed, worlds draw initial states and samples draw noise independently."""
 
 
 @wp.kernel(enable_backward=False)
@@ -65,7 +67,8 @@ def shift_plan(
 def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.array3d[float]):
     """Standard normal numbers that depend on (seed, sample, count, action, step); launched over (nsample, nu)."""
     k, i = wp.tid()
-    rng = stream(world_key(seed_in[0], k), count_in[0], i)
+    key = stream(world_key(seed_in[0], k), NOISE, 0)
+    rng = stream(key, count_in[0], i)
     for t in range(noise_out.shape[0]):
         noise_out[t, k, i] = wp.randn(rng)
 

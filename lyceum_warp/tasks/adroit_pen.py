@@ -41,13 +41,9 @@ class Params:
 
 
 @wp.func
-def pen_axis(s: World, p: Params) -> wp.vec3:
-    return wp.normalize(s.site_xpos[p.pen_top] - s.site_xpos[p.pen_bottom])
-
-
-@wp.func
-def target_axis(s: World, p: Params) -> wp.vec3:
-    return wp.normalize(s.site_xpos[p.target_top] - s.site_xpos[p.target_bottom])
+def axis(s: World, top: int, bottom: int) -> wp.vec3:
+    along = s.site_xpos[top] - s.site_xpos[bottom]
+    return along / wp.length(along)
 
 
 @wp.func
@@ -57,20 +53,21 @@ def distance(s: World, p: Params) -> float:
 
 @wp.func
 def similarity(s: World, p: Params) -> float:
-    return wp.dot(pen_axis(s, p), target_axis(s, p))
+    return wp.dot(axis(s, p.pen_top, p.pen_bottom), axis(s, p.target_top, p.target_bottom))
 
 
 @wp.func
 def observe(s: World, p: Params, obs: Row[float]):
-    position, axis, wanted_axis = s.xpos[p.pen], pen_axis(s, p), target_axis(s, p)
+    position, centre = s.xpos[p.pen], s.site_xpos[p.palm]
+    pen, wanted = axis(s, p.pen_top, p.pen_bottom), axis(s, p.target_top, p.target_bottom)
     for i in range(24):
         obs[i] = s.qpos[i]
     for i in range(3):
         obs[24 + i] = position[i]
-        obs[33 + i] = axis[i]
-        obs[36 + i] = wanted_axis[i]
-        obs[39 + i] = position[i] - s.site_xpos[p.palm][i]
-        obs[42 + i] = axis[i] - wanted_axis[i]
+        obs[33 + i] = pen[i]
+        obs[36 + i] = wanted[i]
+        obs[39 + i] = position[i] - centre[i]
+        obs[42 + i] = pen[i] - wanted[i]
     for i in range(6):
         obs[27 + i] = s.qvel[24 + i]
 
@@ -144,3 +141,4 @@ class AdroitPen(lw.Task):
     lagged = ("xpos", "site_xpos")
     memory = 1
     action_range = (-1.0, 1.0)
+    planning = dict(horizon=32, samples=160, temperature=1.0, noise=1.0)  # the paper's

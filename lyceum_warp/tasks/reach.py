@@ -1,6 +1,8 @@
 """Reach: move the hand of a 7-joint arm to a target in space (the arm that the Lyceum paper calls Sawyer).
 
-The arm has no gravity to fight. Its target is a mocap body, and so belongs to the state.
+The arm has no gravity to fight. Its target is a mocap body, and so belongs to the state. An episode is a success
+while the distance, averaged over ten steps, is under 5 cm. With ``random_start`` one episode in five begins with the
+palm inside the table, which throws it out.
 """
 
 import mujoco
@@ -113,7 +115,7 @@ def arm() -> mujoco.MjSpec:
     spec.option.timestep = 0.01
     spec.option.gravity = (0, 0, 0)
     shape, kind = mujoco.mjtGeom, mujoco.mjtJoint
-    metal, dark, bright = (0.75, 0.77, 0.8, 1), (0.2, 0.22, 0.26, 1), (0.8, 0.25, 0.2, 1)
+    metal, dark, glass = (0.75, 0.77, 0.8, 1), (0.2, 0.22, 0.26, 1), (0.9, 0.3, 0.2, 0.5)
     contact = {"condim": 1, "margin": 0.002, "friction": (0.5, 0.1, 0.1)}
 
     def ball(body, radius, position, colour, collides=0):
@@ -162,28 +164,29 @@ def arm() -> mujoco.MjSpec:
     rod(wrist, 0.01, (0, -0.02, 0), (0, 0.02, 0), dark)
     hinge(wrist)
     hand = wrist.add_body(name="hand")
-    ball(hand, 0.08, (0.03, 0, 0), bright, collides=1)
+    ball(hand, 0.08, (0.03, 0, 0), glass, collides=1)  # a target that is reached lies in it
     hinge(hand)
     hand.add_site(name="finger", size=(0.05, 0, 0), rgba=(0, 0, 0, 0))
-    target = world.add_body(name="target", mocap=True)
+    target = world.add_body(name="target", mocap=True, pos=(0.1, 0.1, 0.1))
     target.add_site(name="target", size=(0.05, 0, 0), rgba=(0.2, 0.7, 0.3, 1))
     return spec
 
 
 def scenery(spec: mujoco.MjSpec) -> None:
     """What only a video shows."""
-    for name, kind, builtin, colours, size in (
-        ("sky", "SKYBOX", "GRADIENT", ((0.5, 0.6, 0.8), (0.9, 0.9, 0.9)), (64, 384)),
-        ("table", "2D", "CHECKER", ((0.55, 0.5, 0.45), (0.6, 0.55, 0.5)), (256, 256)),
-    ):
-        spec.add_texture(
-            name=name, type=mujoco.mjtTexture[f"mjTEXTURE_{kind}"], builtin=mujoco.mjtBuiltin[f"mjBUILTIN_{builtin}"],
-            rgb1=colours[0], rgb2=colours[1], width=size[0], height=size[1],
-        )  # fmt: skip
+    texture, pattern = mujoco.mjtTexture, mujoco.mjtBuiltin
+    spec.add_texture(
+        name="sky", type=texture.mjTEXTURE_SKYBOX, builtin=pattern.mjBUILTIN_GRADIENT,
+        rgb1=(0.5, 0.6, 0.8), rgb2=(0.9, 0.9, 0.9), width=64, height=384,
+    )  # fmt: skip
+    spec.add_texture(
+        name="table", type=texture.mjTEXTURE_2D, builtin=pattern.mjBUILTIN_CHECKER,
+        rgb1=(0.55, 0.5, 0.45), rgb2=(0.6, 0.55, 0.5), width=256, height=256,
+    )  # fmt: skip
     table = spec.add_material(name="table", texrepeat=(8, 8), texuniform=False)
     table.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "table"
-    spec.worldbody.add_light(pos=(0.5, 0.8, 2.5), dir=(-0.2, -0.4, -1))
-    spec.worldbody.add_camera(name="front", pos=(1.3, 1.5, 0.9), xyaxes=(-0.75, 0.66, 0, -0.24, -0.27, 0.93))
+    spec.worldbody.add_light(pos=(0.6, 0.8, 2.5), dir=(-0.2, -0.4, -1), diffuse=(0.8, 0.8, 0.8))
+    spec.worldbody.add_camera(name="front", pos=(0.4, 1.35, 0.7), xyaxes=(-0.99, 0.15, 0, -0.06, -0.42, 0.9))
 
 
 @lw.register
@@ -193,3 +196,4 @@ class Reach(lw.Task):
     obs = {"position": 7, "velocity": 7, "hand": 3, "error": 3}
     horizon = 75
     memory = REMEMBERED
+    planning = dict(horizon=16, samples=30, temperature=0.2, noise=1.0)  # the paper's, its 5 being an inverse

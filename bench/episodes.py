@@ -1,0 +1,180 @@
+"""Episodes under MPPI, many of one task: how often they succeed, and how long they take.
+
+python bench/episodes.py reach --episodes 100
+python bench/episodes.py adroit_pen --episodes 100 --processes 2 --out pen.csv
+
+Without further options these are the planning tasks of the Lyceum paper, with its settings and its 75 steps. Every
+episode is a row of the table, written when it ends: the same command again goes on where the last one stopped.
+"""
+
+import concurrent.futures
+import csv
+import dataclasses
+import math
+import multiprocessing
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from rich.console import Console
+
+import lyceum_warp as lw
+from lyceum_warp.runs import versions
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Success of MPPI over many episodes."""
+
+    task: tyro.conf.Positional[str]
+    """Task."""
+    episodes: int = 100
+    """Episodes; the seed of each is its number."""
+    steps: int = 75
+    """Steps of an episode."""
+    processes: int = 1
+    """Episodes at the same time; with more than one, each has one thread."""
+    plan: tuple[str, ...] = ()
+    """Other settings of MPPI than the task's own, as NAME=VALUE."""
+    param: tuple[str, ...] = ()
+    """Parameters of the task, as NAME=VALUE."""
+    stop_after: float = math.inf
+    """Seconds after which no further episode is begun."""
+    out: Path | None = None
+    """Table (CSV) of the episodes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Episode:
+    """What is kept of an episode."""
+
+    episode: int
+    success: bool
+    episode_return: float
+    eval_mean: float
+    last_ten_evals: float
+    """The evaluation metric's mean over the last ten steps."""
+    length: int
+    effective_samples: float
+    failed_samples: float
+    plan_ms: float
+    """Median planning time."""
+    seconds: float
+
+
+_worlds: dict[Options, tuple[lw.Env, lw.MPPI]] = {}
+
+
+def run(options: Options, number: int) -> Episode:
+    """One episode, in worlds that a process makes once."""
+    if options not in _worlds:
+        nthread = None
+        if options.processes > 1:
+            torch.set_num_threads(1)
+            nthread = 1
+        params = dict(map(setting, options.param))
+        env = lw.make(options.task, autoreset=False, horizon=options.steps, nthread=1, **params)
+        plan = lw.MPPI(options.task, nthread=nthread, **params, **dict(map(setting, options.plan)))
+        _worlds[options] = env, plan
+    env, plan = _worlds[options]
+    env.rand_reset(number)
+    plan.reset(number)
+    rewards, evals, seconds, effective, failed = [], [], [], [], 0.0
+    began = time.perf_counter()
+    while not env.done.item():
+        start = time.perf_counter()
+        action = plan(env.get_state())
+        seconds.append(time.perf_counter() - start)
+        env.step(action[None])
+        rewards.append(env.reward.item())
+        evals.append(env.eval.item())
+        effective.append(plan.summary["effective_samples"])
+        failed += plan.summary["failed_samples"]
+    n = len(rewards)
+    return Episode(
+        number, bool(env.success.item()), sum(rewards), sum(evals) / n, sum(evals[-10:]) / len(evals[-10:]), n,
+        sum(effective) / n, failed, 1e3 * sorted(seconds)[n // 2], time.perf_counter() - began,
+    )  # fmt: skip
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """NAME=VALUE, the value being a number, several numbers, true or false, or a word."""
+    name, _, value = text.partition("=")
+    if value in ("true", "false"):
+        return name, value == "true"
+    try:
+        numbers = [float(part) for part in value.split(",")]
+    except ValueError:
+        return name, value
+    return name, numbers if len(numbers) > 1 else int(numbers[0]) if numbers[0].is_integer() else numbers[0]
+
+
+def wilson(successes: int, n: int, z: float = 1.96) -> tuple[float, float]:
+    """The 95 % interval of a share (Wilson 1927)."""
+    share, spread = successes / n, z * math.sqrt(successes * (n - successes) / n + z * z / 4)
+    return tuple((successes + z * z / 2 + sign * spread) / (n + z * z) for sign in (-1, 1)) if share >= 0 else (0, 0)
+
+
+def main(options: Options) -> None:
+    console = Console(highlight=False, width=140)
+    rows = read(options.out)
+    todo = [i for i in range(options.episodes) if i not in rows]
+    began = time.perf_counter()
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(options.processes, context) as pool:
+        waiting = list(reversed(todo))
+        running: set[concurrent.futures.Future[Episode]] = set()
+        while waiting or running:
+            while waiting and len(running) < options.processes:
+                if time.perf_counter() - began > options.stop_after:
+                    waiting.clear()
+                    break
+                running.add(pool.submit(run, options, waiting.pop()))
+            finished, running = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
+            for future in finished:
+                episode = future.result()
+                rows[episode.episode] = episode
+                write(options.out, episode)
+                console.print(episode, soft_wrap=True)
+    summarise(console, [rows[i] for i in sorted(rows)])
+    console.print(versions("cpu"))
+
+
+def summarise(console: Console, episodes: list[Episode]) -> None:
+    n, good = len(episodes), sum(e.success for e in episodes)
+    low, high = wilson(good, n)
+    console.print(f"{good} of {n} episodes succeed: {good / n:.0%}, 95 % interval {low:.1%} to {high:.1%} (Wilson)")
+    for name in ("episode_return", "eval_mean", "last_ten_evals", "effective_samples", "plan_ms", "seconds"):
+        values = torch.tensor([getattr(e, name) for e in episodes])
+        console.print(f"{name:<18} {values.mean():9.3f} ± {values.std(correction=0):.3f} "
+                      f"({values.min():.3f} to {values.max():.3f})")  # fmt: skip
+
+
+def read(path: Path | None) -> dict[int, Episode]:
+    if path is None or not path.exists():
+        return {}
+    with path.open(newline="") as file:
+        episodes = [parsed(row) for row in csv.DictReader(file)]
+    return {episode.episode: episode for episode in episodes}
+
+
+def parsed(row: dict[str, str]) -> Episode:
+    kinds = {field.name: field.type for field in dataclasses.fields(Episode)}
+    return Episode(**{k: v == "True" if kinds[k] is bool else kinds[k](v) for k, v in row.items()})  # type: ignore
+
+
+def write(path: Path | None, episode: Episode) -> None:
+    if path is None:
+        return
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, [field.name for field in dataclasses.fields(Episode)])
+        if new:
+            writer.writeheader()
+        writer.writerow(dataclasses.asdict(episode))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

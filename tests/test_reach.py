@@ -1,0 +1,227 @@
+"""The reach task: the published arm, its formulas, and a success that is an average over ten steps."""
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from test_authored import check_uniform, positions, put_at_random, same
+
+import lyceum_warp as lw
+
+SharedEnv = Callable[..., lw.Env]
+NWORLD = 256
+
+# the arm
+
+BODIES = {  # parent, position in it, mass, moments of inertia (of capsules and spheres of 1,000 kg/m^3)
+    "shoulder": ("world", (0, -0.6, 0), 24.311738, (1.2153105, 1.2145685, 0.1205579)),
+    "lift": ("shoulder", (0.1, 0, 0), 10.471976, (0.1267109, 0.1267109, 0.0481711)),
+    "upper_roll": ("lift", (0, 0, 0), 0.284838, (0.0012536, 0.0012536, 0.0000556)),
+    "upper_arm": ("upper_roll", (0, 0, 0), 5.428672, (0.1100271, 0.1100271, 0.0094459)),
+    "elbow": ("upper_arm", (0.4, 0, 0), 1.357168, (0.0029466, 0.0029466, 0.0021172)),
+    "fore_roll": ("elbow", (0, 0, 0), 0.284838, (0.0012536, 0.0012536, 0.0000556)),
+    "forearm": ("fore_roll", (0, 0, 0), 2.809107, (0.0320219, 0.0320219, 0.0033805)),
+    "wrist": ("forearm", (0.321, 0, 0), 0.016755, (0.0000045, 0.0000045, 0.0000008)),
+    "hand": ("wrist", (0, 0, 0), 2.144661, (0.0054903, 0.0054903, 0.0054903)),
+}
+JOINTS = {  # body, axis, range, damping, gear
+    "shoulder_pan": ("shoulder", (0, 0, 1), (-2.2854, 1.714602), 2.0, 20),
+    "shoulder_lift": ("lift", (0, 1, 0), (-0.5236, 1.3963), 2.0, 10),
+    "upper_arm_roll": ("upper_roll", (1, 0, 0), (-1.5, 1.7), 0.8, 10),
+    "elbow_flex": ("elbow", (0, 1, 0), (-2.3213, 0.0), 0.8, 10),
+    "forearm_roll": ("fore_roll", (1, 0, 0), (-1.5, 1.5), 0.8, 10),
+    "wrist_flex": ("wrist", (0, 1, 0), (-1.094, 0.0), 0.8, 10),
+    "wrist_roll": ("hand", (1, 0, 0), (-1.5, 1.5), 0.8, 10),
+}
+RANGES = np.array([joint[2] for joint in JOINTS.values()])
+
+
+def test_arm(shared_env: SharedEnv) -> None:
+    """Masses, inertias, joints and motors are those of the arm in the paper's code."""
+    env = shared_env("reach")
+    model = env.model
+    assert (model.nq, model.nv, model.nu, model.nmocap) == (7, 7, 7, 1)
+    for name, (parent, position, mass, inertia) in BODIES.items():
+        body = model.body(name)
+        assert model.body(body.parentid[0]).name == parent
+        np.testing.assert_allclose(body.pos, position, atol=1e-12)
+        np.testing.assert_allclose(body.mass, mass, rtol=1e-6, atol=5e-7, err_msg=name)
+        np.testing.assert_allclose(body.inertia, inertia, rtol=1e-6, atol=6e-8, err_msg=name)
+    for i, (name, (body, axis, limits, damping, gear)) in enumerate(JOINTS.items()):
+        joint = model.joint(i)
+        assert joint.name == name and model.body(joint.bodyid[0]).name == body and model.jnt_limited[i]
+        assert np.array_equal(joint.axis, axis) and not joint.pos.any()
+        np.testing.assert_allclose(joint.range, limits, rtol=1e-12)
+        assert (model.dof_damping[i], model.dof_armature[i], model.dof_frictionloss[i]) == (damping, 0.004, 0)
+        assert model.actuator(i).trnid[0] == i and np.array_equal(model.actuator_gear[i], [gear, 0, 0, 0, 0, 0])
+        assert model.actuator_ctrllimited[i] and np.array_equal(model.actuator_ctrlrange[i], [-1, 1])
+    assert model.opt.timestep == 0.01 and env.timestep == 0.02 and not model.opt.gravity.any()
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+
+
+def test_only_the_palm_collides_and_only_with_the_table(shared_env: SharedEnv) -> None:
+    model = shared_env("reach").model
+    solid = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
+    assert [model.body(model.geom_bodyid[i]).name for i in solid] == ["world", "hand"]
+    np.testing.assert_allclose([model.geom_pos[solid[0]], model.geom_pos[solid[1]]], [[0, 0.5, -0.425], [0.03, 0, 0]])
+    assert model.geom_type[solid[0]] == mujoco.mjtGeom.mjGEOM_PLANE and model.geom_size[solid[1], 0] == 0.08
+    assert (model.geom_condim == 1).all() and (model.geom_margin == 0.002).all()
+    assert model.site("target").size[0] == 0.05
+
+
+# formulas
+
+
+def finger(env: lw.Env, qpos: np.ndarray) -> np.ndarray:
+    """Where the finger is, by MuJoCo's kinematics in float64."""
+    data, found = mujoco.MjData(env.model), []
+    for row in qpos:
+        data.qpos[:] = row
+        mujoco.mj_kinematics(env.model, data)
+        found.append(data.site("finger").xpos.copy())
+    return np.array(found)
+
+
+def errors(env: lw.Env, state: torch.Tensor | None = None) -> np.ndarray:
+    """From the target to the hand, in each world."""
+    state = env.get_state() if state is None else state
+    target = env.state_space.split(state)["mocap_pos"].numpy()
+    return finger(env, positions(env, state)[0]) - target
+
+
+def reward(error: np.ndarray) -> np.ndarray:
+    return -np.abs(error).sum(axis=1) - 5.0 * np.sqrt((error**2).sum(axis=1))
+
+
+def test_formulas(shared_env: SharedEnv) -> None:
+    """Observation, reward and evaluation, of states that a step led to and of given ones, targets all different."""
+    env = shared_env("reach", nworld=NWORLD, autoreset=False)
+    rng = np.random.default_rng(0)
+    assert env.obs.shape == (NWORLD, 20)
+    for _ in range(3):
+        before = put_at_random(env, rng, position=1.0, velocity=3.0)
+        env.step(torch.from_numpy(rng.uniform(-1.5, 1.5, (NWORLD, 7)).astype(np.float32)))
+        qpos, qvel = positions(env)
+        error = errors(env)
+        assert len(np.unique(np.round(error, 6), axis=0)) == NWORLD
+        same(env.obs, np.concatenate([qpos, qvel, finger(env, qpos), error], axis=1))
+        same(env.reward, reward(error))
+        same(env.eval, np.linalg.norm(error, axis=1))
+        assert not env.terminated.any()
+    after = put_at_random(env, rng, position=1.0, velocity=3.0)
+    same(env.get_reward(before, torch.zeros(NWORLD, 7), after), reward(errors(env, after)))
+    same(env.get_eval(after), np.linalg.norm(errors(env, after), axis=1))
+
+
+def test_hand_at_zero(shared_env: SharedEnv) -> None:
+    """Stretched out along x, the arm reaches over its three links, and a target there is worth 0."""
+    env = shared_env("reach", nworld=2, autoreset=False)
+    env.reset()
+    same(env.obs[0], np.concatenate([np.zeros(14), [0.821, -0.6, 0.0], [0.721, -0.7, -0.1]]))
+    state = env.get_state()
+    env.state_space.split(state)["mocap_pos"][1] = torch.tensor([0.821, -0.6, 0.0])
+    rewards = env.get_reward(state, torch.zeros(2, 7), state)
+    same(rewards, np.array([-1.521 - 5.0 * np.sqrt(0.721**2 + 0.7**2 + 0.1**2), 0.0]))
+
+
+# resets
+
+
+def targets(env: lw.Env) -> np.ndarray:
+    return env.state_space.split(env.get_state())["mocap_pos"].numpy().copy()
+
+
+@pytest.mark.parametrize("scale", [None, (0.1, 0.5, 0.0)])
+def test_reset(shared_env: SharedEnv, scale: tuple[float, float, float] | None) -> None:
+    """The arm starts at zero and at rest; the target anywhere in its box, in each world elsewhere."""
+    env = shared_env("reach", nworld=2000, **({} if scale is None else {"target_range": scale}))
+    env.rand_reset(0)
+    size = np.array(scale or (0.3, 0.2, 0.25))
+    found = targets(env)
+    assert not found[:, size == 0].any()
+    check_uniform(found[:, size > 0] / size[size > 0].astype(np.float32))
+    qpos, qvel = positions(env)
+    assert not qpos.any() and not qvel.any()
+    same(env.eval, np.linalg.norm(errors(env), axis=1))
+    env.reset()
+    np.testing.assert_allclose(targets(env), np.full((2000, 3), 0.1), atol=1e-7)
+
+
+def test_random_start(shared_env: SharedEnv) -> None:
+    """With random_start every joint starts anywhere in its range, at rest."""
+    env = shared_env("reach", nworld=2000, random_start=True)
+    qpos, qvel = positions(env)
+    assert not qvel.any()
+    low, high = RANGES.T.astype(np.float32).astype(np.float64)
+    middle = np.concatenate([(2.0 * qpos - low - high) / (high - low), targets(env) / (0.3, 0.2, 0.25)], axis=1)
+    check_uniform(middle / (1.0 + 1e-6))
+    for _ in range(20):  # some start with the palm inside the table
+        env.step(torch.zeros(2000, 7))
+    assert not env.done.any()
+
+
+# success
+
+
+def put_targets(env: lw.Env, distance: np.ndarray) -> None:
+    """Put targets at given distances from the hands, along x."""
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    hand = finger(env, parts["qpos"].numpy())
+    parts["mocap_pos"].copy_(torch.from_numpy(hand + np.stack([distance, 0 * distance, 0 * distance], axis=1)))
+    env.set_state(state)
+
+
+def test_success_takes_ten_steps() -> None:
+    """Ten steps at the target make a success, even where far more distance is allowed; a reset forgets them."""
+    env = lw.make("reach", engine="mujoco", nworld=3, success_distance=np.array([0.05, 0.05, 0.99]), horizon=0)
+    put_targets(env, np.array([0.0, 0.06, 0.0]))
+    still = torch.zeros(3, 7)
+    assert not env.success.any()
+    for _ in range(9):
+        env.step(still)
+        assert not env.success.any()
+    env.step(still)
+    assert env.success.tolist() == [True, False, True]
+    assert env.eval.tolist() == pytest.approx([0.0, 0.06, 0.0], abs=1e-6)
+    state = env.get_state()
+    env.rand_reset(mask=torch.tensor([True, False, False]))
+    assert env.success.tolist() == [False, False, True]
+    env.reset()
+    assert not env.success.any()
+    env.set_state(state)  # what is remembered belongs to the state
+    assert env.success.tolist() == [True, False, True]
+
+
+def test_success_is_an_average(shared_env: SharedEnv) -> None:
+    """Of the last ten distances, counted by hand while targets jump near and away."""
+    env = shared_env("reach", nworld=64, autoreset=False, horizon=0)
+    rng = np.random.default_rng(0)
+    distances: list[np.ndarray] = []
+    successes = 0
+    for i in range(60):
+        if i % 6 == 0:
+            put_targets(env, rng.uniform(0.0, 0.1, 64))
+        env.step(torch.from_numpy(rng.uniform(-0.1, 0.1, (64, 7)).astype(np.float32)))
+        distances.append(np.linalg.norm(errors(env), axis=1))
+        mean = np.mean(distances[-10:], axis=0) if i >= 9 else np.full(64, np.inf)
+        clear = np.abs(mean - 0.05) > 1e-6
+        assert np.array_equal(env.success.numpy()[clear], mean[clear] < 0.05)
+        successes += int(env.success.sum())
+    assert 300 < successes < 51 * 64 - 300
+
+
+def test_episode(shared_env: SharedEnv) -> None:
+    """An episode lasts 75 steps, and the next one has to earn its success anew."""
+    env = shared_env("reach", nworld=2)
+    for i in range(75):
+        if i == 60:
+            put_targets(env, np.zeros(2))
+        env.step(torch.zeros(2, 7))
+        assert bool(env.truncated.all()) == (i == 74)
+    assert env.success.all(), "the last step of an episode tells of the episode"
+    put_targets(env, np.zeros(2))
+    env.step(torch.zeros(2, 7))
+    assert not env.success.any()
