@@ -113,6 +113,7 @@ class OpenLoop:
 
     def _end(self, batch: object) -> None:
         env = self.env
+        env.engine.find_faults(env._everyone)
         wp.launch(planning.merge_faults, env.nworld, [env.engine.fault, self._fault], device=env.device)
         args = [env._everyone, batch, env._params, self._obs]
         wp.launch(env.task.kernels.look, env.nworld, args, device=env.device)
@@ -144,5 +145,4 @@ class OpenLoop:
         wp.launch(kernels.gains, n, [*transition, *earned], device=env.device)
 
     def _end_of_steps(self) -> None:
-        self.env.engine.find_faults(self.env._everyone)
         self._end(self.env._after)

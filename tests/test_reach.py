@@ -71,6 +71,17 @@ def test_only_the_palm_collides_and_only_with_the_table(shared_env: SharedEnv) -
     assert model.site("target").size[0] == 0.05
 
 
+def test_trajectory(shared_env: SharedEnv) -> None:
+    """Three seconds of smooth controls, against a limit, lead where they led the original arm (computed once)."""
+    model = shared_env("reach").model
+    data = mujoco.MjData(model)
+    for i in range(300):
+        data.ctrl[:] = np.sin(0.02 * i * np.arange(1, 8))
+        mujoco.mj_step(model, data)
+    last = [-2.28833384, -0.08709786, -1.51681723, 0.02162415, -0.11015627, -0.49795317, 1.15342769]
+    np.testing.assert_allclose(data.qpos, last, atol=1e-6)
+
+
 # formulas
 
 

@@ -134,7 +134,7 @@ class Engine(abc.ABC):
     def rollout(self, state: wp.array, controls: wp.array, nstep: int, records: Mapping[str, wp.array]) -> None:
         """Step every world from a given state under given controls, and record fields along the way.
 
-        ``fault`` then tells what stood in each world's way. Where the worlds are afterwards is left open.
+        The state fields and ``find_faults`` then tell of the end; derived fields may be those of another time.
 
         Args:
             state: States to start from, whose leading columns are those of ``get_state``; (nworld, ...) float64.
@@ -149,7 +149,6 @@ class Engine(abc.ABC):
             wp.copy(self.ctrl, controls[t])
             self.step(nstep)
             self._keep(records, t + 1)
-        self.find_faults(self._everyone)
 
     def _keep(self, records: Mapping[str, wp.array], t: int) -> None:
         for name, record in records.items():

@@ -152,9 +152,8 @@ class MujocoEngine(Engine):
         key = (len(controls), nstep, *fields)
         if key not in self._rollouts:
             self._rollouts[key] = NativeRollout(self, len(controls), nstep, records)
-        native = self._rollouts[key]
-        native.run(state.numpy(), controls.numpy(), {name: record.numpy() for name, record in records.items()})
-        native.find_faults(self._everyone, self.fault)
+        targets = {name: record.numpy() for name, record in records.items()}
+        self._rollouts[key].run(state.numpy(), controls.numpy(), targets)
 
     def find_faults(self, mask: wp.array) -> None:
         nphysics = 1 + self.model.nq + self.model.nv + self.model.na

@@ -5,11 +5,9 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
-import warp as wp
 from mujoco.batch import Batch
 
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage
-from lyceum_warp.kernels import faults
 
 if TYPE_CHECKING:
     from lyceum_warp.engines.c import MujocoEngine
@@ -32,7 +30,7 @@ class NativeRollout:
     """Rolls out worlds of a C engine, in a batch of its own.
 
     Args:
-        engine: The engine; its worlds stay as they are.
+        engine: The engine.
         steps: Steps of the horizon.
         nstep: Substeps in a step.
         names: The fields to record, of those that the engine keeps.
@@ -41,8 +39,6 @@ class NativeRollout:
     def __init__(self, engine: "MujocoEngine", steps: int, nstep: int, names: Iterable[str]) -> None:
         self.engine, self.nstep = engine, nstep
         self.batch = Batch(engine.native_model, engine.nworld, engine.nthread)
-        self.rows = wp.array(self.batch.state, dtype=wp.float64, device=engine.device, copy=False)
-        self.warning = wp.array(self.batch.warning, dtype=int, device=engine.device, copy=False)
         self.control = np.zeros((engine.nworld, steps * nstep, engine.model.nu))
         self.by_step = self.control.reshape(engine.nworld, steps, nstep, engine.model.nu)
         self.fields = [engine.fields[name] for name in names]
@@ -70,7 +66,7 @@ class NativeRollout:
                     self.final[field.name] = bound
 
     def run(self, state: np.ndarray, controls: np.ndarray, targets: Mapping[str, np.ndarray]) -> None:
-        """Roll out and record.
+        """Roll out and record. The engine's worlds are then where the roll-outs ended, with what went wrong in them.
 
         Args:
             state: States at the start, (nworld, at least state_size) float64.
@@ -81,11 +77,14 @@ class NativeRollout:
         self.batch.state[:] = state[:, : engine.integration_size]
         np.copyto(self.by_step, controls.transpose(1, 0, 2)[:, :, None])
         count, control = self.control.shape[1], self.control
-        engine.contained(
-            self.batch.rollout, nstep=count, control=control, record=list(self.records), out=self.records
-        )  # fmt: skip
+        records: dict[str, Any] = {"record": list(self.records), "out": self.records}
+        engine.contained(self.batch.rollout, nstep=count, control=control, **records)
         if self.stage > Stage.NONE:
             engine.contained(self.batch.forward, stage=int(self.stage))
+        # a simulation that MuJoCo warns of stops there, and its records repeat: only the warning tells
+        engine.batch.state[:] = self.batch.state
+        engine.batch.warning += self.batch.warning
+        self.batch.warning[:] = 0
         for field in self.fields:
             self._copy(field, state, targets[field.name])
 
@@ -101,9 +100,3 @@ class NativeRollout:
             start, values = state[:, self.start[field.name]], record[:, nstep - 1 :: nstep]
             np.copyto(target[0], start.reshape(target[0].shape), "unsafe")
             np.copyto(target[1:], values.swapaxes(0, 1).reshape(target[1:].shape), "unsafe")
-
-    def find_faults(self, mask: wp.array, fault_out: wp.array) -> None:
-        """Faults of the last roll-out: a world that MuJoCo warned of stopped there, and its records repeat."""
-        model = self.engine.model
-        args = [mask, self.rows, 1 + model.nq + model.nv + model.na, self.warning, fault_out]
-        wp.launch(faults.faults_of_rows, self.engine.nworld, args, device=self.engine.device)

@@ -1,0 +1,311 @@
+"""The adroit_pen task against Gymnasium-Robotics' own environment, on the C engine."""
+
+import dataclasses
+import importlib.util
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from gymnasium_robotics.envs.adroit_hand.adroit_pen import AdroitHandPenEnv
+from gymnasium_robotics.utils.rotations import euler2quat
+from test_authored import check_uniform
+
+import lyceum_warp as lw
+
+SharedEnv = Callable[..., lw.Env]
+
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@dataclasses.dataclass
+class Step:
+    """One step of both environments."""
+
+    obs: np.ndarray
+    gym_obs: np.ndarray
+    reward: float
+    gym_reward: float
+    success: bool
+    gym_goal: bool
+    eval: float
+
+    def check(self) -> None:
+        """The same numbers, rounded to float32."""
+        assert relative_error(self.obs, self.gym_obs) <= 1e-5
+        assert relative_error(self.reward, self.gym_reward) <= 1e-5
+        assert abs(self.eval - self.gym_obs[33:36] @ self.gym_obs[36:39]) <= 1e-6
+
+
+def relative_error(ours: np.ndarray | float, theirs: np.ndarray | float) -> float:
+    """Largest difference, relative to the larger of 1 and the value."""
+    return float(np.max(np.abs(ours - theirs) / np.maximum(1.0, np.abs(theirs))))
+
+
+class Pair:
+    """One of our worlds and their environment, unchanged, in the same states and under the same controls."""
+
+    def __init__(self, ours: lw.Env, seed: int = 0) -> None:
+        self.ours, self.theirs = ours, AdroitHandPenEnv()
+        self.theirs.reset(seed=seed)
+        self.rng = np.random.default_rng(seed)
+        self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
+
+    def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:
+        # an action becomes a control in float32 here and in float64 there: over many steps that would show
+        ours = self.ours.state_space.split(self.ours.get_state())["ctrl"][0].numpy()
+        np.testing.assert_allclose(ours, ctrl, atol=2e-7)
+        self._simulate(ours, frames)
+
+    def put(self, target: np.ndarray = UPRIGHT, pen: np.ndarray | float = 0.0, noise: float = 0.05) -> None:
+        """Put both near the initial state; every number is one of float32.
+
+        The pen's first joint moves it down, its third along x: its body lies on its side.
+        """
+        model, data = self.theirs.model, self.theirs.data
+        mujoco.mj_resetData(model, data)
+        model.body("target").quat[:] = np.float32(target)
+        low, high = model.jnt_range[:24].T
+        data.qpos[:24] = np.float32(np.clip(self.rng.uniform(-noise, noise, 24), low, high))
+        data.qpos[24:] = np.float32(pen)
+        data.qvel[:] = np.float32(self.rng.uniform(-noise, noise, 30))
+        mujoco.mj_forward(model, data)
+        data.qacc_warmstart[:] = np.float32(data.qacc)
+
+        state = self.ours.get_state()
+        parts = self.ours.state_space.split(state[0])
+        for name in ("qpos", "qvel", "qacc_warmstart", "xpos", "site_xpos"):
+            parts[name].copy_(torch.from_numpy(np.ravel(getattr(data, name))))
+        parts["mocap_quat"][-4:] = torch.from_numpy(np.float32(target))
+        parts["memory"].zero_()
+        self.ours.set_state(state)
+
+    def pen_axis(self) -> np.ndarray:
+        data = self.theirs.data
+        return (data.site("object_top").xpos - data.site("object_bottom").xpos) / 0.13
+
+    def point_target(self, away: float) -> None:
+        """Turn the target so that its axis is an angle away from the pen's, and start both from where they are."""
+        target, sideways = np.zeros(4), np.cross(self.pen_axis(), (0.0, 1.0, 0.0))
+        axis = np.cos(away) * self.pen_axis() + np.sin(away) * sideways / np.linalg.norm(sideways)
+        mujoco.mju_quatZ2Vec(target, axis)
+        self.theirs.model.body("target").quat[:] = np.float32(target)
+        mujoco.mj_forward(self.theirs.model, self.theirs.data)
+        state = self.ours.get_state()
+        parts = self.ours.state_space.split(state[0])
+        parts["mocap_quat"][-4:] = torch.from_numpy(np.float32(target))
+        for name in ("qacc_warmstart", "xpos", "site_xpos"):
+            parts[name].copy_(torch.from_numpy(np.ravel(getattr(self.theirs.data, name))))
+        self.ours.set_state(state)
+
+    def step(self, action: np.ndarray) -> Step:
+        action = action.astype(np.float32)
+        self.ours.step(torch.from_numpy(action[None]))
+        obs, reward, terminated, truncated, info = self.theirs.step(action.astype(np.float64))
+        assert not terminated and not truncated and not self.ours.done.any()
+        model, contacts = self.theirs.model, self.theirs.data.contact.geom
+        assert not (contacts == model.geom("target").id).any(), "their target was touched, ours can't be"
+        step = Step(
+            self.ours.obs[0].numpy().astype(np.float64), obs, self.ours.reward.item(), float(reward),
+            self.ours.success.item(), bool(info["success"]), self.ours.eval.item(),
+        )  # fmt: skip
+        step.check()
+        return step
+
+
+@pytest.fixture
+def pair(shared_env: SharedEnv) -> Pair:
+    return Pair(shared_env("adroit_pen", autoreset=False, horizon=0, nthread=1))
+
+
+def random_quat(rng: np.random.Generator) -> np.ndarray:
+    return euler2quat([*rng.uniform(-1.0, 1.0, 2), 0.0])
+
+
+def test_random_actions(pair: Pair) -> None:
+    """The same numbers as theirs for 400 steps of random actions, some out of range, in four episodes."""
+    for _ in range(4):
+        pair.put(random_quat(pair.rng))
+        for i in range(100):
+            if i % 4 == 0:
+                action = pair.rng.uniform(-1.3, 1.3, 24)
+            pair.step(action)
+
+
+def test_bonuses_and_success(pair: Pair) -> None:
+    """+10, +60 and -5 in the reward; success after more than 20 steps at their goal, in a row or not."""
+    seen: dict[float, int] = {}
+    goals_at_once, successes = 0, 0
+    for angle, height in ((0.1, 0.0), (0.38, 0.0), (0.1, -0.2), (2.0, -0.2), (0.1, 0.2)):
+        pair.put(pen=np.array([-height, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        goals = 0
+        for i in range(50):
+            if i % 10 == 0:
+                pair.point_target(angle if i < 40 else 1.0)
+            step = pair.step(pair.rng.uniform(-0.2, 0.2, 24))
+            goals += step.gym_goal
+            assert step.success == (goals > 20)
+            successes += step.success
+            goals_at_once = max(goals_at_once, goals)
+            bonus = round(step.gym_reward - step.eval + float(np.linalg.norm(step.gym_obs[39:42])), 3)
+            seen[bonus] = seen.get(bonus, 0) + 1
+    assert seen.keys() == {0.0, 10.0, 60.0, -5.0} and min(seen.values()) >= 5, seen
+    assert goals_at_once > 30 and 10 < successes < 100
+
+
+def test_the_target_is_no_obstacle(pair: Pair) -> None:
+    """A pen inside the target is thrown out there; here it stays, the only difference between the two."""
+    inside = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
+    pair.put(UPRIGHT, inside, noise=0.0)
+    with pytest.raises(AssertionError, match="their target was touched"):
+        pair.step(np.zeros(24))
+    pair.theirs.model.geom("target").contype = pair.theirs.model.geom("target").conaffinity = 0
+    pair.put(UPRIGHT, inside, noise=0.0)
+    for _ in range(50):
+        pair.step(np.zeros(24))
+
+
+def test_model(shared_env: SharedEnv) -> None:
+    """Their model, whose actuators the environment sets anew, but for the target's body."""
+    ours, theirs = shared_env("adroit_pen").model, AdroitHandPenEnv().model
+    for name in (
+        "body_mass", "body_inertia", "body_pos", "body_ipos", "body_iquat", "dof_damping", "dof_armature",
+        "dof_frictionloss", "jnt_range", "jnt_margin", "geom_size", "geom_friction", "geom_margin", "pair_dim",
+        "tendon_range", "actuator_gainprm", "actuator_biasprm", "actuator_ctrlrange", "actuator_forcerange",
+    ):  # fmt: skip
+        assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
+    for name in ("timestep", "integrator", "cone", "solver", "iterations", "noslip_iterations", "disableflags"):
+        assert getattr(ours.opt, name) == getattr(theirs.opt, name), name
+    assert ours.opt.noslip_iterations == 20
+    meshes = ours.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+    assert meshes.any() and not ours.geom_contype[meshes].any() and not ours.geom_conaffinity[meshes].any()
+    target = ours.geom_bodyid == ours.body("target").id
+    assert target.any() and not ours.geom_contype[target].any() and not ours.geom_conaffinity[target].any()
+    assert ours.body("target").mocapid[0] == 1, "the second mocap body: the task must not take the first"
+
+
+def test_spaces(pair: Pair) -> None:
+    assert pair.ours.obs.shape == (1, *pair.theirs.observation_space.shape) == (1, 45)
+    assert np.array_equal(pair.ours.action_space.low, pair.theirs.action_space.low)
+    assert np.array_equal(pair.ours.action_space.high, pair.theirs.action_space.high)
+    assert list(pair.ours.action_space.parts) == [pair.theirs.model.actuator(i).name for i in range(24)]
+    assert pair.ours.timestep == pytest.approx(pair.theirs.dt, rel=1e-12)
+    assert lw.make("adroit_pen", engine="mujoco").horizon == 200
+
+
+# resets
+
+
+def quats(env: lw.Env) -> np.ndarray:
+    """The targets' orientations."""
+    return env.state_space.split(env.get_state())["mocap_quat"][:, 4:].numpy().copy()
+
+
+@pytest.mark.parametrize("scale", [None, 0.2])
+def test_reset(shared_env: SharedEnv, scale: float | None) -> None:
+    """Hand and pen start where the model puts them, and the target turns as theirs does, in each world elsewhere."""
+    env = shared_env("adroit_pen", nworld=2000, **({} if scale is None else {"target_range": scale}))
+    found = quats(env)
+    euler = 2.0 * np.arctan2(found[:, 1:3], found[:, [0, 0]])  # both half angles are under a right angle
+    np.testing.assert_allclose(euler2quat(np.concatenate([euler, np.zeros((2000, 1))], axis=1)), found, atol=1e-6)
+    check_uniform(euler / (scale or 1.0) / (1.0 + 1e-6))
+    theirs = AdroitHandPenEnv()
+    wanted, _ = theirs.reset(seed=0)
+    for w in range(20):
+        theirs.model.body("target").quat[:] = found[w]
+        theirs.set_state(theirs.init_qpos, theirs.init_qvel)
+        assert relative_error(env.obs[w].numpy().astype(np.float64), theirs._get_obs()) <= 1e-6
+    assert len(np.unique(env.obs[:, 36:39].numpy().round(5), axis=0)) > 1900
+    env.reset()
+    assert np.array_equal(quats(env), np.tile(UPRIGHT, (2000, 1)))
+    wanted[36:39], wanted[42:45] = (0.0, 0.0, 1.0), wanted[33:36] - (0.0, 0.0, 1.0)
+    assert relative_error(env.obs.numpy().astype(np.float64), np.tile(wanted, (2000, 1))) <= 1e-6
+
+
+def test_targets_of_their_resets() -> None:
+    """What their reset draws is what ``euler2quat`` makes of two angles, drawn in the order of the axes."""
+    env = AdroitHandPenEnv()
+    env.reset(seed=3)
+    angles = np.random.default_rng(3).uniform(-1, 1, 2)
+    np.testing.assert_allclose(env.model.body("target").quat, euler2quat([*angles, 0.0]), atol=1e-12)
+
+
+# parameters and memory
+
+
+def formula(obs: np.ndarray, near: float, goal: float, reach: np.ndarray | float, drop: float) -> np.ndarray:
+    """The reward, made of the observation."""
+    distance = np.linalg.norm(obs[:, 39:42], axis=1)
+    similarity = (obs[:, 33:36] * obs[:, 36:39]).sum(axis=1)
+    reward = similarity - distance
+    reward += 10.0 * ((distance < reach) & (similarity > near)) + 50.0 * ((distance < reach) & (similarity > goal))
+    return reward - 5.0 * (obs[:, 26] < drop)
+
+
+def test_parameters() -> None:
+    """Every threshold does its work, one of them with another value in each world."""
+    n = 400
+    rng = np.random.default_rng(0)
+    reach = rng.uniform(0.02, 0.2, n)
+    env = lw.make(
+        "adroit_pen", engine="mujoco", nworld=n, autoreset=False, nthread=1, near_similarity=0.3, goal_similarity=0.7,
+        goal_distance=reach, drop_height=0.2, goal_steps=3,
+    )  # fmt: skip
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    parts["qpos"][:, 24:27] = torch.from_numpy(rng.uniform(-0.1, 0.1, (n, 3)))
+    parts["qpos"][:, 27:] = torch.from_numpy(rng.uniform(-1.5, 1.5, (n, 3)))
+    env.set_state(state)
+    assert not env.reward.any()
+    # the fields that mj_step left came with the state: only a step shows the new positions
+    counts, terms = np.zeros(n), set()
+    for _ in range(6):
+        env.step(torch.zeros(n, 24))
+        obs = env.obs.numpy().astype(np.float64)
+        wanted = formula(obs, 0.3, 0.7, reach.astype(np.float32), 0.2)
+        np.testing.assert_allclose(env.reward.numpy(), wanted, rtol=1e-5, atol=1e-5)
+        similarity = (obs[:, 33:36] * obs[:, 36:39]).sum(axis=1)
+        np.testing.assert_allclose(env.eval.numpy(), similarity, atol=1e-6)
+        counts += (np.linalg.norm(obs[:, 39:42], axis=1) < reach) & (similarity > 0.7)
+        assert np.array_equal(env.success.numpy(), counts > 3)
+        terms |= set(np.round(wanted - similarity + np.linalg.norm(obs[:, 39:42], axis=1)).tolist())
+    assert terms == {-5.0, 0.0, 5.0, 10.0, 55.0, 60.0}
+    assert 10 < env.success.sum() < n - 10
+
+
+def test_success_memory() -> None:
+    """A success needs more than 20 steps at the goal; resets forget them, and states keep them."""
+    env = lw.make("adroit_pen", engine="mujoco", nworld=3, horizon=0, goal_similarity=-2.0, goal_distance=10.0)
+    still = torch.zeros(3, 24)
+    for i in range(25):
+        env.step(still)
+        assert env.success.tolist() == 3 * [i >= 20]
+    state = env.get_state()
+    assert env.state_space.split(state)["memory"].tolist() == 3 * [[25.0]]
+    env.rand_reset(mask=torch.tensor([True, False, False]))
+    assert env.success.tolist() == [False, True, True]
+    for _ in range(20):
+        env.step(still)
+        assert env.success.tolist() == [False, True, True]
+    env.step(still)
+    assert env.success.all()
+    env.reset()
+    assert not env.success.any()
+    env.set_state(state)
+    assert env.success.all()
+
+
+# the package with the model
+
+
+def test_gymnasium_robotics_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if "robotics" in name else find(name, *a))
+    with pytest.raises(FileNotFoundError, match=r"gymnasium_robotics, .*: pip install 'lyceum-warp\[hand\]'"):
+        lw.make("adroit_pen", engine="mujoco")
+
+
+def test_a_model_that_gymnasium_robotics_lacks() -> None:
+    with pytest.raises(FileNotFoundError, match=r"no model file 'adroit_hand/adroit_pan.xml'.* adroit_hand/adroit_pen"):
+        lw.gymnasium_robotics_model("adroit_hand/adroit_pan.xml")
