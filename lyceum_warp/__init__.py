@@ -17,7 +17,7 @@ from lyceum_warp.kernels.random import normal, uniform
 from lyceum_warp.models import gymnasium_model, gymnasium_robotics_model
 from lyceum_warp.openloop import OpenLoop
 from lyceum_warp.registry import register, task_names
-from lyceum_warp.runs import load
+from lyceum_warp.runs import load, load_value
 from lyceum_warp.task import Row, Task, body, dof, geom, mocap, qpos, sensor, site
 
 __version__ = "0.1.0"
@@ -43,6 +43,7 @@ __all__ = [
     "gymnasium_model",
     "gymnasium_robotics_model",
     "load",
+    "load_value",
     "make",
     "mocap",
     "normal",

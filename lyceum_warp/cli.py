@@ -237,7 +237,7 @@ def _train(options: Train) -> int:
     }
     npg = _algorithm(config)
     run = Run.create(out, config, device=options.device)
-    run.save(0, npg.policy, npg.state_dict())
+    run.save(0, npg.policy, npg.state_dict(), npg.value)
     return _learn(run, npg, options)
 
 
@@ -326,7 +326,7 @@ def _learn(run: Run, npg: NPG, options: Train) -> int:
             while npg.iteration < options.iterations:
                 record = next(npg)
                 run.write(dataclasses.asdict(record))
-                run.save(npg.iteration, npg.policy, npg.state_dict())
+                run.save(npg.iteration, npg.policy, npg.state_dict(), npg.value)
                 display(record)
     except Interrupted as signalled:
         # iterations count when their checkpoint is complete; what is under way is lost

@@ -104,7 +104,7 @@ class OpenLoop:
         env, kernels = self.env, self.env.task.kernels
         actions = self._actions.reshape((-1, self._actions.shape[2]))
         transition = [self._before, self._after, env._params, actions]
-        if kernels.recall is not None:
+        if self._memory is not None:
             counters = [env._step, env._key, env._episode]
             memory = self._memory.reshape((-1, self._memory.shape[2]))
             wp.launch(kernels.recall, env.nworld, [*transition, *counters, memory, env._rng], device=env.device)

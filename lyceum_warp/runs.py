@@ -7,14 +7,17 @@ import os
 import platform
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
 
 from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.value import ValueFunction
+
+Module = TypeVar("Module", bound=nn.Module)
 
 FORMAT = 1
 """Format of the folder; one more whenever an older release could no longer read it."""
@@ -163,27 +166,25 @@ class Run:
 
     # the checkpoint
 
-    def save(self, iteration: int, policy: GaussianPolicy, state: Mapping[str, Any]) -> None:
+    def save(
+        self, iteration: int, policy: GaussianPolicy, state: Mapping[str, Any], value: ValueFunction | None = None
+    ) -> None:
         """Replace the checkpoint, in one go: a reader finds the old one or the new one, never a part.
 
         Args:
             iteration: Number of complete iterations.
             policy: The policy that ``load`` will give back.
             state: What the algorithm continues from; tensors, numbers, strings and containers of them.
+            value: The value function that ``load_value`` will give back.
         """
-        widths = [layer.out_features for layer in policy.network if isinstance(layer, nn.Linear)]
-        shape = {
-            "nobs": next(layer.in_features for layer in policy.network if isinstance(layer, nn.Linear)),
-            "nact": widths[-1],
-            "hidden": widths[:-1],
-            "normalize": not isinstance(policy.normalizer, nn.Identity),
-        }
-        content = {
+        content: dict[str, Any] = {
             "lyceum_warp": FORMAT,
             "iteration": iteration,
-            "policy": {"shape": shape, "state": policy.state_dict()},
+            "policy": {"shape": policy.shape, "state": policy.state_dict()},
             "state": dict(state),
         }
+        if value is not None:
+            content["value"] = {"shape": value.shape, "state": value.state_dict()}
         temporary = self.checkpoint.with_suffix(".tmp")
         try:
             torch.save(content, temporary)
@@ -212,17 +213,35 @@ def load(run: str | Path | Run, *, device: str | torch.device = "cpu") -> Gaussi
         FileNotFoundError: There is no run, or it has no checkpoint.
         ValueError: The checkpoint is broken, foreign, or of a newer release.
     """
+    return _module(run, "policy", GaussianPolicy, device)
+
+
+def load_value(run: str | Path | Run, *, device: str | torch.device = "cpu") -> ValueFunction:
+    """The value function of a run, for use: ``value(obs, step)`` predicts discounted returns.
+
+    Args:
+        run: A run's folder, or a checkpoint file.
+        device: Where its parameters go.
+
+    Raises:
+        FileNotFoundError: There is no run, or it has no checkpoint.
+        ValueError: The checkpoint holds no value function, is broken, foreign, or of a newer release.
+    """
+    return _module(run, "value", ValueFunction, device)
+
+
+def _module(run: str | Path | Run, name: str, kind: Callable[..., Module], device: str | torch.device) -> Module:
     if isinstance(run, (str, Path)) and Path(run).is_file():
         path = Path(run)
     else:
         path = (run if isinstance(run, Run) else Run.open(run)).checkpoint
-    saved = read_checkpoint(path, device)["policy"]
     try:
-        policy = GaussianPolicy(**saved["shape"])
-        policy.load_state_dict(saved["state"])
+        saved = read_checkpoint(path, device)[name]
+        module = kind(**saved["shape"])
+        module.load_state_dict(saved["state"])
     except (KeyError, TypeError, RuntimeError) as error:
-        raise ValueError(f"{path} holds no policy of lyceum_warp ({_line(error)}): {_MEND}") from error
-    return policy.to(device).eval().requires_grad_(False)
+        raise ValueError(f"{path} holds no {name} of lyceum_warp ({_line(error)}): {_MEND}") from error
+    return module.to(device).eval().requires_grad_(False)
 
 
 _MEND = "restore the file from a copy, or train again with another --out"

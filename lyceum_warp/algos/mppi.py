@@ -25,7 +25,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.kernels import planning
 from lyceum_warp.kernels.arrays import torch_view
 from lyceum_warp.openloop import OpenLoop
-from lyceum_warp.registry import find_task
+from lyceum_warp.registry import find_task, task_name
 from lyceum_warp.spaces import Space
 from lyceum_warp.task import Task
 from lyceum_warp.validate import described, whole_number
@@ -108,7 +108,9 @@ class MPPI:
         )  # fmt: skip
         settings = _DEFAULTS | dict(task.planning) | {name: v for name, v in given.items() if v is not None}
         if unknown := settings.keys() - _DEFAULTS.keys():
-            raise ValueError(f"planning of the task {task.__name__!r} has {sorted(unknown)}: it takes {list(_DEFAULTS)}")
+            raise ValueError(
+                f"planning of the task {task.__name__!r} has {sorted(unknown)}: it takes {list(_DEFAULTS)}"
+            )
         self.horizon = whole_number("horizon", settings["horizon"], low=1)
         self.samples = whole_number("samples", settings["samples"], low=1)
         self.iterations = whole_number("iterations", settings["iterations"], low=1)
@@ -132,9 +134,10 @@ class MPPI:
         self._diagonal = not np.tril(factor, -1).any()
         self._repeat = isinstance(settings["fill"], str) and settings["fill"] == "repeat"
         with wp.ScopedDevice(self.env.device):
-            self._low, self._high = wp.array(space.low, dtype=float), wp.array(space.high, dtype=float)
-            self._fill = wp.array(_filling(settings["fill"], space), dtype=float)
-            self._scale = wp.array(factor, dtype=float)
+            self._low: wp.array = wp.array(space.low, dtype=float)
+            self._high: wp.array = wp.array(space.high, dtype=float)
+            self._fill: wp.array = wp.array(_filling(settings["fill"], space), dtype=float)
+            self._scale: wp.array = wp.array(factor, dtype=float)
             self._plan, self._nominal = (wp.zeros((self.horizon, space.size), dtype=float) for _ in range(2))
             self._noise = wp.zeros((self.horizon, self.samples, space.size), dtype=float)
             self._terminal, self._return, self._weight = (wp.zeros(self.samples, dtype=float) for _ in range(3))
@@ -252,10 +255,10 @@ class MPPI:
         wp.launch(planning.add_up, self.samples, [
             *self._earned, self._terminal, self.discount, self.termination == "stop", self._return,
         ], device=device)  # fmt: skip
-        args = [self._return, self.temperature, self._weight, self._summary]
-        wp.launch_tiled(planning.weigh, dim=[1], inputs=args, block_dim=_BLOCK, device=device)
-        args = [self._weight, self._samples, self._nominal, self._summary, self._plan]
-        wp.launch_tiled(planning.average, dim=[self._plan.size], inputs=args, block_dim=_BLOCK, device=device)
+        weights = [self._return, self.temperature, self._weight, self._summary]
+        wp.launch_tiled(planning.weigh, dim=[1], inputs=weights, block_dim=_BLOCK, device=device)
+        plan = [self._weight, self._samples, self._nominal, self._summary, self._plan]
+        wp.launch_tiled(planning.average, dim=[self._plan.size], inputs=plan, block_dim=_BLOCK, device=device)
 
     def _torch_values(self) -> torch.Tensor:
         obs = self._loop.final_obs
@@ -263,7 +266,7 @@ class MPPI:
             step = self._loop.state[self.env.state_space.parts["step"]] + self.horizon
             values = self.value(obs, step.float().expand(self.samples))
         else:
-            values = self.value(obs)  # type: ignore[misc,operator]
+            values = self.value(obs)  # type: ignore[misc]
         if not isinstance(values, torch.Tensor) or values.numel() != self.samples:
             raise ValueError(f"value has to make {self.samples} numbers of {tuple(obs.shape)} observations, "
                              f"not {described(values)}")  # fmt: skip

@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import nn
@@ -75,6 +76,9 @@ class GaussianPolicy(nn.Module):
         generator: Draws the initial weights.
     """
 
+    shape: dict[str, Any]
+    """The arguments that make another one for the same weights."""
+
     def __init__(
         self,
         nobs: int,
@@ -87,6 +91,7 @@ class GaussianPolicy(nn.Module):
     ) -> None:
         super().__init__()
         self.nobs, self.nact = nobs, nact
+        self.shape = {"nobs": nobs, "nact": nact, "hidden": list(hidden), "normalize": normalize}
         self.normalizer: nn.Module = Normalizer(nobs) if normalize else nn.Identity()
         # a last layer near zero starts every mean near the middle of its range (mjrl)
         self.network = mlp([nobs, *hidden, nact], last_scale=1e-2, generator=generator)

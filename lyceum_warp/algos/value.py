@@ -1,6 +1,7 @@
 """Value functions: what a state is worth, fitted by regression on returns."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import nn
@@ -23,6 +24,8 @@ class ValueFunction(nn.Module):
         generator: Draws the initial weights.
     """
 
+    shape: dict[str, Any]
+    """The arguments that make another one for the same weights."""
     orders: torch.Tensor
 
     def __init__(
@@ -37,6 +40,9 @@ class ValueFunction(nn.Module):
     ) -> None:
         super().__init__()
         self.scale = scale
+        self.shape = {
+            "nobs": nobs, "hidden": list(hidden), "scale": scale, "time_orders": time_orders, "normalize": normalize,
+        }  # fmt: skip
         self.normalizer: nn.Module = Normalizer(nobs) if normalize else nn.Identity()
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
         self.network = mlp([nobs + time_orders, *hidden, 1], generator=generator)

@@ -30,11 +30,12 @@ def controls(
 ):
     """Map actions to controls, within their ranges; one that is not finite counts as zero. Over (steps, nworld)."""
     t, w = wp.tid()
-    finite = bool(True)
+    fault = int(0)
     for i in range(action_inout.shape[2]):
-        finite = finite and wp.isfinite(action_inout[t, w, i])
-    if not finite:
-        fault_out[w] = ACTION
+        if not wp.isfinite(action_inout[t, w, i]):
+            fault = ACTION
+    if fault != 0:
+        fault_out[w] = fault
         for i in range(action_inout.shape[2]):
             action_inout[t, w, i] = 0.0
     for i in range(ctrl_out.shape[2]):

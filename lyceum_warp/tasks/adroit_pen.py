@@ -1,8 +1,9 @@
 """AdroitPen: turn a pen in the hand until it points as the target does (Gymnasium-Robotics' AdroitHandPen-v1).
 
 The hand's model comes with the extra "hand". The target is a mocap body here, so that it belongs to the state, and
-nothing can bump into it; there it is a part of the model, and the pen can. As there, positions are those that
-``mj_step`` leaves. An episode is a success once the pen was held right for more than 20 steps in all.
+nothing can bump into it; there it is a part of the model, and the pen can. The tips of ring and little finger, which
+the model pairs twice, are paired once. As there, positions are those that ``mj_step`` leaves. An episode is a success
+once the pen was held right for more than 20 steps in all.
 """
 
 import mujoco
@@ -14,7 +15,7 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    qpos: Row[float]  # the hand's 24 joints, then the pen's position and Euler angles
+    qpos: Row[float]  # the hand's 24 joints, then the pen's 3 slides and 3 hinges
     qvel: Row[float]
     xpos: Row[wp.vec3]
     site_xpos: Row[wp.vec3]
@@ -121,6 +122,9 @@ def hand_and_pen() -> mujoco.MjSpec:
     target.mocap = True
     for geom in target.geoms:
         geom.contype = geom.conaffinity = 0
+    tips = ("C_rfdistal", "C_lfdistal")
+    for pair in [pair for pair in spec.pairs if (pair.geomname1, pair.geomname2) == tips][1:]:
+        spec.delete(pair)  # else the C engine would count a contact of theirs twice, and MuJoCo Warp once
     return spec
 
 

@@ -1,0 +1,318 @@
+"""What a plan costs, beside the bare engine on the same roll-outs and beside MPPI over single Python environments.
+
+    python bench/planning.py --tasks reach adroit_pen
+
+Planner, bare engine and baseline take turns at every step of a controlled episode. The bare engine is one call of
+``mujoco.batch.Batch.rollout``, or one graph of ``mujoco_warp.step``, from the same state, under the same controls,
+for the same samples, steps and substeps; setting the state and the controls is outside its clock. The baseline does
+what one does without this toolkit, and does it well: an environment as in Gymnasium in each of as many processes as
+there are cores, kept alive, one message for each plan and process, noise and weights in NumPy.
+"""
+
+import dataclasses
+import json
+import multiprocessing
+import os
+import statistics
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import torch
+import tyro
+import warp as wp
+from mujoco.batch import Batch
+from rich.console import Console
+from rich.table import Table
+
+import lyceum_warp as lw
+from lyceum_warp.engines.c import MujocoEngine
+from lyceum_warp.engines.warp import WarpEngine
+from lyceum_warp.runs import versions
+
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Cost of a plan, as a table and as JSON."""
+
+    tasks: tuple[str, ...] = ("reach", "half_cheetah", "adroit_pen")
+    """Tasks to measure, with their own settings of MPPI."""
+    samples: tuple[int, ...] = (0,)
+    """Numbers of samples; 0 for the task's own."""
+    engine: str = "auto"
+    """Engine."""
+    device: str = "cpu"
+    """Device."""
+    seconds: float = 60.0
+    """Time for each measurement, at least ten plans."""
+    baseline: bool = True
+    """Whether to measure single Python environments, too."""
+    out: Path | None = None
+    """JSON file for the record."""
+
+
+# the baseline: single environments with Gymnasium's step
+
+
+class ReachEnv:
+    """Reach as one writes it for Gymnasium: MuJoCo's own objects, NumPy, and as little else as can be."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model, self.data = model, mujoco.MjData(model)
+        self.finger, self.size = model.site("finger").id, mujoco.mj_stateSize(model, STATE)
+
+    def set_state(self, state: np.ndarray) -> None:
+        mujoco.mj_setState(self.model, self.data, state[: self.size], STATE)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        data = self.data
+        data.ctrl[:] = np.clip(action, -1.0, 1.0)
+        mujoco.mj_step(self.model, data, 2)
+        mujoco.mj_kinematics(self.model, data)
+        hand = data.site_xpos[self.finger]
+        error = hand - data.mocap_pos[0]
+        obs = np.concatenate([data.qpos, data.qvel, hand, error])
+        return obs, float(-np.abs(error).sum() - 5.0 * np.sqrt(error @ error)), False, False, {}
+
+
+class GymnasiumEnv:
+    """An environment of Gymnasium or Gymnasium-Robotics, put into the planner's qpos and qvel."""
+
+    def __init__(self, name: str) -> None:
+        if name.startswith("Adroit"):
+            import gymnasium_robotics
+
+            gymnasium.register_envs(gymnasium_robotics)
+        self.env: Any = gymnasium.make(name).unwrapped
+        self.env.reset(seed=0)
+        self.sizes = self.env.model.nq, self.env.model.nv
+
+    def set_state(self, state: np.ndarray) -> None:
+        data, (nq, nv) = self.env.data, self.sizes
+        data.time = state[0]
+        data.qpos[:], data.qvel[:] = state[1 : 1 + nq], state[1 + nq : 1 + nq + nv]
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        return self.env.step(action)
+
+
+BASELINES: dict[str, Callable[[mujoco.MjModel], Any]] = {
+    "reach": ReachEnv,
+    "half_cheetah": lambda model: GymnasiumEnv("HalfCheetah-v5"),
+    "adroit_pen": lambda model: GymnasiumEnv("AdroitHandPen-v1"),
+}
+
+
+def work(pipe: Connection, task: str, samples: int, horizon: int, seed: int) -> None:
+    """A process of the baseline: rolls out its share of the samples for every plan that it is sent."""
+    env = BASELINES[task](lw.make(task, nthread=1).model)
+    random = np.random.default_rng(seed)
+    while (message := pipe.recv()) is not None:
+        state, plan = message
+        noise = random.standard_normal((samples, horizon, plan.shape[1]))
+        for t in range(2, horizon):
+            noise[:, t] = 0.25 * noise[:, t] + 0.8 * noise[:, t - 1]
+        actions = np.clip(plan + noise, -1.0, 1.0)
+        returns = np.zeros(samples)
+        for k in range(samples):
+            env.set_state(state)
+            for t in range(horizon):
+                returns[k] += env.step(actions[k, t])[1]
+        pipe.send((returns, actions))
+
+
+class Baseline:
+    """MPPI over single environments in processes."""
+
+    def __init__(self, task: str, plan: lw.MPPI) -> None:
+        self.temperature = plan.temperature
+        self.plan = np.zeros(tuple(plan.actions.shape))
+        context = multiprocessing.get_context("spawn")
+        shares = np.diff(np.linspace(0, plan.samples, (os.cpu_count() or 1) + 1).astype(int))
+        self.pipes, self.processes = [], []
+        for seed, share in enumerate(shares):
+            pipe, other = context.Pipe()
+            process = context.Process(target=work, args=(other, task, int(share), plan.horizon, seed), daemon=True)
+            process.start()
+            self.pipes.append(pipe)
+            self.processes.append(process)
+        self(plan.state_of().numpy())  # wait until all are there
+
+    def __call__(self, state: np.ndarray) -> None:
+        for pipe in self.pipes:
+            pipe.send((state, self.plan))
+        answers = [pipe.recv() for pipe in self.pipes]
+        returns, actions = (np.concatenate(parts) for parts in zip(*answers, strict=True))
+        weights = np.exp((returns - returns.max()) / self.temperature)
+        self.plan = np.tensordot(weights / weights.sum(), actions, axes=1)
+        self.plan = np.concatenate([self.plan[1:], np.zeros((1, self.plan.shape[1]))])
+
+    def close(self) -> None:
+        for pipe in self.pipes:
+            pipe.send(None)
+        for process in self.processes:
+            process.join()
+
+
+# the bare engines
+
+
+class BareC:
+    """One ``Batch.rollout`` of a plan's samples."""
+
+    def __init__(self, plan: lw.MPPI) -> None:
+        self.plan, engine, self.nstep = plan, plan.env.engine, plan.env.task.frame_skip
+        assert isinstance(engine, MujocoEngine)
+        self.size = engine.integration_size
+        self.batch = Batch(engine.native_model, plan.samples, engine.nthread)
+        self.control = np.zeros((plan.samples, plan.horizon * self.nstep, engine.model.nu))
+        self.records = None
+        env = plan.env
+        low, high = torch.as_tensor(env.action_space.low), torch.as_tensor(env.action_space.high)
+        ranges = engine.model.actuator_ctrlrange
+        self.gain = (ranges[:, 1] - ranges[:, 0]) / (high - low).double().numpy()
+        self.offset = ranges[:, 0] - self.gain * low.double().numpy()
+
+    def load(self, state: torch.Tensor) -> None:
+        """The last plan's state and samples."""
+        self.batch.state[:] = state[0, : self.size].numpy()
+        controls = self.plan.sampled.numpy().transpose(1, 0, 2) * self.gain + self.offset
+        self.control[:] = np.repeat(controls, self.nstep, axis=1)
+
+    def __call__(self) -> None:
+        self.records = self.batch.rollout(
+            self.control.shape[1], self.control, record=["qpos", "qvel"], out=self.records
+        )  # fmt: skip
+
+
+class BareWarp:
+    """One graph of ``mujoco_warp.step`` for a plan's samples."""
+
+    def __init__(self, plan: lw.MPPI) -> None:
+        env, engine = plan.env, plan.env.engine
+        assert isinstance(engine, WarpEngine)
+        self.plan, self.env, self.size = plan, env, engine.integration_size
+        with wp.ScopedDevice(env.device):
+            self.m = mjw.put_model(env.model)
+            self.m.opt.warn_overflow = 0
+            self.d = mjw.make_data(env.model, nworld=env.nworld, nconmax=engine.nconmax, njmax=engine.njmax)
+            self.state = wp.zeros((env.nworld, self.size), dtype=float)
+            self.controls = wp.zeros((plan.horizon, env.nworld, env.model.nu), dtype=float)
+            mjw.step(self.m, self.d)
+            with wp.ScopedCapture() as capture:
+                for t in range(plan.horizon):
+                    wp.copy(self.d.ctrl, self.controls[t])
+                    for _ in range(env.task.frame_skip):
+                        mjw.step(self.m, self.d)
+        self.graph = capture.graph
+
+    def load(self, state: torch.Tensor) -> None:
+        wp.to_torch(self.state).copy_(state[:, : self.size].float())
+        wp.copy(self.controls, self.plan._loop._controls)
+        with wp.ScopedDevice(self.env.device):
+            mjw.reset_data(self.m, self.d)
+            mjw.set_state(self.m, self.d, self.state, STATE)
+        synchronize(self.env)
+
+    def __call__(self) -> None:
+        wp.capture_launch(self.graph)
+
+
+def synchronize(env: lw.Env) -> None:
+    if not env.device.is_cpu:
+        wp.synchronize_device(env.device)
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One measurement; times are milliseconds, medians over the plans."""
+
+    task: str
+    engine: str
+    samples: int
+    horizon: int
+    plans: int
+    plan_ms: float
+    plan_ms_p99: float | None
+    """Where there were 200 plans."""
+    bare_ms: float
+    ratio: float
+    """Median over the plans of the planner's time by the bare engine's."""
+    python_ms: float | None
+    python_by_plan: float | None
+    python_by_bare: float | None
+
+
+def measure(task: str, samples: int, options: Options) -> Row:
+    more = {"samples": samples} if samples else {}
+    plan = lw.MPPI(task, engine=options.engine, device=options.device, **more)
+    plant = lw.make(task, autoreset=False, engine=options.engine, device=options.device, seed=1)
+    bare: BareC | BareWarp = (BareC if isinstance(plan.env.engine, MujocoEngine) else BareWarp)(plan)
+    baseline = Baseline(task, plan) if options.baseline and task in BASELINES else None
+    times: list[tuple[float, float, float]] = []
+
+    def timed(function: Callable[[], object]) -> float:
+        synchronize(plant)
+        start = time.perf_counter()
+        function()
+        synchronize(plant)
+        return time.perf_counter() - start
+
+    warm, began = 4, time.perf_counter()
+    while len(times) < warm + 10 or time.perf_counter() - began < options.seconds:
+        state = plant.get_state()
+        spent = timed(lambda state=state: plan(state))
+        bare.load(state)
+        alone = timed(bare)
+        python = 0.0
+        # by far the slowest: not at every step where that would take all the time
+        if baseline is not None and len(times) % 5 == 0:
+            python = timed(lambda state=state: baseline(state[0].numpy()))
+        times.append((spent, alone, python))
+        plant.step(plan.actions[:1])
+        if plant.done.item():
+            plant.rand_reset()
+    if baseline is not None:
+        baseline.close()
+    times = times[warm:]
+    spent_ms, bare_ms = (1e3 * statistics.median(t[i] for t in times) for i in (0, 1))
+    python_ms = 1e3 * statistics.median(t[2] for t in times if t[2]) if baseline is not None else None
+    ordered = sorted(1e3 * t[0] for t in times)
+    return Row(
+        task, plan.env.engine.name, plan.samples, plan.horizon, len(times), spent_ms,
+        ordered[int(0.99 * len(ordered))] if len(ordered) >= 200 else None, bare_ms,
+        statistics.median(a / b for a, b, _ in times), python_ms,
+        python_ms and python_ms / spent_ms, python_ms and python_ms / bare_ms,
+    )  # fmt: skip
+
+
+def main(options: Options) -> None:
+    console, rows = Console(width=140), []
+    table = Table("task", "engine", "samples", "horizon", "plan, ms", "p99, ms", "bare, ms", "plan / bare",
+                  "Python, ms", "Python / plan", "Python / bare")  # fmt: skip
+    for column in table.columns[2:]:
+        column.justify = "right"
+    for task in options.tasks:
+        for samples in options.samples:
+            row = measure(task, samples, options)
+            rows.append(row)
+            numbers = (row.plan_ms, row.plan_ms_p99, row.bare_ms, row.ratio, row.python_ms, row.python_by_plan,
+                       row.python_by_bare)  # fmt: skip
+            table.add_row(task, row.engine, str(row.samples), str(row.horizon),
+                          *("" if number is None else f"{number:.3f}" for number in numbers))  # fmt: skip
+    console.print(table)
+    if options.out is not None:
+        record = {"versions": versions(options.device), "rows": [dataclasses.asdict(row) for row in rows]}
+        options.out.write_text(json.dumps(record, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
