@@ -16,6 +16,7 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import cli, report
 from lyceum_warp.algos.npg import MEAN_SEED
+from lyceum_warp.cli.common import parameter, spelled
 from lyceum_warp.registry import find_task, task_names
 from lyceum_warp.runs import Run, load
 
@@ -285,10 +286,10 @@ def test_signals_are_left_as_they_were(trained: Path) -> None:
     ("a=0.7,inf", [0.7, float("inf")]), ("a=[1, 2]", [1, 2]),
 ])  # fmt: skip
 def test_parameters(text: str, value: object) -> None:
-    name, parsed = cli._parameter(text)
+    name, parsed = parameter(text)
     assert (name, parsed) == ("a", value)
     assert type(parsed) is type(value)
-    assert cli._parameter(f"a={cli._spelled(parsed)}") == ("a", value)
+    assert parameter(f"a={spelled(parsed)}") == ("a", value)
 
 
 def test_the_table_is_short() -> None:

@@ -25,7 +25,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.kernels import planning
 from lyceum_warp.kernels.arrays import torch_view
 from lyceum_warp.openloop import OpenLoop
-from lyceum_warp.registry import find_task, task_name
+from lyceum_warp.registry import find_task
 from lyceum_warp.spaces import Space
 from lyceum_warp.task import Task
 from lyceum_warp.validate import described, whole_number
@@ -108,9 +108,8 @@ class MPPI:
         )  # fmt: skip
         settings = _DEFAULTS | dict(task.planning) | {name: v for name, v in given.items() if v is not None}
         if unknown := settings.keys() - _DEFAULTS.keys():
-            raise ValueError(
-                f"planning of the task {task.__name__!r} has {sorted(unknown)}: it takes {list(_DEFAULTS)}"
-            )
+            names = ", ".join(_DEFAULTS)
+            raise ValueError(f"planning of the task {task_name(task)!r} has {sorted(unknown)}: it takes {names}")
         self.horizon = whole_number("horizon", settings["horizon"], low=1)
         self.samples = whole_number("samples", settings["samples"], low=1)
         self.iterations = whole_number("iterations", settings["iterations"], low=1)

@@ -1,0 +1,68 @@
+"""The command line: tasks, train, eval, plan."""
+
+import importlib.metadata
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import tyro
+
+from lyceum_warp.cli.common import Interrupted, signals
+from lyceum_warp.cli.evaluate import Eval, evaluate_run
+from lyceum_warp.cli.tasks import Tasks, list_tasks
+from lyceum_warp.cli.train import Train, resume, saved_options, train
+from lyceum_warp.viz.video import NoVideoError
+
+_Command = Annotated[Tasks, tyro.conf.subcommand("tasks")] \
+    | Annotated[Train, tyro.conf.subcommand("train")] \
+    | Annotated[Eval, tyro.conf.subcommand("eval")]  # fmt: skip
+
+_DESCRIPTION = """Batched MuJoCo worlds for robot learning.
+
+$ lyceum-warp tasks
+$ lyceum-warp train hopper --iterations 100
+$ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The program ``lyceum-warp``.
+
+    Returns:
+        0; 1 if --require-return was not met; 2 for bad input; 130 or 143 after Ctrl-C or SIGTERM.
+    """
+    argv = list(sys.argv[1:] if argv is None else argv)
+    if argv == ["--version"]:
+        print(f"lyceum-warp {importlib.metadata.version('lyceum-warp')}")
+        return 0
+    try:
+        with signals():
+            command = _parse(argv)
+            if isinstance(command, Tasks):
+                return list_tasks()
+            if isinstance(command, Eval):
+                return evaluate_run(command)
+            if command.resume is not None:
+                return resume(_parse(argv, saved_options(command.resume)), command.resume)
+            return train(command)
+    except (ValueError, FileNotFoundError, FloatingPointError, ImportError, NoVideoError) as error:
+        print(f"lyceum-warp: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except Interrupted as signalled:
+        return 128 + signalled.number
+    except BrokenPipeError:  # as in: lyceum-warp tasks | head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _parse(argv: Sequence[str], default: Train | None = None) -> Any:
+    options = {} if default is None else {"default": default}
+    return tyro.cli(  # type: ignore[call-overload]
+        _Command,
+        prog="lyceum-warp",
+        description=_DESCRIPTION,
+        args=argv,
+        config=(tyro.conf.OmitSubcommandPrefixes,),
+        **options,
+    )

@@ -1,0 +1,78 @@
+"""lyceum-warp eval."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import rich.box
+import tyro
+from rich.table import Table
+
+from lyceum_warp.algos.rollout import Episodes, evaluate
+from lyceum_warp.env import Env
+from lyceum_warp.report import filmed, make_console
+from lyceum_warp.runs import Run, load
+from lyceum_warp.viz.video import check_video
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Eval:
+    """Run the mean policy of a run for whole episodes and print what came of them.
+
+    $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    episodes: int = 32
+    """How many."""
+    seed: int = 1
+    """Seed of the initial states."""
+    nworld: int = 32
+    """Worlds that step at once, at most; no more than there are episodes."""
+    engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
+    """Another engine than the run's: mujoco, warp or auto."""
+    device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
+    """Another device than the run's."""
+    video: bool = False
+    """Whether to film the first episode of one world, into eval.mp4 in the run's folder."""
+
+
+def evaluate_run(options: Eval) -> int:
+    """The command."""
+    if options.episodes < 1 or options.nworld < 1:
+        raise ValueError(f"eval needs at least 1 episode and 1 world, not {options.episodes} and {options.nworld}")
+    if options.video:
+        check_video()
+    run = Run.open(options.run)
+    config = run.config
+    nworld = min(options.nworld, options.episodes)
+    device = options.device or config["device"]
+    env = Env(
+        config["task"], nworld=nworld, engine=options.engine or config["engine"], device=device, **config["params"]
+    )
+    policy = load(run, device=env.obs.device)
+    sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
+    if sizes != wanted:
+        raise ValueError(
+            f"the policy in {options.run} takes {sizes[0]} observations and gives {sizes[1]} actions, but the task "
+            f"{env.task.name!r} now has {wanted[0]} and {wanted[1]}: evaluate it with the task as it was"
+        )
+    episodes = evaluate(env, policy, options.episodes, seed=options.seed)
+    episodes = Episodes(*(getattr(episodes, f.name)[: options.episodes] for f in dataclasses.fields(episodes)))
+    table = Table(box=rich.box.SIMPLE)
+    for heading in ("", "mean", "std", "min", "max"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for name, values in (("return", episodes.returns), ("evaluation at the end", episodes.evals),
+                         ("last reward", episodes.rewards), ("length", episodes.lengths)):  # fmt: skip
+        numbers = (values.mean(), values.std(correction=0), values.min(), values.max())
+        table.add_row(name, *(f"{number.item():.6g}" for number in numbers))
+    console = make_console()
+    console.print(f"{env.task.name}: {options.episodes} episodes of the mean policy in {options.run}", soft_wrap=True)
+    console.print(table)
+    if env.task.functions["success"] is not None:
+        console.print(f"success: {episodes.success.mean().item():.0%}")
+    if options.video:
+        video = filmed(env, policy, run.folder / "eval.mp4", options.seed)
+        console.print(f"video: {video}", soft_wrap=True, markup=False)
+    return 0

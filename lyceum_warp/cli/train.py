@@ -1,0 +1,237 @@
+"""lyceum-warp train."""
+
+import dataclasses
+import datetime
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+from rich.console import Console
+
+from lyceum_warp.algos.npg import NPG, NPGConfig
+from lyceum_warp.algos.rollout import Episodes, evaluate
+from lyceum_warp.cli.common import Interrupted, parameter, portable, spelled
+from lyceum_warp.env import Env
+from lyceum_warp.registry import find_task, task_name, task_names
+from lyceum_warp.report import Display, curve_table, filmed, make_console, plotted
+from lyceum_warp.runs import Run, versions
+
+_FINAL_EPISODES = 32
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Train:
+    """Train a policy on a task with the natural policy gradient.
+
+    The run's folder then holds config.json, versions.json, metrics.csv (a row an iteration), checkpoint.pt,
+    curve.png and video.mp4. The checkpoint is renewed after every iteration: Ctrl-C loses only the one that
+    is under way.
+
+    $ lyceum-warp train hopper --iterations 100 --seed 1
+    $ lyceum-warp train half_cheetah --param ctrl_cost_weight=0.05 --param reset_noise_scale=0 --hidden 32 32
+    $ lyceum-warp train path/to/my_task.py --samples 4000 --out runs/mine
+    $ lyceum-warp train --resume runs/mine --iterations 200
+    """
+
+    task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
+    """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
+    iterations: int = 100
+    """Iterations in total, those before --resume included."""
+    seed: int = 0
+    """Seed of the networks, the noise and the worlds' initial states."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """The run's folder, new or empty; runs/TASK-DATE by default."""
+    resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Continue the run in this folder, exactly and with all its settings. --iterations says up to where."""
+    engine: str = "auto"
+    """mujoco (C, on CPU cores), warp, or auto: warp on CUDA and mujoco on the CPU."""
+    device: str = "cpu"
+    """cpu, or a CUDA device such as cuda:0."""
+    nworld: int = 64
+    """Worlds that step at once, each samples / nworld steps in an iteration: whole episodes where those fit (the
+    paper's way: 10 worlds for 10,000 samples and episodes of 1,000 steps), segments of them elsewhere."""
+    threads: int = 1
+    """Threads of torch on the CPU. Small networks gain little from more, and a number that is the same everywhere
+    keeps runs the same to the bit. The mujoco engine uses all cores in any case."""
+    param: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf; may be given several times."""
+    video: bool = True
+    """Whether to film an episode of the trained policy at the end."""
+    plot: bool = True
+    """Whether to draw the learning curve at the end."""
+    require_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    """Exit with code 1 unless the trained mean policy's return exceeds this."""
+    npg: tyro.conf.OmitArgPrefixes[NPGConfig] = dataclasses.field(default_factory=NPGConfig)
+
+
+def train(options: Train) -> int:
+    """The command."""
+    if options.task is None:
+        raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
+    _check_iterations(options.iterations)
+    task = find_task(options.task)
+    out = options.out or Path("runs", f"{task_name(task)}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
+    Run.check_free(out)
+    # all that can be wrong with the options comes to light before the folder is made
+    config = {
+        "algorithm": "npg",
+        "task": portable(options.task),
+        "params": dict(parameter(text) for text in options.param),
+        "engine": options.engine,
+        "device": options.device,
+        "nworld": options.nworld,
+        "threads": options.threads,
+        "seed": options.seed,
+        "iterations": options.iterations,
+        "npg": dataclasses.asdict(options.npg),
+    }
+    npg = _algorithm(config)
+    run = Run.create(out, config, device=options.device)
+    run.save(0, npg.policy, npg.state_dict(), npg.value)
+    return _learn(run, npg, options)
+
+
+def saved_options(folder: Path) -> Train:
+    """The options that a run was started with."""
+    config = Run.open(folder).config
+    try:
+        npg = _hyperparameters(config)
+        return Train(
+            task=config["task"], iterations=config["iterations"], seed=config["seed"], resume=folder,
+            engine=config["engine"], device=config["device"], nworld=config["nworld"],
+            threads=config["threads"],
+            param=tuple(f"{name}={spelled(value)}" for name, value in config["params"].items()), npg=npg,
+        )  # fmt: skip
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{folder / 'config.json'} is not the configuration of an NPG run ({error})") from error
+
+
+def resume(options: Train, folder: Path) -> int:
+    """The command with --resume; ``options`` are those of the run, with what was given on top of them."""
+    run = Run.open(folder)
+    given, saved = (_settings(o) for o in (options, saved_options(folder)))
+    for name, value in given.items():
+        if value != saved[name]:
+            raise ValueError(
+                f"the run in {folder} has {name} {spelled(saved[name])}, not {spelled(value)}, and a run keeps its "
+                f"settings: leave the option out, or start a new run without --resume"
+            )
+    if options.out not in (None, folder):
+        raise ValueError(f"a resumed run stays in its folder {folder}: leave out --out")
+    checkpoint = run.read()
+    done = checkpoint["iteration"]
+    if options.iterations <= done:
+        raise ValueError(
+            f"the run in {folder} has {done} iterations already: ask for more, as in --iterations {2 * done}"
+        )
+    npg = _algorithm(run.config)
+    try:
+        npg.load_state_dict(run.read(npg.env.obs.device)["state"])
+    except (KeyError, RuntimeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {reason}") from error
+    _warn_of_versions(run)
+    run.cut(done)
+    run.amend(iterations=options.iterations)
+    return _learn(run, npg, options)
+
+
+def _settings(options: Train) -> dict[str, Any]:
+    """What a resumed run has to keep."""
+    free = ("iterations", "out", "resume", "video", "plot", "require_return", "npg", "param")
+    settings = {f.name: getattr(options, f.name) for f in dataclasses.fields(options) if f.name not in free}
+    settings["task"] = portable(options.task or "")
+    settings["param"] = dict(parameter(text) for text in options.param)
+    return settings | dataclasses.asdict(options.npg)
+
+
+def _hyperparameters(config: dict[str, Any]) -> NPGConfig:
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in config["npg"].items()}
+    return NPGConfig(**values)
+
+
+def _algorithm(config: dict[str, Any]) -> NPG:
+    if config["threads"] < 1:
+        raise ValueError(f"threads has to be at least 1, not {config['threads']}")
+    torch.set_num_threads(config["threads"])
+    env = Env(
+        config["task"], nworld=config["nworld"], engine=config["engine"], device=config["device"],
+        seed=config["seed"], **config["params"],
+    )  # fmt: skip
+    npg = _hyperparameters(config)
+    return NPG(env, config=npg, seed=config["seed"])
+
+
+def _learn(run: Run, npg: NPG, options: Train) -> int:
+    console = make_console()
+    env = npg.env
+    engine = {"auto": "mujoco" if env.device.is_cpu else "warp"}.get(options.engine, options.engine)
+    console.print(
+        f"[bold]{env.task.name}[/]: {env.obs_space.size} observations, {env.action_space.size} actions; "
+        f"{env.nworld} worlds, {engine} engine on {options.device}, "
+        f"{'segments' if npg.segments else 'episodes'} of {npg.rollout.steps} steps; run in {run.folder}",
+        soft_wrap=True,
+    )  # fmt: skip
+    try:
+        with Display(console, npg.iteration, options.iterations) as display:
+            while npg.iteration < options.iterations:
+                record = next(npg)
+                run.write(dataclasses.asdict(record))
+                run.save(npg.iteration, npg.policy, npg.state_dict(), npg.value)
+                display(record)
+    except Interrupted as signalled:
+        # iterations count when their checkpoint is complete; what is under way is lost
+        done = run.read()["iteration"]
+        run.cut(done)
+        told = f"interrupted by {signal.Signals(signalled.number).name} after {done} of {options.iterations} iterations"
+        mend = f"lyceum-warp train --resume {run.folder} --iterations {options.iterations}"
+        console.print(f"{told}; continue with\n  {mend}", soft_wrap=True, markup=False)
+        raise
+    return _report(run, npg, options, console)
+
+
+def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:
+    """What came of it: the table, the curve, the video, and whether it is enough."""
+    rows = run.rows()
+    console.print(curve_table(rows))
+    episodes = evaluate(npg.env.replicate(nworld=_FINAL_EPISODES), npg.policy, _FINAL_EPISODES, seed=options.seed + 1)
+    console.print(f"mean policy, {len(episodes.returns)} new episodes: {_returns(episodes)}", soft_wrap=True)
+    paths = [("checkpoint", str(run.checkpoint)), ("metrics", str(run.metrics))]
+    if options.plot:
+        paths.append(("curve", plotted(run)))
+    if options.video:
+        paths.append(("video", filmed(npg.env, npg.policy, run.folder / "video.mp4", options.seed + 1)))
+    for name, path in paths:
+        console.print(f"{name + ':':<12}{path}", soft_wrap=True, markup=False)
+    final = episodes.returns.mean().item()
+    if options.require_return is not None and not final > options.require_return:
+        print(
+            f"lyceum-warp: the mean policy's return is {final:.1f}; --require-return asks for more than "
+            f"{options.require_return:g}",
+            file=sys.stderr,
+        )
+        return 1
+    return 0
+
+
+def _returns(episodes: Episodes) -> str:
+    r = episodes.returns
+    return f"return {r.mean():.1f} ± {r.std(correction=0):.1f} ({r.min():.1f} to {r.max():.1f})"
+
+
+def _warn_of_versions(run: Run) -> None:
+    changed = run.changed(versions(run.config["device"]))
+    if changed:
+        told = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
+        print(f"lyceum-warp: the run goes on with other versions, so not to the bit: {told}", file=sys.stderr)
+
+
+# lyceum-warp eval
+
+
+def _check_iterations(iterations: int) -> None:
+    if iterations < 1:
+        raise ValueError(f"iterations has to be at least 1, not {iterations}")
