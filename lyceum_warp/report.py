@@ -5,12 +5,15 @@ import sys
 from pathlib import Path
 
 import rich.box
+import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from lyceum_warp.algos.control import ControlProgress
 from lyceum_warp.algos.npg import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.trajectory import ControlReport, Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs import Run
 
@@ -102,8 +105,79 @@ def filmed(env: Env, policy: GaussianPolicy, path: Path, seed: int) -> str:
     """Film an episode of a policy; the video's path, or why there is none."""
     from lyceum_warp.viz import video
 
+    one = env.replicate(nworld=1, autoreset=False)
     try:
-        one = env.replicate(nworld=1, autoreset=False)
-        return str(video.record(one, video.episode(one, policy, seed=seed), path))
+        return filmed_states(one, video.episode(one, policy, seed=seed), path)
+    except ValueError as error:
+        return f"none: {error}"
+
+
+def filmed_states(env: Env, states: torch.Tensor, path: Path) -> str:
+    """Film given states; the video's path, or why there is none."""
+    from lyceum_warp.viz import video
+
+    try:
+        return str(video.record(env, states, path))
     except (video.NoVideoError, ValueError) as error:
+        return f"none: {error}"
+
+
+# plans
+
+
+class PlanDisplay:
+    """Progress of an episode under a planner: a live line on a terminal, and a line an episode everywhere.
+
+    Rate and real-time factor are of the episode so far.
+    """
+
+    def __init__(self, console: Console, episode: int, episodes: int, steps: int, timestep: float) -> None:
+        self.console, self.timestep = console, timestep
+        self.title = f"episode {episode + 1}/{episodes}"
+        self.progress = Progress(
+            TextColumn(self.title), BarColumn(bar_width=8), MofNCompleteColumn(), TextColumn("{task.fields[text]}"),
+            console=console, disable=not console.is_terminal, transient=True,
+        )  # fmt: skip
+        self.bar = self.progress.add_task("", total=steps, text="")
+
+    def __enter__(self) -> "PlanDisplay":
+        self.progress.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.progress.stop()
+
+    def __call__(self, now: ControlProgress) -> None:
+        """Show a step."""
+        if self.console.is_terminal:
+            rate = now.step / max(now.time, 1e-9)
+            text = f"reward {now.reward:.3g} eval {now.eval:.3g} {rate:.0f} Hz {rate * self.timestep:.2f}x real time"
+            self.progress.update(self.bar, completed=now.step, text=text)
+
+    def done(self, trajectory: Trajectory) -> None:
+        """Say what came of the episode."""
+        factor = trajectory.steps * trajectory.timestep / trajectory.wall_seconds
+        end = "success, " if trajectory.succeeded else "ended early, " if trajectory.terminated else ""
+        self.console.print(
+            f"{self.title}: {end}return {trajectory.episode_return:.4g}, evaluation {trajectory.evals[-1]:.3g} after "
+            f"{trajectory.steps} steps, {trajectory.wall_seconds:.3g} s, {factor:.2f}x real time", soft_wrap=True,
+        )  # fmt: skip
+        sys.stdout.flush()
+
+
+def report_table(report: ControlReport) -> Table:
+    """A controller's report."""
+    table = Table(box=rich.box.SIMPLE, show_header=False)
+    for row in report.rows():
+        table.add_row(*row)
+    return table
+
+
+def plotted_control(trajectories: list[Trajectory], path: Path) -> str:
+    """Draw trajectories; the picture's path, or why there is none."""
+    try:
+        from lyceum_warp.viz.control import control_plot
+
+        return str(control_plot(trajectories, path))
+    except ImportError as error:
         return f"none: {error}"

@@ -25,7 +25,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.kernels import planning
 from lyceum_warp.kernels.arrays import torch_view
 from lyceum_warp.openloop import OpenLoop
-from lyceum_warp.registry import find_task
+from lyceum_warp.registry import find_task, task_name
 from lyceum_warp.spaces import Space
 from lyceum_warp.task import Task
 from lyceum_warp.validate import described, whole_number
@@ -71,6 +71,8 @@ class MPPI:
         ValueError: An argument makes no sense; the message says which and why.
     """
 
+    settings: dict[str, Any]
+    """The settings above as they are, from horizon to termination; numbers, words and lists of them."""
     actions: torch.Tensor
     """The plan, (horizon, nu); the first row is what the last call returned."""
     nominal: torch.Tensor
@@ -110,6 +112,7 @@ class MPPI:
         if unknown := settings.keys() - _DEFAULTS.keys():
             names = ", ".join(_DEFAULTS)
             raise ValueError(f"planning of the task {task_name(task)!r} has {sorted(unknown)}: it takes {names}")
+        self.settings = {name: _plain(value) for name, value in settings.items()}
         self.horizon = whole_number("horizon", settings["horizon"], low=1)
         self.samples = whole_number("samples", settings["samples"], low=1)
         self.iterations = whole_number("iterations", settings["iterations"], low=1)
@@ -292,6 +295,10 @@ _DEFAULTS: dict[str, Any] = dict(
     horizon=32, samples=64, temperature=0.1, noise=0.5, smoothing=(0.25, 0.8, 0.0), discount=1.0, iterations=1,
     fill="zero", termination="stop",
 )  # fmt: skip
+
+
+def _plain(value: Any) -> Any:
+    return value if isinstance(value, (int, float, str)) else np.asarray(value).tolist()
 
 
 def _number(name: str, value: Any, low: float, high: float = math.inf) -> float:

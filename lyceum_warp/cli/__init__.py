@@ -10,19 +10,22 @@ import tyro
 
 from lyceum_warp.cli.common import Interrupted, signals
 from lyceum_warp.cli.evaluate import Eval, evaluate_run
+from lyceum_warp.cli.plan import Plan, plan
 from lyceum_warp.cli.tasks import Tasks, list_tasks
 from lyceum_warp.cli.train import Train, resume, saved_options, train
 from lyceum_warp.viz.video import NoVideoError
 
 _Command = Annotated[Tasks, tyro.conf.subcommand("tasks")] \
     | Annotated[Train, tyro.conf.subcommand("train")] \
-    | Annotated[Eval, tyro.conf.subcommand("eval")]  # fmt: skip
+    | Annotated[Eval, tyro.conf.subcommand("eval")] \
+    | Annotated[Plan, tyro.conf.subcommand("plan")]  # fmt: skip
 
 _DESCRIPTION = """Batched MuJoCo worlds for robot learning.
 
 $ lyceum-warp tasks
 $ lyceum-warp train hopper --iterations 100
 $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
+$ lyceum-warp plan reach --real-time
 """
 
 
@@ -43,6 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return list_tasks()
             if isinstance(command, Eval):
                 return evaluate_run(command)
+            if isinstance(command, Plan):
+                return plan(command)
             if command.resume is not None:
                 return resume(_parse(argv, saved_options(command.resume)), command.resume)
             return train(command)

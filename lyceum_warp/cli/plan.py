@@ -1,0 +1,180 @@
+"""lyceum-warp plan."""
+
+import dataclasses
+import datetime
+import signal
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+
+from lyceum_warp.algos.control import control, control_async
+from lyceum_warp.algos.mppi import MPPI
+from lyceum_warp.algos.trajectory import ControlReport, Trajectory, control_report
+from lyceum_warp.cli.common import Interrupted, parameter, portable
+from lyceum_warp.env import Env
+from lyceum_warp.registry import find_task, task_name
+from lyceum_warp.report import PlanDisplay, filmed_states, make_console, plotted_control, report_table
+from lyceum_warp.runs import Run, load_value
+from lyceum_warp.validate import whole_number
+
+Words = tyro.conf.UseAppendAction[tuple[str, ...]]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Control a task with MPPI: plan anew at every step, and report how well and how fast.
+
+    The folder then holds config.json, versions.json, a file for each episode (episode-000.npz: states, actions,
+    rewards, evaluations, times; numpy reads it), report.json, plan.png and video.mp4 of the first episode. What is
+    not given of the planner's settings comes from the task.
+
+    $ lyceum-warp plan reach
+    $ lyceum-warp plan reach --real-time --episodes 10
+    $ lyceum-warp plan half_cheetah --steps 200 --samples 128 --temperature 1
+    $ lyceum-warp plan hopper --steps 300 --horizon 16 --value runs/hopper-20260101-120000 --discount 0.995
+    """
+
+    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
+    """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
+    episodes: int = 1
+    """How many."""
+    steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Steps of an episode; by default the task's horizon."""
+    seed: int = 0
+    """Seed of the first episode's initial state and noise; the next episode has the next number."""
+    real_time: bool = False
+    """Let the world run at its own rate while the planner plans, instead of waiting for each plan."""
+    rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
+    """Plans a second that are asked for, which makes the deadline; by default one a step."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """The folder, new or empty; runs/plan-TASK-DATE by default."""
+
+    horizon: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Steps of a plan."""
+    samples: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Roll-outs for each improvement of the plan."""
+    temperature: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    """In units of reward: low ones follow the best sample, high ones average all."""
+    noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
+    """Standard deviation of the noise, one number or one for each action."""
+    smoothing: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="B0 B1 B2")] = None
+    """Weights of the noise, of the last step's and of the one before it; 1 0 0 is white noise."""
+    discount: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    """Of rewards and of the terminal value, a step."""
+    iterations: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Improvements of the plan at every step."""
+    fill: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
+    """What fills the end of a plan that moves forward: zero, or repeat."""
+    termination: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
+    """Whether a sample that ends its episode stops earning (stop) or not (ignore)."""
+    value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
+    """Run of NPG whose value function tells what the end of a plan is worth."""
+
+    engine: str = "auto"
+    """Engine of the planner: mujoco (C, on CPU cores), warp, or auto. The world itself runs on mujoco."""
+    device: str = "cpu"
+    """Device of the planner: cpu, or a CUDA device such as cuda:0."""
+    nthread: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Threads of the planner's mujoco engine; all cores by default."""
+    param: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf; may be given several times."""
+    planner_param: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Another value of a parameter, for the planner alone."""
+    planner_model: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Another model for the planner than for the world."""
+    video: bool = True
+    """Whether to film the first episode."""
+    plot: bool = True
+    """Whether to draw rewards, planning times and ages."""
+
+
+_SETTINGS = (
+    "horizon", "samples", "temperature", "noise", "smoothing", "discount", "iterations", "fill", "termination",
+)  # fmt: skip
+
+
+def plan(options: Plan) -> int:
+    """The command."""
+    whole_number("episodes", options.episodes, low=1)
+    if options.rate is not None and not 0 < options.rate < float("inf"):
+        raise ValueError(f"rate has to be a positive number of plans a second, not {options.rate}")
+    out = options.out or Path(
+        "runs", f"plan-{task_name(find_task(options.task))}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    )
+    Run.check_free(out)
+    # all that can be wrong with the options comes to light before the folder is made
+    torch.set_num_threads(1)
+    plant, planner = _worlds(options)
+    config = {
+        "algorithm": "mppi", "task": portable(options.task), "params": dict(map(parameter, options.param)),
+        "planner": planner.settings, "planner_params": dict(map(parameter, options.planner_param)),
+        "planner_model": options.planner_model and str(options.planner_model.resolve()),
+        "value": options.value and str(options.value.resolve()), "engine": planner.env.engine.name,
+        "device": options.device, "nthread": options.nthread, "episodes": options.episodes, "steps": options.steps,
+        "seed": options.seed, "real_time": options.real_time, "rate": options.rate,
+    }  # fmt: skip
+    return _run(Run.create(out, config, device=options.device), plant, planner, options)
+
+
+def _worlds(options: Plan) -> tuple[Env, MPPI]:
+    params = dict(map(parameter, options.param))
+    steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
+    plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
+    if plant.horizon == 0:
+        raise ValueError(f"episodes of {plant.task.name!r} never end without a horizon: give --steps")
+    settings = {name: getattr(options, name) for name in _SETTINGS}
+    if options.noise is not None and len(options.noise) == 1:
+        settings["noise"] = options.noise[0]
+    more: dict[str, Any] = {}
+    if options.nthread is not None:
+        more["nthread"] = options.nthread
+    if options.planner_model is not None:
+        more["model"] = options.planner_model
+    if options.value is not None:
+        more["value"] = load_value(options.value, device=options.device)
+    planner = MPPI(
+        options.task, **settings, engine=options.engine, device=options.device, **more,
+        **(params | dict(map(parameter, options.planner_param))),
+    )  # fmt: skip
+    return plant, planner
+
+
+def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
+    console = make_console()
+    console.print(
+        f"[bold]{plant.task.name}[/]: {planner.samples} samples of {planner.horizon} steps "
+        f"({planner.horizon * planner.timestep:.3g} s), {planner.env.engine.name} engine on {options.device}; "
+        f"{'real time' if options.real_time else 'the world waits'}; files in {run.folder}",
+        soft_wrap=True,
+    )  # fmt: skip
+    trajectories: list[Trajectory] = []
+    method: Any = control_async if options.real_time else control
+    try:
+        for episode in range(options.episodes):
+            with PlanDisplay(console, episode, options.episodes, plant.horizon, plant.timestep) as display:
+                trajectory = method(plant, planner, seed=options.seed + episode, on_step=display)
+            trajectory.save(run.folder / f"episode-{episode:03d}.npz")
+            trajectories.append(trajectory)
+            display.done(trajectory)
+            report = control_report(trajectories, rate=options.rate)
+            report.write(run.folder / "report.json")
+    except Interrupted as signalled:
+        told = f"interrupted by {signal.Signals(signalled.number).name} after {len(trajectories)} episodes"
+        console.print(f"{told}; they are in {run.folder}", soft_wrap=True, markup=False)
+        raise
+    return _tell(run, plant, trajectories, report, options)
+
+
+def _tell(run: Run, plant: Env, trajectories: list[Trajectory], report: ControlReport, options: Plan) -> int:
+    console = make_console()
+    console.print(report_table(report))
+    paths = [("episodes", str(run.folder / "episode-*.npz")), ("report", str(run.folder / "report.json"))]
+    if options.plot:
+        paths.append(("plot", plotted_control(trajectories, run.folder / "plan.png")))
+    if options.video:
+        paths.append(("video", filmed_states(plant, trajectories[0].states, run.folder / "video.mp4")))
+    for name, path in paths:
+        console.print(f"{name + ':':<12}{path}", soft_wrap=True, markup=False)
+    return 0

@@ -1,0 +1,497 @@
+"""Controllers in step with the world and against the clock, and what is reported of them."""
+
+import dataclasses
+import json
+import math
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import lyceum_warp as lw
+from lyceum_warp.algos import control as module
+from lyceum_warp.algos.control import ControlProgress, control, control_async
+from lyceum_warp.algos.trajectory import Trajectory, control_report, wilson
+
+
+@pytest.fixture(scope="module")
+def env() -> lw.Env:
+    return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
+
+
+def towards(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+    """Push the point to its target."""
+    x, y, vx, vy, tx, ty = obs
+    return torch.stack([2 * (tx - x) - vx, 2 * (ty - y) - vy]).clamp(-1, 1)
+
+
+class Planner:
+    """Says in its actions which state they were planned from, and for how many steps later they are."""
+
+    def __init__(self, env: lw.Env, horizon: int = 8, seconds: float = 0.0) -> None:
+        self.timestep = env.timestep
+        self.actions = torch.zeros(horizon, 2)
+        self.seconds = seconds
+        self.column = env.state_space.parts["step"].start
+        self.shifts: list[int] = []
+        self.resets: list[int | None] = []
+
+    def __call__(self, state: torch.Tensor, obs: torch.Tensor | None = None, *, shift: int = 1) -> torch.Tensor:
+        assert not torch.is_grad_enabled()
+        self.shifts.append(shift)
+        time.sleep(self.seconds)
+        self.actions[:, 0] = state[self.column].float() / 100
+        self.actions[:, 1] = torch.arange(len(self.actions)) / 100
+        return self.actions[0].clone()
+
+    def reset(self, seed: int | None = None) -> None:
+        self.resets.append(seed)
+
+
+# in step
+
+
+def test_an_episode(env: lw.Env) -> None:
+    seen: list[ControlProgress] = []
+    episode = control(env, towards, seed=3, on_step=seen.append)
+    assert episode.steps == 40 and episode.truncated and not episode.terminated
+    assert episode.states.shape == (41, env.state_space.size) and episode.states.dtype == torch.float64
+    assert episode.obs.shape == (41, 6) and episode.actions.shape == (40, 2)
+    assert episode.evals[-1] < episode.evals[0]
+    assert episode.mode == "sync" and episode.period == episode.timestep == env.timestep
+    assert torch.equal(episode.plan_of, torch.arange(40)) and not episode.age_steps.any() and not episode.late.any()
+    assert torch.allclose(episode.actions[7], towards(episode.states[7], episode.obs[7]))
+    assert (episode.ages >= episode.plan_times).all() and (episode.times.diff() > 0).all()
+    assert float(episode.plan_times.sum()) < episode.wall_seconds
+    assert [progress.step for progress in seen] == list(range(1, 41))
+    assert seen[-1].eval == episode.evals[-1] and seen[4].age == episode.ages[4]
+
+
+def test_an_episode_replays_exactly(env: lw.Env) -> None:
+    episode = control(env, towards, seed=5)
+    env.set_state(episode.states[:1])
+    for k, action in enumerate(episode.actions):
+        env.step(action[None])
+        assert torch.equal(env.get_state()[0], episode.states[k + 1])
+        assert torch.equal(env.obs[0], episode.obs[k + 1])
+        assert env.reward[0] == episode.rewards[k] and env.eval[0] == episode.evals[k]
+
+
+def test_the_seed_decides(env: lw.Env) -> None:
+    one, same, other = (control(env, towards, seed=seed, steps=3) for seed in (1, 1, 2))
+    assert torch.equal(one.states, same.states) and not torch.equal(one.states, other.states)
+    assert one.done_reason == 0 and one.steps == 3
+
+
+def test_a_controller_is_told_of_shift_and_reset(env: lw.Env) -> None:
+    planner = Planner(env)
+    control(env, planner, seed=4, steps=4)
+    assert planner.shifts == [0, 1, 1, 1] and planner.resets == [4]
+    episode = control(env, planner, steps=3, reset=False)
+    assert planner.shifts[4:] == [1, 1, 1] and planner.resets == [4]
+    assert torch.allclose(episode.actions[:, 0], torch.tensor([0.04, 0.05, 0.06]))
+    planner.shifts.clear()
+    planner.timestep = 2 * env.timestep
+    control(env, planner, steps=6)
+    assert planner.shifts == [0, 1, 0, 1, 0, 1]
+
+
+def test_what_does_not_fit(env: lw.Env, shared_env: Callable[..., lw.Env]) -> None:
+    for other in (shared_env("point_mass"), shared_env("point_mass", nworld=2, autoreset=False)):
+        with pytest.raises(ValueError, match="one world without automatic resets"):
+            control(other, towards)
+        with pytest.raises(ValueError, match="one world without automatic resets"):
+            control_async(other, towards)
+    with pytest.raises(ValueError, match="give steps, or a horizon"):
+        control(shared_env("point_mass", autoreset=False, horizon=0), towards)
+    with pytest.raises(ValueError, match="steps has to be a whole number"):
+        control(env, towards, steps=0)
+    with pytest.raises(ValueError, match="can't"):
+        control(env, "towards")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="a seed needs a reset"):
+        control(env, towards, seed=1, reset=False)
+    for period in (0.0, math.nan, math.inf, "fast"):
+        with pytest.raises(ValueError, match="period has to be a positive number of seconds"):
+            control_async(env, towards, period=period)  # type: ignore[arg-type]
+    control(env, towards)
+    with pytest.raises(ValueError, match="over before its first step"):
+        control(env, towards, reset=False)
+
+
+@pytest.mark.parametrize("run", [control, control_async])
+def test_what_is_no_action(env: lw.Env, run: Callable[..., Trajectory]) -> None:
+    with pytest.raises(ValueError, match=r"return an action of shape \(2,\), not a float32 tensor of shape \(1, 2\)"):
+        run(env, lambda state, obs: torch.zeros(1, 2))
+    with pytest.raises(ValueError, match=r"return an action of shape \(2,\), not NoneType None"):
+        run(env, lambda state, obs: None)
+    with pytest.raises(ValueError, match=r"wants 'y' to be nan at step 0: it has to be finite"):
+        run(env, lambda state, obs: torch.tensor([0.0, math.nan]))
+    planner = Planner(env)
+    planner.actions = torch.zeros(8, 3)
+    with pytest.raises(ValueError, match=r"have actions of shape \(horizon, 2\)"):
+        run(env, type("Bad", (), {"actions": planner.actions, "__call__": lambda *_: torch.zeros(2)})())
+
+
+# by the clock, without one: everything happens at the time that it should
+
+
+class Clock:
+    """Stands still but for who waits, and for those who say that they take time."""
+
+    def __init__(self) -> None:
+        self.time = 100.0
+
+    def now(self) -> float:
+        return self.time
+
+    def wait_until(self, moment: float) -> None:
+        self.time = max(self.time, moment)
+
+
+class Plans:
+    """Plans that take a given time of the clock, one after the other, from the newest state each."""
+
+    def __init__(self, controller: Any, clock: Clock, seconds: float, first: tuple[torch.Tensor, torch.Tensor]) -> None:
+        self.controller, self.clock, self.seconds = controller, clock, seconds
+        actions = controller(*first, 0, 0)
+        self.plans = [module._Plan(0, 0, clock.time - seconds, seconds, actions)]
+        self.free = clock.time
+        self.waiting: tuple[float, int, torch.Tensor, torch.Tensor] | None = None
+
+    def work(self) -> None:
+        while self.waiting is not None and max(self.free, self.waiting[0]) + self.seconds <= self.clock.time + 1e-9:
+            published, step, state, obs = self.waiting
+            begun = max(self.free, published)
+            actions = self.controller(state, obs, 1, step)
+            self.plans.append(module._Plan(len(self.plans), step, begun, self.seconds, actions))
+            self.free, self.waiting = begun + self.seconds, None
+
+    def newest(self) -> module._Plan:
+        self.work()
+        return self.plans[-1]
+
+    def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor) -> None:
+        self.work()
+        # a planner that is busy takes what is newest when it is done
+        published = self.clock.time
+        self.waiting = (published, step, state, obs)
+
+
+def clocked(
+    env: lw.Env, *, seconds: float, steps: int, horizon: int = 8, busy: dict[int, float] | None = None
+) -> Trajectory:
+    """A run on the clock above, with a period of one second."""
+    env.rand_reset(0)
+    clock = Clock()
+    controller = module._Controller(Planner(env, horizon), env)
+    recording = module._Recording(env, "async", 1.0)
+    with torch.no_grad():
+        plans = Plans(controller, clock, seconds, (recording.states[0], recording.obs[0]))
+
+        def on_step(progress: ControlProgress) -> None:
+            clock.time += (busy or {}).get(progress.step - 1, 0.0)
+
+        start = clock.now()
+        wall = module._run_plant(env, controller, plans, clock, recording, start, steps, on_step)  # type: ignore[arg-type]
+    for plan in plans.plans:
+        recording.plan(plan, start)
+    return recording.trajectory(wall)
+
+
+def hundredths(values: torch.Tensor) -> list[int]:
+    return (100 * values).round().int().tolist()
+
+
+def test_a_fast_planner_is_a_step_behind(env: lw.Env) -> None:
+    episode = clocked(env, seconds=0.3, steps=6)
+    assert episode.times.tolist() == pytest.approx([0, 1, 2, 3, 4, 5])
+    assert episode.age_steps.tolist() == [0, 1, 1, 1, 1, 1]
+    assert episode.ages.tolist() == pytest.approx([0, 1, 1, 1, 1, 1])
+    assert hundredths(episode.actions[:, 0]) == [0, 0, 1, 2, 3, 4]  # the state that it was planned from
+    assert hundredths(episode.actions[:, 1]) == [0, 1, 1, 1, 1, 1]  # the second action of each plan
+    assert episode.wall_seconds == pytest.approx(6)
+    report = control_report(episode)
+    assert (report.misses, report.late_ticks, report.age_steps_max) == (0, 0, 1)
+    assert report.tick_jitter_ms == pytest.approx(0, abs=1e-6)
+    assert report.deadline_ms == 1000
+    assert report.real_time_factor == pytest.approx(env.timestep)
+
+
+def test_a_slow_planner_misses_deadlines(env: lw.Env) -> None:
+    episode = clocked(env, seconds=2.5, steps=9)
+    # the plan from state 1 is there at 3.5; the next, from the newest state then, is begun at 3.5 and there at 6
+    assert episode.plan_of.tolist() == [0, 0, 0, 0, 1, 1, 2, 2, 2]
+    assert episode.plan_steps[:3].tolist() == [0, 1, 3]
+    assert episode.ages.tolist() == pytest.approx([0, 1, 2, 3, 3, 4, 3, 4, 5])
+    assert hundredths(episode.actions[:, 1]) == [0, 1, 2, 3, 3, 4, 3, 4, 5]
+    report = control_report(episode)
+    assert report.misses == report.plans == len(episode.plan_times) - 1 and report.miss_share == 1
+    assert report.age_steps_max == 5 and report.age_max_ms == pytest.approx(5000)
+    assert control_report(episode, rate=0.1).misses == 0
+
+
+def test_a_plan_that_is_used_up_holds_its_last_action(env: lw.Env) -> None:
+    assert hundredths(clocked(env, seconds=100, steps=6, horizon=3).actions[:, 1]) == [0, 1, 2, 2, 2, 2]
+    assert hundredths(clocked(env, seconds=100, steps=4, horizon=1).actions[:, 1]) == [0, 0, 0, 0]
+
+
+def test_a_plant_that_overruns_keeps_its_schedule(env: lw.Env) -> None:
+    episode = clocked(env, seconds=0.1, steps=6, busy={1: 2.25})
+    assert episode.times.tolist() == pytest.approx([0, 1, 3.25, 3.25, 4, 5])
+    assert episode.late.tolist() == [False, False, True, True, False, False]
+    report = control_report(episode)
+    assert report.late_ticks == 2 and report.tick_delay_max_ms == pytest.approx(1250)
+    assert report.tick_jitter_ms == pytest.approx(np.std([0, 0, 1250, 250, 0, 0], ddof=1))
+    assert report.misses == 0
+
+
+def test_which_action_is_for_now(env: lw.Env) -> None:
+    planner = Planner(env)
+    planner.timestep = 2 * env.timestep
+    coarse = module._Controller(planner, env)
+    assert [coarse.index(steps, 3) for steps in range(8)] == [0, 1, 1, 2, 2, 2, 2, 2]
+    planner.timestep = env.timestep / 2
+    fine = module._Controller(planner, env)
+    assert [fine.index(steps, 8) for steps in range(6)] == [0, 2, 4, 6, 7, 7]
+
+
+# by the clock, with a thread: slow periods, and much slower controllers
+
+
+def planner_threads() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "lyceum_warp planner"]
+
+
+def test_a_planner_in_a_thread(env: lw.Env) -> None:
+    planner, interval = Planner(env, seconds=0.12), sys.getswitchinterval()
+    episode = control_async(env, planner, period=0.04, seconds=0.4, seed=6)
+    assert episode.steps == 10 and episode.mode == "async" and episode.period == 0.04
+    assert planner.resets == [6, 6]
+    assert planner.shifts[:3] == [0, 0, 0]
+    assert planner.shifts[3:] == episode.plan_steps.diff().tolist()
+    # whatever the machine was busy with: each action is what its plan has for its step
+    assert hundredths(episode.actions[:, 0]) == episode.plan_steps[episode.plan_of].tolist()
+    assert hundredths(episode.actions[:, 1]) == episode.age_steps.clamp(max=7).tolist()
+    assert episode.plan_starts[0] < 0 and episode.ages[0] == 0 and (episode.plan_starts[1:] > 0).all()
+    report = control_report(episode)
+    assert report.misses == report.plans > 0 and report.age_steps_max > 1 and report.age_max_ms > 80
+    assert report.plan_max_ms is not None and report.plan_max_ms >= 120
+    assert episode.wall_seconds >= 0.4
+    assert not planner_threads() and sys.getswitchinterval() == interval
+    env.set_state(episode.states[:1])
+    for k, action in enumerate(episode.actions):
+        env.step(action[None])
+        assert torch.equal(env.get_state()[0], episode.states[k + 1])
+
+
+def test_a_policy_in_a_thread_is_in_time(env: lw.Env) -> None:
+    episode = control_async(env, towards, period=0.03, steps=12, seed=6)
+    assert episode.age_steps[0] == 0 and (episode.age_steps[1:] >= 1).all()
+    for k in range(12):
+        made_from = int(episode.plan_steps[episode.plan_of[k]])
+        assert torch.allclose(episode.actions[k], towards(episode.states[made_from], episode.obs[made_from]))
+
+
+def test_an_episode_ends_by_itself_when_it_is_over(env: lw.Env) -> None:
+    episode = control_async(env, towards, period=0.001, steps=1000)
+    assert episode.steps == 40 and episode.truncated
+
+
+def test_an_error_of_the_controller_is_raised(env: lw.Env) -> None:
+    calls = []
+
+    def failing(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        calls.append(threading.current_thread())
+        if len(calls) == fails_at:
+            raise ZeroDivisionError("the controller's own")
+        return torch.zeros(2)
+
+    for fails_at in (1, 3, 5):
+        calls.clear()
+        with pytest.raises(ZeroDivisionError, match="the controller's own"):
+            control_async(env, failing, period=0.01)
+        assert len(calls) == fails_at and not planner_threads()
+
+
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, RuntimeError])
+def test_an_error_of_the_plant_ends_the_thread(env: lw.Env, kind: type[BaseException]) -> None:
+    def stop(progress: ControlProgress) -> None:
+        if progress.step == 3:
+            raise kind
+
+    interval = sys.getswitchinterval()
+    with pytest.raises(kind):
+        control_async(env, Planner(env, seconds=0.02), period=0.01, on_step=stop)
+    assert not planner_threads() and sys.getswitchinterval() == interval
+
+
+def test_the_real_clock_waits_long_enough() -> None:
+    clock = module._Clock()
+    for wait in (-1.0, 0.0, 0.0002, 0.004):
+        moment = clock.now() + wait
+        clock.wait_until(moment)
+        assert clock.now() >= moment
+
+
+# the file
+
+
+@pytest.fixture(scope="module")
+def episode(env: lw.Env) -> Trajectory:
+    return control(env, towards, seed=3)
+
+
+def test_a_file_gives_back_everything(episode: Trajectory, tmp_path: Path) -> None:
+    path = episode.save(tmp_path / "new" / "episode.npz")
+    assert [file.name for file in path.parent.iterdir()] == ["episode.npz"]
+    loaded = Trajectory.load(path)
+    for field in dataclasses.fields(Trajectory):
+        one, other = getattr(episode, field.name), getattr(loaded, field.name)
+        if isinstance(one, torch.Tensor):
+            assert one.dtype == other.dtype and torch.equal(one, other), field.name
+        else:
+            assert one == other, field.name
+    assert loaded.params["success_distance"] == pytest.approx(0.05) and loaded.versions["torch"]
+    with np.load(path, allow_pickle=False) as file:  # with numpy alone
+        assert file["states"].shape == (41, len(episode.states[0]))
+        assert json.loads(str(file["info"]))["task"] == "point_mass"
+
+
+def test_a_file_that_is_broken_or_foreign(episode: Trajectory, tmp_path: Path) -> None:
+    whole = episode.save(tmp_path / "whole.npz").read_bytes()
+    broken = tmp_path / "broken.npz"
+    middle = len(whole) // 2
+    for content in (b"", b"no zip", whole[:middle], whole[:-1], whole[:40] + b"????????" + whole[48:]):
+        broken.write_bytes(content)
+        with pytest.raises(ValueError, match=r"broken\.npz is broken, or is no trajectory"):
+            Trajectory.load(broken)
+    with np.load(tmp_path / "whole.npz") as file:
+        arrays = dict(file)
+    for change in (
+        {"rewards": arrays["rewards"][:-1]}, {"states": arrays["states"][:, 0]}, {"plan_of": arrays["plan_of"] + 1},
+        {"info": np.array("{}")}, {"success": arrays["success"].astype(int)},
+    ):  # fmt: skip
+        np.savez(broken, **(arrays | change))
+        with pytest.raises(ValueError, match=r"broken\.npz is broken, or is no trajectory"):
+            Trajectory.load(broken)
+    np.save(broken.with_suffix(".npy"), np.zeros(3))
+    with pytest.raises(ValueError, match="is broken, or is no trajectory"):
+        Trajectory.load(broken.with_suffix(".npy"))
+    np.savez(broken, **(arrays | {"info": np.array(json.dumps({"format": 2}))}))
+    with pytest.raises(ValueError, match=r"written by a newer lyceum_warp \(format 2"):
+        Trajectory.load(broken)
+    with pytest.raises(FileNotFoundError):
+        Trajectory.load(tmp_path / "nowhere.npz")
+
+
+# the report
+
+
+def timed(episode: Trajectory, times: np.ndarray, **changes: Any) -> Trajectory:
+    """The episode as if its plans had taken these times, the first one a second."""
+    plans = len(times) + 1
+    return dataclasses.replace(
+        episode, plan_times=torch.tensor([1.0, *times], dtype=torch.float64),
+        plan_starts=torch.arange(plans, dtype=torch.float64), plan_steps=torch.zeros(plans, dtype=torch.int64), **changes,
+    )  # fmt: skip
+
+
+def test_quantiles(episode: Trajectory) -> None:
+    times = np.random.default_rng(0).gamma(2, 0.005, 1000)
+    report = control_report(timed(episode, times))
+    for name, q in (("p50", 0.5), ("p90", 0.9), ("p99", 0.99), ("p99_9", 0.999), ("max", 1.0)):
+        assert getattr(report, f"plan_{name}_ms") == pytest.approx(1000 * np.quantile(times, q))
+    assert report.plan_jitter_ms == pytest.approx(1000 * times.std(ddof=1))
+    assert report.misses == (times > env_period(episode)).sum()
+    assert control_report(timed(episode, times), rate=100).misses == (times > 0.01).sum()
+    assert report.first_plan_ms == 1000
+    for plans, missing in ((999, "p99_9"), (99, "p99"), (9, "p90"), (1, "p50"), (0, "max")):
+        report = control_report(timed(episode, times[:plans]))
+        assert getattr(report, f"plan_{missing}_ms") is None
+    assert report.miss_share is None and ("planning time max", "-") in report.rows()
+
+
+def env_period(episode: Trajectory) -> float:
+    return episode.timestep
+
+
+def test_many_episodes(episode: Trajectory) -> None:
+    met = torch.ones_like(episode.success)
+    three = [
+        dataclasses.replace(episode, success=met, rewards=met * 1.0, wall_seconds=1.0),
+        dataclasses.replace(episode, success=met, rewards=met * 2.0, wall_seconds=2.0),
+        dataclasses.replace(episode, success=~met, rewards=met * 3.0, wall_seconds=3.0),
+    ]
+    report = control_report(three)
+    assert (report.episodes, report.steps, report.plans) == (3, 120, 117)
+    assert report.return_mean == 80 and report.return_std == pytest.approx(40)
+    assert report.success == pytest.approx(2 / 3)
+    assert report.episode_seconds_mean == 2 and report.real_time_factor == pytest.approx(120 * episode.timestep / 6)
+    assert report.eval_mean == pytest.approx(float(episode.evals[-1]))
+    assert report.tick_jitter_ms is None and report.late_ticks is None
+    for wrong, message in ((0.0, "rate has to be"), (math.inf, "rate has to be"), ("fast", "rate has to be")):
+        with pytest.raises(ValueError, match=message):
+            control_report(three, rate=wrong)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="a trajectory at least"):
+        control_report([])
+    with pytest.raises(ValueError, match="differ in their mode"):
+        control_report([episode, dataclasses.replace(episode, mode="async")])
+
+
+def test_the_interval_of_a_share() -> None:
+    # Brown, Cai and DasGupta (2001) and any table: 8 of 10 is 0.490 to 0.943
+    assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
+    assert wilson(0, 10) == pytest.approx((0, 0.2775), abs=1e-4)
+    assert wilson(10, 10) == pytest.approx((0.7225, 1), abs=1e-4)
+
+
+def test_json_is_finite(episode: Trajectory, tmp_path: Path) -> None:
+    def refuse(text: str) -> None:
+        raise AssertionError(text)
+
+    rewards = torch.full_like(episode.rewards, math.inf)
+    odd = dataclasses.replace(episode, rewards=rewards, params={"range": (0.7, math.inf)})
+    path = control_report([odd, episode]).write(tmp_path / "new" / "report.json")
+    content = json.loads(path.read_text(), parse_constant=refuse)
+    assert content["return_mean"] is None and content["params"] == {"range": [0.7, None]}
+    assert content["steps"] == 80 and content["task"] == "point_mass" and content["plan_p99_9_ms"] is None
+    assert [file.name for file in path.parent.iterdir()] == ["report.json"]
+
+
+def test_rows_are_for_people(episode: Trajectory, env: lw.Env) -> None:
+    rows = dict(control_report(episode).rows())
+    assert rows["episodes"] == "1 of point_mass (40 steps, sync)"
+    assert rows["planning time p99.9"] == "-" and rows["planning time p50"].endswith(" ms")
+    assert "late ticks" not in rows
+    rows = dict(control_report(clocked(env, seconds=2.5, steps=9)).rows())
+    assert rows["late ticks"] == "0 of 9" and rows["missed deadlines (1000 ms)"].endswith("(100.0%)")
+    assert rows["age of the action, max"] == "5e+03 ms (5 steps)"
+
+
+# the picture
+
+
+def test_a_picture(episode: Trajectory, env: lw.Env, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    from lyceum_warp.viz.control import control_plot
+
+    single = control(env, towards, steps=1)
+    for episodes in (episode, [episode, control(env, towards, seed=8)], clocked(env, seconds=2.5, steps=9), single):
+        path = control_plot(episodes, tmp_path / "new" / "control.png", title="a title")
+        assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
+    with pytest.raises(ValueError, match="a trajectory at least"):
+        control_plot([], tmp_path / "none.png")
+
+
+def test_a_picture_without_matplotlib(episode: Trajectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from lyceum_warp.viz.control import control_plot
+
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ImportError, match=r"needs matplotlib: pip install 'lyceum-warp\[viz\]'"):
+        control_plot(episode, tmp_path / "none.png")

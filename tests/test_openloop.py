@@ -1,0 +1,451 @@
+"""Open-loop roll-outs: what they tell is what stepping an environment tells, to the bit, on both engines."""
+
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Done, Row
+from lyceum_warp.engines import c
+from lyceum_warp.engines.native import NativeRollout
+from lyceum_warp.openloop import OpenLoop
+from lyceum_warp.registry import find_task
+
+SharedEnv = Callable[..., lw.Env]
+ENGINES = ["mujoco", "warp"]
+PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
+
+
+# tasks of the tests' own: an arm of two joints above a floor
+
+ARM = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <geom type="plane" size="2 2 .1" pos="0 0 -.35"/>
+    <body pos="0 0 .2">
+      <joint name="shoulder" axis="0 1 0" damping=".1"/>
+      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/>
+      <body pos=".3 0 0">
+        <joint name="elbow" axis="0 1 0" damping=".1" range="-150 150" limited="true"/>
+        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/>
+        <site name="tip" pos=".3 0 0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="shoulder" joint="shoulder" ctrlrange="-2 3" ctrllimited="true"/>
+    <motor name="elbow" joint="elbow" ctrlrange="-1 1" ctrllimited="true"/>
+  </actuator>
+  <sensor>
+    <accelerometer name="shock" site="tip"/>
+    <framelinvel name="velocity" objtype="site" objname="tip"/>
+  </sensor>
+</mujoco>
+"""
+
+
+@wp.struct
+class Arm:
+    qpos: Row[float]
+    qvel: Row[float]
+    site_xpos: Row[wp.vec3]
+    memory: Row[float]  # a sum over the steps, and the last step's draw
+
+
+@wp.struct
+class SensingArm:
+    qpos: Row[float]
+    sensordata: Row[float]
+
+
+@wp.struct
+class ArmParams:
+    dt: float
+    gain: float = 1.0
+    cost: float = 0.01
+    bound: float = 0.1
+    tip: int = lw.site("tip")
+
+
+@wp.func
+def observe_arm(s: Arm, p: ArmParams, obs: Row[float]):
+    for i in range(2):
+        obs[i] = s.qpos[i]
+        obs[2 + i] = s.qvel[i]
+        obs[4 + i] = s.memory[i]
+    for i in range(3):
+        obs[6 + i] = s.site_xpos[p.tip][i]
+
+
+@wp.func
+def reward_of_arm(s0: Arm, action: Row[float], s1: Arm, p: ArmParams) -> float:
+    r = s1.site_xpos[p.tip][2] - s0.site_xpos[p.tip][2] - p.cost * action[0] * action[1]
+    return r + s1.memory[0] * s0.memory[0] + p.gain * s1.memory[1]
+
+
+@wp.func
+def swung_out(s: Arm, p: ArmParams) -> bool:
+    return s.qpos[1] > p.bound
+
+
+@wp.func
+def remember_draws(s0: Arm, action: Row[float], s1: Arm, p: ArmParams, rng: Row[wp.uint32]):
+    first = lw.uniform(rng, 0.0, 1.0)
+    s1.memory[0] = 0.5 * s0.memory[0] + s1.site_xpos[p.tip][0] - action[0] * first
+    s1.memory[1] = lw.normal(rng)
+
+
+@wp.func
+def servo(s: Arm, action: Row[float], p: ArmParams, ctrl: Row[float]):
+    for i in range(2):
+        ctrl[i] = p.gain * action[i] - 0.3 * s.qvel[i] - s.qpos[i]
+
+
+@wp.func
+def observe_sensors(s: SensingArm, p: ArmParams, obs: Row[float]):
+    for i in range(6):
+        obs[i] = s.sensordata[i]
+
+
+@wp.func
+def reward_of_sensors(s0: SensingArm, action: Row[float], s1: SensingArm, p: ArmParams) -> float:
+    return s1.sensordata[2] - 10.0 * s0.sensordata[5] + s0.sensordata[0] + s1.sensordata[3]
+
+
+class Forgetful(lw.Task):
+    """Actions are controls: the task of which the C engine rolls out a horizon in one call."""
+
+    model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
+    frame_skip = 3
+    obs = {"joints": 4, "memory": 2, "tip": 3}
+    memory = 2
+    World = Arm
+    Params = ArmParams
+    observe, reward, terminated, advance = observe_arm, reward_of_arm, swung_out, remember_draws
+
+
+class Servo(Forgetful):
+    """Controls depend on the state that a step starts from."""
+
+    control = servo
+
+
+class Sensing(lw.Task):
+    """Its sensor data are of two ages: the velocity is the state's, the acceleration the last substep's."""
+
+    model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
+    frame_skip = 2
+    obs = {"sensors": 6}
+    World = SensingArm
+    Params = ArmParams
+    observe, reward = observe_sensors, reward_of_sensors
+
+
+def under_rk4() -> mujoco.MjSpec:
+    spec = mujoco.MjSpec.from_string(ARM)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    return spec
+
+
+def rollouts(task: str | type[lw.Task], steps: int, *, engine: str, nworld: int = 4, **options: Any) -> OpenLoop:
+    env = lw.make(task, engine=engine, nworld=nworld, autoreset=False, **options)
+    return OpenLoop(env, steps)
+
+
+def random_actions(env: lw.Env, steps: int, seed: int) -> torch.Tensor:
+    """Actions of which many lie beyond the bounds."""
+    generator = torch.Generator().manual_seed(seed)
+    low, high = (torch.from_numpy(bound) for bound in (env.action_space.low, env.action_space.high))
+    unit = torch.rand(steps, *env.action.shape, generator=generator)
+    return low + (high - low) * (1.6 * unit - 0.3)
+
+
+def some_state(env: lw.Env, seed: int, steps: int = 7) -> torch.Tensor:
+    """A state some random steps into an episode, whose end is not yet said."""
+    env.rand_reset(seed)
+    for action in random_actions(env, steps, seed):
+        env.step(action)
+    state = env.get_state()[1 % env.nworld].clone()
+    state[env.state_space.parts["done_reason"]] = 0
+    return state
+
+
+def run(loop: OpenLoop, state: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
+    loop.state.copy_(state)
+    loop.actions.copy_(actions)
+    loop.run()
+    return {name: getattr(loop, name).clone() for name in ("reward", "terminated", "final_obs", "fault")}
+
+
+def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None:
+    """Several roll-outs, the later ones from recordings, from other states and under other actions each time."""
+    for seed in range(rounds):
+        state, actions = some_state(env, seed), random_actions(env, loop.horizon, 10 + seed)
+        low, high = env.action_space.low, env.action_space.high
+        assert ((actions.numpy() < low) | (actions.numpy() > high)).any()
+        found = run(loop, state, actions)
+        assert not found["fault"].any() and torch.equal(loop.actions, actions)
+        ended = found["terminated"].cumsum(0) > 0  # an environment goes on telling of an end
+        env.set_state(state.expand(env.nworld, -1).contiguous())
+        for t, action in enumerate(actions):
+            env.step(action)
+            assert not (env.done_reason & ~int(Done.TERMINATED | Done.TRUNCATED)).any()
+            assert torch.equal(found["reward"][t], env.reward), f"reward of step {t}, round {seed}"
+            assert torch.equal(ended[t], env.terminated), f"terminated of step {t}, round {seed}"
+        assert torch.equal(found["final_obs"], env.final_obs), f"final_obs, round {seed}"
+        assert len(env.final_obs.unique(dim=0)) == env.nworld, "all worlds are the same: nothing was tested"
+
+
+# the tasks of the package
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("task", PACKAGE)
+def test_tells_what_stepping_tells(shared_env: SharedEnv, task: str, engine: str) -> None:
+    steps = 3 if task in ("humanoid", "adroit_pen") else 5
+    env = shared_env(task, engine=engine, nworld=4, autoreset=False)
+    check_against_stepping(rollouts(task, steps, engine=engine), env)
+
+
+@pytest.fixture
+def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Grows by one with every roll-out of a whole horizon in one native call."""
+    calls, original = [], NativeRollout.run
+
+    def counting(self: NativeRollout, *args: Any) -> None:
+        calls.append(1)
+        original(self, *args)
+
+    monkeypatch.setattr(NativeRollout, "run", counting)
+    return calls
+
+
+@pytest.mark.parametrize("task", [*PACKAGE, Forgetful])
+def test_one_native_call_or_many_steps(
+    task: str | type[lw.Task], monkeypatch: pytest.MonkeyPatch, native_calls: list[int]
+) -> None:
+    """A plan on the C engine is the same whether or not its horizon is rolled out in one call."""
+    loop = rollouts(task, 4, engine="mujoco")
+    state, actions = some_state(loop.env, 3), random_actions(loop.env, 4, 5)
+    fast = run(loop, state, actions)
+    assert len(native_calls) == 1, "the fast path was not taken"
+    monkeypatch.setattr(c, "is_exact", lambda model, fields: False)
+    slow = run(loop, state, actions)
+    assert len(native_calls) == 1
+    for name, value in fast.items():
+        assert torch.equal(value, slow[name]), name
+
+
+# what a task may do
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize(
+    ("task", "native", "options"),
+    [
+        (Forgetful, True, {}),
+        (Forgetful, True, {"gain": np.array([0.0, 0.5, 1.0, 2.0]), "cost": np.array([0.0, 1.0, 2.0, 3.0])}),
+        (Forgetful, True, {"frame_skip": 1}),
+        (Forgetful, False, {"model": under_rk4()}),
+        (Servo, False, {}),
+        (Servo, False, {"gain": np.array([0.0, 0.5, 1.0, 2.0]), "model": under_rk4()}),
+        (Sensing, False, {}),
+    ],
+    ids="memory worlds one_substep rk4 control control_worlds sensors".split(),
+)
+def test_whatever_a_task_does(
+    task: type[lw.Task], native: bool, options: dict[str, Any], engine: str, native_calls: list[int]
+) -> None:
+    """Memory with draws, parameters of each world, RK4 behind derived fields, controls of the task's own, sensors."""
+    loop = rollouts(task, 6, engine=engine, **options)
+    check_against_stepping(loop, lw.make(task, engine=engine, nworld=4, autoreset=False, **options))
+    assert len(native_calls) == (3 if native and engine == "mujoco" else 0)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_parameters_that_change_between_roll_outs(engine: str) -> None:
+    """Also those that were one number and become one a world, after a recording was made."""
+    loop, env = rollouts(Forgetful, 3, engine=engine), lw.make(Forgetful, engine=engine, nworld=4, autoreset=False)
+    check_against_stepping(loop, env)
+    for params in ({"cost": 5.0}, {"gain": np.array([1.0, 2.0, 3.0, 4.0]), "bound": -1.0}):
+        loop.env.set_params(**params)
+        env.set_params(**params)
+        check_against_stepping(loop, env)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_end_is_told_step_by_step(engine: str) -> None:
+    """Whoever goes on after an end sees whether each state by itself is one: the arm swings out and back in."""
+    loop = rollouts(Forgetful, 40, engine=engine, nworld=2, bound=0.05)
+    loop.env.reset()
+    actions = torch.zeros(40, 2, 2)
+    actions[:8, :, 1], actions[8:, :, 1] = 1.0, -1.0
+    actions[:, 1] *= -1
+    found = run(loop, loop.env.get_state()[0], actions)
+    changes = found["terminated"][1:, 0] != found["terminated"][:-1, 0]
+    assert changes.sum() == 2 and not found["terminated"][[0, -1], 0].any(), "out and back in again"
+    assert found["terminated"][-1, 1], "the other world swings the other way first"
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_roll_outs_leave_no_trace(engine: str) -> None:
+    """The same state and actions earn the same, whatever was rolled out before; the tensors stay where they are."""
+    loop = rollouts(Forgetful, 4, engine=engine)
+    state, other = some_state(loop.env, 1), some_state(loop.env, 2)
+    actions = random_actions(loop.env, 4, 0)
+    tensors = [loop.state, loop.actions, loop.reward, loop.terminated, loop.final_obs, loop.fault]
+    first = run(loop, state, actions)
+    changed = run(loop, other, -actions)
+    again = run(loop, state, actions)
+    assert not torch.equal(first["reward"], changed["reward"])
+    for name, value in first.items():
+        assert torch.equal(value, again[name]), name
+    now = [loop.state, loop.actions, loop.reward, loop.terminated, loop.final_obs, loop.fault]
+    assert all(a is b for a, b in zip(tensors, now, strict=True))
+
+
+# failures
+
+BAD = 1
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("task", [Forgetful, Servo])
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_an_action_that_is_not_finite(task: type[lw.Task], engine: str, number: float) -> None:
+    """Its world is flagged and gets zeros for that step; nothing else changes, and the flag is gone next time."""
+    loop = rollouts(task, 5, engine=engine)
+    state, actions = some_state(loop.env, 0), random_actions(loop.env, 5, 0)
+    zeroed, wrong = actions.clone(), actions.clone()
+    zeroed[2, BAD] = 0.0
+    wrong[2, BAD, 1] = number
+    expected = run(loop, state, zeroed)
+    assert not expected.pop("fault").any()
+    for _ in range(3):
+        found = run(loop, state, wrong)
+        assert found.pop("fault").tolist() == [0, int(Done.ACTION), 0, 0]
+        assert torch.equal(loop.actions, zeroed)
+        for name, value in expected.items():
+            assert torch.equal(found[name], value), name
+    clean = run(loop, state, actions)
+    assert not clean["fault"].any()
+    others = torch.arange(4) != BAD
+    assert torch.equal(clean["reward"][:, others], expected["reward"][:, others])
+    assert not torch.equal(clean["reward"][:, BAD], expected["reward"][:, BAD])
+
+
+RUNAWAY = """
+<mujoco>
+  <option timestep="0.01" {}/>
+  <worldbody>
+    <geom type="plane" size="1 1 .1"/>
+    <body pos="0 0 .3">
+      <joint name="up" type="slide" axis="0 0 1"/>
+      <geom size=".1" mass="1"/>
+      <site name="tip"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="up" gear="1e4" ctrllimited="false"/></actuator>
+</mujoco>
+"""
+
+
+@wp.struct
+class Ball:
+    qpos: Row[float]
+    site_xpos: Row[wp.vec3]
+
+
+@wp.struct
+class BallParams:
+    dt: float
+
+
+@wp.func
+def observe_ball(s: Ball, p: BallParams, obs: Row[float]):
+    obs[0] = s.qpos[0]
+    obs[1] = s.site_xpos[0][2]
+
+
+@wp.func
+def height_of_ball(s0: Ball, action: Row[float], s1: Ball, p: BallParams) -> float:
+    return s1.site_xpos[0][2] + s0.qpos[0]
+
+
+@wp.func
+def push_ball(s: Ball, action: Row[float], p: BallParams, ctrl: Row[float]):
+    ctrl[0] = action[0]
+
+
+class Runaway(lw.Task):
+    model = staticmethod(lambda: mujoco.MjSpec.from_string(RUNAWAY.format("")))
+    obs = {"height": 2}
+    World = Ball
+    Params = BallParams
+    observe, reward = observe_ball, height_of_ball
+
+
+class PushedRunaway(Runaway):
+    control = push_ball
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("how", ["native", "rk4", "control"])
+@pytest.mark.parametrize("size, step", [(1e9, 1), (1e9, 5), (1e13, 1)])  # MuJoCo leaves out controls beyond 1e10
+def test_a_sample_that_diverges(size: float, how: str, step: int, engine: str) -> None:
+    """It is flagged, the others don't notice, and the next roll-outs know nothing of it.
+
+    On the C engine such a world stops, and goes on telling the finite numbers that it had: nothing but the flag
+    tells that they mean nothing.
+    """
+    task = PushedRunaway if how == "control" else Runaway
+    model = mujoco.MjSpec.from_string(RUNAWAY.format('integrator="RK4"' if how == "rk4" else ""))
+    loop = rollouts(task, 6, engine=engine, model=model)
+    loop.env.reset()
+    state = loop.env.get_state()[0].clone()
+    generator = torch.Generator().manual_seed(0)
+    actions = 2e-3 * torch.randn(6, 4, 1, generator=generator)
+    wild = actions.clone()
+    wild[step, [1, 3]] = torch.tensor([[size], [-size]])
+    clean = run(loop, state, actions)
+    assert not clean["fault"].any()
+    for _ in range(3):
+        found = run(loop, state, wild)
+        assert (found["fault"] != 0).tolist() == [False, True, False, True]
+        assert size == 1e13 or (found["fault"][[1, 3]] & int(Done.NAN)).all()
+        for name in ("reward", "terminated"):
+            assert torch.equal(found[name][:, [0, 2]], clean[name][:, [0, 2]]), name
+        assert torch.equal(found["final_obs"][[0, 2]], clean["final_obs"][[0, 2]])
+        again = run(loop, state, actions)
+        for name, value in clean.items():
+            assert torch.equal(again[name], value), f"{name} of a roll-out after one that diverged"
+
+
+@pytest.mark.parametrize("task", [Runaway, PushedRunaway])
+def test_trouble_that_is_over_before_the_end_is_told(task: type[lw.Task]) -> None:
+    """A ball that is driven into the floor, for which there is no room, and is in the air again at the end."""
+    loop = rollouts(task, 20, engine="warp", nworld=3, nconmax=8, njmax=2)
+    loop.env.reset()
+    state = loop.env.get_state()[0].clone()
+    actions = torch.full((20, 3, 1), 9.81e-4)
+    actions[:12, BAD], actions[12:, BAD] = -4e-3, 8e-2
+    for _ in range(3):
+        found = run(loop, state, actions)
+        assert found["final_obs"][BAD, 1] > 0.2, "it lies on the floor at the end: nothing was tested"
+        assert found["fault"].tolist() == [0, int(Done.CONSTRAINT_OVERFLOW), 0]
+    assert not run(loop, state, torch.full_like(actions, 9.81e-4))["fault"].any()
+
+
+def test_what_makes_no_sense_is_refused(shared_env: SharedEnv) -> None:
+    with pytest.raises(ValueError, match=r"worlds that do not reset: make\(..., autoreset=False\)"):
+        OpenLoop(shared_env("point_mass"), 5)
+    env = shared_env("point_mass", autoreset=False)
+    for horizon in (0, -1, 2.5, "a"):
+        with pytest.raises(ValueError, match="horizon has to be a whole number from 1"):
+            OpenLoop(env, horizon)  # type: ignore[arg-type]
