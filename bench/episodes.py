@@ -12,15 +12,17 @@ import csv
 import dataclasses
 import math
 import multiprocessing
+import statistics
 import time
 from pathlib import Path
-from typing import Any
 
 import torch
 import tyro
 from rich.console import Console
 
 import lyceum_warp as lw
+from lyceum_warp.algos.trajectory import wilson
+from lyceum_warp.cli.common import parameter
 from lyceum_warp.runs import versions
 
 
@@ -74,47 +76,18 @@ def run(options: Options, number: int) -> Episode:
         if options.processes > 1:
             torch.set_num_threads(1)
             nthread = 1
-        params = dict(map(setting, options.param))
+        params = dict(map(parameter, options.param))
         env = lw.make(options.task, autoreset=False, horizon=options.steps, nthread=1, **params)
-        plan = lw.MPPI(options.task, nthread=nthread, **params, **dict(map(setting, options.plan)))
+        plan = lw.MPPI(options.task, nthread=nthread, **params, **dict(map(parameter, options.plan)))
         _worlds[options] = env, plan
     env, plan = _worlds[options]
-    env.rand_reset(number)
-    plan.reset(number)
-    rewards, evals, seconds, effective, failed = [], [], [], [], 0.0
-    began = time.perf_counter()
-    while not env.done.item():
-        start = time.perf_counter()
-        action = plan(env.get_state())
-        seconds.append(time.perf_counter() - start)
-        env.step(action[None])
-        rewards.append(env.reward.item())
-        evals.append(env.eval.item())
-        effective.append(plan.summary["effective_samples"])
-        failed += plan.summary["failed_samples"]
-    n = len(rewards)
+    summaries: list[dict[str, float]] = []
+    done = lw.control(env, plan, seed=number, on_step=lambda _: summaries.append(plan.summary))
     return Episode(
-        number, bool(env.success.item()), sum(rewards), sum(evals) / n, sum(evals[-10:]) / len(evals[-10:]), n,
-        sum(effective) / n, failed, 1e3 * sorted(seconds)[n // 2], time.perf_counter() - began,
+        number, done.succeeded, done.episode_return, done.evals.mean().item(), done.evals[-10:].mean().item(),
+        done.steps, statistics.mean(s["effective_samples"] for s in summaries),
+        sum(s["failed_samples"] for s in summaries), 1e3 * done.plan_times.median().item(), done.wall_seconds,
     )  # fmt: skip
-
-
-def setting(text: str) -> tuple[str, Any]:
-    """NAME=VALUE, the value being a number, several numbers, true or false, or a word."""
-    name, _, value = text.partition("=")
-    if value in ("true", "false"):
-        return name, value == "true"
-    try:
-        numbers = [float(part) for part in value.split(",")]
-    except ValueError:
-        return name, value
-    return name, numbers if len(numbers) > 1 else int(numbers[0]) if numbers[0].is_integer() else numbers[0]
-
-
-def wilson(successes: int, n: int, z: float = 1.96) -> tuple[float, float]:
-    """The 95 % interval of a share (Wilson 1927)."""
-    share, spread = successes / n, z * math.sqrt(successes * (n - successes) / n + z * z / 4)
-    return tuple((successes + z * z / 2 + sign * spread) / (n + z * z) for sign in (-1, 1)) if share >= 0 else (0, 0)
 
 
 def main(options: Options) -> None:

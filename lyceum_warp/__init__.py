@@ -5,10 +5,12 @@ import warp as _wp
 if _wp.config.log_level == _wp.LOG_INFO:  # Warp's default, at which it greets and reports every kernel
     _wp.config.log_level = _wp.LOG_WARNING
 
+from lyceum_warp.algos.control import control, control_async
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.npg import NPG, Iteration, NPGConfig
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.rollout import Episodes, Rollout, evaluate
+from lyceum_warp.algos.trajectory import ControlReport, Trajectory, control_report
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env, make
 from lyceum_warp.fields import vec10
@@ -25,6 +27,7 @@ __version__ = "0.1.0"
 __all__ = [
     "MPPI",
     "NPG",
+    "ControlReport",
     "Done",
     "Env",
     "Episodes",
@@ -35,8 +38,12 @@ __all__ = [
     "Rollout",
     "Row",
     "Task",
+    "Trajectory",
     "ValueFunction",
     "body",
+    "control",
+    "control_async",
+    "control_report",
     "dof",
     "evaluate",
     "geom",

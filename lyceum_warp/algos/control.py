@@ -126,8 +126,9 @@ def control_async(
     while another thread launches. For the same reason ``on_step`` must not ask for a new ``env.field``, or evaluate
     given states.
 
-    While it runs, Python switches between threads more often than usual (``sys.setswitchinterval``). The plan that is
-    under way when the world stops is completed and counted.
+    While it runs, Python switches between threads more often than usual (``sys.setswitchinterval``). For a plant
+    that is on time, leave it a core: give the planner's environment ``nthread``. The plan that is under way when the
+    world stops is completed and counted.
 
     Args:
         env: The plant: one world, made with ``autoreset=False``.

@@ -112,17 +112,18 @@ class MPPI:
         if unknown := settings.keys() - _DEFAULTS.keys():
             names = ", ".join(_DEFAULTS)
             raise ValueError(f"planning of the task {task_name(task)!r} has {sorted(unknown)}: it takes {names}")
-        self.settings = {name: _plain(value) for name, value in settings.items()}
         self.horizon = whole_number("horizon", settings["horizon"], low=1)
         self.samples = whole_number("samples", settings["samples"], low=1)
         self.iterations = whole_number("iterations", settings["iterations"], low=1)
-        self.temperature = _number("temperature", settings["temperature"], math.ulp(0.0))
+        self.temperature = _number("temperature", settings["temperature"], _SMALLEST)
         self.discount = _number("discount", settings["discount"], 0.0, 1.0)
         self.termination = settings["termination"]
         if self.termination not in ("stop", "ignore"):
             raise ValueError(f"termination has to be 'stop' or 'ignore', not {self.termination!r}")
         self._smoothing = wp.vec3(*_numbers("smoothing", settings["smoothing"], 3))
         whole_number("seed", seed, low=0)
+        if value is not None and not callable(value):
+            raise ValueError(f"value has to be a function of observations, or None, not {described(value)}")
 
         self.env = Env(task, nworld=self.samples, autoreset=False, **({"horizon": 0} | options))
         self.env.reset()
@@ -145,6 +146,7 @@ class MPPI:
             self._terminal, self._return, self._weight = (wp.zeros(self.samples, dtype=float) for _ in range(3))
             self._summary = wp.zeros(4, dtype=float)
             self._seed, self._count, self._shift = (wp.zeros(1, dtype=int) for _ in range(3))
+        self.settings = {name: _plain(value) for name, value in settings.items()}
         loop = self._loop
         self._samples = wp.from_torch(loop.actions)
         self._earned = [wp.from_torch(buffer) for buffer in (loop.reward, loop.terminated, loop.fault)]
@@ -297,8 +299,22 @@ _DEFAULTS: dict[str, Any] = dict(
 )  # fmt: skip
 
 
+# the kernels' float32 holds no smaller one at full precision
+_SMALLEST = float(np.finfo(np.float32).tiny)
+
+
 def _plain(value: Any) -> Any:
-    return value if isinstance(value, (int, float, str)) else np.asarray(value).tolist()
+    return value if isinstance(value, (int, float, str)) else _array(value).tolist()
+
+
+def _array(value: Any) -> np.ndarray:
+    """Numbers as float64; one that is not finite for what are none."""
+    try:
+        if isinstance(value, torch.Tensor):
+            value = value.detach().cpu()
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.array(math.nan)
 
 
 def _number(name: str, value: Any, low: float, high: float = math.inf) -> float:
@@ -313,7 +329,7 @@ def _number(name: str, value: Any, low: float, high: float = math.inf) -> float:
 
 
 def _numbers(name: str, value: Any, size: int) -> np.ndarray:
-    array = np.asarray(value, dtype=np.float64)
+    array = _array(value)
     if array.shape != (size,) or not np.isfinite(array).all():
         raise ValueError(f"{name} has to be {size} finite numbers, not {value!r}")
     return array
@@ -321,7 +337,7 @@ def _numbers(name: str, value: Any, size: int) -> np.ndarray:
 
 def _factor(noise: Any, nu: int) -> np.ndarray:
     """The lower Cholesky factor of the noise's covariance, (nu, nu)."""
-    array = np.asarray(noise, dtype=np.float64)
+    array = _array(noise)
     if array.ndim < 2 and array.shape in ((), (nu,)) and np.isfinite(array).all() and (array >= 0).all():
         return np.diag(np.broadcast_to(array, nu))
     if array.shape == (nu, nu) and np.isfinite(array).all() and np.allclose(array, array.T):

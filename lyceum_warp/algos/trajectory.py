@@ -325,8 +325,8 @@ class ControlReport:
         rows += [
             ("planning jitter (std)", _text(self.plan_jitter_ms, ".2g", "{} ms")),
             (f"missed deadlines ({self.deadline_ms:.4g} ms)", missed),
-            ("age of the action, mean", f"{self.age_mean_ms:.3g} ms ({self.age_steps_mean:.3g} steps)"),
-            ("age of the action, max", f"{self.age_max_ms:.3g} ms ({self.age_steps_max} steps)"),
+            ("age of the action, mean", _text(self.age_mean_ms, ".3g", f"{{}} ms ({self.age_steps_mean:.3g} steps)")),
+            ("age of the action, max", _text(self.age_max_ms, ".3g", f"{{}} ms ({self.age_steps_max} steps)")),
         ]
         if self.mode == "async":
             rows += [
@@ -370,14 +370,14 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
         plan_mean_ms=1000 * float(times.mean()) if len(times) else None,
         **_quantiles(1000 * times),
         plan_max_ms=1000 * float(times.max()) if len(times) else None,
-        plan_jitter_ms=1000 * float(times.std(ddof=1)) if len(times) > 1 else None,
+        plan_jitter_ms=_std(1000 * times),
         plans_per_second=_plans_per_second(episodes),
         deadline_ms=1000 * deadline, misses=misses, miss_share=misses / len(times) if len(times) else None,
         **_ticks(episodes),
         age_mean_ms=1000 * float(ages.mean()), age_max_ms=1000 * float(ages.max()),
         age_steps_mean=float(age_steps.mean()), age_steps_max=int(age_steps.max()),
         real_time_factor=steps * first.timestep / wall, episode_seconds_mean=wall / len(episodes),
-        return_mean=float(returns.mean()), return_std=float(returns.std(ddof=1)) if len(returns) > 1 else None,
+        return_mean=float(returns.mean()), return_std=_std(returns),
         eval_mean=float(np.mean([float(episode.evals[-1]) for episode in episodes])),
         success=successes / len(episodes), success_low=low, success_high=high,
         params=first.params, versions=first.versions,
@@ -407,7 +407,7 @@ def _ticks(episodes: Sequence[Trajectory]) -> dict[str, Any]:
         return {"tick_jitter_ms": None, "tick_delay_max_ms": None, "late_ticks": None}
     delays = 1000 * _joined(episode.times - episode.period * torch.arange(episode.steps) for episode in episodes)
     return {
-        "tick_jitter_ms": float(delays.std(ddof=1)) if len(delays) > 1 else None,
+        "tick_jitter_ms": _std(delays),
         "tick_delay_max_ms": float(delays.max()),
         "late_ticks": sum(int(episode.late.sum()) for episode in episodes),
     }
@@ -423,12 +423,19 @@ def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
     return plans / seconds if plans and seconds > 0 else None
 
 
+def _std(values: np.ndarray) -> float | None:
+    """Standard deviation of a sample; None of one, and of numbers that are not finite."""
+    return float(values.std(ddof=1)) if len(values) > 1 and np.isfinite(values).all() else None
+
+
 def _joined(parts: Any) -> np.ndarray:
     return torch.cat(list(parts)).numpy()
 
 
 def _text(value: float | None, form: str, around: str = "{}", missing: str = "-") -> str:
-    return missing if value is None or not math.isfinite(value) else around.format(format(value, form))
+    if value is None or not math.isfinite(value):
+        return missing
+    return around.format(format(value, form if abs(value) < 1000 else ".0f"))
 
 
 def _finite(value: Any) -> Any:

@@ -11,7 +11,7 @@ import tyro
 
 from lyceum_warp.algos.control import control, control_async
 from lyceum_warp.algos.mppi import MPPI
-from lyceum_warp.algos.trajectory import ControlReport, Trajectory, control_report
+from lyceum_warp.algos.trajectory import Trajectory, control_report
 from lyceum_warp.cli.common import Interrupted, parameter, portable
 from lyceum_warp.env import Env
 from lyceum_warp.registry import find_task, task_name
@@ -155,21 +155,27 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
         for episode in range(options.episodes):
             with PlanDisplay(console, episode, options.episodes, plant.horizon, plant.timestep) as display:
                 trajectory = method(plant, planner, seed=options.seed + episode, on_step=display)
-            trajectory.save(run.folder / f"episode-{episode:03d}.npz")
             trajectories.append(trajectory)
             display.done(trajectory)
-            report = control_report(trajectories, rate=options.rate)
-            report.write(run.folder / "report.json")
+            _save(run, trajectories, options)
     except Interrupted as signalled:
+        if trajectories:
+            _save(run, trajectories, options)  # a second signal does not disturb it
         told = f"interrupted by {signal.Signals(signalled.number).name} after {len(trajectories)} episodes"
         console.print(f"{told}; they are in {run.folder}", soft_wrap=True, markup=False)
         raise
-    return _tell(run, plant, trajectories, report, options)
+    return _tell(run, plant, trajectories, options)
 
 
-def _tell(run: Run, plant: Env, trajectories: list[Trajectory], report: ControlReport, options: Plan) -> int:
+def _save(run: Run, trajectories: list[Trajectory], options: Plan) -> None:
+    """Write the last episode, and the report of all."""
+    trajectories[-1].save(run.folder / f"episode-{len(trajectories) - 1:03d}.npz")
+    control_report(trajectories, rate=options.rate).write(run.folder / "report.json")
+
+
+def _tell(run: Run, plant: Env, trajectories: list[Trajectory], options: Plan) -> int:
     console = make_console()
-    console.print(report_table(report))
+    console.print(report_table(control_report(trajectories, rate=options.rate)))
     paths = [("episodes", str(run.folder / "episode-*.npz")), ("report", str(run.folder / "report.json"))]
     if options.plot:
         paths.append(("plot", plotted_control(trajectories, run.folder / "plan.png")))

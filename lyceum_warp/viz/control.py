@@ -33,6 +33,7 @@ def control_plot(trajectories: Trajectory | Sequence[Trajectory], out: str | Pat
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
+        from matplotlib.ticker import LogFormatter
     except ImportError as error:
         raise ImportError(f"drawing a controller's episodes needs matplotlib: {EXTRA}") from error
 
@@ -47,6 +48,8 @@ def control_plot(trajectories: Trajectory | Sequence[Trajectory], out: str | Pat
     _draw_outcomes(reward, evaluation, episodes)
     _draw_times(planning, age, episodes)
     _draw_histogram(histogram, episodes)
+    histogram.xaxis.set_major_formatter(LogFormatter())  # 10, not a power of ten
+    histogram.xaxis.set_minor_formatter(LogFormatter())
     for axes in (reward, evaluation, planning, age, histogram):
         axes.grid(color=_GRID)
         axes.set_axisbelow(True)

@@ -1,0 +1,158 @@
+"""lyceum-warp plan, called as a shell would."""
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+from test_cli import QUIET, TINY, refused
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.algos.trajectory import Trajectory
+from lyceum_warp.report import PlanDisplay
+
+SMALL = ["--horizon", "10", "--samples", "8", "--temperature", "0.01", "--noise", "0.3", "--steps", "40"]
+
+
+def plan(out: Path, *options: str, task: str = "point_mass") -> int:
+    return cli.main(["plan", task, "--out", str(out), *SMALL, *options])
+
+
+def test_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["plan", "--help"])
+    assert ended.value.code == 0
+    out = capsys.readouterr().out
+    assert "$ lyceum-warp plan reach" in out
+    assert all(f"--{name}" in out for name in ("horizon", "temperature", "smoothing", "real-time", "value", "rate"))
+
+
+def test_episodes_files_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    assert plan(out, "--episodes", "2", "--seed", "3", "--no-video") == 0
+    shown = capsys.readouterr().out
+    assert "episode 1/2" in shown and "episode 2/2" in shown
+    assert "planning time p50" in shown and "real-time factor" in shown
+    assert sorted(path.name for path in out.iterdir()) == [
+        "config.json", "episode-000.npz", "episode-001.npz", "plan.png", "report.json", "versions.json",
+    ]  # fmt: skip
+    config = json.loads((out / "config.json").read_text())
+    assert config["planner"]["horizon"] == 10 and config["planner"]["noise"] == 0.3 and config["seed"] == 3
+    report = json.loads((out / "report.json").read_text())
+    assert report["episodes"] == 2 and report["steps"] == 80
+    with np.load(out / "episode-001.npz", allow_pickle=False) as file:  # as a user without this package would
+        assert file["actions"].shape == (40, 2) and file["rewards"].shape == (40,)
+    # the same controller, called from Python, does the same
+    env = lw.make("point_mass", autoreset=False, horizon=40)
+    planner = lw.MPPI("point_mass", horizon=10, samples=8, temperature=0.01, noise=0.3)
+    again = lw.control(env, planner, seed=4)
+    assert torch.equal(again.states, Trajectory.load(out / "episode-001.npz").states)
+
+
+def test_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert plan(tmp_path / "run", "--no-plot") == 0
+    lines = capsys.readouterr().out.splitlines()
+    video = next(line for line in lines if line.startswith("video:")).split(maxsplit=1)[1]
+    if video.startswith("none: this machine can't draw"):
+        pytest.skip(video)
+    assert Path(video).read_bytes()[4:8] == b"ftyp"
+
+
+def test_real_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert plan(tmp_path / "run", *QUIET, "--real-time", "--rate", "10") == 0
+    assert "async" in capsys.readouterr().out
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["mode"] == "async" and report["deadline_ms"] == 100.0
+    assert 0.5 < report["real_time_factor"] < 1.01  # 40 steps of 20 ms, and however late a busy machine was
+
+
+def test_a_value_function_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "npg"
+    assert cli.main(["train", "point_mass", "--out", str(run), *TINY, *QUIET, "--iterations", "1"]) == 0
+    assert plan(tmp_path / "with", *QUIET, "--value", str(run), "--discount", "0.97") == 0
+    assert plan(tmp_path / "without", *QUIET, "--discount", "0.97") == 0
+    with_value, without = (Trajectory.load(tmp_path / name / "episode-000.npz") for name in ("with", "without"))
+    assert torch.equal(with_value.states[0], without.states[0])
+    assert not torch.equal(with_value.actions, without.actions)
+    assert json.loads((tmp_path / "with" / "config.json").read_text())["value"] == str(run)
+    capsys.readouterr()
+    assert plan(tmp_path / "none", "--value", str(tmp_path / "nowhere")) == 2
+    refused(capsys, "nowhere")
+    assert not (tmp_path / "none").exists()
+
+
+def test_world_and_planner_may_differ(tmp_path: Path) -> None:
+    options = ["--param", "success_distance=0.2", "--planner-param", "success_distance=0.1"]
+    assert plan(tmp_path / "run", *QUIET, *options) == 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["params"] == {"success_distance": 0.2} and config["planner_params"] == {"success_distance": 0.1}
+    assert Trajectory.load(tmp_path / "run" / "episode-000.npz").params["success_distance"] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("options, words", [
+    (["--horizon", "0"], ["horizon", "0"]),
+    (["--samples", "0"], ["samples", "0"]),
+    (["--temperature", "0"], ["temperature", "0"]),
+    (["--noise", "-1"], ["noise", "-1"]),
+    (["--noise", "1", "2", "3"], ["noise", "2"]),
+    (["--discount", "1.5"], ["discount", "1.5"]),
+    (["--fill", "hold"], ["fill", "hold"]),
+    (["--termination", "maybe"], ["termination", "maybe"]),
+    (["--episodes", "0"], ["episodes", "0"]),
+    (["--steps", "0"], ["steps", "0"]),
+    (["--rate", "0"], ["rate", "0"]),
+    (["--param", "mass=2"], ["mass"]),
+    (["--planner-param", "mass=2"], ["mass"]),
+    (["--planner-model", "nowhere.xml"], ["nowhere.xml"]),
+    (["--engine", "bullet"], ["bullet"]),
+    (["--device", "cuda:7"], ["cuda:7"]),
+])  # fmt: skip
+def test_bad_options_leave_nothing_behind(
+    options: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert plan(tmp_path / "run", *options) == 2
+    refused(capsys, *words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_used_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.tex").write_text("")
+    assert plan(tmp_path / "run") == 2
+    refused(capsys, "run")
+    assert cli.main(["plan", "no_such_task"]) == 2
+    refused(capsys, "no_such_task")
+
+
+def test_an_interrupt_keeps_whole_episodes(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    argv = ["plan", "point_mass", "--out", str(out), *SMALL, *QUIET, "--episodes", "100000"]
+    program = f"import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if "episode 2/" in line:
+                process.send_signal(signal.SIGINT)
+                break
+        rest = process.stdout.read()
+    assert process.returncode == 130
+    files = sorted(out.glob("episode-*.npz"))
+    assert f"after {len(files)} episodes" in rest and len(files) >= 2
+    assert all(Trajectory.load(path).steps == 40 for path in files)
+    assert json.loads((out / "report.json").read_text())["episodes"] == len(files)
+
+
+def test_the_live_display(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console(force_terminal=True, width=120)
+    env = lw.make("point_mass", autoreset=False, horizon=3)
+    with PlanDisplay(console, 0, 1, 3, env.timestep) as display:
+        lw.control(env, lambda state, obs: torch.zeros(2), seed=0, on_step=display)
+        display.progress.refresh()
+    shown = capsys.readouterr().out
+    assert all(word in shown for word in ("3/3", "reward", "eval", "Hz", "real time"))
