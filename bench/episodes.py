@@ -23,7 +23,7 @@ from rich.console import Console
 import lyceum_warp as lw
 from lyceum_warp.algos.trajectory import wilson
 from lyceum_warp.cli.common import parameter
-from lyceum_warp.runs import versions
+from lyceum_warp.versions import versions
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 import lyceum_warp as lw
-from lyceum_warp.runs import versions
+from lyceum_warp.versions import versions
 
 
 @dataclasses.dataclass(frozen=True)

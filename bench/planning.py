@@ -34,7 +34,7 @@ from rich.table import Table
 import lyceum_warp as lw
 from lyceum_warp.engines.c import MujocoEngine
 from lyceum_warp.engines.warp import WarpEngine
-from lyceum_warp.runs import versions
+from lyceum_warp.versions import versions
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 

@@ -5,7 +5,7 @@ import warp as _wp
 if _wp.config.log_level == _wp.LOG_INFO:  # Warp's default, at which it greets and reports every kernel
     _wp.config.log_level = _wp.LOG_WARNING
 
-from lyceum_warp.algos.control import control, control_async
+from lyceum_warp.algos.control import ControlProgress, control, control_async
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.npg import NPG, Iteration, NPGConfig
 from lyceum_warp.algos.policy import GaussianPolicy
@@ -27,6 +27,7 @@ __version__ = "0.1.0"
 __all__ = [
     "MPPI",
     "NPG",
+    "ControlProgress",
     "ControlReport",
     "Done",
     "Env",

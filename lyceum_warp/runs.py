@@ -1,12 +1,8 @@
 """Runs: a folder with a training run's configuration, versions, metrics and checkpoint."""
 
 import csv
-import importlib.metadata
 import json
 import os
-import platform
-import shutil
-import subprocess
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,6 +12,7 @@ from torch import nn
 
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.versions import versions
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -23,7 +20,6 @@ FORMAT = 1
 """Format of the folder; one more whenever an older release could no longer read it."""
 
 _CONFIG, _VERSIONS, _METRICS, _CHECKPOINT = "config.json", "versions.json", "metrics.csv", "checkpoint.pt"
-_PACKAGES = ("lyceum-warp", "mujoco", "mujoco-warp", "warp-lang", "torch", "numpy", "gymnasium")
 
 
 class Run:
@@ -282,48 +278,6 @@ def read_metrics(path: Path) -> list[dict[str, float | None]]:
             return [{key: float(cell) if cell else None for key, cell in row.items()} for row in reader]
         except (ValueError, TypeError, csv.Error) as error:
             raise ValueError(f"{path} is no table of metrics: line {reader.line_num}: {error}") from error
-
-
-def versions(device: str = "cpu") -> dict[str, Any]:
-    """What a run depends on: packages, Python, the machine, and the commit if this is a checkout of git."""
-    found: dict[str, Any] = {}
-    for package in _PACKAGES:
-        try:
-            found[package.replace("-", "_")] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            found[package.replace("-", "_")] = None
-    found["torch"] = torch.__version__  # with the build, such as +cpu
-    found["python"] = platform.python_version()
-    found["platform"] = platform.platform()
-    found["cpu"] = _cpu_name()
-    found["cores"] = os.cpu_count()
-    if device.startswith("cuda") and torch.cuda.is_available():
-        found["gpu"] = torch.cuda.get_device_name(device)
-        found["cuda"] = torch.version.cuda
-    if commit := _commit():
-        found["commit"] = commit
-    return found
-
-
-def _cpu_name() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
-
-
-def _commit() -> str | None:
-    root = Path(__file__).resolve().parent.parent
-    git = shutil.which("git")
-    # an installed package may lie in somebody else's checkout: only our own counts
-    if git is None or not (root / ".git").exists():
-        return None
-    command = [git, "describe", "--always", "--dirty", "--abbrev=40"]
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
-    return done.stdout.strip() or None
 
 
 def _check_format(path: Path, number: Any) -> None:

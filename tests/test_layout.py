@@ -10,7 +10,7 @@ import lyceum_warp as lw
 ROOT = Path(lw.__file__).parent
 
 LEVELS = {
-    "kernels": 0, "quiet": 0, "validate": 0,
+    "kernels": 0, "quiet": 0, "validate": 0, "versions": 0,
     "fields": 1,
     "engines": 2, "task": 2, "models": 2,
     "registry": 3, "spaces": 3,

@@ -1,11 +1,9 @@
 """Trajectories of controlled worlds: what happened, when, and a report of how well the controller kept up."""
 
 import dataclasses
-import importlib.metadata
 import json
 import math
 import os
-import platform
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,11 +13,10 @@ import torch
 
 from lyceum_warp.env import Env
 from lyceum_warp.kernels.faults import Done
+from lyceum_warp.versions import versions
 
 FORMAT = 1
 """Format of the file; one more whenever an older release could no longer read it."""
-
-_PACKAGES = ("lyceum-warp", "mujoco", "mujoco-warp", "warp-lang", "torch", "numpy")
 
 # every array of a trajectory: its type and axes, of which those with the same name have the same length
 _ARRAYS = {
@@ -92,7 +89,7 @@ class Trajectory:
     params: Mapping[str, Any]
     """The task's parameters."""
     versions: Mapping[str, Any]
-    """Packages, Python and machine."""
+    """Packages, Python, machine and commit."""
 
     @property
     def steps(self) -> int:
@@ -191,15 +188,9 @@ def _check(arrays: Mapping[str, torch.Tensor]) -> None:
 
 def provenance(env: Env) -> dict[str, Any]:
     """What a trajectory tells of where it comes from: ``task``, ``engine``, ``params`` and ``versions``."""
-    versions: dict[str, Any] = {}
-    for package in _PACKAGES:
-        try:
-            versions[package.replace("-", "_")] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package.replace("-", "_")] = None
-    versions |= {"python": platform.python_version(), "platform": platform.platform(), "cores": os.cpu_count()}
     params = {name: np.asarray(value).tolist() for name, value in env.task.params.items()}
-    return {"task": env.task.name, "engine": env.engine.name, "params": params, "versions": versions}
+    device = env.device.alias
+    return {"task": env.task.name, "engine": env.engine.name, "params": params, "versions": versions(device)}
 
 
 # the report

@@ -17,7 +17,8 @@ from lyceum_warp.cli.common import Interrupted, parameter, portable, spelled
 from lyceum_warp.env import Env
 from lyceum_warp.registry import find_task, task_name, task_names
 from lyceum_warp.report import Display, curve_table, filmed, make_console, plotted
-from lyceum_warp.runs import Run, versions
+from lyceum_warp.runs import Run
+from lyceum_warp.versions import versions
 
 _FINAL_EPISODES = 32
 
