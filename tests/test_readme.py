@@ -14,7 +14,7 @@ def test_the_readmes_python_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    assert len(blocks) == 3
+    assert len(blocks) == 4
     # Warp compiles the source of functions: it has to lie in a file, as a user's does
     file = tmp_path / "my_hopper.py"
     file.write_text(blocks[0])
@@ -25,8 +25,9 @@ def test_the_readmes_python_runs(
         exec(block, scope)
     out = capsys.readouterr().out
     assert "my_hopper on the mujoco engine" in out
-    returns = [float(line) for line in out.splitlines()[-3:]]
-    assert all(0 < value < 200 for value in returns)
+    *_, first, second, third, planned = out.splitlines()
+    assert all(0 < float(line) < 200 for line in (first, second, third))
+    assert planned.startswith("success: True")
 
 
 def test_the_readmes_task_is_shorter_than_the_papers() -> None:

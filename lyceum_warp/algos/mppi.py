@@ -57,7 +57,6 @@ class MPPI:
             on; (1, 0, 0) is white noise ((0.25, 0.8, 0)).
         discount: Of rewards and of the terminal value, a step (1).
         iterations: Improvements of the plan in a call (1).
-        keep: Whether one of the samples is the plan itself, without noise (False).
         fill: What fills the end of a plan that moves forward: "zero" (the action nearest to it), "repeat" the last
             action, or an action, (nu,) ("zero").
         termination: Whether a sample that reaches the end of its episode earns nothing from there on ("stop"), or
@@ -98,7 +97,6 @@ class MPPI:
         smoothing: Sequence[float] | None = None,
         discount: float | None = None,
         iterations: int | None = None,
-        keep: bool | None = None,
         fill: str | Sequence[float] | np.ndarray | torch.Tensor | None = None,
         termination: str | None = None,
         value: Value | None = None,
@@ -108,7 +106,7 @@ class MPPI:
         task = find_task(task)
         given = dict(
             horizon=horizon, samples=samples, temperature=temperature, noise=noise, smoothing=smoothing,
-            discount=discount, iterations=iterations, keep=keep, fill=fill, termination=termination,
+            discount=discount, iterations=iterations, fill=fill, termination=termination,
         )  # fmt: skip
         settings = _DEFAULTS | dict(task.planning) | {name: v for name, v in given.items() if v is not None}
         if unknown := settings.keys() - _DEFAULTS.keys():
@@ -122,7 +120,6 @@ class MPPI:
         self.termination = settings["termination"]
         if self.termination not in ("stop", "ignore"):
             raise ValueError(f"termination has to be 'stop' or 'ignore', not {self.termination!r}")
-        self._keep = bool(settings["keep"])
         self._smoothing = wp.vec3(*_numbers("smoothing", settings["smoothing"], 3))
         whole_number("seed", seed, low=0)
         if value is not None and not callable(value):
@@ -249,8 +246,8 @@ class MPPI:
         wp.launch(planning.draw_noise, dim, [self._seed, self._count, self._noise], device=device)
         wp.launch(planning.count_up, 1, [self._count], device=device)
         wp.launch(planning.perturb, dim, [
-            self._nominal, self._noise, self._scale, self._diagonal, self._smoothing, self._keep, self._low,
-            self._high, self._samples,
+            self._nominal, self._noise, self._scale, self._diagonal, self._smoothing, self._low, self._high,
+            self._samples,
         ], device=device)  # fmt: skip
 
     def _update(self) -> None:
@@ -298,7 +295,7 @@ class MPPI:
 
 _DEFAULTS: dict[str, Any] = dict(
     horizon=32, samples=64, temperature=0.1, noise=0.5, smoothing=(0.25, 0.8, 0.0), discount=1.0, iterations=1,
-    keep=False, fill="zero", termination="stop",
+    fill="zero", termination="stop",
 )  # fmt: skip
 
 

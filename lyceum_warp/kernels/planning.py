@@ -81,7 +81,6 @@ def perturb(
     scale_in: wp.array2d[float],
     diagonal: bool,
     smoothing: wp.vec3,
-    keep: bool,
     low_in: wp.array[float],
     high_in: wp.array[float],
     action_out: wp.array3d[float],
@@ -89,7 +88,7 @@ def perturb(
     """Actions around a plan: coloured, smoothed noise on top of it, within bounds; launched over (nsample, nu).
 
     ``scale`` is the lower Cholesky factor of the noise's covariance. Smoothing follows trajopt: from the third step
-    on, e_t <- b0 e_t + b1 e_(t-1) + b2 e_(t-2), with those before already smoothed. Sample 0 may ``keep`` to the plan.
+    on, e_t <- b0 e_t + b1 e_(t-1) + b2 e_(t-2), with those before already smoothed.
     """
     k, i = wp.tid()
     last, before_last = float(0.0), float(0.0)
@@ -102,8 +101,6 @@ def perturb(
             e = smoothing[0] * e + smoothing[1] * last + smoothing[2] * before_last
         before_last = last
         last = e
-        if keep and k == 0:
-            e = 0.0
         action_out[t, k, i] = wp.clamp(nominal_in[t, i] + e, low_in[i], high_in[i])
 
 
