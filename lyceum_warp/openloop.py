@@ -6,8 +6,9 @@ import torch
 import warp as wp
 
 from lyceum_warp.env import Env
-from lyceum_warp.kernels import planning
+from lyceum_warp.kernels import planning, state
 from lyceum_warp.kernels.arrays import torch_view
+from lyceum_warp.spaces import COUNTERS
 from lyceum_warp.validate import whole_number
 
 
@@ -68,7 +69,6 @@ class OpenLoop:
         self.reward = torch_view(self._reward).view(self.horizon, n)
         self.terminated = torch_view(self._terminated).view(self.horizon, n)
         self.fault, self.final_obs = torch_view(self._fault), torch_view(self._obs)
-        env._set_mask(None)
 
     def record(self, function: Callable[..., None], *args: Hashable) -> None:
         """Call a function made of launches, recorded once for the same arguments and replayed."""
@@ -79,8 +79,16 @@ class OpenLoop:
         self.env._run(function, *args)
 
     def run(self) -> None:
-        """Roll out."""
+        """Roll out.
+
+        Raises:
+            ValueError: A field was asked for that became part of the state, so that ``state`` no longer fits.
+        """
         env = self.env
+        if env.state_space.size != self.state.numel():
+            raise ValueError(
+                f"a field of {env.task.name!r} that was asked for later has made its states longer: ask for it before"
+            )
         self.record(self._begin)
         if env.task.functions["control"] is None:
             env.engine.rollout(env._state, self._controls, env.task.frame_skip, self._records)
@@ -92,8 +100,11 @@ class OpenLoop:
         """The start in every world, and the controls of all steps."""
         env = self.env
         wp.launch(planning.broadcast, env._state.shape, [self._state, env._state], device=env.device)
-        env._unpack_counters()
+        rest = env._state[:, env.engine.state_size :]
+        counters = [env._everyone, rest, env._step, env._key, env._episode, env._out.done_reason]
+        wp.launch(state.unpack_counters, env.nworld, counters, device=env.device)
         if self._memory is not None:
+            state.launch_rows(state.narrow, env._everyone, rest[:, len(COUNTERS) :], env._memory)
             wp.copy(self._memory[0], env._memory)
         self._fault.zero_()
         args = [self._actions, env._ranges, env._scale, self._fault, self._controls]
@@ -104,7 +115,10 @@ class OpenLoop:
         env, kernels = self.env, self.env.task.kernels
         actions = self._actions.reshape((-1, self._actions.shape[2]))
         transition = [self._before, self._after, env._params, actions]
-        if self._memory is not None:
+        if self._memory is not None and kernels.recall is None:  # it stays as it was at the reset
+            for t in range(self.horizon):
+                wp.copy(self._memory[t + 1], self._memory[0])
+        elif self._memory is not None:
             counters = [env._step, env._key, env._episode]
             memory = self._memory.reshape((-1, self._memory.shape[2]))
             wp.launch(kernels.recall, env.nworld, [*transition, *counters, memory, env._rng], device=env.device)

@@ -196,15 +196,16 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
             steps = {plain.ended[:, k].argmax() for k in plain.ended.any(axis=0).nonzero()[0]}
             assert len(steps) > 1 and not plain.ended.all(axis=0).any(), "they should end at different times"
         assert torch.equal(action, plan.actions[0])
-        np.testing.assert_allclose(plan.sampled, plain.sampled, atol=2e-4, err_msg=f"samples of call {call}")
-        np.testing.assert_allclose(plan.returns, plain.returns, atol=2e-4, rtol=2e-5, err_msg=f"returns of call {call}")
-        np.testing.assert_allclose(plan.weights, plain.weights, atol=5e-4, err_msg=f"weights of call {call}")
-        np.testing.assert_allclose(plan.actions, plain.actions, atol=5e-4, err_msg=f"plan of call {call}")
+        np.testing.assert_allclose(plan.sampled, plain.sampled, atol=2e-6, err_msg=f"samples of call {call}")
+        np.testing.assert_allclose(plan.returns, plain.returns, atol=5e-5, rtol=5e-6, err_msg=f"returns of call {call}")
+        np.testing.assert_allclose(plan.weights, plain.weights, atol=1e-4, err_msg=f"weights of call {call}")
+        np.testing.assert_allclose(plan.actions, plain.actions, atol=2e-4, err_msg=f"plan of call {call}")
         summary = plan.summary
         assert summary["best_return"] == pytest.approx(plain.returns.max(), rel=1e-4)
         assert summary["mean_return"] == pytest.approx(plain.returns.mean(), rel=1e-4)
         assert summary["effective_samples"] == pytest.approx(1 / (plain.weights**2).sum(), rel=1e-2)
         assert summary["failed_samples"] == 0
+        plain.actions = plan.actions.double().numpy()  # else low temperatures make differences grow from call to call
         plant.step(action[None])
     assert len(starts) == 5
 
@@ -698,9 +699,9 @@ def test_half_cheetah_runs() -> None:
 
 
 def test_hopper_hops_without_a_fall() -> None:
-    plant, rewards, evals = drive("hopper", 70, 0)
-    assert len(evals) == 70 and not plant.terminated.item()
-    assert evals[-1] > 0.3 and rewards.sum() > 90
+    plant, rewards, evals = drive("hopper", 60, 0, horizon=24)
+    assert len(evals) == 60 and not plant.terminated.item()
+    assert evals[-1] > 0.25 and rewards.sum() > 85, (evals[-1], rewards.sum())
 
 
 # what makes no sense is refused
@@ -747,3 +748,22 @@ def test_planning_of_a_task() -> None:
     wrong = type("Wrong", (Picky,), {"planning": {"horizont": 3}})
     with pytest.raises(ValueError, match=r"planning of the task 'wrong' has \['horizont'\]: it takes horizon, samples"):
         MPPI(wrong)
+
+
+def test_settings_stay_as_they_are() -> None:
+    plan = lw.MPPI("point_mass", horizon=3, samples=2)
+    with pytest.raises(AttributeError, match=r"temperature=2\.0"):
+        plan.temperature = 2.0
+
+
+def test_a_planner_is_not_disturbed_by_resets_of_its_worlds() -> None:
+    env = lw.make("reach", autoreset=False)
+    env.rand_reset(0)
+    plans = [lw.MPPI("reach", horizon=3, samples=4) for _ in range(2)]
+    plans[0].env.reset(torch.tensor([True, False, False, False]))
+    for _ in range(3):
+        state = env.get_state()
+        first, second = (plan(state) for plan in plans)
+        assert torch.equal(first, second)
+        env.step(first[None])
+    assert plans[0].env.episode_step.tolist() == [2, 2, 2, 2]

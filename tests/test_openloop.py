@@ -54,6 +54,7 @@ ARM = """
 class Arm:
     qpos: Row[float]
     qvel: Row[float]
+    ctrl: Row[float]
     site_xpos: Row[wp.vec3]
     memory: Row[float]  # a sum over the steps, and the last step's draw
 
@@ -86,6 +87,7 @@ def observe_arm(s: Arm, p: ArmParams, obs: Row[float]):
 @wp.func
 def reward_of_arm(s0: Arm, action: Row[float], s1: Arm, p: ArmParams) -> float:
     r = s1.site_xpos[p.tip][2] - s0.site_xpos[p.tip][2] - p.cost * action[0] * action[1]
+    r += 0.1 * s0.ctrl[0] - 0.2 * s1.ctrl[0] * s1.ctrl[1]
     return r + s1.memory[0] * s0.memory[0] + p.gain * s1.memory[1]
 
 
@@ -99,6 +101,12 @@ def remember_draws(s0: Arm, action: Row[float], s1: Arm, p: ArmParams, rng: Row[
     first = lw.uniform(rng, 0.0, 1.0)
     s1.memory[0] = 0.5 * s0.memory[0] + s1.site_xpos[p.tip][0] - action[0] * first
     s1.memory[1] = lw.normal(rng)
+
+
+@wp.func
+def remember_once(s: Arm, p: ArmParams, rng: Row[wp.uint32]):
+    for i in range(2):
+        s.memory[i] = lw.normal(rng)
 
 
 @wp.func
@@ -128,6 +136,15 @@ class Forgetful(lw.Task):
     World = Arm
     Params = ArmParams
     observe, reward, terminated, advance = observe_arm, reward_of_arm, swung_out, remember_draws
+
+
+class Keepsake(lw.Task):
+    """What it remembers from its reset stays as it is."""
+
+    model, frame_skip, obs, memory = Forgetful.model, 3, Forgetful.obs, 2
+    World = Arm
+    Params = ArmParams
+    observe, reward, randomize = observe_arm, reward_of_arm, remember_once
 
 
 class Servo(Forgetful):
@@ -253,11 +270,12 @@ def test_one_native_call_or_many_steps(
         (Forgetful, True, {"gain": np.array([0.0, 0.5, 1.0, 2.0]), "cost": np.array([0.0, 1.0, 2.0, 3.0])}),
         (Forgetful, True, {"frame_skip": 1}),
         (Forgetful, False, {"model": under_rk4()}),
+        (Keepsake, True, {}),
         (Servo, False, {}),
         (Servo, False, {"gain": np.array([0.0, 0.5, 1.0, 2.0]), "model": under_rk4()}),
         (Sensing, False, {}),
     ],
-    ids="memory worlds one_substep rk4 control control_worlds sensors".split(),
+    ids="memory worlds one_substep rk4 keepsake control control_worlds sensors".split(),
 )
 def test_whatever_a_task_does(
     task: type[lw.Task], native: bool, options: dict[str, Any], engine: str, native_calls: list[int]
@@ -449,3 +467,11 @@ def test_what_makes_no_sense_is_refused(shared_env: SharedEnv) -> None:
     for horizon in (0, -1, 2.5, "a"):
         with pytest.raises(ValueError, match="horizon has to be a whole number from 1"):
             OpenLoop(env, horizon)  # type: ignore[arg-type]
+
+
+def test_a_field_that_comes_later_is_refused() -> None:
+    loop = lw.OpenLoop(lw.make("point_mass", nworld=2, autoreset=False), 3)
+    loop.run()
+    loop.env.field("qacc")  # of the acceleration stage: it becomes part of the state
+    with pytest.raises(ValueError, match="asked for later"):
+        loop.run()

@@ -156,6 +156,11 @@ class MPPI:
         self._terminal_view, self._shift_view = torch_view(self._terminal), torch_view(self._shift)
         self.reset(seed)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _DEFAULTS and name in self.__dict__:
+            raise AttributeError(f"{name} is part of what was recorded: make another MPPI with {name}={value!r}")
+        super().__setattr__(name, value)
+
     def reset(self, seed: int | None = None) -> None:
         """Forget the plan, and begin the noise anew.
 

@@ -145,4 +145,4 @@ class AdroitPen(lw.Task):
     lagged = ("xpos", "site_xpos")
     memory = 1
     action_range = (-1.0, 1.0)
-    planning = dict(horizon=32, samples=160, temperature=1.0, noise=1.0)  # the paper's
+    planning = {"horizon": 32, "samples": 160, "temperature": 1.0, "noise": 1.0}  # the paper's

@@ -196,4 +196,4 @@ class Reach(lw.Task):
     obs = {"position": 7, "velocity": 7, "hand": 3, "error": 3}
     horizon = 75
     memory = REMEMBERED
-    planning = dict(horizon=16, samples=30, temperature=0.2, noise=1.0)  # the paper's, its 5 being an inverse
+    planning = {"horizon": 16, "samples": 30, "temperature": 0.2, "noise": 1.0}  # the paper's: its 5 is an inverse
