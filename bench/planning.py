@@ -32,6 +32,7 @@ from rich.console import Console
 from rich.table import Table
 
 import lyceum_warp as lw
+from lyceum_warp.cli.common import parameter
 from lyceum_warp.engines.c import MujocoEngine
 from lyceum_warp.engines.warp import WarpEngine
 from lyceum_warp.versions import versions
@@ -51,6 +52,10 @@ class Options:
     """Engine."""
     device: str = "cpu"
     """Device."""
+    nthread: int | None = None
+    """Threads of the C engine, and processes of the baseline; all cores by default."""
+    option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Other settings of MPPI or options of its environment, as NAME=VALUE."""
     seconds: float = 60.0
     """Time for each measurement, at least ten plans."""
     baseline: bool = True
@@ -132,11 +137,11 @@ def work(pipe: Connection, task: str, samples: int, horizon: int, seed: int) -> 
 class Baseline:
     """MPPI over single environments in processes."""
 
-    def __init__(self, task: str, plan: lw.MPPI) -> None:
+    def __init__(self, task: str, plan: lw.MPPI, processes: int) -> None:
         self.temperature = plan.temperature
         self.plan = np.zeros(tuple(plan.actions.shape))
         context = multiprocessing.get_context("spawn")
-        shares = np.diff(np.linspace(0, plan.samples, (os.cpu_count() or 1) + 1).astype(int))
+        shares = np.diff(np.linspace(0, plan.samples, processes + 1).astype(int))
         self.pipes, self.processes = [], []
         for seed, share in enumerate(shares):
             pipe, other = context.Pipe()
@@ -252,11 +257,16 @@ class Row:
 
 
 def measure(task: str, samples: int, options: Options) -> Row:
-    more = {"samples": samples} if samples else {}
+    more = dict(map(parameter, options.option))
+    if samples:
+        more["samples"] = samples
+    if options.nthread is not None:
+        more["nthread"] = options.nthread
     plan = lw.MPPI(task, engine=options.engine, device=options.device, **more)
     plant = lw.make(task, autoreset=False, engine=options.engine, device=options.device, seed=1)
     bare: BareC | BareWarp = (BareC if isinstance(plan.env.engine, MujocoEngine) else BareWarp)(plan)
-    baseline = Baseline(task, plan) if options.baseline and task in BASELINES else None
+    processes = options.nthread or os.cpu_count() or 1
+    baseline = Baseline(task, plan, processes) if options.baseline and task in BASELINES else None
     times: list[tuple[float, float, float]] = []
 
     def timed(function: Callable[[], object]) -> float:
