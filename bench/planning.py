@@ -10,7 +10,6 @@ there are cores, kept alive, one message for each plan and process, noise and we
 """
 
 import dataclasses
-import json
 import multiprocessing
 import os
 import statistics
@@ -24,6 +23,7 @@ import gymnasium
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
+import records
 import torch
 import tyro
 import warp as wp
@@ -35,7 +35,6 @@ import lyceum_warp as lw
 from lyceum_warp.cli.common import parameter
 from lyceum_warp.engines.c import MujocoEngine
 from lyceum_warp.engines.warp import WarpEngine
-from lyceum_warp.versions import versions
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
@@ -320,8 +319,7 @@ def main(options: Options) -> None:
                           *("" if number is None else f"{number:.3f}" for number in numbers))  # fmt: skip
     console.print(table)
     if options.out is not None:
-        record = {"versions": versions(options.device), "rows": [dataclasses.asdict(row) for row in rows]}
-        options.out.write_text(json.dumps(record, indent=2) + "\n")
+        records.write(options.out, rows, options.device)
 
 
 if __name__ == "__main__":

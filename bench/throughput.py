@@ -9,7 +9,6 @@ same model, controls and number of substeps. ``kept`` is bare time by environmen
 """
 
 import dataclasses
-import json
 import statistics
 import time
 from collections.abc import Callable
@@ -19,6 +18,7 @@ import gymnasium
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
+import records
 import torch
 import tyro
 import warp as wp
@@ -29,7 +29,6 @@ from rich.table import Table
 import lyceum_warp as lw
 from lyceum_warp.engines.c import MujocoEngine
 from lyceum_warp.engines.warp import WarpEngine
-from lyceum_warp.versions import versions
 
 GYMNASIUM = {
     "hopper": "Hopper-v5",
@@ -146,13 +145,20 @@ class Row:
     bare_steps_per_second: float
     kept: float
     added_microseconds: float
+    physics_steps_per_second: float
+    """Substeps of all worlds."""
+    bytes_per_world: float
+    first_step_seconds: float
+    """Until the environment was made and its first step was done: with a cold cache, mostly compilation."""
 
 
 BLOCK = 10
 """Steps after which environment and bare engine change places."""
 
 
-def measure(env: lw.Env, name: str, options: Options, act: Callable[[int], None], block: Callable[[], None]) -> Row:
+def measure(
+    env: lw.Env, name: str, options: Options, act: Callable[[int], None], block: Callable[[], None], first: float
+) -> Row:
     """Time an environment and the bare engine on the same states.
 
     Args:
@@ -161,6 +167,7 @@ def measure(env: lw.Env, name: str, options: Options, act: Callable[[int], None]
         options: How often.
         act: Sets the actions of step t of a block.
         block: Makes the steps of a block, with those actions.
+        first: Seconds until the environment's first step was done.
     """
     bare = bare_engine(env)
     whole, alone = [], []
@@ -184,11 +191,21 @@ def measure(env: lw.Env, name: str, options: Options, act: Callable[[int], None]
     kept = statistics.median(b / a for a, b in zip(whole, alone, strict=True))
     step, step_alone = statistics.median(whole), statistics.median(alone)
     added = statistics.median(a - b for a, b in zip(whole, alone, strict=True)) * 1e6
-    return Row(name, env.engine.name, env.nworld, env.nworld / step, env.nworld / step_alone, kept, added)
+    rate = env.nworld / step
+    return Row(
+        name, env.engine.name, env.nworld, rate, env.nworld / step_alone, kept, added, rate * env.task.frame_skip,
+        env.bytes_per_world, first,
+    )  # fmt: skip
+
+
+def first_step(task: str, nworld: int, options: Options) -> tuple[lw.Env, float]:
+    began = time.perf_counter()
+    env = lw.make(task, nworld=nworld, engine=options.engine, device=options.device)
+    return env, time.perf_counter() - began + seconds(env, env.step)
 
 
 def measure_env(task: str, nworld: int, options: Options) -> Row:
-    env = lw.make(task, nworld=nworld, engine=options.engine, device=options.device)
+    env, first = first_step(task, nworld, options)
     generator = torch.Generator(env.obs.device).manual_seed(0)
     low, high = (torch.as_tensor(x, device=env.obs.device) for x in (env.action_space.low, env.action_space.high))
     draws = torch.rand(BLOCK, *env.action.shape, generator=generator, device=env.obs.device)
@@ -202,18 +219,18 @@ def measure_env(task: str, nworld: int, options: Options) -> Row:
             act(t)
             env.step()
 
-    return measure(env, task, options, act, block)
+    return measure(env, task, options, act, block, first)
 
 
 def measure_sampling(task: str, nworld: int, options: Options) -> Row:
     """NPG's sampling: the policy's forward passes, the noise and the record are part of it."""
-    env = lw.make(task, nworld=nworld, engine=options.engine, device=options.device)
+    env, first = first_step(task, nworld, options)
     npg = lw.NPG(env, config=lw.NPGConfig(samples=BLOCK * nworld, mean_every=0))
 
     def act(t: int) -> None:
         npg.policy.sample(env.obs, npg.noise[t], out=env.action)
 
-    return measure(env, f"{task}, sampling of NPG", options, act, npg.sample)
+    return measure(env, f"{task}, sampling of NPG", options, act, npg.sample, first)
 
 
 def measure_gymnasium(name: str, steps: int) -> tuple[str, float]:
@@ -235,10 +252,11 @@ def measure_gymnasium(name: str, steps: int) -> tuple[str, float]:
 
 
 def main(options: Options) -> None:
-    console = Console(width=130)
+    console = Console(width=160)
     rows: list[Row] = []
-    table = Table("task", "engine", "worlds", "env steps/s", "bare steps/s", "kept", "added, µs", "Gymnasium", "ratio")
-    for column in table.columns[2:7]:
+    table = Table("task", "engine", "worlds", "env steps/s", "bare steps/s", "kept", "added, µs", "physics/s",
+                  "kB/world", "first, s", "Gymnasium", "ratio")  # fmt: skip
+    for column in table.columns[2:10]:
         column.justify = "right"
     baseline: dict[str, tuple[str, float]] = {}
     for task in options.tasks:
@@ -258,13 +276,13 @@ def main(options: Options) -> None:
     console.print(table)
     if options.out is not None:
         gym = {task: {"mode": mode, "env_steps_per_second": rate} for task, (mode, rate) in baseline.items()}
-        record = {"versions": versions(), "rows": [dataclasses.asdict(row) for row in rows], "gymnasium": gym}
-        options.out.write_text(json.dumps(record, indent=2) + "\n")
+        records.write(options.out, rows, options.device, gymnasium=gym)
 
 
 def cells(row: Row) -> list[str]:
     rates = f"{row.env_steps_per_second:,.0f}", f"{row.bare_steps_per_second:,.0f}"
-    return [row.task, row.engine, str(row.nworld), *rates, f"{row.kept:.3f}", f"{row.added_microseconds:,.0f}"]
+    more = f"{row.physics_steps_per_second:,.0f}", f"{row.bytes_per_world / 1e3:,.1f}", f"{row.first_step_seconds:.1f}"
+    return [row.task, row.engine, str(row.nworld), *rates, f"{row.kept:.3f}", f"{row.added_microseconds:,.0f}", *more]
 
 
 if __name__ == "__main__":
