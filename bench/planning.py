@@ -55,6 +55,8 @@ class Options:
     """Threads of the C engine, and processes of the baseline; all cores by default."""
     option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Other settings of MPPI or options of its environment, as NAME=VALUE."""
+    solver: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Other limits of the planner's constraint solver, as NAME=VALUE."""
     seconds: float = 60.0
     """Time for each measurement, at least ten plans."""
     baseline: bool = True
@@ -256,7 +258,9 @@ class Row:
 
 
 def measure(task: str, samples: int, options: Options) -> Row:
-    more = dict(map(parameter, options.option))
+    more: dict[str, Any] = dict(map(parameter, options.option))
+    if options.solver:
+        more["solver"] = dict(map(parameter, options.solver))
     if samples:
         more["samples"] = samples
     if options.nthread is not None:

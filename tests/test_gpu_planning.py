@@ -1,0 +1,80 @@
+"""Planning on a GPU."""
+
+import pytest
+import torch
+import warp as wp
+from test_gpu import CUDA, no_word_to_the_host
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+pytestmark = pytest.mark.gpu
+
+
+@wp.func
+def first_squared(obs: Row[float]) -> float:
+    return 3.0 * obs[0] * obs[0]
+
+
+def plant(task: str) -> lw.Env:
+    env = lw.make(task, autoreset=False)
+    env.rand_reset(1)
+    return env
+
+
+@pytest.mark.parametrize("task, horizon", [("reach", 16), ("half_cheetah", 8), ("cartpole_swingup", 20)])
+def test_plans_are_those_of_the_cpu(task: str, horizon: int) -> None:
+    env = plant(task)
+    # a high temperature: a low one would let rounding choose between samples
+    gpu, cpu = (
+        lw.MPPI(task, device=device, engine=engine, horizon=horizon, samples=30, temperature=10.0, seed=3)
+        for device, engine in ((CUDA, "warp"), ("cpu", "mujoco"))
+    )
+    for _ in range(4):
+        state = env.get_state()[0]
+        action, other = gpu(state), cpu(state)
+        torch.testing.assert_close(gpu.standard_noise.cpu(), cpu.standard_noise, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(gpu.returns.cpu(), cpu.returns, rtol=2e-2, atol=2e-2)
+        torch.testing.assert_close(action.cpu(), other, rtol=1e-2, atol=1e-2)
+        cpu.actions.copy_(gpu.actions)
+        env.step(other[None])
+
+
+def test_a_replay_equals_the_unrecorded_plan() -> None:
+    env = plant("reach")
+    recorded, plain = (lw.MPPI("reach", device=CUDA, deterministic=True, record=record) for record in (True, False))
+    for _ in range(4):
+        state = env.get_state()[0]
+        assert torch.equal(recorded(state), plain(state))
+        assert torch.equal(recorded.returns, plain.returns)
+        env.step(recorded.actions[:1].cpu())
+
+
+@pytest.mark.parametrize("kind", ["none", "warp", "torch"])
+def test_plans_do_not_wait(kind: str) -> None:
+    value = {"none": None, "warp": first_squared, "torch": lambda obs: 3.0 * obs[:, 0] ** 2}[kind]
+    plan = lw.MPPI("reach", device=CUDA, samples=256, value=value)
+    state = plan.state_of(mocap_pos=[0.1, 0.1, 0.2])
+    for _ in range(3):
+        plan(state)
+    memory = torch.cuda.memory_allocated(), wp.get_mempool_used_mem_current(CUDA)
+    with no_word_to_the_host():
+        for _ in range(50):
+            plan(state)
+    assert (torch.cuda.memory_allocated(), wp.get_mempool_used_mem_current(CUDA)) == memory
+
+
+def test_values_agree() -> None:
+    warp, tensor = (
+        lw.MPPI("reach", device=CUDA, samples=64, value=value, temperature=10.0, deterministic=True)
+        for value in (first_squared, lambda obs: 3.0 * obs[:, 0] ** 2)
+    )
+    state = warp.state_of(mocap_pos=[0.1, 0.1, 0.2])
+    for _ in range(3):
+        torch.testing.assert_close(warp(state), tensor(state), rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(warp.returns, tensor.returns, rtol=1e-4, atol=1e-4)
+
+
+def test_a_planner_on_the_gpu_controls_a_plant_on_the_cpu() -> None:
+    done = lw.control(plant("reach"), lw.MPPI("reach", device=CUDA, samples=128), seed=0)
+    assert done.succeeded
