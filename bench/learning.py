@@ -37,6 +37,12 @@ class Options:
     """Worlds."""
     device: str = "cpu"
     """Device."""
+    engine: str = "auto"
+    """Engine."""
+    integrator: str | None = None
+    """Another integrator than the model's: euler, rk4, implicit or implicitfast."""
+    target: float | None = None
+    """A mean return; the seconds until the stochastic policy reaches it are printed."""
     processes: int = 1
     """Runs at the same time; each then has one thread."""
     out: Path | None = None
@@ -49,7 +55,10 @@ def run(options: Options, seed: int) -> list[dict[str, Any]]:
     if options.processes > 1:
         torch.set_num_threads(1)
         nthread = 1 if options.device == "cpu" else None
-    env = lw.make(options.task, nworld=options.nworld, seed=seed, device=options.device, nthread=nthread)
+    env = lw.make(
+        options.task, nworld=options.nworld, seed=seed, device=options.device, engine=options.engine,
+        integrator=options.integrator, nthread=nthread,
+    )  # fmt: skip
     npg = lw.NPG(env, config=options.config, seed=seed)
     start, rows = time.perf_counter(), []
     for iteration in npg:
@@ -79,6 +88,11 @@ def main(options: Options) -> None:
     terminal = [statistics.mean(row["terminal_reward"] for row in rows[-10:]) for rows in runs]
     console.print(f"median seconds of an iteration: sampling {sample:.2f}, learning {learn:.2f}")
     console.print(f"mean terminal reward of the last ten iterations, each seed: {[round(x, 3) for x in terminal]}")
+    if options.target is not None:
+        for seed, rows in zip(options.seeds, runs, strict=True):
+            first = next((row for row in rows if row["return_mean"] >= options.target), None)
+            told = "not reached" if first is None else f"{first['seconds']:.1f} s, {first['samples']:,} samples"
+            console.print(f"a mean return of {options.target:g}, seed {seed}: {told}")
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         record = {
