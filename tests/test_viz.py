@@ -4,6 +4,7 @@ import os
 import sys
 from pathlib import Path
 
+import mujoco
 import pytest
 import torch
 from conftest import SharedEnv
@@ -11,6 +12,7 @@ from conftest import SharedEnv
 import lyceum_warp as lw
 from lyceum_warp.runs import Run
 from lyceum_warp.viz import plot, video
+from lyceum_warp.viz._render import camera
 
 
 @pytest.fixture
@@ -113,3 +115,8 @@ def test_video_of_bad_states(env: lw.Env, tmp_path: Path) -> None:
         video.record(env, torch.zeros(3, size - 1), tmp_path / "video.mp4")
     with pytest.raises(ValueError, match=r"even numbers, not \(31, 20\)"):
         video.record(env, env.get_state(), tmp_path / "video.mp4", size=(31, 20))
+
+
+@pytest.mark.parametrize("task, expected", [("half_cheetah", 0), ("hopper", 0), ("reach", 0), ("point_mass", 0)])
+def test_the_models_own_camera_is_used(task: str, expected: int) -> None:
+    assert camera(mujoco, lw.make(task).model) == expected

@@ -15,8 +15,9 @@ CANNOT_DRAW = 3
 
 def camera(mujoco: Any, model: Any) -> Any:
     """One that tracks, else one that is fixed to the world, else a free one that follows the first body."""
-    modes = list(model.cam_mode)
-    tracking = (mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
+    modes = [int(mode) for mode in model.cam_mode]
+    # as numbers: an enum of MuJoCo equals no integer of NumPy
+    tracking = (int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
     for i, mode in enumerate(modes):
         if mode in tracking:
             return i
