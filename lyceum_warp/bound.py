@@ -31,8 +31,15 @@ _SIGNATURES = {
 }
 """How each function is written, the kinds of its arguments, and its result."""
 
-_OPTIONS = ("nworld", "device", "engine", "seed", "autoreset", "horizon", "record", "model", "frame_skip", "cone")
-_OTHER_WORDS = {"num_envs": ["nworld"], "n_envs": ["nworld"], "xml_file": ["model"], "max_episode_steps": ["horizon"]}
+_OPTIONS = (
+    "nworld", "device", "engine", "seed", "autoreset", "horizon", "record", "model", "frame_skip", "cone", "integrator",
+    "solver", "deterministic", "nvtx",
+)  # fmt: skip
+_OTHER_WORDS = {
+    "num_envs": ["nworld"], "n_envs": ["nworld"], "xml_file": ["model"], "max_episode_steps": ["horizon"],
+    "iterations": ["solver={'iterations': ...}"], "ls_iterations": ["solver={'ls_iterations': ...}"],
+    "noslip_iterations": ["solver={'noslip_iterations': ...}"],
+}  # fmt: skip
 
 _SPELLED = {
     "float32": "float", "int32": "int", "vec3f": "wp.vec3", "quatf": "wp.quat", "mat33f": "wp.mat33",
@@ -50,7 +57,7 @@ class BoundTask:
         nworld: Number of worlds, for parameters that differ between them.
         model: Another model than the task's own.
         frame_skip: Another number of substeps.
-        cone: Another friction cone.
+        cone, integrator, solver: Other physics options than the model's, see ``models.compile_model``.
         params: Values for the fields of ``Params``; for a scalar also one value a world.
 
     Raises:
@@ -65,6 +72,8 @@ class BoundTask:
         model: models.ModelSource | None = None,
         frame_skip: int | None = None,
         cone: str | None = None,
+        integrator: str | None = None,
+        solver: Mapping[str, int] | None = None,
         **params: Any,
     ) -> None:
         self.task = task
@@ -88,7 +97,8 @@ class BoundTask:
                 raise ValueError(f"the task {self.name!r} has no {name}: add {_MISSING[name]} to its class")
         source = model if model is not None else task.model() if callable(task.model) else task.model
         engine_fields = [name for name in self.fields if name != "memory"]
-        self.model = models.compile_model(models.load_spec(source, task), engine_fields, cone=cone)
+        spec = models.load_spec(source, task if model is None else None)
+        self.model = models.compile_model(spec, engine_fields, cone=cone, integrator=integrator, solver=solver)
         if self.model.nu == 0:
             raise ValueError(f"the model of the task {self.name!r} has no actuators, so there is nothing to act on")
         whole_number(f"horizon of the task {self.name!r}", task.horizon, low=0)
@@ -183,7 +193,7 @@ class BoundTask:
         for name in given:
             if name not in known or name == "dt":
                 names = sorted(set(known) - {"dt"})
-                close = difflib.get_close_matches(name, [*names, *_OPTIONS], 3) or _OTHER_WORDS.get(name, [])
+                close = _OTHER_WORDS.get(name) or difflib.get_close_matches(name, [*names, *_OPTIONS], 3)
                 hint = f"did you mean {' or '.join(close)}?" if close else f"it has {', '.join(names) or 'none'}"
                 raise ValueError(f"the task {self.name!r} has no parameter {name!r}: {hint}")
         missing = [name for name in known if name not in self.params and name not in given]

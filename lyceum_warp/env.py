@@ -1,5 +1,6 @@
 """Env: one task in many worlds."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -9,6 +10,7 @@ import warp as wp
 
 from lyceum_warp.bound import BoundTask
 from lyceum_warp.engines import EngineFactory, find_device, open_engine
+from lyceum_warp.engines.memory import bytes_of
 from lyceum_warp.fields import elements
 from lyceum_warp.kernels import random, steps
 from lyceum_warp.kernels.arrays import torch_view
@@ -18,7 +20,8 @@ from lyceum_warp.models import ModelSource
 from lyceum_warp.registry import find_task
 from lyceum_warp.task import Task
 from lyceum_warp.validate import check_tensor, whole_number
-from lyceum_warp.worlds import Worlds
+from lyceum_warp.warmup import compile_ahead
+from lyceum_warp.worlds import PHASES, Worlds
 
 
 def make(task: str | type[Task], **options: Any) -> "Env":
@@ -43,6 +46,8 @@ class Env(Worlds):
         device: "cpu" or a CUDA device.
         engine: "mujoco" (C, on CPU cores), "warp", or "auto": Warp on CUDA and C on the CPU.
         seed: Seed of the worlds' random streams.
+        first_world: Number of the first world among those of all processes, where several share a batch: its
+            worlds have the random streams of these numbers.
         autoreset: False lets finished worlds keep stepping with their ``done`` set until they are reset. Only
             worlds with a fault still begin again at once.
         horizon: Steps after which an episode is truncated, 0 for never; the task's own by default.
@@ -50,9 +55,15 @@ class Env(Worlds):
         model: Another model than the task's: a file or an MjSpec.
         frame_skip: Another number of substeps in a step.
         cone: Another friction cone: "pyramidal" or "elliptic".
+        integrator: Another integrator: "euler", "rk4", "implicit" or "implicitfast".
+        solver: Other limits of the constraint solver, any of {"iterations": 4, "ls_iterations": 10,
+            "noslip_iterations": 0}.
         nthread: Threads of the C engine; all cores by default.
         nconmax: Contacts that the Warp engine has room for in each world, on average; probed by default.
         njmax: Constraints that the Warp engine has room for in each world; probed by default.
+        deterministic: True makes two runs on a CUDA device equal to the bit, for a price; on the CPU they are anyway.
+        nvtx: True marks the phases of a step for NVIDIA's profilers (act, physics, judge, restart, refresh, look), and
+            records each by itself.
         params: The task's parameters; a scalar may also be given as one value a world.
 
     Raises:
@@ -89,24 +100,34 @@ class Env(Worlds):
         device: str | None = None,
         engine: str | EngineFactory = "auto",
         seed: int = 0,
+        first_world: int = 0,
         autoreset: bool = True,
         horizon: int | None = None,
         record: bool = True,
         model: ModelSource | None = None,
         frame_skip: int | None = None,
         cone: str | None = None,
+        integrator: str | None = None,
+        solver: Mapping[str, int] | None = None,
         nthread: int | None = None,
         nconmax: int | None = None,
         njmax: int | None = None,
+        deterministic: bool = False,
+        nvtx: bool = False,
         **params: Any,
     ) -> None:
         self._options: dict[str, Any] = dict(
             device=device, engine=engine, record=record, model=model, frame_skip=frame_skip, cone=cone,
-            nthread=nthread, nconmax=nconmax, njmax=njmax,
+            integrator=integrator, solver=solver, nthread=nthread, nconmax=nconmax, njmax=njmax,
+            deterministic=deterministic, nvtx=nvtx,
         )  # fmt: skip
         self.nworld = whole_number("nworld", nworld, low=1)
+        self._first_world = whole_number("first_world", first_world, low=0)
         self.device = find_device(device)
-        self.task = BoundTask(find_task(task), self.nworld, model=model, frame_skip=frame_skip, cone=cone, **params)
+        self.task = BoundTask(
+            find_task(task), self.nworld, model=model, frame_skip=frame_skip, cone=cone, integrator=integrator,
+            solver=solver, **params,
+        )  # fmt: skip
         self._horizon = self.task.task.horizon if horizon is None else whole_number("horizon", horizon, low=0)
         self._autoreset = autoreset
         self._given_params = dict(params)
@@ -114,15 +135,20 @@ class Env(Worlds):
         self.timestep: float = self.task.timestep  # seconds in a step
         self.model: mujoco.MjModel = self.task.model
         self.engine = open_engine(
-            engine, self.model, self.nworld, self.device, nthread=nthread, nconmax=nconmax, njmax=njmax
-        )
+            engine, self.model, self.nworld, self.device, nthread=nthread, nconmax=nconmax, njmax=njmax,
+            deterministic=deterministic,
+        )  # fmt: skip
         self.record = record
-        self._record = Recorder(self.device, record)
+        if nvtx and not torch.backends.cuda.is_built():
+            raise ValueError("nvtx=True marks phases through torch, whose build here is without CUDA: leave it out")
+        self._record = Recorder(self.device, record, PHASES if nvtx else None)
         self._scratch: Env | None = None
         self._views: dict[str, torch.Tensor] = {}
         with wp.ScopedDevice(self.device):
             self._allocate()
         try:
+            if self.engine.recordable:
+                compile_ahead(self._rehearsal, self.device, self.task.name)
             self.rand_reset(seed)
         except Exception as error:
             raise self.task.explained(error) from None
@@ -137,6 +163,11 @@ class Env(Worlds):
     def horizon(self) -> int:
         """Steps after which an episode is truncated; 0 for never."""
         return self._horizon
+
+    @property
+    def first_world(self) -> int:
+        """Number of the first world among those of all processes; 0 where there is but one."""
+        return self._first_world
 
     @property
     def autoreset(self) -> bool:
@@ -180,7 +211,7 @@ class Env(Worlds):
         self._set_mask(mask)
         if seed is not None:
             self._seed.fill_(whole_number("seed", seed, low=0))
-            args = [self._mask, self._seed, self._key, self._episode]
+            args = [self._mask, self._seed, self._first_world, self._key, self._episode]
             wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
         self._begin_episodes(randomly=True)
 
@@ -360,6 +391,15 @@ class Env(Worlds):
     def follow(self, other: "Env") -> None:
         """Take over the parameters of another environment of the same task, as ``replicate`` does."""
         self.set_params(**other._params_for(self.nworld))
+
+    @property
+    def bytes_per_world(self) -> float:
+        """Memory that a world takes, in bytes: of every array behind this environment, its share.
+
+        The model, which all worlds share, is not counted, nor are arrays that MuJoCo Warp makes within a recording or
+        what an MjData's arena holds. Scratch worlds, which judge given states, count once they exist.
+        """
+        return (bytes_of(self) - self.engine.shared_bytes + self.engine.hidden_bytes) / self.nworld
 
     @property
     def fault_counts(self) -> dict[str, int]:

@@ -6,7 +6,7 @@ import importlib.util
 import logging
 import sys
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -14,6 +14,7 @@ import mujoco
 
 from lyceum_warp.fields import ON_DEMAND
 from lyceum_warp.quiet import quiet
+from lyceum_warp.validate import whole_number
 
 log = logging.getLogger(__name__)
 
@@ -72,9 +73,9 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
     """Read a model, editable.
 
     Args:
-        source: A path, absolute or relative to the current folder or to the file that defines ``owner``;
+        source: A path, absolute or relative to the current folder, or to the file that defines ``owner``;
             otherwise the name of a model that gymnasium ships; or an MjSpec, which is copied.
-        owner: The task class.
+        owner: The task class whose own model it is: the current folder then has no say.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -84,14 +85,11 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         raise ValueError("a task's model has to be a file or an MjSpec, not a compiled MjModel: give its MjSpec")
     if isinstance(source, mujoco.MjSpec):
         return source.copy()
-    folders = [Path()]
+    folder = Path()
     if owner is not None and (file := getattr(sys.modules.get(owner.__module__), "__file__", None)):
-        folders.append(Path(file).parent)
-    for folder in folders:
-        path = folder / Path(source).expanduser()
-        if path.is_file():
-            break
-    else:
+        folder = Path(file).parent
+    path = folder / Path(source).expanduser()
+    if not path.is_file():
         if Path(source).name != str(source):
             raise FileNotFoundError(f"there is no model file {str(source)!r}")
         path = _GYMNASIUM.path(str(source))
@@ -101,7 +99,25 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         raise ValueError(f"MuJoCo can't read the model {path}: {error}") from error
 
 
-def compile_model(spec: mujoco.MjSpec, fields: Iterable[str], *, cone: str | None = None) -> mujoco.MjModel:
+_CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+_INTEGRATORS = {
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+}
+_SOLVER = {"iterations": 1, "ls_iterations": 1, "noslip_iterations": 0}
+"""What a caller may say about the solver, and the least that makes sense."""
+
+
+def compile_model(
+    spec: mujoco.MjSpec,
+    fields: Iterable[str],
+    *,
+    cone: str | None = None,
+    integrator: str | None = None,
+    solver: Mapping[str, int] | None = None,
+) -> mujoco.MjModel:
     """Compile a model for either engine.
 
     MuJoCo Warp has no PGS solver, so a model that asks for it gets Newton on both engines, which converges to
@@ -112,18 +128,22 @@ def compile_model(spec: mujoco.MjSpec, fields: Iterable[str], *, cone: str | Non
         spec: The model; changed in place.
         fields: Names of the fields that will be read.
         cone: "pyramidal" or "elliptic" friction cones instead of the model's own.
+        integrator: "euler", "rk4", "implicit" or "implicitfast" instead of the model's own.
+        solver: Other limits than the model's own: "iterations" of the solver, "ls_iterations" of its line search,
+            "noslip_iterations" after it (0 for none).
 
     Raises:
-        ValueError: MuJoCo refuses the model.
+        ValueError: MuJoCo refuses the model, or one of the options makes no sense.
     """
     if spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
         spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
         log.info("%s asks for the PGS solver, which MuJoCo Warp lacks: both engines use Newton", spec.modelname)
     if cone is not None:
-        cones = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
-        if cone not in cones:
-            raise ValueError(f"there is no friction cone {cone!r}: use 'pyramidal' or 'elliptic'")
-        spec.option.cone = cones[cone]
+        spec.option.cone = _chosen("friction cone", cone, _CONES)
+    if integrator is not None:
+        spec.option.integrator = _chosen("integrator", integrator, _INTEGRATORS)
+    for name, limit in _limits(solver).items():
+        setattr(spec.option, name, limit)
     for sensor in sorted({ON_DEMAND[name] for name in fields if name in ON_DEMAND}, key=int):
         body = spec.bodies[1]
         if not body.name:
@@ -140,3 +160,22 @@ def compile_model(spec: mujoco.MjSpec, fields: Iterable[str], *, cone: str | Non
     for warning in caught:  # most are about Gymnasium's own XML, where a user can change nothing
         log.info("%s: %s", spec.modelname, warning.message)
     return model
+
+
+def _chosen(what: str, name: Any, known: Mapping[str, Any]) -> Any:
+    if not isinstance(name, str) or name not in known:
+        *others, last = map(repr, known)
+        raise ValueError(f"there is no {what} {name!r}: use {', '.join(others)} or {last}")
+    return known[name]
+
+
+def _limits(solver: Mapping[str, int] | None) -> dict[str, int]:
+    names = ", ".join(map(repr, _SOLVER))
+    if solver is not None and not isinstance(solver, Mapping):
+        raise ValueError(f"solver has to be a dict of limits, as solver={{'iterations': 4}}, not {solver!r}")
+    limits = {}
+    for name, value in (solver or {}).items():
+        if name not in _SOLVER:
+            raise ValueError(f"solver has no limit {name!r}: it takes {names}")
+        limits[name] = whole_number(f"solver's {name}", value, low=_SOLVER[name])
+    return limits

@@ -8,12 +8,18 @@ import warp as wp
 from lyceum_warp.bound import BoundTask
 from lyceum_warp.engines import Engine
 from lyceum_warp.fields import Stage
-from lyceum_warp.kernels import state, steps
+from lyceum_warp.kernels import random, state, steps
 from lyceum_warp.kernels.arrays import torch_view
 from lyceum_warp.kernels.faults import FAULTS
 from lyceum_warp.kernels.recorder import Recorder
 from lyceum_warp.spaces import COUNTERS, Space, action_space, control_map, state_space
 from lyceum_warp.validate import check_tensor
+
+PHASES = {
+    "_begin": "act", "step": "physics", "_judge_step": "judge", "_restart": "restart", "refresh": "refresh",
+    "_look": "look", "_judge_state": "judge",
+}  # fmt: skip
+"""What a profiler calls the functions that a step is made of."""
 
 
 class Worlds:
@@ -83,19 +89,34 @@ class Worlds:
     def _run(self, function: Callable[..., None], *args: Hashable) -> None:
         """Call a function that calls the engine: as one recording where the engine can be recorded."""
         if self.engine.recordable:
+            self._whole(function, *args)
+        else:
+            function(*args)
+
+    def _whole(self, function: Callable[..., None], *args: Hashable) -> None:
+        """Record a function of several phases as one; for a profiler, who asks for ranges, each phase by itself."""
+        if self._record.ranges is None:
             self._record(function, *args)
         else:
             function(*args)
 
+    def _physics(self, function: Callable[..., None], *args: Hashable) -> None:
+        """Call a function of the engine, as a recording where the engine can be recorded."""
+        if self.engine.recordable:
+            self._record(function, *args)
+        else:
+            with self._record.range(function):
+                function(*args)
+
     def _whole_step(self) -> None:
         """One step: the task before physics, physics, the task after it, and new episodes."""
         self._record(self._begin)
-        self.engine.step(self.task.frame_skip)
+        self._physics(self.engine.step, self.task.frame_skip)
         if self.engine.reset_stage == Stage.NONE:
-            self._record(self._finish)
+            self._whole(self._finish)
         else:
-            self._record(self._judge_and_restart)
-            self.engine.refresh(self._restarting)
+            self._whole(self._judge_and_restart)
+            self._physics(self.engine.refresh, self._restarting)
             self._record(self._look)
 
     def _begin(self) -> None:
@@ -110,10 +131,14 @@ class Worlds:
 
     def _finish(self) -> None:
         self._judge_and_restart()
-        self._look()
+        self._record(self._look)
 
     def _judge_and_restart(self) -> None:
-        """Faults, task memory, reward and ends; then the next episode's initial states."""
+        self._record(self._judge_step)
+        self._record(self._restart, self._restarting, True)
+
+    def _judge_step(self) -> None:
+        """Faults, task memory, reward and ends of a step."""
         kernels = self.task.kernels
         self.engine.find_faults(self._everyone)
         if kernels.remember is not None:
@@ -124,7 +149,6 @@ class Worlds:
         sticky = not self._autoreset
         self._judge(self._everyone, self.engine.fault, self._action_fault, transition=True, sticky=sticky)
         wp.launch(steps.count_faults, self.nworld, [self.engine.fault, self._fault_count], device=self.device)
-        self._restart(self._restarting, True)
 
     def _judge(
         self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, sticky: bool = False
@@ -150,6 +174,18 @@ class Worlds:
         args = [self._restarting, self._after, self._params, self._out.obs]
         wp.launch(self.task.kernels.look, self.nworld, args, device=self.device)
 
+    def _rehearsal(self) -> None:
+        """Everything that an environment launches, unrecorded and in a senseless order."""
+        enabled, self._record.enabled = self._record.enabled, False
+        try:
+            wp.launch(random.seed_worlds, 1, [self._mask, self._seed, 0, self._key, self._episode], device=self.device)
+            self._whole_reset(True)
+            self._whole_step()
+            self._pack()
+            self._unpack()
+        finally:
+            self._record.enabled = enabled
+
     def _begin_episodes(self, *, randomly: bool) -> None:
         self.action.masked_fill_(self._mask_view[:, None], 0.0)
         self._run(self._whole_reset, randomly)
@@ -157,7 +193,7 @@ class Worlds:
     def _whole_reset(self, randomly: bool) -> None:
         """Begin episodes in the masked worlds; every getter tells of them afterwards."""
         self._record(self._restart, self._mask, randomly)
-        self.engine.refresh(self._mask)
+        self._physics(self.engine.refresh, self._mask)
         self._record(self._judge_state)
 
     def _judge_state(self, sticky: bool = False) -> None:

@@ -1,14 +1,21 @@
 """What a task can do on one engine it can do on the other: fields, controls and resets beyond the package's tasks."""
 
+import copy
+import dataclasses
 import gc
 from pathlib import Path
 
 import mujoco
+import mujoco_warp as mjw
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 import lyceum_warp as lw
+from lyceum_warp.engines.order import CanonicalOrder
+from lyceum_warp.engines.warp import WarpEngine
+from lyceum_warp.kernels import order
 
 TASK = """
 import mujoco
@@ -137,3 +144,212 @@ def test_a_reset_leaves_the_faults_of_other_worlds_alone() -> None:
     env.rand_reset(mask=torch.tensor([True, False, False]))
     env.step()
     assert env.done_reason.tolist() == [0, 0, int(lw.Done.ENGINE_WARNING)]
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_integrator_and_solver(engine: str) -> None:
+    solver = {"iterations": 3, "ls_iterations": 7, "noslip_iterations": 2}
+    env = lw.make("point_mass", engine=engine, nworld=2, integrator="implicitfast", solver=solver)
+    for other in (env, env.replicate(nworld=1)):
+        options = other.model.opt
+        assert options.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        assert (options.iterations, options.ls_iterations, options.noslip_iterations) == (3, 7, 2)
+        other.step()
+        assert torch.isfinite(other.obs).all()
+    if engine == "warp":
+        opt = env.engine.m.opt  # type: ignore[attr-defined]
+        assert (int(opt.integrator), opt.iterations, opt.ls_iterations) == (int(options.integrator), 3, 7)
+    assert lw.make("point_mass", engine=engine).model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+
+
+def test_the_integrator_matters_and_both_engines_have_it() -> None:
+    ends = {}
+    for integrator in ("euler", "rk4"):
+        for engine in ("mujoco", "warp"):
+            env = lw.make("hopper", engine=engine, integrator=integrator, reset_noise_scale=0.0)
+            env.reset()
+            env.step(torch.ones(1, 3))
+            ends[integrator, engine] = env.obs
+        torch.testing.assert_close(ends[integrator, "warp"], ends[integrator, "mujoco"], rtol=1e-3, atol=1e-3)
+    assert (ends["euler", "mujoco"] - ends["rk4", "mujoco"]).abs().max() > 3e-3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"integrator": "rk5"}, "no integrator 'rk5': use 'euler', 'rk4', 'implicit' or 'implicitfast'"),
+        ({"integrator": 1}, "no integrator 1: use"),
+        ({"solver": {"iteration": 3}}, "no limit 'iteration': it takes 'iterations', 'ls_iterations', 'noslip_"),
+        ({"solver": {"iterations": 0}}, "solver's iterations has to be a whole number from 1 to .*, not 0"),
+        ({"solver": 4}, "solver has to be a dict of limits, as .*, not 4"),
+        ({"iterations": 4}, r"no parameter 'iterations': did you mean solver=\{'iterations': ...\}"),
+        ({"nvtx": True}, "nvtx=True marks phases through torch"),
+    ],
+)
+def test_options_that_make_no_sense(options: dict[str, object], message: str) -> None:
+    if "nvtx" in options and torch.backends.cuda.is_built():
+        pytest.skip("this torch can")
+    with pytest.raises(ValueError, match=message):
+        lw.make("point_mass", **options)
+
+
+def test_deterministic_is_given_on_the_cpu() -> None:
+    for engine in ("mujoco", "warp"):
+        env = lw.make("point_mass", engine=engine, deterministic=True)
+        assert env.replicate()._options["deterministic"]
+        env.step()
+
+
+PHASES = ["act", "physics", "judge", "restart", "refresh", "look"]
+
+
+@pytest.mark.parametrize("record", [True, False])
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_a_profiler_sees_the_phases(engine: str, record: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, open_ranges = [], []
+    monkeypatch.setattr(torch.backends.cuda, "is_built", lambda: True)
+    monkeypatch.setattr(torch.cuda.nvtx, "range_push", lambda name: open_ranges.append(name))
+    monkeypatch.setattr(torch.cuda.nvtx, "range_pop", lambda: seen.append(open_ranges.pop()))
+    marked = lw.make("reach", engine=engine, nworld=2, nvtx=True, record=record)
+    plain = lw.make("reach", engine=engine, nworld=2)
+    for _ in range(4):
+        seen.clear()
+        marked.step()
+        plain.step()
+        assert seen == [phase for phase in PHASES if phase != "refresh" or marked.engine.reset_stage > 0]
+        assert not open_ranges
+    assert torch.equal(marked.get_state(), plain.get_state()) and torch.equal(marked.obs, plain.obs)
+
+
+def test_worlds_that_begin_again_get_a_forward_pass_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether in a group of one world at a time or all together, a run is the same to the bit."""
+    runs = []
+    for partial in (True, False):
+        monkeypatch.setattr(WarpEngine, "partial_refresh", partial)
+        env = lw.make("humanoid", engine="warp", nworld=3, horizon=5, seed=1)
+        state = env.get_state()
+        state[1, env.state_space.parts["step"]] = 3
+        env.set_state(state)
+        run = []
+        for _ in range(8):
+            env.step(torch.full_like(env.action, 0.3))
+            run.append((env.done.clone(), env.obs.clone(), env.get_state()))
+        runs.append(run)
+    assert sum(int(done.sum()) for done, *_ in runs[0]) >= 4
+    for one, other in zip(*runs, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def test_the_contact_pool_has_room_for_one_absurd_world() -> None:
+    env = lw.make("humanoid", engine="warp", nworld=4)
+    engine = env.engine
+    assert isinstance(engine, WarpEngine)
+    assert engine.naconmax == 4 * engine.nconmax + engine.spare == engine.d.naconmax and engine.spare >= 256
+    model, data = engine.bare()
+    assert (data.naconmax, data.njmax, model.opt.warn_overflow) == (engine.naconmax, engine.njmax, 0)
+    assert lw.make("point_mass", engine="warp", nconmax=8).engine.naconmax == 8  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("partial", [True, False])
+def test_an_overflow_while_a_world_begins_again_is_told(partial: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a reset at once, within a step with the next one; here a world begins in more contacts than have room."""
+    monkeypatch.setattr(WarpEngine, "partial_refresh", partial)
+    spec = lw.gymnasium_model("humanoid.xml")
+    spec.body("torso").pos[2] = 0.1
+    env = lw.make("humanoid", engine="warp", nworld=2, model=spec, nconmax=1, njmax=128, reset_noise_scale=0.0,
+                  autoreset=False)  # fmt: skip
+    env.reset(torch.tensor([True, False]))
+    told = [bool(reason & int(lw.Done.CONTACT_OVERFLOW)) for reason in env.done_reason.tolist()]
+    assert told[0]
+
+
+# what MuJoCo Warp leaves to chance on a GPU is shuffled here by hand, and put in order again
+
+
+@pytest.fixture(scope="module", params=["dense", "sparse"])
+def forwarded(request: pytest.FixtureRequest) -> tuple[WarpEngine, CanonicalOrder]:
+    """Humanoids on the ground after the position stage, with contacts and limits, and what puts them in order."""
+    model = copy.copy(lw.make("humanoid").model)
+    model.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{request.param.upper()}")
+    engine = WarpEngine(model, 3, wp.get_device("cpu"))
+    qpos = engine.field("qpos").numpy()
+    qpos[:, 2] = (1.2, 0.25, 0.3)
+    qpos[1:, 3:7] = (0.7, 0.0, 0.7, 0.0)
+    qpos[:, 7:] = np.random.default_rng(0).uniform(-1.5, 1.5, qpos[:, 7:].shape)
+    sorter = CanonicalOrder(engine.m, engine.d)
+    return engine, sorter
+
+
+def contents(*owners: object) -> dict[str, np.ndarray]:
+    return {f.name: getattr(o, f.name).numpy().copy() for o in owners for f in dataclasses.fields(o)}  # type: ignore[arg-type]
+
+
+def test_contacts_get_into_the_same_order_whoever_came_first(forwarded: tuple[WarpEngine, CanonicalOrder]) -> None:
+    engine, _ = forwarded
+    m, d = engine.m, engine.d
+    sort_rows, m.callback.passive = m.callback.passive, None
+    mjw.fwd_position(m, d)
+    n, wanted = int(d.nacon.numpy()[0]), contents(d.contact)
+    assert n > 8 and len(set(wanted["worldid"][:n])) > 1
+    assert (np.diff(wanted["worldid"][:n]) >= 0).all()
+    shuffle = np.random.default_rng(1).permutation(n)
+    assert (shuffle != np.arange(n)).any()
+    for name, values in wanted.items():
+        if len(values):
+            getattr(d.contact, name).numpy()[:n] = values[:n][shuffle]
+    m.callback.contactfilter(m, d)
+    for name, values in contents(d.contact).items():
+        np.testing.assert_array_equal(values[:n], wanted[name][:n], err_msg=name)
+    m.callback.passive = sort_rows
+
+
+def test_rows_get_into_the_same_order_whoever_came_first(forwarded: tuple[WarpEngine, CanonicalOrder]) -> None:
+    engine, sorter = forwarded
+    m, d = engine.m, engine.d
+    mjw.fwd_position(m, d)
+    sorter.sort_rows(m, d)
+    wanted, counts = contents(d.efc), d.nefc.numpy()
+    addresses = d.contact.efc_address.numpy().copy()
+    assert counts.max() > 20
+    names = [name for name in order.Rows.vars if not name.startswith("jtdaj")]  # type: ignore[attr-defined]
+    rng = np.random.default_rng(2)
+    for w, n in enumerate(counts):
+        kinds = np.minimum(wanted["type"][w, :n], 5)
+        groups = {key: rng.random() for key in zip(kinds, wanted["id"][w, :n], strict=True)}
+        keys = [groups[kind, i] for kind, i in zip(kinds, wanted["id"][w, :n], strict=True)]
+        shuffle = np.argsort(keys, kind="stable")  # rows of one constraint come together and in order
+        place = np.argsort(shuffle)
+        for name in names:
+            array = getattr(d.efc, name).numpy()
+            if not (name == "J" and m.is_sparse) and array.shape[1]:
+                array[w, :n] = wanted[name][w, :n][shuffle]
+        mine = d.contact.worldid.numpy()[: int(d.nacon.numpy()[0])] == w
+        rows = d.contact.efc_address.numpy()[: len(mine)]
+        rows[mine] = np.where(addresses[: len(mine)][mine] >= 0, place[addresses[: len(mine)][mine]], -1)
+        if m.is_sparse:
+            blocks = rng.permutation(nblock := wanted["jtdaj_nblock"][w])
+            d.efc.jtdaj_adr.numpy()[w, :nblock] = place[wanted["jtdaj_adr"][w, blocks]]
+            d.efc.jtdaj_nrow.numpy()[w, :nblock] = wanted["jtdaj_nrow"][w, blocks]
+    assert (d.efc.id.numpy() != wanted["id"]).any()
+    sorter.sort_rows(m, d)
+    found = contents(d.efc)
+    for name in names:
+        for w, n in enumerate(counts):
+            np.testing.assert_array_equal(found[name][w, :n], wanted[name][w, :n], err_msg=name)
+    for w, nblock in enumerate(wanted["jtdaj_nblock"] if m.is_sparse else ()):
+        for name in ("jtdaj_adr", "jtdaj_nrow"):
+            np.testing.assert_array_equal(found[name][w, :nblock], wanted[name][w, :nblock], err_msg=name)
+    n = int(d.nacon.numpy()[0])
+    np.testing.assert_array_equal(d.contact.efc_address.numpy()[:n], addresses[:n])
+
+
+def test_order_changes_no_more_than_rounding(forwarded: tuple[WarpEngine, CanonicalOrder]) -> None:
+    engine, sorter = forwarded
+    m, d = engine.m, engine.d
+    mjw.forward(m, d)
+    ordered = d.qacc.numpy().copy()
+    m.callback.contactfilter = m.callback.passive = None
+    mjw.forward(m, d)
+    plain = d.qacc.numpy().copy()
+    m.callback.contactfilter, m.callback.passive = sorter.sort_contacts, sorter.sort_rows
+    np.testing.assert_allclose(ordered, plain, rtol=1e-3, atol=1e-3 * np.abs(plain).max())

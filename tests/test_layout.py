@@ -15,7 +15,7 @@ LEVELS = {
     "engines": 2, "task": 2, "models": 2,
     "registry": 3, "spaces": 3,
     "bound": 4,
-    "worlds": 5,
+    "warmup": 5, "worlds": 5,
     "env": 6,
     "openloop": 7, "testing": 7,
     "algos": 8,

@@ -1,4 +1,4 @@
-"""The command line: tasks, train, eval, plan."""
+"""The command line: tasks, train, eval, plan, warmup."""
 
 import importlib.metadata
 import os
@@ -13,12 +13,14 @@ from lyceum_warp.cli.evaluate import Eval, evaluate_run
 from lyceum_warp.cli.plan import Plan, plan
 from lyceum_warp.cli.tasks import Tasks, list_tasks
 from lyceum_warp.cli.train import Train, resume, saved_options, train
+from lyceum_warp.cli.warmup import Warmup, warm_up
 from lyceum_warp.viz.video import NoVideoError
 
 _Command = Annotated[Tasks, tyro.conf.subcommand("tasks")] \
     | Annotated[Train, tyro.conf.subcommand("train")] \
     | Annotated[Eval, tyro.conf.subcommand("eval")] \
-    | Annotated[Plan, tyro.conf.subcommand("plan")]  # fmt: skip
+    | Annotated[Plan, tyro.conf.subcommand("plan")] \
+    | Annotated[Warmup, tyro.conf.subcommand("warmup")]  # fmt: skip
 
 _DESCRIPTION = """Batched MuJoCo worlds for robot learning.
 
@@ -26,6 +28,7 @@ $ lyceum-warp tasks
 $ lyceum-warp train hopper --iterations 100
 $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
 $ lyceum-warp plan reach --real-time
+$ lyceum-warp warmup hopper --device cuda:0
 """
 
 
@@ -48,6 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return evaluate_run(command)
             if isinstance(command, Plan):
                 return plan(command)
+            if isinstance(command, Warmup):
+                return warm_up(command)
             if command.resume is not None:
                 return resume(_parse(argv, saved_options(command.resume)), command.resume)
             return train(command)

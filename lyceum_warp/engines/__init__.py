@@ -43,7 +43,7 @@ def find_device(device: str | None) -> wp.Device:
 
 
 def open_engine(
-    engine: "str | EngineFactory", model: mujoco.MjModel, nworld: int, device: wp.Device, **options: int | None
+    engine: "str | EngineFactory", model: mujoco.MjModel, nworld: int, device: wp.Device, **options: int | bool | None
 ) -> Engine:
     """Make an engine by name, or by a factory of your own.
 
@@ -53,26 +53,29 @@ def open_engine(
         model: The compiled model.
         nworld: Number of worlds.
         device: Where it runs.
-        options: Engine options: ``nthread`` of the C engine, ``nconmax`` and ``njmax`` of the Warp engine.
-            None leaves an engine its default.
+        options: Engine options: ``nthread`` of the C engine, ``nconmax``, ``njmax`` and ``deterministic`` of the
+            Warp engine. None leaves an engine its default.
 
     Raises:
         ValueError: There is no such engine, or it refuses the model, the device or an option.
     """
     if engine == "auto":
         engine = "mujoco" if device.is_cpu else "warp"
-    given = {
+    given: dict[str, int | bool] = {
         key: whole_number(key, value, low=0 if key == "nthread" else 1)
         for key, value in options.items()
-        if value is not None
+        if value is not None and key != "deterministic"
     }
+    if options.get("deterministic") and engine != "mujoco":  # which is so anyway
+        given["deterministic"] = True
     if not callable(engine):
         if engine not in _ENGINES:
             raise ValueError(f"there is no engine {engine!r}: use one of 'auto', {', '.join(map(repr, _ENGINES))}")
         module, attribute = _ENGINES[engine]
-        known = {"mujoco": {"nthread"}, "warp": {"nconmax", "njmax"}}[engine]
+        known = {"mujoco": {"nthread"}, "warp": {"nconmax", "njmax", "deterministic"}}[engine]
         if unknown := given.keys() - known:
-            raise ValueError(f"the {engine} engine takes no {', '.join(sorted(unknown))}; it takes {sorted(known)}")
+            names = sorted(known - {"deterministic"})
+            raise ValueError(f"the {engine} engine takes no {', '.join(sorted(unknown))}; it takes {names}")
         return getattr(importlib.import_module(module), attribute)(model, nworld, device, **given)
     return engine(model, nworld, device, **given)
 

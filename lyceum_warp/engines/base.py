@@ -98,6 +98,18 @@ class Engine(abc.ABC):
     def _bind(self, field: Field) -> wp.array:
         """The array that will hold a field, (nworld, *field.shape) of field.dtype."""
 
+    # memory
+
+    @property
+    def shared_bytes(self) -> int:
+        """Bytes that any number of worlds share: the model's arrays."""
+        return 0
+
+    @property
+    def hidden_bytes(self) -> int:
+        """Bytes that all worlds together have in memory that no array of this object shows."""
+        return 0
+
     # physics
 
     @abc.abstractmethod

@@ -11,6 +11,7 @@ import warp as wp
 from mujoco.batch import Batch, SimulationError
 
 from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines.memory import Footprint, check_fit
 from lyceum_warp.engines.native import NativeRollout, is_exact
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage
 from lyceum_warp.kernels import faults
@@ -40,7 +41,7 @@ class MujocoEngine(Engine):
         nthread: Threads of the pool; 0 takes all cores.
 
     Raises:
-        ValueError: The device is not the CPU.
+        ValueError: The device is not the CPU, or so many worlds do not fit into memory.
     """
 
     name = "mujoco"
@@ -51,6 +52,8 @@ class MujocoEngine(Engine):
             raise ValueError(
                 f"the mujoco engine runs on the CPU, not on {device.alias!r}: use device='cpu' or engine='warp'"
             )
+        row = 8 * mujoco.mj_stateSize(model, _INTEGRATION)
+        check_fit(Footprint(0, row), nworld, device)
         super().__init__(model, nworld, device)
         quiet()
         self.native_model = copy.copy(model)
@@ -74,6 +77,12 @@ class MujocoEngine(Engine):
 
     def _alias(self, rows: np.ndarray) -> wp.array:
         return wp.array(rows, dtype=wp.float64, device=self.device, copy=False)
+
+    @property
+    def hidden_bytes(self) -> int:
+        """Without what MuJoCo's arenas hold, which grows with a world's contacts."""
+        data = mujoco.MjData(self.model)
+        return self.nworld * int(data.nbuffer) if self.batch.persistent else 0
 
     # fields
 

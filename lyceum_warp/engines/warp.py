@@ -1,6 +1,6 @@
 """The Warp engine: MuJoCo Warp, float32, on a CUDA device or on the CPU."""
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from typing import Any
 
 import mujoco
@@ -8,6 +8,9 @@ import mujoco_warp as mjw
 import warp as wp
 
 from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines.memory import Footprint, bytes_of, check_fit, temporaries
+from lyceum_warp.engines.order import CanonicalOrder
+from lyceum_warp.engines.partial import PartialForward, group_size, report_overflow
 from lyceum_warp.engines.sizes import probe_sizes
 from lyceum_warp.fields import Field, Stage
 from lyceum_warp.kernels import faults
@@ -27,6 +30,9 @@ _CONSTRAINT_BITS = int(_OVERFLOW.NEFC | _OVERFLOW.NJMAX_NNZ | _OVERFLOW.NVMAX)
 # a solver that ran into its iteration limit has still given an answer
 _IGNORED_BITS = int(_OVERFLOW.ITERATIONS | _OVERFLOW.LS_ITERATIONS)
 
+_FEW = 256
+"""Worlds that fit anywhere, so that nobody has to ask."""
+
 
 class WarpEngine(Engine):
     """Worlds in ``mujoco_warp``'s own arrays, shown without a copy.
@@ -35,15 +41,21 @@ class WarpEngine(Engine):
         model: The compiled model.
         nworld: Number of worlds.
         device: A CUDA device, or the CPU (single-threaded: for tests).
-        nconmax: Contacts a world has room for on average; None probes the model.
+        nconmax: Contacts a world has room for on average; None probes the model, and adds to all worlds' room
+            together what a single one in an absurd state may need.
         njmax: Constraints a world has room for; None probes the model.
+        deterministic: Whether the same worlds take the same steps to the bit on a CUDA device, too, as they always do
+            on the CPU.
 
     Raises:
-        ValueError: MuJoCo Warp refuses the model.
+        ValueError: MuJoCo Warp refuses the model, or so many worlds do not fit into memory.
     """
 
     name = "warp"
     recordable = True
+
+    partial_refresh = True
+    """Whether worlds that begin again get a forward pass of their own, beyond kinematics, instead of one with all."""
 
     def __init__(
         self,
@@ -53,25 +65,75 @@ class WarpEngine(Engine):
         *,
         nconmax: int | None = None,
         njmax: int | None = None,
+        deterministic: bool = False,
     ) -> None:
-        super().__init__(model, nworld, device)
+        spare = nconmax is None
         if nconmax is None or njmax is None:
             contacts, constraints = probe_sizes(model)
             nconmax, njmax = nconmax or contacts, njmax or constraints
-        self.nconmax, self.njmax = nconmax, njmax
-        self._own: dict[str, wp.array] = {}
+        self.model, self.device, self.nconmax, self.njmax = model, device, nconmax, njmax
+        self.deterministic = deterministic
+        try:
+            self.m = self._put_model()
+            self.spare = _one_world(self.m) if spare else 0
+            if nworld >= _FEW:
+                check_fit(self.footprint(), nworld, device)
+            self.naconmax = nworld * nconmax + self.spare
+            self.d = self._make_data(nworld)
+        except (NotImplementedError, ValueError) as error:
+            if "do not fit" in str(error):
+                raise
+            raise ValueError(
+                f"MuJoCo Warp refuses the model: {error}; change the model, or use engine='mujoco'"
+            ) from error
+        super().__init__(model, nworld, device)
         with wp.ScopedDevice(device):
-            try:
-                self.m = mjw.put_model(model)
-                self.d = mjw.make_data(model, nworld=nworld, nconmax=nconmax, njmax=njmax)
-            except (NotImplementedError, ValueError) as error:
-                raise ValueError(
-                    f"MuJoCo Warp refuses the model: {error}; change the model, or use engine='mujoco'"
-                ) from error
-            # overflows are reported per world; printed from a kernel they would fill the disk
-            self.m.opt.warn_overflow = 0
-            self._state = wp.zeros((nworld, self.integration_size), dtype=float, device=device)
+            self._order = self._in_order(self.m, self.d)
+            self._state = wp.zeros((nworld, self.integration_size), dtype=float)
+        self._own: dict[str, wp.array] = {}
+        # sorting pairs of geoms, as for large models, takes memory that can't be set aside
+        self._sorts = self.m.opt.broadphase != mjw.BroadphaseType.NXN
+        self._partial: PartialForward | None = None
         self.ctrl = self.d.ctrl
+
+    def _put_model(self) -> mjw.Model:
+        with wp.ScopedDevice(self.device):
+            model = mjw.put_model(self.model)
+        # overflows are reported per world; printed from a kernel they would fill the disk
+        model.opt.warn_overflow = 0
+        if self.deterministic and self.device.is_cuda:
+            model.opt.deterministic = mjw.DeterminismType.ALL
+        return model
+
+    def _make_data(self, nworld: int, device: str | wp.Device | None = None) -> mjw.Data:
+        with wp.ScopedDevice(device or self.device):
+            naconmax = nworld * self.nconmax + self.spare
+            return mjw.make_data(self.model, nworld=nworld, naconmax=naconmax, njmax=self.njmax)
+
+    def _in_order(self, model: mjw.Model, data: mjw.Data) -> CanonicalOrder | None:
+        return CanonicalOrder(model, data) if self.deterministic and self.device.is_cuda else None
+
+    def bare(self) -> tuple[mjw.Model, mjw.Data]:
+        """Another model and data of MuJoCo Warp with the same options and sizes, to measure it alone."""
+        model, data = self._put_model(), self._make_data(self.nworld)
+        with wp.ScopedDevice(self.device):
+            self._in_order(model, data)  # lives on in the model's callbacks
+        return model, data
+
+    @property
+    def shared_bytes(self) -> int:
+        return bytes_of(self.m)
+
+    def footprint(self) -> Footprint:
+        """The engine's memory, from the arrays that one world and two worlds have on the CPU."""
+        sizes = []
+        for nworld in (1, 2):
+            data = self._make_data(nworld, "cpu")
+            with wp.ScopedDevice(self.device):
+                within = temporaries(lambda data=data: mjw.step(self.m, data))  # type: ignore[misc]
+            sizes.append(bytes_of(data) + within)
+        each = sizes[1] - sizes[0]
+        return Footprint(sizes[0] - each + bytes_of(self.m), each)
 
     # fields
 
@@ -102,13 +164,13 @@ class WarpEngine(Engine):
             self._refresh_current()
             self._copy_snapshots(self._everyone, lagged=False)
 
-    def _forward(self, names: Iterable[str], stage: Stage) -> None:
-        """Run the part of a forward pass that the named fields need; it covers every world."""
-        m, d = self.m, self.d
+    def _forward(self, names: Collection[str], stage: Stage, data: mjw.Data | None = None) -> None:
+        """Run the part of a forward pass that the named fields need; it covers every world of a data."""
+        m, d = self.m, self.d if data is None else data
         with wp.ScopedDevice(self.device):
             if stage == Stage.ACCELERATION:
                 mjw.forward(m, d)
-            elif stage == Stage.POSITION and _KINEMATIC.issuperset(names):
+            elif _is_kinematic(names, stage):
                 mjw.kinematics(m, d)
                 mjw.com_pos(m, d)
             elif stage > Stage.NONE:
@@ -135,8 +197,20 @@ class WarpEngine(Engine):
         """Nothing to do: the fields are the engine's own arrays."""
 
     def refresh(self, mask: wp.array) -> None:
-        self._forward([field.name for field in self.fields.values() if field.reset > Stage.NONE], self.reset_stage)
-        self._copy_snapshots(mask)
+        names = [field.name for field in self.fields.values() if field.reset > Stage.NONE]
+        stage = self.reset_stage
+        cheap = stage == Stage.NONE or _is_kinematic(names, stage)
+        if cheap or not self.partial_refresh or self._order is not None or self._sorts:
+            self._forward(names, stage)
+            self._copy_snapshots(mask)
+            if stage > Stage.NONE and not _is_kinematic(names, stage):
+                report_overflow(self.d, mask)
+            return
+        if self._partial is None:
+            group = self._make_data(group_size(self.nworld, self.device))
+            self._partial = PartialForward(self.d, group)
+        targets = {name: self.arrays[name] for name in names}
+        self._partial(mask, lambda data: self._forward(names, stage, data), targets)
 
     # state
 
@@ -149,3 +223,13 @@ class WarpEngine(Engine):
         launch_rows(narrow, mask, state_in, self._state)
         with wp.ScopedDevice(self.device):
             mjw.set_state(self.m, self.d, self._state, _SPEC, mask)
+
+
+def _is_kinematic(names: Collection[str], stage: Stage) -> bool:
+    return stage == Stage.POSITION and _KINEMATIC.issuperset(names)
+
+
+def _one_world(model: mjw.Model) -> int:
+    """Contacts to spare for a world in which everything touches everything, which is about to be reset."""
+    pairs = len(model.nxn_geom_pair_filtered)
+    return int(min(max(256, 4 * pairs), 4096))

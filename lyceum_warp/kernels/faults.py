@@ -78,6 +78,21 @@ def faults_of_rows(
 
 
 @wp.kernel(enable_backward=False)
+def pool_overflow(
+    mask_in: wp.array[bool],
+    npair_in: wp.array[int],
+    ncontact_in: wp.array[int],
+    nmax: int,
+    bits: int,
+    overflow_inout: wp.array[int],
+):
+    """The overflow of a pool of pairs and contacts, as ``mujoco_warp.step`` sees it and ``forward`` does not."""
+    w = wp.tid()
+    if mask_in[w] and (npair_in[0] > nmax or ncontact_in[0] > nmax):
+        overflow_inout[w] = overflow_inout[w] | bits
+
+
+@wp.kernel(enable_backward=False)
 def faults_of_fields(
     mask_in: wp.array[bool],
     qpos_in: wp.array2d[float],

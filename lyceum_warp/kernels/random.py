@@ -43,10 +43,14 @@ def normal(rng: wp.array[wp.uint32]) -> float:
 
 @wp.kernel(enable_backward=False)
 def seed_worlds(
-    mask_in: wp.array[bool], seed_in: wp.array[int], key_out: wp.array[wp.uint32], episode_out: wp.array[int]
+    mask_in: wp.array[bool],
+    seed_in: wp.array[int],
+    first: int,
+    key_out: wp.array[wp.uint32],
+    episode_out: wp.array[int],
 ):
-    """Give the masked worlds the streams of a seed, from their first episode on."""
+    """Give the masked worlds the streams of a seed, from their first episode on; world 0 has the number ``first``."""
     w = wp.tid()
     if mask_in[w]:
-        key_out[w] = world_key(seed_in[0], w)
+        key_out[w] = world_key(seed_in[0], first + int(w))
         episode_out[w] = -1

@@ -2,6 +2,11 @@
 
 import warp as wp
 
+from lyceum_warp.kernels.faults import FAULTS
+
+_FAULTS = wp.constant(int(FAULTS))
+_BITS = wp.constant(int(FAULTS).bit_length())
+
 
 @wp.struct
 class Record:
@@ -45,10 +50,12 @@ def record_outputs(
     terminated_in: wp.array[bool],
     done_in: wp.array[bool],
     success_in: wp.array[bool],
+    done_reason_in: wp.array[int],
     return_inout: wp.array[float],
+    fault_inout: wp.array[int],
     out: Record,
 ):
-    """What a step gave, and the return of the episode so far; launched over (nworld, nobs)."""
+    """What a step gave, the return of the episode so far, and faults since the record began; over (nworld, nobs)."""
     w, i = wp.tid()
     t = index_in[0]
     out.final_obs[t, w, i] = final_obs_in[w, i]
@@ -62,6 +69,12 @@ def record_outputs(
         out.episode_return[t, w] = total
         out.episode_length[t, w] = out.step[t, w] + 1.0
         return_inout[w] = wp.where(done_in[w], 0.0, total)
+        fault = done_reason_in[w] & _FAULTS
+        if fault != 0:
+            count = int(0)
+            for bit in range(_BITS):
+                count += (fault >> bit) & 1
+            fault_inout[w] = fault_inout[w] + count
 
 
 @wp.kernel(enable_backward=False)

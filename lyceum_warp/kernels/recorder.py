@@ -1,8 +1,10 @@
 """Launches recorded once as a graph, and replayed."""
 
-from collections.abc import Callable, Hashable
+import contextlib
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from typing import Any
 
+import torch
 import warp as wp
 
 
@@ -17,16 +19,25 @@ class Recorder:
     Args:
         device: Where the launches run; "cpu" records as CUDA does.
         enabled: False runs every function unrecorded.
+        ranges: Names of NVTX ranges for a profiler, by the functions' names; None for no ranges.
     """
 
-    def __init__(self, device: wp.Device, enabled: bool = True) -> None:
+    def __init__(self, device: wp.Device, enabled: bool = True, ranges: Mapping[str, str] | None = None) -> None:
         self.device = device
         self.enabled = enabled
+        self.ranges = ranges
         self._graphs: dict[Hashable, Any] = {}
         self._recording = False
 
     def __call__(self, function: Callable[..., None], *args: Hashable) -> None:
         """Run a function, or replay its recording; one recording is kept for each set of arguments."""
+        if self.ranges is None or self._recording:
+            self._call(function, *args)
+        else:
+            with self.range(function):
+                self._call(function, *args)
+
+    def _call(self, function: Callable[..., None], *args: Hashable) -> None:
         if not self.enabled or self._recording:
             function(*args)
             return
@@ -44,6 +55,19 @@ class Recorder:
                 self._recording = False
             self._graphs[key] = capture.graph
         wp.capture_launch(self._graphs[key])
+
+    @contextlib.contextmanager
+    def range(self, function: Callable[..., None]) -> Iterator[None]:
+        """A profiler's range around a function's launches, if there are to be ranges and this one has a name."""
+        name = (self.ranges or {}).get(function.__name__)
+        if name is None:
+            yield
+            return
+        torch.cuda.nvtx.range_push(name)
+        try:
+            yield
+        finally:
+            torch.cuda.nvtx.range_pop()
 
     def forget(self) -> None:
         """Drop all recordings, after the launches or the arrays behind them have changed."""

@@ -1,0 +1,70 @@
+"""lyceum-warp warmup."""
+
+import dataclasses
+import time
+from typing import Annotated
+
+import tyro
+
+from lyceum_warp.algos.mppi import MPPI
+from lyceum_warp.algos.npg import NPG, NPGConfig
+from lyceum_warp.cli.common import parameter
+from lyceum_warp.engines.memory import free_memory
+from lyceum_warp.engines.warp import WarpEngine
+from lyceum_warp.env import Env
+from lyceum_warp.report import make_console
+from lyceum_warp.warmup import cached
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Warmup:
+    """Compile a task's kernels ahead of time, so that no later run waits for them, and say what a world costs.
+
+    Warp keeps what it has compiled in its cache, for each kind of device. Sizes of the model's arrays are part of some
+    kernels, numbers of worlds are not.
+
+    $ lyceum-warp warmup hopper --device cuda:0 --nworld 4096 --npg
+    $ lyceum-warp warmup reach --device cuda:0 --plan
+    """
+
+    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
+    """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
+    engine: str = "auto"
+    """mujoco (C, on CPU cores), warp, or auto: warp on CUDA and mujoco on the CPU."""
+    device: str = "cpu"
+    """cpu, or a CUDA device such as cuda:0."""
+    nworld: int = 64
+    """Worlds of the environment."""
+    plan: bool = False
+    """Whether to compile what MPPI needs, too."""
+    npg: bool = False
+    """Whether to compile what NPG needs, too."""
+    param: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf; may be given several times."""
+
+
+def warm_up(options: Warmup) -> int:
+    """The command."""
+    params = dict(parameter(text) for text in options.param)
+    start, before = time.perf_counter(), cached()
+    env = Env(options.task, nworld=options.nworld, engine=options.engine, device=options.device, **params)
+    for _ in range(3):  # unrecorded, recorded, replayed
+        env.step()
+    if options.npg:
+        next(NPG(env, config=NPGConfig(samples=2 * env.nworld, mean_every=0)))
+    if options.plan:
+        plan = MPPI(options.task, engine=options.engine, device=options.device, **params)
+        for _ in range(3):
+            plan(plan.state_of())
+    new = cached().keys() - before.keys()
+    seconds, megabytes = time.perf_counter() - start, sum(cached()[path] for path in new) / 1e6
+    console = make_console()
+    built = f"compiled {len(new)} modules of kernels ({megabytes:.1f} MB)" if new else "every kernel was there"
+    console.print(f"{env.task.name} on {env.device.alias}: {built}, {seconds:.1f} s in all", soft_wrap=True)
+    text = f"memory: {env.bytes_per_world / 1e3:.1f} kB a world of {env.nworld}"
+    free = free_memory(env.device)
+    if isinstance(env.engine, WarpEngine) and free is not None:
+        footprint = env.engine.footprint()
+        text += f"; at most some {footprint.largest(free):,d} worlds fit into the {free / 1e9:.1f} GB that are free"
+    console.print(text, soft_wrap=True)
+    return 0

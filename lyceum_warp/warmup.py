@@ -1,0 +1,126 @@
+"""Kernels compiled ahead of time, on all cores, while somebody is told about it.
+
+Warp compiles a module when the first of its kernels is launched, one after another and without a word. On a new GPU
+that takes a minute or more for a task. Here the launches of a step are rehearsed, the modules that Warp's cache lacks
+are compiled side by side, and each is reported. What is in the cache costs nothing and says nothing.
+"""
+
+import concurrent.futures
+import dataclasses
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from lyceum_warp.kernels.rehearsal import rehearse
+
+
+@dataclasses.dataclass(frozen=True)
+class Built:
+    """What was compiled."""
+
+    modules: int = 0
+    """How many modules were compiled."""
+    known: int = 0
+    """How many more were in the cache."""
+    seconds: float = 0.0
+    """How long compiling took, all together."""
+
+
+def workers() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def compile_ahead(function: Callable[[], None], device: wp.Device, what: str) -> Built:
+    """Compile every kernel that a function would launch and that is in no cache yet, and say so on stderr.
+
+    Args:
+        function: Made of launches; it is gone through without launching anything, and may spoil its arrays.
+        device: Where the kernels will run.
+        what: What they are for, as "hopper".
+    """
+    with rehearse() as rehearsal:
+        function()
+    wanted = list(dict.fromkeys((module, _block(device, block)) for module, block in rehearsal.modules))
+    missing = [(module, block) for module, block in wanted if not _is_there(module, block, device)]
+    if not missing:
+        return Built(known=len(wanted))
+    start = time.perf_counter()
+    with _Teller(len(missing), what, device) as tell:
+        pool = concurrent.futures.ThreadPoolExecutor(min(workers(), len(missing)))
+        try:
+            futures = [pool.submit(_load, module, block, device) for module, block in missing]
+            for future in concurrent.futures.as_completed(futures):
+                tell(*future.result())
+        finally:
+            pool.shutdown(cancel_futures=True)  # after an error, or Ctrl-C
+    return Built(len(missing), len(wanted) - len(missing), time.perf_counter() - start)
+
+
+def _load(module: Any, block: int, device: wp.Device) -> tuple[str, float]:
+    start = time.perf_counter()
+    wp.force_load(device, modules=[module], block_dim=block, max_workers=0)
+    return module.name, time.perf_counter() - start
+
+
+def _block(device: wp.Device, block: int | None) -> int:
+    """The block size that a launch comes to; on the CPU there are none."""
+    return 1 if device.is_cpu else block or 256
+
+
+def _is_there(module: Any, block: int, device: wp.Device) -> bool:
+    """Whether a module is loaded or in Warp's cache; Warp has no public question for it, so that a no is no harm."""
+    if (device.context, block) in module.execs:
+        return True
+    try:
+        module.get_module_hash(block)
+        folder = Path(wp.config.kernel_cache_dir or "", module.get_module_identifier(block))
+        return (folder / module._get_compile_output_name(device, block_dim=block)).is_file()
+    except AttributeError:
+        return False
+
+
+def cached() -> dict[Path, int]:
+    """The compiled modules in Warp's cache, and their sizes in bytes."""
+    wp.init()  # which finds the cache
+    files = Path(wp.config.kernel_cache_dir or "").glob("*/*")
+    return {path: path.stat().st_size for path in files if path.suffix in (".o", ".ptx", ".cubin")}
+
+
+class _Teller:
+    """A bar on a terminal, and a line for each module elsewhere."""
+
+    def __init__(self, total: int, what: str, device: wp.Device) -> None:
+        self._text = f"compiling kernels of {what} for {device.alias}"
+        self._total, self._done = total, 0
+        console = Console(stderr=True)
+        self._progress = Progress(
+            TextColumn("{task.description}"), BarColumn(bar_width=12), MofNCompleteColumn(), TimeElapsedColumn(),
+            TextColumn("{task.fields[last]}"), console=console, transient=True, disable=not console.is_terminal,
+        )  # fmt: skip
+        self._bar = self._progress.add_task(self._text, total=total, last="")
+        self._lines = not console.is_terminal
+
+    def __enter__(self) -> "_Teller":
+        self._progress.start()
+        if self._lines:
+            cores = f"{workers()} cores" if workers() > 1 else "1 core"
+            print(f"{self._text}: {self._total} modules on {cores}, once", file=sys.stderr, flush=True)
+        return self
+
+    def __call__(self, module: str, seconds: float) -> None:
+        self._done += 1
+        name = module.removeprefix("mujoco_warp._src.").removeprefix("lyceum_warp.").partition("__locals__")[0]
+        self._progress.update(self._bar, completed=self._done, last=name)
+        if self._lines:
+            print(f"  {self._done}/{self._total} {name} {seconds:.1f} s", file=sys.stderr, flush=True)
+
+    def __exit__(self, *exception: object) -> None:
+        self._progress.stop()

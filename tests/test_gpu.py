@@ -1,0 +1,180 @@
+"""What only a GPU can show: steps without a word to the host, graphs that equal what they recorded, determinism."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp.engines.warp import WarpEngine
+from lyceum_warp.testing import check_task
+
+pytestmark = pytest.mark.gpu
+
+CUDA = "cuda:0"
+
+
+@contextlib.contextmanager
+def no_word_to_the_host() -> Iterator[None]:
+    """Everything that waits for the device raises."""
+    patch = pytest.MonkeyPatch()
+
+    def forbid(name: str) -> Callable[..., None]:
+        def forbidden(*args: object, **kwargs: object) -> None:
+            raise AssertionError(f"{name} waits for the device")
+
+        return forbidden
+
+    copy = wp.copy
+
+    def checked_copy(dest: wp.array, src: wp.array, *args: object, **kwargs: object) -> None:
+        assert dest.device == src.device, f"a copy from {src.device} to {dest.device} waits for the device"
+        copy(dest, src, *args, **kwargs)  # type: ignore[arg-type]
+
+    for name in ("synchronize", "synchronize_device", "synchronize_stream", "synchronize_event"):
+        patch.setattr(wp, name, forbid(f"wp.{name}"))
+    patch.setattr(wp.array, "numpy", forbid("numpy()"))
+    patch.setattr(wp.array, "list", forbid("list()"))
+    patch.setattr(wp, "copy", checked_copy)
+    patch.setattr(torch.cuda, "synchronize", forbid("torch.cuda.synchronize"))
+    mode = torch.cuda.get_sync_debug_mode()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        yield
+    finally:
+        torch.cuda.set_sync_debug_mode(mode)
+        patch.undo()
+
+
+def memory() -> tuple[int, int]:
+    torch.cuda.synchronize()
+    wp.synchronize_device(CUDA)
+    return wp.get_mempool_used_mem_current(CUDA), torch.cuda.memory_allocated()
+
+
+def test_what_waits_is_seen() -> None:
+    array = wp.zeros(3, dtype=float, device=CUDA)
+    with no_word_to_the_host():
+        for waits in (array.numpy, lambda: wp.synchronize_device(CUDA), lambda: wp.to_torch(array).sum().item()):
+            with pytest.raises((AssertionError, RuntimeError)):
+                waits()
+
+
+@pytest.mark.parametrize("task", ["hopper", "half_cheetah", "humanoid", "reach"])
+def test_steps_neither_wait_nor_allocate(task: str) -> None:
+    env = lw.make(task, nworld=256, device=CUDA)
+    generator = torch.Generator(CUDA).manual_seed(0)
+    actions = 2 * torch.rand(16, *env.action.shape, generator=generator, device=CUDA) - 1
+    mask = torch.zeros(256, dtype=torch.bool, device=CUDA)
+    mask[::3] = True
+    state = env.get_state()
+
+    def round_of(steps: int) -> None:
+        for t in range(steps):
+            env.step(actions[t % 16])
+            if t % 10 == 0:
+                env.rand_reset(mask=mask)
+                env.get_state(out=state)
+                env.reset(mask)
+                env.set_state(state, mask, check=False)
+                env.set_state(state, check=False)
+
+    round_of(30)  # recordings
+    before = memory()
+    with no_word_to_the_host():
+        round_of(10_000 if task == "hopper" else 1000)
+    assert memory() == before
+    assert torch.isfinite(env.obs).all()
+    assert env.episode_step.max() > 0
+
+
+def test_seeds_neither_wait_nor_allocate() -> None:
+    env = lw.make("hopper", nworld=64, device=CUDA)
+    for seed in range(3):
+        env.rand_reset(seed)
+    before = memory()
+    with no_word_to_the_host():
+        for seed in range(100):
+            env.rand_reset(seed)
+    assert memory() == before
+
+
+def run(env: lw.Env, steps: int) -> list[torch.Tensor]:
+    generator = torch.Generator(CUDA).manual_seed(1)
+    results = []
+    env.rand_reset(3)
+    for _ in range(steps):
+        env.step(2 * torch.rand(env.action.shape, generator=generator, device=CUDA) - 1)
+        results += [env.get_state(), env.obs.clone(), env.reward.clone(), env.done_reason.clone()]
+    return results
+
+
+@pytest.mark.parametrize("task", ["hopper", "humanoid", "half_cheetah"])
+def test_deterministic_replays_equal_unrecorded_steps(task: str) -> None:
+    recorded, unrecorded = (
+        lw.make(task, nworld=512, device=CUDA, deterministic=True, record=record) for record in (True, False)
+    )
+    for a, b in zip(run(recorded, 20), run(unrecorded, 20), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("task", ["hopper", "humanoid", "half_cheetah"])
+def test_deterministic_runs_are_the_same_to_the_bit(task: str) -> None:
+    """With thousands of worlds, more blocks than the device runs at once."""
+    env = lw.make(task, nworld=8192, device=CUDA, deterministic=True)
+    first = run(env, 50)
+    for a, b in zip(first, run(env, 50), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_what_worlds_see_when_they_begin_again(deterministic: bool) -> None:
+    """It is what a forward pass of all worlds says, though it was computed within a loop of the step's graph."""
+    env, other = (lw.make("humanoid", nworld=512, device=CUDA, deterministic=deterministic) for _ in range(2))
+    other.engine.partial_refresh = False  # type: ignore[attr-defined]
+    seen = 0
+    for t in range(200):
+        env.step(0.4 * torch.ones_like(env.action))
+        if t < 5 or not (done := env.done.clone()).any():
+            continue
+        other.set_state(env.get_state())
+        other.engine.refresh(other._everyone)
+        for field in env.engine.snapshots:
+            found, wanted = (e.field(field.name)[done] for e in (env, other))
+            torch.testing.assert_close(found, wanted, rtol=1e-3, atol=1e-3 * float(wanted.abs().max() + 1))
+        seen += int(done.sum())
+        if seen > 300:
+            break
+    assert seen > 0
+
+
+def test_humanoids_in_trouble_leave_few_others_alone() -> None:
+    """The pool of contacts has room for an absurd world even where there are but a few worlds."""
+    from lyceum_warp.testing import CHECKS
+
+    checks = [check for check in CHECKS if check.__name__ in ("check_bad_state", "check_bad_action")]
+    check_task("humanoid", engine="warp", device=CUDA, nworld=4, deterministic=True, steps=50, checks=checks)
+
+
+def test_memory_is_as_announced() -> None:
+    small, large = 1024, 8192
+    sizes = []
+    for nworld in (small, large):
+        start = memory()
+        env = lw.make("humanoid", nworld=nworld, device=CUDA)
+        for _ in range(3):
+            env.step()
+        used = [b - a for a, b in zip(start, memory(), strict=True)]
+        sizes.append(sum(used))
+        assert isinstance(env.engine, WarpEngine)
+        announced, footprint = env.bytes_per_world, env.engine.footprint()
+        del env
+    each = (sizes[1] - sizes[0]) / (large - small)
+    assert 0.8 * announced < each < 1.3 * (announced + footprint.each)
+
+
+def test_too_many_worlds_are_refused_at_once() -> None:
+    with pytest.raises(ValueError, match=r"do not fit into the memory of cuda:0: .* use nworld=\d+ at most"):
+        lw.make("humanoid", nworld=100_000_000, device=CUDA)
