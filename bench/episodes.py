@@ -10,6 +10,7 @@ episode is a row of the table, written when it ends: the same command again goes
 import concurrent.futures
 import csv
 import dataclasses
+import json
 import math
 import multiprocessing
 import statistics
@@ -92,6 +93,7 @@ def run(options: Options, number: int) -> Episode:
 
 def main(options: Options) -> None:
     console = Console(highlight=False, width=140)
+    same_experiment(options)
     rows = read(options.out)
     todo = [i for i in range(options.episodes) if i not in rows]
     began = time.perf_counter()
@@ -123,6 +125,22 @@ def summarise(console: Console, episodes: list[Episode]) -> None:
         values = torch.tensor([getattr(e, name) for e in episodes])
         console.print(f"{name:<18} {values.mean():9.3f} ± {values.std(correction=0):.3f} "
                       f"({values.min():.3f} to {values.max():.3f})")  # fmt: skip
+
+
+def same_experiment(options: Options) -> None:
+    """Refuse to go on with a table of other settings; they lie beside it."""
+    if options.out is None:
+        return
+    settings = {name: getattr(options, name) for name in ("task", "steps", "plan", "param")}
+    beside = options.out.with_suffix(".json")
+    if options.out.exists():
+        before = json.loads(beside.read_text()) if beside.exists() else {}
+        before.pop("versions", None)
+        if before != json.loads(json.dumps(settings)):
+            raise SystemExit(f"{options.out} holds episodes of {before or 'unknown settings'}: give another --out")
+    else:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        beside.write_text(json.dumps(settings | {"versions": versions("cpu")}, indent=2) + "\n")
 
 
 def read(path: Path | None) -> dict[int, Episode]:

@@ -10,6 +10,7 @@ used. The discount is the one that it was fitted for, with and without it.
 import concurrent.futures
 import csv
 import dataclasses
+import itertools
 import multiprocessing
 import statistics
 import time
@@ -39,10 +40,8 @@ class Options:
     """Steps of an episode."""
     samples: int = 32
     """Samples of a plan."""
-    temperature: float = 0.1
-    """Temperature without the value function."""
-    value_temperature: float = 1.0
-    """Temperature with it: values differ more than the rewards of a few steps do."""
+    temperatures: tuple[float, ...] = (0.1, 1.0)
+    """Temperatures: values differ more than the rewards of a few steps do."""
     noise: float = 0.5
     """Standard deviation of the noise."""
     processes: int = 1
@@ -57,6 +56,7 @@ class Episode:
 
     horizon: int
     value: bool
+    temperature: float
     seed: int
     episode_return: float
     length: int
@@ -64,7 +64,7 @@ class Episode:
     plan_ms: float
 
 
-def episode(options: Options, horizon: int, with_value: bool, seed: int) -> Episode:
+def episode(options: Options, horizon: int, with_value: bool, temperature: float, seed: int) -> Episode:
     nthread = None
     if options.processes > 1:
         torch.set_num_threads(1)
@@ -74,7 +74,7 @@ def episode(options: Options, horizon: int, with_value: bool, seed: int) -> Epis
     more: dict[str, Any] = {"value": lw.load_value(options.run)} if with_value else {}
     plan = lw.MPPI(
         task, horizon=horizon, samples=options.samples, noise=options.noise, discount=config["npg"]["gamma"], seed=seed,
-        temperature=options.value_temperature if with_value else options.temperature, nthread=nthread, **more, **params,
+        temperature=temperature, nthread=nthread, **more, **params,
     )  # fmt: skip
     env = lw.make(task, autoreset=False, horizon=options.steps, nthread=1, **params)
     env.rand_reset(seed)
@@ -86,26 +86,28 @@ def episode(options: Options, horizon: int, with_value: bool, seed: int) -> Epis
         env.step(action[None])
         total += env.reward.item()
     length = int(env.episode_step.item())
-    return Episode(horizon, with_value, seed, total, length, env.eval.item(), 1e3 * statistics.median(times))
+    return Episode(
+        horizon, with_value, temperature, seed, total, length, env.eval.item(), 1e3 * statistics.median(times)
+    )
 
 
 def main(options: Options) -> None:
-    cases = [(h, v, s) for h in sorted(options.horizons, reverse=True) for v in (False, True) for s in options.seeds]
+    kinds = list(itertools.product(sorted(options.horizons), (False, True), options.temperatures))
+    cases = [(*kind, seed) for kind in reversed(kinds) for seed in options.seeds]  # the longest first
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(options.processes, context) as pool:
         episodes = list(pool.map(episode, [options] * len(cases), *zip(*cases, strict=True)))
-    table = Table("horizon", "value function", "return", "steps of " + str(options.steps), "plan, ms")
-    for column in table.columns[2:]:
+    table = Table("horizon", "value function", "temperature", "return", f"steps of {options.steps}", "plan, ms")
+    for column in table.columns[3:]:
         column.justify = "right"
-    for horizon in sorted(options.horizons):
-        for with_value in (False, True):
-            rows = [e for e in episodes if (e.horizon, e.value) == (horizon, with_value)]
-            returns = [e.episode_return for e in rows]
-            table.add_row(
-                str(horizon), "yes" if with_value else "no",
-                f"{statistics.mean(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})",
-                f"{statistics.mean(e.length for e in rows):.0f}", f"{statistics.median(e.plan_ms for e in rows):.1f}",
-            )  # fmt: skip
+    for horizon, with_value, temperature in kinds:
+        rows = [e for e in episodes if (e.horizon, e.value, e.temperature) == (horizon, with_value, temperature)]
+        returns = [e.episode_return for e in rows]
+        table.add_row(
+            str(horizon), "yes" if with_value else "no", f"{temperature:g}",
+            f"{statistics.mean(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})",
+            f"{statistics.mean(e.length for e in rows):.0f}", f"{statistics.median(e.plan_ms for e in rows):.1f}",
+        )  # fmt: skip
     Console().print(table)
     if options.out is not None:
         with options.out.open("w", newline="") as file:

@@ -117,15 +117,15 @@ BASELINES: dict[str, Callable[[mujoco.MjModel], Any]] = {
 }
 
 
-def work(pipe: Connection, task: str, samples: int, horizon: int, seed: int) -> None:
+def work(pipe: Connection, task: str, samples: int, horizon: int, noise_scale: float, smooth: list, seed: int) -> None:
     """A process of the baseline: rolls out its share of the samples for every plan that it is sent."""
     env = BASELINES[task](lw.make(task, nthread=1).model)
     random = np.random.default_rng(seed)
     while (message := pipe.recv()) is not None:
         state, plan = message
-        noise = random.standard_normal((samples, horizon, plan.shape[1]))
+        noise = noise_scale * random.standard_normal((samples, horizon, plan.shape[1]))
         for t in range(2, horizon):
-            noise[:, t] = 0.25 * noise[:, t] + 0.8 * noise[:, t - 1]
+            noise[:, t] = smooth[0] * noise[:, t] + smooth[1] * noise[:, t - 1] + smooth[2] * noise[:, t - 2]
         actions = np.clip(plan + noise, -1.0, 1.0)
         returns = np.zeros(samples)
         for k in range(samples):
@@ -146,11 +146,12 @@ class Baseline:
         self.pipes, self.processes = [], []
         for seed, share in enumerate(shares):
             pipe, other = context.Pipe()
-            process = context.Process(target=work, args=(other, task, int(share), plan.horizon, seed), daemon=True)
+            settings = (int(share), plan.horizon, plan.settings["noise"], plan.settings["smoothing"], seed)
+            process = context.Process(target=work, args=(other, task, *settings), daemon=True)
             process.start()
             self.pipes.append(pipe)
             self.processes.append(process)
-        self(plan.state_of().numpy())  # wait until all are there
+        self(plan.state_of().cpu().numpy())  # wait until all are there
 
     def __call__(self, state: np.ndarray) -> None:
         for pipe in self.pipes:
@@ -181,17 +182,11 @@ class BareC:
         self.batch = Batch(engine.native_model, plan.samples, engine.nthread)
         self.control = np.zeros((plan.samples, plan.horizon * self.nstep, engine.model.nu))
         self.records = None
-        env = plan.env
-        low, high = torch.as_tensor(env.action_space.low), torch.as_tensor(env.action_space.high)
-        ranges = engine.model.actuator_ctrlrange
-        self.gain = (ranges[:, 1] - ranges[:, 0]) / (high - low).double().numpy()
-        self.offset = ranges[:, 0] - self.gain * low.double().numpy()
 
     def load(self, state: torch.Tensor) -> None:
         """The last plan's state and samples."""
         self.batch.state[:] = state[0, : self.size].numpy()
-        controls = self.plan.sampled.numpy().transpose(1, 0, 2) * self.gain + self.offset
-        self.control[:] = np.repeat(controls, self.nstep, axis=1)
+        self.control[:] = np.repeat(self.plan._loop._controls.numpy().transpose(1, 0, 2), self.nstep, axis=1)
 
     def __call__(self) -> None:
         self.records = self.batch.rollout(
@@ -288,7 +283,7 @@ def measure(task: str, samples: int, options: Options) -> Row:
         python = 0.0
         # by far the slowest: not at every step where that would take all the time
         if baseline is not None and len(times) % 5 == 0:
-            python = timed(lambda state=state: baseline(state[0].numpy()))
+            python = timed(lambda state=state: baseline(state[0].cpu().numpy()))
         times.append((spent, alone, python))
         plant.step(plan.actions[:1])
         if plant.done.item():

@@ -55,12 +55,13 @@ class MPPI:
             covariance, (nu, nu) (0.5).
         smoothing: Weights (b0, b1, b2) of the noise, of the last step's and of the one before it, from the third step
             on; (1, 0, 0) is white noise ((0.25, 0.8, 0)).
-        discount: Of rewards and of the terminal value, a step (1).
+        discount: Of rewards and of the terminal value, a step (1, or what ``value`` was fitted for).
         iterations: Improvements of the plan in a call (1).
         fill: What fills the end of a plan that moves forward: "zero" (the action nearest to it), "repeat" the last
             action, or an action, (nu,) ("zero").
         termination: Whether a sample that reaches the end of its episode earns nothing from there on ("stop"), or
-            goes on ("ignore", as Lyceum and trajopt do).
+            goes on ("ignore", as Lyceum and trajopt do). Either way a sample whose physics fails anywhere within the
+            horizon has no weight.
         value: What is added for where a sample ends: a ``ValueFunction``, or anything that makes (nsample,) values of
             (nsample, nobs) observations, or a Warp function of one observation, ``value(obs: Row[float]) -> float``,
             which on the Warp engine becomes part of the recording.
@@ -104,6 +105,10 @@ class MPPI:
         **options: Any,
     ) -> None:
         task = find_task(task)
+        for name, instead in (("nworld", "samples is the number of worlds"), ("autoreset", "samples never reset")):
+            if name in options:
+                raise ValueError(f"a planner takes no {name}: {instead}")
+        discount = getattr(value, "discount", None) if discount is None else discount
         given = dict(
             horizon=horizon, samples=samples, temperature=temperature, noise=noise, smoothing=smoothing,
             discount=discount, iterations=iterations, fill=fill, termination=termination,
@@ -131,6 +136,7 @@ class MPPI:
         self.timestep = self.env.timestep
         self._loop = OpenLoop(self.env, self.horizon)
         self.value = value
+        self.seed = seed
         self._value_kernel = planning.value_kernel(value) if isinstance(value, wp.Function) else None
         space = self.env.action_space
         factor = _factor(settings["noise"], space.size)
@@ -154,10 +160,16 @@ class MPPI:
         self.standard_noise, self.sampled = torch_view(self._noise), loop.actions
         self.returns, self.weights = torch_view(self._return), torch_view(self._weight)
         self._terminal_view, self._shift_view = torch_view(self._terminal), torch_view(self._shift)
+        if value is not None and self._value_kernel is None:
+            try:
+                self._torch_values()
+            except RuntimeError as error:  # its weights lie elsewhere, or it takes other observations
+                raise ValueError(f"value can't take observations {described(loop.final_obs)}: {error}") from error
         self.reset(seed)
+        self._made = True
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in _DEFAULTS and name in self.__dict__:
+        if name in (*_DEFAULTS, "value", "seed") and "_made" in self.__dict__:
             raise AttributeError(f"{name} is part of what was recorded: make another MPPI with {name}={value!r}")
         super().__setattr__(name, value)
 
@@ -208,6 +220,9 @@ class MPPI:
     def state_of(self, **parts: Any) -> torch.Tensor:
         """A state by its parts, as a robot knows it; the rest is as the task's fixed reset leaves it.
 
+        That is true also of fields which a task wants as the last substep left them: they matter for what the first
+        step of a plan came from. A ``time`` sets the step counter, too, if ``step`` does not.
+
         Args:
             parts: Values for parts of ``env.state_space``: qpos, qvel, time, mocap_pos, ...
 
@@ -215,15 +230,20 @@ class MPPI:
             (state_space.size,) float64.
 
         Raises:
-            ValueError: There is no such part, or its value has another size.
+            ValueError: There is no such part, or its value has another size, or is no number.
         """
         space = self.env.state_space
         state = self._initial.clone()
+        if "time" in parts and "step" not in parts:
+            parts["step"] = np.round(np.asarray(parts["time"], dtype=np.float64) / self.timestep)
         for name, value in parts.items():
             if name not in space.parts:
                 raise ValueError(f"a state of {self.env.task.name!r} has no part {name!r}: it has {list(space.parts)}")
             target = state[space.parts[name]]
-            values = torch.as_tensor(value, dtype=torch.float64).ravel()
+            try:
+                values = torch.as_tensor(value, dtype=torch.float64).ravel()
+            except (TypeError, ValueError, RuntimeError) as error:
+                raise ValueError(f"the part {name!r} of a state has to be numbers, not {value!r}") from error
             if values.shape != target.shape:
                 raise ValueError(f"the part {name!r} of a state has {len(target)} numbers, not {len(values)}")
             target.copy_(values)
@@ -288,7 +308,8 @@ class MPPI:
         if not isinstance(state, torch.Tensor) or state.shape != expected.shape or state.dtype != expected.dtype:
             raise ValueError(
                 f"a state to plan from has to be {described(expected)}, not {described(state)}: take it from "
-                "env.get_state() of the same task, or make it by its parts with plan.state_of(qpos=..., qvel=...)"
+                "env.get_state() of the same task, or make it by its parts with plan.state_of(qpos=..., qvel=...). "
+                "(env.field() of an acceleration or of its like makes an environment's states longer.)"
             )
         # on a GPU this would wait for the device: there every sample fails, and the plan stays
         if state.device.type == "cpu" and not (finite := torch.isfinite(state)).all():
