@@ -202,9 +202,7 @@ class BareWarp:
         assert isinstance(engine, WarpEngine)
         self.plan, self.env, self.size = plan, env, engine.integration_size
         with wp.ScopedDevice(env.device):
-            self.m = mjw.put_model(env.model)
-            self.m.opt.warn_overflow = 0
-            self.d = mjw.make_data(env.model, nworld=env.nworld, nconmax=engine.nconmax, njmax=engine.njmax)
+            self.m, self.d = engine.bare()
             self.state = wp.zeros((env.nworld, self.size), dtype=float)
             self.controls = wp.zeros((plan.horizon, env.nworld, env.model.nu), dtype=float)
             mjw.step(self.m, self.d)

@@ -91,9 +91,7 @@ class BareWarp:
         self.engine = engine
         self.spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
         with wp.ScopedDevice(env.device):
-            self.m = mjw.put_model(env.model)
-            self.m.opt.warn_overflow = 0
-            self.d = mjw.make_data(env.model, nworld=env.nworld, nconmax=engine.nconmax, njmax=engine.njmax)
+            self.m, self.d = engine.bare()
             mjw.step(self.m, self.d)
             with wp.ScopedCapture() as capture:
                 for _ in range(env.task.frame_skip):

@@ -125,7 +125,8 @@ class Task:
     """The range of an action that the default ``control`` maps to the model's control ranges; None: actions
     are controls."""
     planning: ClassVar[Mapping[str, Any]] = {}
-    """What suits this task of MPPI's arguments: horizon, samples, temperature, noise, ..."""
+    """What suits this task of MPPI's arguments (horizon, samples, temperature, noise, ...), and options or
+    parameters for the planner's worlds alone."""
 
     scope: ClassVar[dict[str, Any]] = {}
     """What the class's module held by the names above when the class was made."""

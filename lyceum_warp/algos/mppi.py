@@ -25,7 +25,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.kernels import planning
 from lyceum_warp.kernels.arrays import torch_view
 from lyceum_warp.openloop import OpenLoop
-from lyceum_warp.registry import find_task, task_name
+from lyceum_warp.registry import find_task
 from lyceum_warp.spaces import Space
 from lyceum_warp.task import Task
 from lyceum_warp.validate import described, whole_number
@@ -44,7 +44,7 @@ class MPPI:
     many plans came before it, and on what those left as the plan to start from.
 
     Everything that is left at None comes from the task's ``planning``, if it names it, and else from the default in
-    brackets.
+    brackets. ``planning`` may also hold options and parameters for the planner's worlds, which those given override.
 
     Args:
         task: Name of a task, a file with one, or its class.
@@ -73,7 +73,7 @@ class MPPI:
     """
 
     settings: dict[str, Any]
-    """The settings above as they are, from horizon to termination; numbers, words and lists of them."""
+    """The settings above as they are, from horizon to termination, and the options of the planner's worlds."""
     actions: torch.Tensor
     """The plan, (horizon, nu); the first row is what the last call returned."""
     nominal: torch.Tensor
@@ -113,10 +113,10 @@ class MPPI:
             horizon=horizon, samples=samples, temperature=temperature, noise=noise, smoothing=smoothing,
             discount=discount, iterations=iterations, fill=fill, termination=termination,
         )  # fmt: skip
-        settings = _DEFAULTS | dict(task.planning) | {name: v for name, v in given.items() if v is not None}
-        if unknown := settings.keys() - _DEFAULTS.keys():
-            names = ", ".join(_DEFAULTS)
-            raise ValueError(f"planning of the task {task_name(task)!r} has {sorted(unknown)}: it takes {names}")
+        own = dict(task.planning)
+        options = {name: own[name] for name in own if name not in _DEFAULTS} | options
+        own = {name: own[name] for name in own if name in _DEFAULTS}
+        settings = _DEFAULTS | own | {name: v for name, v in given.items() if v is not None}
         self.horizon = whole_number("horizon", settings["horizon"], low=1)
         self.samples = whole_number("samples", settings["samples"], low=1)
         self.iterations = whole_number("iterations", settings["iterations"], low=1)
@@ -152,7 +152,7 @@ class MPPI:
             self._terminal, self._return, self._weight = (wp.zeros(self.samples, dtype=float) for _ in range(3))
             self._summary = wp.zeros(4, dtype=float)
             self._seed, self._count, self._shift = (wp.zeros(1, dtype=int) for _ in range(3))
-        self.settings = {name: _plain(value) for name, value in settings.items()}
+        self.settings = {name: _plain(value) for name, value in (settings | options).items()}
         loop = self._loop
         self._samples = wp.from_torch(loop.actions)
         self._earned = [wp.from_torch(buffer) for buffer in (loop.reward, loop.terminated, loop.fault)]
