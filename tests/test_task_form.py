@@ -140,3 +140,14 @@ def test_buffers_are_written_into() -> None:
         env.action = torch.zeros(2, 3)
     env.step(torch.zeros(2, 3, requires_grad=True) + 1.0)
     assert not env.action.requires_grad
+
+
+def test_a_file_in_the_current_folder_takes_no_tasks_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only a model that is asked for comes from the current folder."""
+    spec = lw.gymnasium_model("hopper.xml")
+    spec.geom("torso_geom").density = 5000
+    (tmp_path / "hopper.xml").write_text(spec.to_xml())
+    own = lw.make("hopper").model.body_mass
+    monkeypatch.chdir(tmp_path)
+    assert (lw.make("hopper").model.body_mass == own).all()
+    assert lw.make("hopper", model="hopper.xml").model.body_mass[1] > 2 * own[1]
