@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,9 +11,13 @@ import torch
 import warp as wp
 
 import lyceum_warp as lw
+from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.npg import FisherProduct, conjugate_gradient
 from lyceum_warp.algos.policy import Normalizer
+from lyceum_warp.algos.rollout import finished, summary
+from lyceum_warp.algos.value import ValueFit, _CapturedStep
 from lyceum_warp.kernels import returns
+from lyceum_warp.runs import Run
 
 SMALL = lw.NPGConfig(samples=320, hidden=(8, 8), value_hidden=(16,), mean_every=2, mean_episodes=2)
 
@@ -148,6 +154,91 @@ def test_a_run_is_reproducible_and_resumes_to_the_bit(env: lw.Env, rollout: str)
     np.testing.assert_equal([numbers(next(resumed)) for _ in range(2)], rest)
 
 
+def test_statistics_are_of_the_episodes_that_ended() -> None:
+    """Against plain ones, in one record and pooled from the records of two halves of the worlds."""
+    env = lw.make("hopper", nworld=6)
+    rollout = lw.Rollout(env, 60)
+    rollout.running_return[0] = math.nan  # an episode that was begun in its middle is not counted
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, log_std=0.0)
+    rollout.collect(policy, torch.randn(rollout.action.shape, generator=torch.Generator().manual_seed(0)))
+    ended = rollout.done & ~rollout.episode_return.isnan()
+    assert 6 < ended.sum() < rollout.done.sum()
+    returns = rollout.episode_return[ended].double()
+    expected = {
+        "return_mean": returns.mean(), "return_std": returns.std(correction=0), "return_min": returns.min(),
+        "return_max": returns.max(), "length_mean": rollout.episode_length[ended].mean(),
+        "terminal_reward": rollout.reward[ended].mean(), "eval_mean": rollout.eval[ended].mean(),
+        "success": rollout.success[ended].float().mean(),
+    }  # fmt: skip
+    assert summary([finished(rollout).tolist()]) == pytest.approx({k: v.item() for k, v in expected.items()}, rel=1e-5)
+    names = ("done", "episode_return", "episode_length", "reward", "eval", "success")
+    halves = [
+        finished(SimpleNamespace(**{name: getattr(rollout, name)[:, part] for name in names})).tolist()
+        for part in (slice(0, 1), slice(1, None))
+    ]
+    assert halves[0][0] < halves[1][0]
+    assert summary(halves) == pytest.approx({k: v.item() for k, v in expected.items()}, rel=1e-5)
+    assert all(math.isnan(number) for number in summary([[0.0] * 9]).values())
+
+
+def test_faults_of_a_record_are_counted() -> None:
+    env = lw.make("hopper", nworld=3)
+    rollout = lw.Rollout(env, 4)
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
+    noise = torch.zeros(rollout.action.shape)
+    noise[1:3, 2] = math.nan
+    rollout.collect(policy, noise)
+    assert rollout.faults.tolist() == [0, 0, 2]
+    assert env.fault_counts["action"] == 2
+    noise.zero_()
+    rollout.collect(policy, noise)
+    assert rollout.faults.tolist() == [0, 0, 0]
+
+
+def test_mini_batches_grow_with_the_samples(env: lw.Env) -> None:
+    def batch(samples: int, given: int | None = None) -> int:
+        return lw.NPG(env, config=dataclasses.replace(SMALL, samples=samples, value_batch=given)).fit.batch
+
+    assert [batch(320), batch(16 * 2048)] == [64, 128]
+    assert batch(320, 10) == 10
+
+
+def test_a_mini_batch_of_its_own_counting_learns_as_one_that_is_given() -> None:
+    """The step that CUDA records, run without a recording: an index on the device, a last mini-batch filled up."""
+    fits = []
+    obs, step, target = torch.randn(50, 5), torch.zeros(50), torch.randn(50)
+    for counting in (False, True):
+        value = lw.ValueFunction(5, (8,), scale=1.0, generator=torch.Generator().manual_seed(0))
+        fit = ValueFit(value, 50, 5, rate=1e-2, epochs=2, batch=16, team=Team())
+        generator = torch.Generator().manual_seed(1)
+        if not counting:
+            fit(obs, step, target, generator)
+        else:
+            captured = _CapturedStep(fit, obs, target[:, None])
+            for _ in range(2):
+                captured.load(obs, target[:, None], torch.randperm(50, generator=generator))
+                for _ in range(captured.count):
+                    captured.learn()
+        fits.append(torch.cat([p.detach().flatten() for p in fit.parameters]))
+    torch.testing.assert_close(*fits)
+
+
+def test_a_value_function_knows_the_discount_of_the_returns_that_it_was_fitted_to(env: lw.Env, tmp_path: Path) -> None:
+    env.rand_reset(0)
+    config = dataclasses.replace(SMALL, gamma=0.9)
+    value = lw.ValueFunction(env.obs_space.size, (4,))
+    assert value.discount is None
+    npg = lw.NPG(env, value=value, config=config)
+    assert value.discount == lw.NPG(env, config=config).value.discount == 0.9
+    run = Run.create(tmp_path, {}, device="cpu")
+    run.save(0, npg.policy, {}, value)
+    assert lw.load_value(run).discount == 0.9
+    content = torch.load(run.checkpoint)
+    del content["value"]["shape"]["discount"]  # as older releases saved it
+    torch.save(content, run.checkpoint)
+    assert lw.load_value(run).discount is None
+
+
 def test_segments_go_on_where_the_last_ones_ended(env: lw.Env) -> None:
     env.rand_reset(0)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=16 * 5, mean_every=0))
@@ -167,12 +258,14 @@ def test_segments_go_on_where_the_last_ones_ended(env: lw.Env) -> None:
 def test_gradient_that_is_not_finite_leaves_the_policy_alone(env: lw.Env) -> None:
     env.rand_reset(0)
     npg = lw.NPG(env, config=SMALL)
-    before = [p.clone() for p in npg.policy.parameters()]
     with torch.no_grad():
-        npg.value.network[0].weight.fill_(math.nan)
+        npg.policy.log_std.fill_(-4.0)  # below its limit, which is only kept to by a step
+        npg.value.network[0].weight[0, 0] = math.nan
+    before = [p.clone() for p in (*npg.policy.parameters(), *npg.value.parameters())]
     with pytest.raises(FloatingPointError, match="gradient of iteration 1 is not finite"):
         next(npg)
-    assert all(torch.equal(a, b) for a, b in zip(before, npg.policy.parameters(), strict=True))
+    after = (*npg.policy.parameters(), *npg.value.parameters())
+    assert all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(before, after, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -240,3 +333,72 @@ def test_npg_wants_automatic_resets() -> None:
         lw.NPG(env)
     with pytest.raises(ValueError, match="autoreset=True"):
         lw.evaluate(env, lw.GaussianPolicy(6, 2), 1)
+
+
+def on_gpu(**changes: object) -> lw.NPG:
+    """NPG on Hopper on a GPU, 2 iterations old: everything is compiled and recorded."""
+    env = lw.make("hopper", nworld=64, device="cuda")
+    config = lw.NPGConfig(samples=64 * 16, rollout="segments", mean_every=0, value_batch=100, **changes)
+    npg = lw.NPG(env, config=config, seed=1)
+    for _ in range(2):
+        next(npg)
+    return npg
+
+
+@pytest.mark.gpu
+def test_gpu_an_iteration_waits_for_one_copy_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everything that torch would have to wait for raises, but for the copy of the statistics."""
+    npg = on_gpu(normalize=True)
+    copies = []
+
+    def tolist(tensor: torch.Tensor) -> list[list[float]]:
+        torch.cuda.set_sync_debug_mode("default")
+        copies.append(tensor.shape)
+        numbers = tensor.cpu().numpy().tolist()
+        torch.cuda.set_sync_debug_mode("error")
+        return numbers
+
+    monkeypatch.setattr(torch.Tensor, "tolist", tolist)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        it = next(npg)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert len(copies) == 1 and math.isfinite(it.kl)
+
+
+@pytest.mark.gpu
+def test_gpu_a_recorded_fit_learns_as_plain_launches() -> None:
+    """In two calls: the first records between two mini-batches, the second only replays, on other samples."""
+    samples, batch = 1000, 96  # a last mini-batch that is smaller
+    generator = torch.Generator("cuda").manual_seed(2)
+    data = [torch.randn(samples, 6, generator=generator, device="cuda") for _ in range(2)]
+    fits = []
+    for recorded in (False, True):
+        value = lw.ValueFunction(5, (32, 32), scale=1.0, generator=torch.Generator().manual_seed(0)).cuda()
+        fit = ValueFit(value, samples, 10, rate=1e-2, epochs=2, batch=batch, team=Team())
+        generator = torch.Generator("cuda").manual_seed(1)
+        for obs, target in ((part[:, :5], part[:, 5]) for part in data):
+            if recorded:
+                fit(obs, torch.zeros(samples, device="cuda"), target, generator)
+                assert fit._step is not None and fit._step.graph is not None
+                continue
+            for _ in range(fit.epochs):
+                order = torch.randperm(samples, generator=generator, device="cuda")
+                for rows in order.split(batch):
+                    fit.learn(obs[rows], target[rows, None], 1.0 / len(rows))
+        fits.append(torch.nn.utils.parameters_to_vector(fit.parameters))
+    torch.testing.assert_close(*fits, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.gpu
+def test_gpu_resumes() -> None:
+    """A recorded fit has the addresses of its optimizer's moments: other ones want another recording."""
+    npg = on_gpu()
+    saved = npg.state_dict()
+    first = next(npg)
+    npg.load_state_dict(saved)
+    again = next(npg)
+    assert again.kl == pytest.approx(first.kl, rel=1e-2)
+    assert again.value_error == pytest.approx(first.value_error, rel=1e-2)
+    assert again.gradient_norm == pytest.approx(first.gradient_norm, rel=1e-2)

@@ -5,21 +5,20 @@ Control"): generalised advantages, the vanilla gradient, conjugate gradient on t
 step of a fixed length in the metric of the Fisher information.
 """
 
-import contextlib
 import copy
 import dataclasses
 import logging
-import math
-import time
 from collections.abc import Iterator
 from typing import Any, Literal
 
 import torch
 import warp as wp
 
+from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.policy import GaussianPolicy, Normalizer
-from lyceum_warp.algos.rollout import Episodes, Rollout, evaluate, finished
-from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.algos.rollout import Rollout, evaluate, finished, pooled, summary
+from lyceum_warp.algos.timing import Clock, one_thread
+from lyceum_warp.algos.value import ValueFit, ValueFunction
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import returns
 
@@ -63,8 +62,9 @@ class NPGConfig:
     """Widths of the value function's hidden layers."""
     value_epochs: int = 2
     """Passes over the samples when the value function is fitted."""
-    value_batch: int = 64
-    """Samples in a mini-batch of the same."""
+    value_batch: int | None = None
+    """Samples in a mini-batch of the same; by default a 256th of all, but at least the paper's 64, so that more
+    samples cost no more steps."""
     value_rate: float = 1e-3
     """Learning rate of the same (Adam)."""
     time_orders: int = 0
@@ -145,6 +145,8 @@ class NPG:
         value: The value function; a new one by default.
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
+        team: The processes that learn together, each with an environment of its share of the worlds; every one
+            of them makes the same calls of the same arguments, and gets the same numbers.
 
     Raises:
         FloatingPointError: Raised by an iteration whose gradient is not finite; the policy stays as it was.
@@ -158,10 +160,19 @@ class NPG:
         config: NPGConfig | None = None,
         *,
         seed: int = 0,
+        team: Team | None = None,
     ) -> None:
         self.env = env
+        self.team = team = team or Team()
         self.config = config = config or NPGConfig()
         _check(config)
+        n, nworld = env.nworld, env.nworld * team.size
+        self._own = slice(team.rank * n, (team.rank + 1) * n)
+        if team.size > 1 and env.first_world != self._own.start:
+            raise ValueError(
+                f"process {team.rank} of {team.size} with {n} worlds needs an environment with "
+                f"first_world={self._own.start}, not {env.first_world}"
+            )
         if not env.autoreset:
             raise ValueError("NPG needs an environment that resets by itself: make it with autoreset=True")
         device = env.obs.device
@@ -173,18 +184,26 @@ class NPG:
         self.value = value or ValueFunction(
             nobs, config.value_hidden, scale=scale, time_orders=config.time_orders, **options
         )
+        self.value.discount = config.gamma
         self.policy.to(device)
         self.value.to(device)
-        self.optimizer = torch.optim.Adam(self.value.parameters(), lr=config.value_rate, fused=True)
-        self.rollout = Rollout(env, -(-config.samples // env.nworld))
+        self.rollout = Rollout(env, -(-config.samples // nworld))
+        self.count = self.rollout.steps * nworld
+        self.fit = ValueFit(
+            self.value, self.count, n, rate=config.value_rate, epochs=config.value_epochs,
+            batch=config.value_batch or max(64, self.count // 256), team=team,
+        )  # fmt: skip
         whole = 0 < env.horizon <= self.rollout.steps
         self.segments = config.rollout == "segments" or (config.rollout == "auto" and not whole)
-        if not self.segments and not whole:
+        if not self.segments and not whole and team.leads:
             log.warning(
                 "%d samples of %d worlds are %d steps: no episode will reach its horizon of %d; take fewer worlds, "
-                "more samples, or rollout='segments'", config.samples, env.nworld, self.rollout.steps, env.horizon,
+                "more samples, or rollout='segments'", config.samples, nworld, self.rollout.steps, env.horizon,
             )  # fmt: skip
-        self.noise = torch.empty_like(self.rollout.action)
+        self.noise = torch.empty(self.rollout.steps, nworld, nact, device=device)
+        places = torch.arange(0, self.count, max(1, round(1.0 / max(config.fisher_fraction, 1e-9))))
+        rows, own = team.rows(places, n)
+        self._fisher_count, self._fisher_rows = len(places), rows[own].to(device)
         # a seed of its own: the same numbers should not make both the weights and the noise
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
         self.iteration = 0
@@ -194,92 +213,96 @@ class NPG:
         self._mean_env: Env | None = None
         self.rollout.restart()
         if self.segments:
-            self.rollout.stagger(self.generator)
+            self.rollout.stagger(self.generator, team)
 
     def __iter__(self) -> Iterator[Iteration]:
         return self
 
     def __next__(self) -> Iteration:
-        config, rollout = self.config, self.rollout
-        faults_before = sum(self.env.fault_counts.values())
-        clock = _Clock(self.env.obs.device)
+        config, rollout, team = self.config, self.rollout, self.team
+        clock = Clock(self.env.obs.device)
 
         # 1. Samples of the current policy.
         if not self.segments:
             rollout.restart()
         self.sample()
-        time_sample = clock.lap()
+        clock.mark()
 
         # 2. Advantages, from the value function as it was while the samples were drawn.
-        advantage, target, statistics = self.advantages()
+        advantage, target, fitted = self.advantages()
 
         # 3. Vanilla gradient of E[log pi(a|s) A(s, a)].
         obs, action = rollout.obs.flatten(0, 1), rollout.action.flatten(0, 1)
         parameters = [p for p in self.policy.parameters() if p.requires_grad]
-        objective = (self.policy.log_prob(obs, action) * advantage.flatten()).mean()
-        gradient = _flat(torch.autograd.grad(objective, parameters))
-        time_gradient = clock.lap()
+        objective = (self.policy.log_prob(obs, action) * advantage.flatten()).sum() / self.count
+        gradient = team.sum(_flat(torch.autograd.grad(objective, parameters)))
+        clock.mark()
 
         # 4. Natural gradient x = F^-1 g, and the step x sqrt(delta / (g.x)), so that step.F.step = delta.
-        fisher = FisherProduct(self.policy, _thinned(obs, config.fisher_fraction), config.damping)
+        some = obs if self._fisher_count == self.count else obs[self._fisher_rows]
+        fisher = FisherProduct(self.policy, some, config.damping, count=self._fisher_count, team=team)
         direction = conjugate_gradient(fisher, gradient, config.cg_iterations)
         step = direction * torch.sqrt(config.delta / (gradient @ direction + 1e-20))
-        if not torch.isfinite(step).all():
+        finite, kl = self.move(step, obs)
+        clock.mark()
+
+        # One copy brings all numbers of this iteration to the host, those of every process.
+        spread = self.policy.log_std.detach().exp().mean()
+        own = [finite, kl, step.norm(), gradient.norm(), spread, *fitted, rollout.faults.sum()]
+        rows = team.gather(torch.cat([torch.stack([x.double() for x in own]), finished(rollout)])[None]).tolist()
+        if not rows[0][0]:
             raise FloatingPointError(
                 f"the policy gradient of iteration {self.iteration + 1} is not finite; the policy was left as it "
                 "was. Check the task's rewards and observations, or make the step (delta) smaller"
             )
-        kl = self.move(step, obs)
-        time_solve = clock.lap()
 
         # 5. The value function, on the returns of these samples.
-        self.fit_value(obs, rollout.step.flatten(), target.flatten())
+        self.fit(obs, rollout.step.flatten(), target.flatten(), self.generator)
         for module in (self.policy, self.value):
             if isinstance(module.normalizer, Normalizer):
-                module.normalizer.update(obs)
-        time_value = clock.lap()
+                module.normalizer.update(obs, team)
+        clock.mark()
 
-        # One copy brings all numbers to the host.
-        spread = self.policy.log_std.detach().exp().mean()
-        numbers = torch.stack([kl, step.norm(), gradient.norm(), spread, *statistics]).tolist()
         self.iteration += 1
-        self.samples += obs.shape[0]
-        episodes = finished(rollout)
+        self.samples += self.count
         mean = self._evaluate_mean()
+        clock.mark()
+        time_sample, time_gradient, time_solve, time_value, time_mean = clock.seconds()
+        _, _, step_norm, gradient_norm, std_mean = rows[0][:5]
         return Iteration(
             iteration=self.iteration,
             samples=self.samples,
-            **_summary(episodes),
+            **summary([row[10:] for row in rows]),
             **mean,
-            kl=numbers[0],
-            step_norm=numbers[1],
-            gradient_norm=numbers[2],
-            std_mean=numbers[3],
-            value_error=numbers[4],
-            explained_variance=numbers[5],
-            faults=sum(self.env.fault_counts.values()) - faults_before,
+            kl=sum(row[1] for row in rows) / len(rows),
+            step_norm=step_norm,
+            gradient_norm=gradient_norm,
+            std_mean=std_mean,
+            **_fit_quality(obs.shape[0], [row[5:9] for row in rows]),
+            faults=round(sum(row[9] for row in rows)),
             time_sample=time_sample,
             time_gradient=time_gradient,
             time_solve=time_solve,
             time_value=time_value,
-            time_mean=clock.lap(),
-            samples_per_second=obs.shape[0] / time_sample,
+            time_mean=time_mean,
+            samples_per_second=self.count / time_sample,
         )
 
     def sample(self) -> None:
         """Fill the record with steps of the current policy under fresh noise."""
-        with _one_thread():
+        with one_thread():
             self.noise.normal_(generator=self.generator)
-            self.rollout.collect(self.policy, self.noise)
+            self.rollout.collect(self.policy, self.noise[:, self._own])
 
     @torch.no_grad()
     def advantages(self) -> tuple[torch.Tensor, torch.Tensor, list[torch.Tensor]]:
         """Generalised advantages and discounted returns, (steps, nworld), and how well the values fitted them.
 
         A state that a time limit, or the end of the record, cut off is worth what the value function says; a
-        state in which the episode terminated is worth nothing (mjrl; Lyceum bootstraps there, too).
+        state in which the episode terminated is worth nothing (mjrl; Lyceum bootstraps there, too). The fit is
+        told by mean and summed squared deviation of the returns, and of what the values missed of them.
         """
-        rollout, config = self.rollout, self.config
+        rollout, config, team = self.rollout, self.config, self.team
         value = self.value(rollout.obs, rollout.step)
         next_value = self.value(rollout.final_obs, rollout.step + 1.0)
         arrays = [rollout.reward, value, next_value, rollout.terminated, rollout.done]
@@ -288,75 +311,86 @@ class NPG:
         args = [*inputs, config.gamma, config.lam, *outputs]
         wp.launch(returns.advantages, self.env.nworld, args, device=self.env.device)
         advantage, target = self._advantage, self._return
-        error = (target - value).square().mean() / target.square().mean().clamp_min(1e-20)
-        explained = 1.0 - (target - value).var() / target.var().clamp_min(1e-20)
+        fitted = []
+        for part in (target.double(), (target - value).double()):
+            fitted += [part.mean(), (part - part.mean()).square().sum()]
         if config.whiten:
-            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
-        return advantage, target, [error, explained]
+            advantage = advantage - team.sum(advantage.sum()) / self.count
+            variance = team.sum(advantage.square().sum()) / (self.count - 1)
+            advantage = advantage / (variance.sqrt() + 1e-6)
+        return advantage, target, fitted
 
     @torch.no_grad()
-    def move(self, step: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
-        """Add a step to the policy's parameters; returns the mean KL divergence from the old to the new."""
+    def move(self, step: torch.Tensor, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Add a step to the policy's parameters, unless it is not finite.
+
+        Returns:
+            Whether it is finite, and the KL divergence from the old policy to the new one, averaged over ``obs``.
+        """
         old_mean, old_log_std = self.policy(obs), self.policy.log_std.clone()
+        finite = torch.isfinite(step).all()
         start = 0
         for parameter in self.policy.parameters():
             if parameter.requires_grad:
-                parameter.add_(step[start : start + parameter.numel()].view_as(parameter))
+                moved = parameter + step[start : start + parameter.numel()].view_as(parameter)
+                if parameter is self.policy.log_std:
+                    moved.clamp_(min=self.config.min_log_std)
+                parameter.copy_(torch.where(finite, moved, parameter))
                 start += parameter.numel()
-        self.policy.log_std.clamp_(min=self.config.min_log_std)
+        self.team.follow(self.policy.parameters())
         log_std = self.policy.log_std
         square = (old_mean - self.policy(obs)).square() + torch.exp(2 * old_log_std)
-        return (log_std - old_log_std + 0.5 * square * torch.exp(-2 * log_std) - 0.5).sum(-1).mean()
-
-    def fit_value(self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor) -> None:
-        """Mini-batch Adam on the squared error of the value function, in random order."""
-        config = self.config
-        with torch.no_grad():
-            features = self.value.features(obs, step)
-            target = (target / self.value.scale).unsqueeze(-1)
-        with _one_thread():
-            for _ in range(config.value_epochs):
-                order = torch.randperm(len(features), generator=self.generator, device=features.device)
-                for batch in order.split(config.value_batch):
-                    self.optimizer.zero_grad(set_to_none=False)
-                    torch.nn.functional.mse_loss(self.value.network(features[batch]), target[batch]).backward()
-                    self.optimizer.step()
+        return finite, (log_std - old_log_std + 0.5 * square * torch.exp(-2 * log_std) - 0.5).sum(-1).mean()
 
     def _evaluate_mean(self) -> dict[str, Any]:
         config = self.config
         names = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")
         if not config.mean_every or self.iteration % config.mean_every:
             return dict.fromkeys(names)
-        if self._mean_env is None:
-            self._mean_env = self.env.replicate(nworld=config.mean_episodes)
-        # the same initial states each time, and none of those that are trained on: what changes is the policy
-        self._mean_env.follow(self.env)
-        episodes = evaluate(self._mean_env, self.policy, config.mean_episodes, seed=MEAN_SEED)
-        parts = (episodes.returns, episodes.lengths, episodes.rewards, episodes.evals, episodes.success)
-        return {name: part.mean().item() for name, part in zip(names, parts, strict=True)}
+        means = torch.zeros(len(names), dtype=torch.float64, device=self.env.obs.device)
+        if self.team.leads:
+            if self._mean_env is None:
+                self._mean_env = self.env.replicate(nworld=config.mean_episodes)
+            # the same initial states each time, and none of those that are trained on: what changes is the policy
+            self._mean_env.follow(self.env)
+            episodes = evaluate(self._mean_env, self.policy, config.mean_episodes, seed=MEAN_SEED)
+            parts = (episodes.returns, episodes.lengths, episodes.rewards, episodes.evals, episodes.success)
+            means.copy_(torch.stack([part.mean() for part in parts]))
+        self.team.follow([means])
+        return dict(zip(names, means.tolist(), strict=True))
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the next iteration depends on."""
+        """Everything that the next iteration depends on, all processes' worlds included.
+
+        With several processes every one has to call it. Any number of them can go on from it.
+        """
         state = {
             "policy": self.policy.state_dict(),
             "value": self.value.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizer": self.fit.state_dict(),
             "generator": self.generator.get_state(),
-            "env": self.env.get_state(),
-            "returns": self.rollout.running_return.clone(),
+            "env": self.team.gather(self.env.get_state()),
+            "returns": self.team.gather(self.rollout.running_return),
             "iteration": self.iteration,
             "samples": self.samples,
         }
         return copy.deepcopy(state)  # a module's own state_dict shares memory with its parameters
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on exactly where ``state_dict`` was taken."""
+        """Go on exactly where ``state_dict`` was taken.
+
+        Raises:
+            ValueError: It was taken with another number of worlds, or does not fit otherwise.
+        """
+        nworld = self.env.nworld * self.team.size
+        if len(state["env"]) != nworld:
+            raise ValueError(f"the state is one of {len(state['env'])} worlds, not of {nworld}")
         self.policy.load_state_dict(state["policy"])
         self.value.load_state_dict(state["value"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        self.fit.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"].cpu())
-        self.env.set_state(state["env"].to(self.env.obs.device))
-        self.rollout.running_return.copy_(state["returns"])
+        self.env.set_state(state["env"][self._own].to(self.env.obs.device))
+        self.rollout.running_return.copy_(state["returns"][self._own])
         self.iteration = state["iteration"]
         self.samples = state["samples"]
 
@@ -372,14 +406,24 @@ class FisherProduct:
         policy: The policy.
         obs: Observations, (samples, nobs).
         damping: Added to the diagonal.
+        count: Number of observations of all processes, if there are several.
+        team: These processes.
     """
 
-    def __init__(self, policy: GaussianPolicy, obs: torch.Tensor, damping: float) -> None:
+    def __init__(
+        self,
+        policy: GaussianPolicy,
+        obs: torch.Tensor,
+        damping: float,
+        *,
+        count: int | None = None,
+        team: Team | None = None,
+    ) -> None:
         self.parameters = [p for p in policy.parameters() if p.requires_grad]
         self.log_std_at = next((i for i, p in enumerate(self.parameters) if p is policy.log_std), None)
         self.network = [p for p in self.parameters if p is not policy.log_std]
-        self.precision = torch.exp(-2 * policy.log_std.detach()) / len(obs)
-        self.damping = damping
+        self.precision = torch.exp(-2 * policy.log_std.detach()) / (count or len(obs))
+        self.damping, self.team = damping, team or Team()
         self.mean = policy(obs)
         self.probe = torch.zeros_like(self.mean, requires_grad=True)
         self.pulled = torch.autograd.grad(self.mean, self.network, self.probe, create_graph=True)
@@ -390,14 +434,12 @@ class FisherProduct:
             part.view_as(p)
             for part, p in zip(vector.split([p.numel() for p in self.parameters]), self.parameters, strict=True)
         ]
-        products = []
-        if self.log_std_at is not None:
-            products = [2.0 * parts.pop(self.log_std_at)]
+        spread = vector if self.log_std_at is None else parts.pop(self.log_std_at)
         (pushed,) = torch.autograd.grad(self.pulled, self.probe, parts, retain_graph=True)
         pulled = list(torch.autograd.grad(self.mean, self.network, pushed * self.precision, retain_graph=True))
-        if self.log_std_at is not None:
-            pulled.insert(self.log_std_at, products[0])
-        return _flat(pulled) + self.damping * vector
+        if self.log_std_at is not None:  # no sum over samples: each process brings an equal part
+            pulled.insert(self.log_std_at, 2.0 / self.team.size * spread)
+        return self.team.sum(_flat(pulled)) + self.damping * vector
 
 
 def conjugate_gradient(product: Any, target: torch.Tensor, iterations: int) -> torch.Tensor:
@@ -413,11 +455,11 @@ def conjugate_gradient(product: Any, target: torch.Tensor, iterations: int) -> t
     for _ in range(iterations):
         image = product(direction)
         curvature = direction @ image
-        alpha = torch.where(curvature > 0, square / curvature, 0.0)
+        alpha = (square / curvature).masked_fill(~(curvature > 0), 0.0)
         x += alpha * direction
         residual -= alpha * image
         previous, square = square, residual @ residual
-        direction = residual + torch.where(previous > 0, square / previous, 0.0) * direction
+        direction = residual + (square / previous).masked_fill(~(previous > 0), 0.0) * direction
     return x
 
 
@@ -425,23 +467,14 @@ def _flat(tensors: Any) -> torch.Tensor:
     return torch.cat([tensor.reshape(-1) for tensor in tensors])
 
 
-def _thinned(obs: torch.Tensor, fraction: float) -> torch.Tensor:
-    """Evenly spread samples."""
-    return obs if fraction >= 1.0 else obs[:: max(1, round(1.0 / fraction))]
-
-
-def _summary(episodes: Episodes) -> dict[str, float]:
-    nan = math.nan
-    some = len(episodes.returns) > 0
+def _fit_quality(n: int, parts: list[list[float]]) -> dict[str, float]:
+    """How well values fitted returns: each process's mean and summed squared deviation of returns and of errors."""
+    count, mean, square = pooled([(n, part[0], part[1]) for part in parts])
+    _, error_mean, error_square = pooled([(n, part[2], part[3]) for part in parts])
+    error, size = error_square + count * error_mean**2, square + count * mean**2
     return {
-        "return_mean": episodes.returns.mean().item() if some else nan,
-        "return_std": episodes.returns.std(correction=0).item() if some else nan,
-        "return_min": episodes.returns.min().item() if some else nan,
-        "return_max": episodes.returns.max().item() if some else nan,
-        "length_mean": episodes.lengths.mean().item() if some else nan,
-        "terminal_reward": episodes.rewards.mean().item() if some else nan,
-        "eval_mean": episodes.evals.mean().item() if some else nan,
-        "success": episodes.success.mean().item() if some else nan,
+        "value_error": error / max(size, 1e-20 * count),
+        "explained_variance": 1.0 - error_square / max(square, 1e-20 * count),
     }
 
 
@@ -453,34 +486,5 @@ def _check(config: NPGConfig) -> None:
     }  # fmt: skip
     for name, (low, high) in limits.items():
         value = getattr(config, name)
-        if not (value >= low and (high is None or value <= high)):
+        if value is not None and not (value >= low and (high is None or value <= high)):
             raise ValueError(f"{name} has to be {f'from {low} to {high}' if high else f'at least {low}'}, not {value}")
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Keep torch to one CPU thread: operations on a step or a mini-batch are too small to share out.
-
-    On a busy machine torch's threads would wait for each other much longer than they compute.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-class _Clock:
-    """Seconds between calls of ``lap``, work on the device included."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.device = device
-        self.last = time.perf_counter()
-
-    def lap(self) -> float:
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-        now = time.perf_counter()
-        seconds, self.last = now - self.last, now
-        return seconds

@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import nn
 
+from lyceum_warp.algos.distributed import Team
+
 
 def mlp(sizes: Sequence[int], *, last_scale: float = 1.0, generator: torch.Generator | None = None) -> nn.Sequential:
     """A tanh network with Glorot-uniform weights and zero biases; the last layer's weights are scaled."""
@@ -48,12 +50,15 @@ class Normalizer(nn.Module):
         self.register_buffer("scale", torch.ones(size))
 
     @torch.no_grad()
-    def update(self, obs: torch.Tensor) -> None:
-        """Take in (..., size) observations (Chan et al. 1983, parallel mean and variance)."""
+    def update(self, obs: torch.Tensor, team: Team | None = None) -> None:
+        """Take in (..., size) observations, as many of each process (Chan et al. 1983, parallel mean and variance)."""
+        team = team or Team()
         obs = obs.reshape(-1, obs.shape[-1]).double()
-        n, total = obs.shape[0], self.count + obs.shape[0]
-        delta = obs.mean(0) - self.mean
-        self.square += obs.var(0, correction=0) * n + delta.square() * (self.count * n / total)
+        n = obs.shape[0] * team.size
+        mean = team.sum(obs.sum(0)) / n
+        square = team.sum((obs - mean).square().sum(0))
+        total, delta = self.count + n, mean - self.mean
+        self.square += square + delta.square() * (self.count * n / total)
         self.mean += delta * (n / total)
         self.count.copy_(total)
         self.shift.copy_(self.mean)

@@ -1,10 +1,13 @@
 """Rollouts of a policy: recorded for learning, or summed up for evaluation."""
 
 import dataclasses
+import math
+from collections.abc import Sequence
 
 import torch
 import warp as wp
 
+from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import record
@@ -58,10 +61,15 @@ class Rollout:
                 setattr(self, name, torch_view(array))
             self._index = wp.zeros(1, dtype=int)
             self._return = wp.zeros(n, dtype=float)
+            self._fault = wp.zeros(n, dtype=int)
         self.running_return = torch_view(self._return)
+        self.faults = torch_view(self._fault)
+        """Faults of each world within the record, (nworld,) int32."""
         self._recorder = Recorder(env.device, env.record)
         self._inputs = [wp.from_torch(env.obs), wp.from_torch(env.action), wp.from_torch(env.episode_step)]
-        outputs = [env.final_obs, env.reward, env.eval, env.terminated, env.done, env.success]
+        outputs = [
+            env.final_obs, env.reward, env.eval, env.terminated, env.done, env.success, env.done_reason,
+        ]  # fmt: skip
         self._outputs = [wp.from_torch(output) for output in outputs]
 
     @torch.no_grad()
@@ -74,6 +82,7 @@ class Rollout:
         """
         env = self.env
         self._index.zero_()
+        self._fault.zero_()
         for t in range(self.steps):
             policy.sample(env.obs, noise[t], out=env.action)
             self._recorder(self._before_step)
@@ -85,18 +94,19 @@ class Rollout:
         self.env.rand_reset()
         self.running_return.zero_()
 
-    def stagger(self, generator: torch.Generator) -> None:
+    def stagger(self, generator: torch.Generator, team: Team | None = None) -> None:
         """Set the worlds' step counters to random steps of an episode, so that time limits fall at all times.
 
         Worlds that began together and never terminate would otherwise all end together, too, most records would
         hold no end at all, and those that do would be all alike. Returns of these first, shortened episodes are
         not counted.
         """
-        env = self.env
+        env, team = self.env, team or Team()
         if env.horizon == 0:
             return
         state = env.get_state()
-        first = torch.randint(env.horizon, (env.nworld,), generator=generator, device=state.device)
+        everyones = torch.randint(env.horizon, (team.size * env.nworld,), generator=generator, device=state.device)
+        first = everyones[team.rank * env.nworld :][: env.nworld]
         state[:, env.state_space.parts["step"]] = first.unsqueeze(-1).double()
         env.set_state(state)
         self.running_return.masked_fill_(first > 0, torch.nan)
@@ -108,7 +118,7 @@ class Rollout:
 
     def _after_step(self) -> None:
         dim = (self.env.nworld, self.env.obs_space.size)
-        args = [self._index, *self._outputs, self._return, self._record]
+        args = [self._index, *self._outputs, self._return, self._fault, self._record]
         wp.launch(record.record_outputs, dim, args, device=self.env.device)
         wp.launch(record.advance_index, 1, [self._index], device=self.env.device)
 
@@ -129,11 +139,43 @@ class Episodes:
     """Whether the goal was met at the end."""
 
 
-def finished(rollout: Rollout) -> Episodes:
-    """The episodes that ended within a rollout."""
+def finished(rollout: Rollout) -> torch.Tensor:
+    """Sums over the episodes that ended within a rollout, (9,) float64, on its device; see ``summary``."""
     ended = rollout.done & ~rollout.episode_return.isnan()
-    parts = (rollout.episode_return, rollout.episode_length, rollout.reward, rollout.eval, rollout.success)
-    return Episodes(*(part[ended].float().cpu() for part in parts))
+    returns = rollout.episode_return.double()
+    infinity = torch.inf
+
+    def total(part: torch.Tensor) -> torch.Tensor:
+        return part.double().masked_fill(~ended, 0.0).sum()
+
+    count = ended.sum().double()
+    mean = total(returns) / count.clamp_min(1.0)
+    lowest, highest = returns.masked_fill(~ended, infinity).min(), returns.masked_fill(~ended, -infinity).max()
+    rest = (rollout.episode_length, rollout.reward, rollout.eval, rollout.success)
+    return torch.stack([count, mean, total((returns - mean).square()), lowest, highest, *map(total, rest)])
+
+
+def summary(sums: Sequence[Sequence[float]]) -> dict[str, float]:
+    """Statistics of finished episodes from the sums of several rollouts; nan where none ended."""
+    count, mean, square = pooled([(row[0], row[1], row[2]) for row in sums])
+    total = [sum(row[i] for row in sums) / count if count else math.nan for i in range(5, 9)]
+    return {
+        "return_mean": mean if count else math.nan,
+        "return_std": math.sqrt(square / count) if count else math.nan,
+        "return_min": min(row[3] for row in sums) if count else math.nan,
+        "return_max": max(row[4] for row in sums) if count else math.nan,
+        "length_mean": total[0],
+        "terminal_reward": total[1],
+        "eval_mean": total[2],
+        "success": total[3],
+    }
+
+
+def pooled(parts: Sequence[tuple[float, float, float]]) -> tuple[float, float, float]:
+    """Count, mean and summed squared deviation from the mean of several samples together, from those of each."""
+    count = sum(n for n, _, _ in parts)
+    mean = sum(n * m for n, m, _ in parts) / count if count else 0.0
+    return count, mean, sum(s + n * (m - mean) ** 2 for n, m, s in parts)
 
 
 @torch.no_grad()

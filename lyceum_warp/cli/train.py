@@ -2,6 +2,7 @@
 
 import dataclasses
 import datetime
+import os
 import signal
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import torch
 import tyro
 from rich.console import Console
 
+from lyceum_warp.algos.distributed import Team, join
 from lyceum_warp.algos.npg import NPG, NPGConfig
 from lyceum_warp.algos.rollout import Episodes, evaluate
 from lyceum_warp.cli.common import Interrupted, parameter, portable, spelled
@@ -35,6 +37,10 @@ class Train:
     $ lyceum-warp train half_cheetah --param ctrl_cost_weight=0.05 --param reset_noise_scale=0 --hidden 32 32
     $ lyceum-warp train path/to/my_task.py --samples 4000 --out runs/mine
     $ lyceum-warp train --resume runs/mine --iterations 200
+    $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda --nworld 8192 --samples 262144
+
+    Processes that torchrun starts share the worlds, on several machines, too. Their number makes no difference to
+    the run but for rounding, and a run may go on with another one; the first process writes and speaks.
     """
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
@@ -50,10 +56,11 @@ class Train:
     engine: str = "auto"
     """mujoco (C, on CPU cores), warp, or auto: warp on CUDA and mujoco on the CPU."""
     device: str = "cpu"
-    """cpu, or a CUDA device such as cuda:0."""
+    """cpu, or a CUDA device such as cuda:0. Under torchrun each process takes the GPU of its own number."""
     nworld: int = 64
-    """Worlds that step at once, each samples / nworld steps in an iteration: whole episodes where those fit (the
-    paper's way: 10 worlds for 10,000 samples and episodes of 1,000 steps), segments of them elsewhere."""
+    """Worlds that step at once, those of all processes together, each samples / nworld steps in an iteration: whole
+    episodes where those fit (the paper's way: 10 worlds for 10,000 samples and episodes of 1,000 steps), segments of
+    them elsewhere."""
     threads: int = 1
     """Threads of torch on the CPU. Small networks gain little from more, and a number that is the same everywhere
     keeps runs the same to the bit. The mujoco engine uses all cores in any case."""
@@ -70,14 +77,26 @@ class Train:
 
 def train(options: Train) -> int:
     """The command."""
+    with join(options.device) as team:
+        with team.together():
+            # all that can be wrong with the options comes to light before the folder is made
+            config, out = _config(options), _folder(options)
+            if team.leads:
+                Run.check_free(out)
+            npg = _algorithm(config, team)
+            run = Run.create(out, config, device=options.device) if team.leads else None
+        state = npg.state_dict()
+        if run is not None:
+            run.save(0, npg.policy, state, npg.value)
+        return _learn(run, npg, options)
+
+
+def _config(options: Train) -> dict[str, Any]:
     if options.task is None:
         raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
     _check_iterations(options.iterations)
-    task = find_task(options.task)
-    out = options.out or Path("runs", f"{task_name(task)}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
-    Run.check_free(out)
-    # all that can be wrong with the options comes to light before the folder is made
-    config = {
+    find_task(options.task)
+    return {
         "algorithm": "npg",
         "task": portable(options.task),
         "params": dict(parameter(text) for text in options.param),
@@ -89,10 +108,11 @@ def train(options: Train) -> int:
         "iterations": options.iterations,
         "npg": dataclasses.asdict(options.npg),
     }
-    npg = _algorithm(config)
-    run = Run.create(out, config, device=options.device)
-    run.save(0, npg.policy, npg.state_dict(), npg.value)
-    return _learn(run, npg, options)
+
+
+def _folder(options: Train) -> Path:
+    name = task_name(find_task(options.task or ""))
+    return options.out or Path("runs", f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
 
 
 def saved_options(folder: Path) -> Train:
@@ -112,6 +132,18 @@ def saved_options(folder: Path) -> Train:
 
 def resume(options: Train, folder: Path) -> int:
     """The command with --resume; ``options`` are those of the run, with what was given on top of them."""
+    with join(options.device) as team:
+        with team.together():
+            run, npg = _reopened(options, folder, team)
+        if team.leads:
+            _warn_of_versions(run)
+            run.cut(npg.iteration)
+            run.amend(iterations=options.iterations)
+        return _learn(run if team.leads else None, npg, options)
+
+
+def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, NPG]:
+    """A run, and its algorithm as it was left."""
     run = Run.open(folder)
     given, saved = (_settings(o) for o in (options, saved_options(folder)))
     for name, value in given.items():
@@ -128,16 +160,13 @@ def resume(options: Train, folder: Path) -> int:
         raise ValueError(
             f"the run in {folder} has {done} iterations already: ask for more, as in --iterations {2 * done}"
         )
-    npg = _algorithm(run.config)
+    npg = _algorithm(run.config, team)
     try:
         npg.load_state_dict(run.read(npg.env.obs.device)["state"])
     except (KeyError, RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {reason}") from error
-    _warn_of_versions(run)
-    run.cut(done)
-    run.amend(iterations=options.iterations)
-    return _learn(run, npg, options)
+    return run, npg
 
 
 def _settings(options: Train) -> dict[str, Any]:
@@ -154,25 +183,39 @@ def _hyperparameters(config: dict[str, Any]) -> NPGConfig:
     return NPGConfig(**values)
 
 
-def _algorithm(config: dict[str, Any]) -> NPG:
+def _algorithm(config: dict[str, Any], team: Team) -> NPG:
     if config["threads"] < 1:
         raise ValueError(f"threads has to be at least 1, not {config['threads']}")
     torch.set_num_threads(config["threads"])
+    options = dict(config["params"])
+    if team.neighbours > 1 and _engine(config) == "mujoco":
+        options["nthread"] = max(1, (os.cpu_count() or 1) // team.neighbours)
+    nworld = team.share(config["nworld"])
     env = Env(
-        config["task"], nworld=config["nworld"], engine=config["engine"], device=config["device"],
-        seed=config["seed"], **config["params"],
+        config["task"], nworld=nworld, first_world=team.rank * nworld, engine=config["engine"],
+        device=team.device or config["device"], seed=config["seed"], **options,
     )  # fmt: skip
-    npg = _hyperparameters(config)
-    return NPG(env, config=npg, seed=config["seed"])
+    return NPG(env, config=_hyperparameters(config), seed=config["seed"], team=team)
 
 
-def _learn(run: Run, npg: NPG, options: Train) -> int:
+def _engine(config: dict[str, Any]) -> str:
+    automatic = "warp" if config["device"].startswith("cuda") else "mujoco"
+    return automatic if config["engine"] == "auto" else config["engine"]
+
+
+def _learn(run: Run | None, npg: NPG, options: Train) -> int:
+    """Iterate; the process that has the run writes and speaks."""
+    if run is None:
+        while npg.iteration < options.iterations:
+            next(npg)
+            npg.state_dict()  # the run's checkpoint takes everybody's worlds
+        return 0
     console = make_console()
     env = npg.env
-    engine = {"auto": "mujoco" if env.device.is_cpu else "warp"}.get(options.engine, options.engine)
+    processes = f" each in {npg.team.size} processes" if npg.team.size > 1 else ""
     console.print(
         f"[bold]{env.task.name}[/]: {env.obs_space.size} observations, {env.action_space.size} actions; "
-        f"{env.nworld} worlds, {engine} engine on {options.device}, "
+        f"{env.nworld} worlds{processes}, {_engine(run.config)} engine on {options.device}, "
         f"{'segments' if npg.segments else 'episodes'} of {npg.rollout.steps} steps; run in {run.folder}",
         soft_wrap=True,
     )  # fmt: skip
@@ -228,9 +271,6 @@ def _warn_of_versions(run: Run) -> None:
     if changed:
         told = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
         print(f"lyceum-warp: the run goes on with other versions, so not to the bit: {told}", file=sys.stderr)
-
-
-# lyceum-warp eval
 
 
 def _check_iterations(iterations: int) -> None:

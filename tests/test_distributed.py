@@ -1,0 +1,173 @@
+"""NPG in several processes: the same worlds, the same update, and a run that any number of processes goes on with."""
+
+import csv
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.algos import distributed
+from lyceum_warp.algos.distributed import Team
+from lyceum_warp.runs import Run
+
+# whatever could tell one process from two: unfinished episodes, a normaliser, thinned samples, a last mini-batch
+# that is smaller than the others, an evaluation
+OPTIONS = ["--samples", "600", "--nworld", "12", "--hidden", "8", "--value-hidden", "8", "--mean-every", "1",
+           "--mean-episodes", "2", "--rollout", "segments", "--normalize", "--time-orders", "2",
+           "--fisher-fraction", "0.34"]  # fmt: skip
+QUIET = ["--no-video", "--no-plot"]
+
+
+def torchrun(*arguments: str, options: list[str]) -> subprocess.Popen[str]:
+    """``torchrun``, from this Python, on the loopback interface."""
+    command = [sys.executable, "-m", "torch.distributed.run", *options, "-m", "lyceum_warp.cli", *arguments]
+    environment = os.environ | {"GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+    )  # fmt: skip
+
+
+def ended(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:
+    """Exit codes and what was said."""
+    try:
+        said = [process.communicate(timeout=120) for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    return [(process.returncode, *texts) for process, texts in zip(processes, said, strict=True)]
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return listener.getsockname()[1]
+
+
+def table(run: Path) -> list[dict[str, float]]:
+    """The metrics without what clocks say."""
+    with (run / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    clocks = {name for name in rows[0] if "time" in name or name == "samples_per_second"}
+    return [{name: float(cell or "nan") for name, cell in row.items() if name not in clocks} for row in rows]
+
+
+def assert_alike(one: Path, other: Path, *, tolerance: float) -> None:
+    """The same numbers in the tables' last rows and in the checkpoints, to rounding."""
+    row, expected = table(one)[-1], table(other)[-1]
+    for name in expected:
+        np.testing.assert_allclose(row[name], expected[name], rtol=tolerance, atol=tolerance, err_msg=name)
+    state, wanted = (Run.open(folder).read()["state"] for folder in (one, other))
+    assert torch.equal(state["generator"], wanted["generator"])
+    close = dict(rtol=tolerance, atol=tolerance)
+    for part in ("policy", "value"):
+        for name, tensor in wanted[part].items():
+            torch.testing.assert_close(state[part][name], tensor, **close)
+    torch.testing.assert_close(state["returns"], wanted["returns"], **close, equal_nan=True)
+    if tolerance < 1e-4:  # later on a foot may touch the ground a step earlier
+        torch.testing.assert_close(state["env"], wanted["env"], **close)
+
+
+def test_two_machines_make_the_update_of_one_process(tmp_path: Path) -> None:
+    """Two torchrun commands, as on two machines, against one process; one process goes on with their run."""
+    two, one = tmp_path / "two", tmp_path / "one"
+    arguments = ["train", "hopper", *OPTIONS, *QUIET]
+    endpoint = f"--rdzv-endpoint=127.0.0.1:{free_port()}"
+    launch = [
+        "--nnodes=2",
+        "--nproc-per-node=1",
+        "--monitor-interval=0.1",
+        "--rdzv-backend=c10d",
+        endpoint,
+        "--local-addr=127.0.0.1",
+    ]
+    machines = [torchrun(*arguments, "--iterations", "1", "--out", str(two), options=launch) for _ in range(2)]
+    assert cli.main([*arguments, "--iterations", "1", "--out", str(one)]) == 0  # meanwhile
+    results = ended(machines)
+    assert [code for code, _, _ in results] == [0, 0], results
+    assert not any("terminate called" in error for _, _, error in results)
+    # one of them spoke
+    said = sorted((out for _, out, _ in results), key=len)
+    assert said[0] == ""
+    assert "6 worlds each in 2 processes" in said[1] and "iteration    1/1" in said[1]
+    assert Run.open(two).config == Run.open(one).config
+    assert_alike(two, one, tolerance=2e-5)
+    for run in (one, two):
+        assert cli.main(["train", "--resume", str(run), "--iterations", "2", *QUIET]) == 0
+    assert_alike(two, one, tolerance=2e-3)
+
+
+@pytest.mark.slow
+def test_an_error_in_one_process_ends_all_and_two_go_on_with_the_run_of_one(tmp_path: Path) -> None:
+    """The error is one that only the first process can see: the folder is taken."""
+    launch = ["--standalone", "--nproc-per-node=2"]
+    run, other = tmp_path / "run", tmp_path / "other"
+    arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations"]
+    assert cli.main([*arguments, "1", "--out", str(run)]) == 0
+    assert cli.main([*arguments, "2", "--out", str(other)]) == 0
+    [(code, out, error)] = ended([torchrun(*arguments, "1", "--out", str(run), options=launch)])
+    assert code != 0 and out == "", (code, out, error)
+    assert error.count(f"lyceum-warp: {run} holds a run") == 1
+    assert "lyceum_warp/algos" not in error  # no traceback of the other
+    [(code, out, error)] = ended([torchrun("train", "--resume", str(run), "--iterations", "2", *QUIET, options=launch)])
+    assert code == 0 and out.count("iteration    2/2") == 1, (code, out, error)
+    assert_alike(run, other, tolerance=2e-3)
+
+
+def test_worlds_of_all_processes_are_numbered_through() -> None:
+    whole, part = lw.make("hopper", nworld=5), lw.make("hopper", nworld=2, first_world=3)
+    assert torch.equal(part.obs, whole.obs[3:])
+    for env in (whole, part):
+        env.rand_reset(4)
+        env.rand_reset()
+    assert torch.equal(part.obs, whole.obs[3:])
+    assert part.first_world == 3
+    assert part.replicate(nworld=1).first_world == 0
+
+
+def test_samples_are_found_among_those_of_ones_own_worlds() -> None:
+    """Of 4 steps of 6 worlds, shared by 3 processes."""
+    everyones = torch.arange(24)
+    samples = everyones.view(4, 6)
+    for rank in range(3):
+        rows, own = Team(rank, 3).rows(everyones, 2)
+        mine = samples[:, 2 * rank : 2 * rank + 2]
+        assert torch.equal(everyones[own], mine.flatten())
+        assert torch.equal(mine.flatten()[rows[own]], everyones[own])
+        assert not rows[~own].any()
+
+
+def test_worlds_have_to_be_shared_evenly() -> None:
+    assert Team(0, 3).share(9) == 3
+    with pytest.raises(ValueError, match="8 worlds cannot be shared evenly by 3 processes"):
+        Team(0, 3).share(8)
+    with pytest.raises(ValueError, match="needs an environment with first_world=4, not 0"):
+        lw.NPG(lw.make("point_mass", nworld=4), team=Team(1, 2))
+
+
+def test_each_process_wants_a_gpu_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    for name, value in {"WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1"}.items():
+        monkeypatch.setenv(name, value)
+    wanted = pytest.raises(ValueError, match="2 processes on this machine want a GPU each, and it has 1")
+    with wanted, distributed.join("cuda"):
+        pass
+
+
+def test_a_team_of_one_is_alone() -> None:
+    with distributed.join("cpu") as team:
+        numbers = torch.arange(3.0)
+        assert team.leads and team.records
+        assert team.sum(numbers) is numbers and team.gather(numbers) is numbers
+        team.follow([numbers])
+        with team.together():
+            pass
+        with pytest.raises(KeyError), team.together():
+            raise KeyError
+    assert not torch.distributed.is_initialized()
