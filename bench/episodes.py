@@ -22,7 +22,7 @@ import tyro
 from rich.console import Console
 
 import lyceum_warp as lw
-from lyceum_warp.algos.trajectory import wilson
+from lyceum_warp.algos.report import wilson
 from lyceum_warp.cli.common import parameter
 from lyceum_warp.versions import versions
 

@@ -41,11 +41,15 @@ class Slowed:
 
     def __init__(self, plan: lw.MPPI, seconds: float) -> None:
         self.plan, self.seconds = plan, seconds
-        self.timestep, self.reset = plan.timestep, plan.reset
+        self.timestep, self.reset, self.samples = plan.timestep, plan.reset, plan.samples
 
     @property
     def actions(self) -> torch.Tensor:
         return self.plan.actions
+
+    @property
+    def summary(self) -> dict[str, float]:
+        return self.plan.summary
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, *, shift: int = 1) -> torch.Tensor:
         due = time.perf_counter() + self.seconds

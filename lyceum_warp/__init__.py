@@ -9,8 +9,9 @@ from lyceum_warp.algos.control import ControlProgress, control, control_async
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.npg import NPG, Iteration, NPGConfig
 from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.report import ControlReport, control_report
 from lyceum_warp.algos.rollout import Episodes, Rollout, evaluate
-from lyceum_warp.algos.trajectory import ControlReport, Trajectory, control_report
+from lyceum_warp.algos.trajectory import Trajectory
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env, make
 from lyceum_warp.fields import vec10

@@ -13,7 +13,8 @@ from rich.table import Table
 from lyceum_warp.algos.control import ControlProgress
 from lyceum_warp.algos.npg import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.algos.trajectory import ControlReport, Trajectory
+from lyceum_warp.algos.report import ControlReport
+from lyceum_warp.algos.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs import Run
 
@@ -128,11 +129,14 @@ def filmed_states(env: Env, states: torch.Tensor, path: Path) -> str:
 class PlanDisplay:
     """Progress of an episode under a planner: a live line on a terminal, and a line an episode everywhere.
 
-    Rate and real-time factor are of the episode so far.
+    Rates and the real-time factor are of the episode so far. A plant that waits shows how fast it runs; one that keeps
+    its rate, whose own says nothing, how often it is planned for and how old its action is.
     """
 
-    def __init__(self, console: Console, episode: int, episodes: int, steps: int, timestep: float) -> None:
-        self.console, self.timestep = console, timestep
+    def __init__(
+        self, console: Console, episode: int, episodes: int, steps: int, timestep: float, *, real_time: bool = False
+    ) -> None:
+        self.console, self.timestep, self.real_time = console, timestep, real_time
         self.title = f"episode {episode + 1}/{episodes}"
         self.progress = Progress(
             TextColumn(self.title), BarColumn(bar_width=8), MofNCompleteColumn(), TextColumn("{task.fields[text]}"),
@@ -150,8 +154,12 @@ class PlanDisplay:
     def __call__(self, now: ControlProgress) -> None:
         """Show a step."""
         if self.console.is_terminal:
-            rate = now.step / max(now.time, 1e-9)
-            text = f"reward {now.reward:.3g} eval {now.eval:.3g} {rate:.0f} Hz {rate * self.timestep:.2f}x real time"
+            time = max(now.time, 1e-9)
+            if self.real_time:  # the first plan was made before the clock started
+                pace = f"{(now.plans - 1) / time:.0f} plans/s action {1000 * now.age:.3g} ms old"
+            else:
+                pace = f"{now.step / time:.0f} Hz {now.step / time * self.timestep:.2f}x real time"
+            text = f"reward {now.reward:.3g} eval {now.eval:.3g} {pace}"
             self.progress.update(self.bar, completed=now.step, text=text)
 
     def done(self, trajectory: Trajectory) -> None:

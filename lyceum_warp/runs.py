@@ -52,15 +52,20 @@ class Run:
         return self.folder / _CHECKPOINT
 
     @staticmethod
-    def check_free(folder: str | Path) -> None:
+    def check_free(folder: str | Path, *, resumable: bool = True) -> None:
         """Refuse a folder that a new run can't have.
+
+        Args:
+            folder: The folder.
+            resumable: Whether to say how to continue what is in it.
 
         Raises:
             ValueError: There is something in it already.
         """
         folder = Path(folder)
         if (folder / _CONFIG).exists():
-            raise ValueError(f"{folder} holds a run: continue it with --resume {folder}, or give another --out")
+            mend = f"continue it with --resume {folder}, or give another --out" if resumable else "give another --out"
+            raise ValueError(f"{folder} holds a run: {mend}")
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise ValueError(f"{folder} exists and is not an empty folder: give another --out")
 

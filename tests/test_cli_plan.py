@@ -1,6 +1,7 @@
 """lyceum-warp plan, called as a shell would."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from test_cli import QUIET, TINY, refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
+from lyceum_warp.algos.control import ControlProgress
 from lyceum_warp.algos.trajectory import Trajectory
 from lyceum_warp.report import PlanDisplay
 
@@ -109,7 +111,11 @@ def test_world_and_planner_may_differ(tmp_path: Path) -> None:
     (["--rate", "0"], ["rate", "0"]),
     (["--param", "mass=2"], ["mass"]),
     (["--planner-param", "mass=2"], ["mass"]),
-    (["--planner-model", "nowhere.xml"], ["nowhere.xml"]),
+    (["--planner-model", "nowhere.xml"], ["there is no file", str(Path("nowhere.xml").resolve())]),
+    (["--fill", "1", "2", "3"], ["fill", "2"]),
+    (["--fill", "1", "zero"], ["fill", "1 zero"]),
+    (["--seed", "-1"], ["seed", "-1"]),
+    (["--seed", "2147483647", "--episodes", "2"], ["seed of the last episode", "2147483648"]),
     (["--engine", "bullet"], ["bullet"]),
     (["--device", "cuda:7"], ["cuda:7"]),
 ])  # fmt: skip
@@ -126,6 +132,9 @@ def test_a_used_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[
     (tmp_path / "run" / "thesis.tex").write_text("")
     assert plan(tmp_path / "run") == 2
     refused(capsys, "run")
+    (tmp_path / "run" / "config.json").write_text("{}")
+    assert plan(tmp_path / "run") == 2
+    assert "--resume" not in (error := capsys.readouterr().err) and "holds a run: give another --out" in error
     assert cli.main(["plan", "no_such_task"]) == 2
     refused(capsys, "no_such_task")
 
@@ -143,9 +152,41 @@ def test_an_interrupt_keeps_whole_episodes(tmp_path: Path) -> None:
         rest = process.stdout.read()
     assert process.returncode == 130
     files = sorted(out.glob("episode-*.npz"))
-    assert f"after {len(files)} episodes" in rest and len(files) >= 2
-    assert all(Trajectory.load(path).steps == 40 for path in files)
-    assert json.loads((out / "report.json").read_text())["episodes"] == len(files)
+    part = f"the episode under way is in {files[-1].name}" in rest
+    whole = len(files) - part
+    assert f"after {whole} episodes" in rest and whole >= 2
+    assert all(Trajectory.load(path).steps == 40 for path in files[:whole])
+    assert json.loads((out / "report.json").read_text())["episodes"] == whole
+
+
+@pytest.mark.parametrize("mode", [[], ["--real-time"]])
+def test_an_interrupt_keeps_the_episode_under_way(mode: list[str], tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    options = ["--horizon", "10", "--samples", "8", "--steps", "100000", *QUIET, *mode]
+    program = f"""
+import os, signal, sys
+from lyceum_warp import cli, report
+def third(self, now):
+    if now.step == 3:
+        os.kill(os.getpid(), signal.SIGINT)
+report.PlanDisplay.__call__ = third
+sys.exit(cli.main(["plan", "point_mass", "--out", {str(out)!r}, *{options!r}]))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 130, done.stderr
+    path = out / "episode-000.npz"
+    assert f"interrupted by SIGINT in the first episode, after 3 steps; it is in {path}" in done.stdout
+    part = Trajectory.load(path)
+    assert part.steps == 3 and part.done_reason == 0 and len(part.states) == 4
+    assert not (out / "report.json").exists()
+
+
+def test_an_action_fills_the_plan(tmp_path: Path) -> None:
+    for name, words, fill in (("one", ["-0.5"], [-0.5, -0.5]), ("each", ["-0.5", "0.25"], [-0.5, 0.25])):
+        assert plan(tmp_path / name, *QUIET, "--steps", "1", "--fill", *words) == 0
+        assert json.loads((tmp_path / name / "config.json").read_text())["planner"]["fill"] == fill
+    assert plan(tmp_path / "word", *QUIET, "--steps", "1", "--fill", "repeat") == 0
+    assert json.loads((tmp_path / "word" / "config.json").read_text())["planner"]["fill"] == "repeat"
 
 
 def test_the_live_display(capsys: pytest.CaptureFixture[str]) -> None:
@@ -156,3 +197,12 @@ def test_the_live_display(capsys: pytest.CaptureFixture[str]) -> None:
         display.progress.refresh()
     shown = capsys.readouterr().out
     assert all(word in shown for word in ("3/3", "reward", "eval", "Hz", "real time"))
+
+
+def test_the_numbers_of_the_live_display(capsys: pytest.CaptureFixture[str]) -> None:
+    now = ControlProgress(10, 0.5, 1.0, 2.0, True, 0.01, 0.03, plans=6)
+    for real_time, words in ((False, "20 Hz 0.40x real time"), (True, "10 plans/s action 30 ms old")):
+        with PlanDisplay(Console(force_terminal=True, width=120), 0, 1, 20, 0.02, real_time=real_time) as display:
+            display(now)
+            display.progress.refresh()
+        assert f"10/20 reward 1 eval 2 {words}" in re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", capsys.readouterr().out)

@@ -4,27 +4,28 @@ A controller is anything that can be called with one world's state, (state_size,
 and returns an action, (nu,): ``lw.MPPI``, or a policy as ``lambda state, obs: policy(obs)``. Where it has more, that is
 used: an argument ``shift``, the number of its steps since the state of its last plan; ``actions``, the whole plan,
 (horizon, nu), of which the action is the first; ``timestep``, seconds between the plan's actions; ``reset(seed)``,
-called before an episode.
+called before an episode; ``samples``, how many a plan has, and ``summary``, a mapping that tells of the last plan's
+``failed_samples`` and ``effective_samples``; ``settings``, a mapping for the record.
 """
 
+import atexit
 import contextlib
+import ctypes
 import dataclasses
-import inspect
 import math
 import queue
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 
+from lyceum_warp.algos.controller import CheckedController, Controller, seconds_of
 from lyceum_warp.algos.trajectory import Trajectory, provenance
 from lyceum_warp.env import Env
-from lyceum_warp.validate import described, whole_number
-
-Controller = Callable[..., torch.Tensor]
+from lyceum_warp.validate import whole_number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +35,7 @@ class ControlProgress:
     step: int
     """Steps so far."""
     time: float
-    """Seconds of the wall clock so far."""
+    """Seconds of the wall clock so far, the step included."""
     reward: float
     """Reward of the step."""
     eval: float
@@ -45,9 +46,12 @@ class ControlProgress:
     """Seconds that the plan took which the action came from."""
     age: float
     """Age of the action when it was applied, seconds."""
+    plans: int
+    """Plans up to that one, the first included."""
 
 
 OnStep = Callable[[ControlProgress], object]
+OnAbort = Callable[[Trajectory], object]
 
 
 @torch.no_grad()
@@ -59,6 +63,7 @@ def control(
     seed: int | None = None,
     reset: bool = True,
     on_step: OnStep | None = None,
+    on_abort: OnAbort | None = None,
 ) -> Trajectory:
     """Let a controller run one world that waits for its plans, until the episode ends.
 
@@ -69,6 +74,8 @@ def control(
         seed: Seed of the initial state and of the controller.
         reset: False goes on from where the world and the controller's plan are.
         on_step: Called after each step; the time that it takes counts for none of the plans.
+        on_abort: Called with the steps so far, if there are any, when an exception ends the run, Ctrl-C among them; the
+            exception then goes on. ``done_reason`` of such a trajectory is 0.
 
     Returns:
         The episode; its deadline is the plant's time step.
@@ -78,25 +85,29 @@ def control(
             what is no action.
     """
     limit = _limit(env, steps)
-    plan = _Controller(controller, env)
+    plan = CheckedController(controller, env)
     _begin(env, plan, seed, reset)
     clock = _Clock()
-    recording = _Recording(env, "sync", env.timestep)
+    recording = _Recording(env, "sync", env.timestep, plan, seed)
     start = clock.now()
     shift = 0 if reset else 1
-    for k in range(limit):
-        begun = clock.now()
-        actions = plan(recording.states[k], recording.obs[k], shift, k)
-        planned = clock.now()
-        recording.plan(_Plan(k, k, begun, planned - begun, actions), start)
-        env.action[0] = actions[0]
-        recording.apply(k, clock.now() - start, clock.now() - begun, late=False)
-        env.step()
-        recording.after_step(on_step)
-        if env.done.item():
-            break
-        shift = plan.steps(k + 1) - plan.steps(k)
-    return recording.trajectory(clock.now() - start)
+    try:
+        for k in range(limit):
+            begun = clock.now()
+            actions = plan(recording.states[k], recording.obs[k], shift, k)
+            planned = clock.now()
+            env.action[0] = actions[0]
+            recording.apply(k, clock.now() - start, clock.now() - begun, late=False)
+            recording.plan(_Plan(k, k, begun, planned - begun, actions), start, plan.quality())
+            env.step()
+            recording.after_step(on_step, clock, start)
+            if env.done.item():
+                break
+            shift = plan.steps(k + 1) - plan.steps(k)
+        return recording.trajectory(clock.now() - start, int(env.done_reason.item()))
+    except BaseException:
+        recording.abort(on_abort, clock.now() - start)
+        raise
 
 
 @torch.no_grad()
@@ -110,6 +121,7 @@ def control_async(
     seed: int | None = None,
     reset: bool = True,
     on_step: OnStep | None = None,
+    on_abort: OnAbort | None = None,
 ) -> Trajectory:
     """Let a controller run one world that does not wait: it keeps its rate by the wall clock.
 
@@ -127,8 +139,10 @@ def control_async(
     given states.
 
     While it runs, Python switches between threads more often than usual (``sys.setswitchinterval``). For a plant
-    that is on time, leave it a core: give the planner's environment ``nthread``. The plan that is under way when the
-    world stops is completed and counted.
+    that is on time, leave it a core: give the planner's environment ``nthread``. The plant belongs on the CPU: on the
+    planner's GPU both would share Warp's one stream, where each step waits for the plan before it. The plan that is
+    under way when the world stops is completed and counted; when an exception ends the run, Ctrl-C among them, a plan
+    that takes longer than a moment is left to its thread, and the controller is of no use until that has ended.
 
     Args:
         env: The plant: one world, made with ``autoreset=False``.
@@ -139,6 +153,8 @@ def control_async(
         seed: Seed of the initial state and of the controller.
         reset: False goes on from where the world and the controller's plan are.
         on_step: Called after each step in the calling thread: what it takes is the plant's time.
+        on_abort: Called with the steps so far, if there are any, when an exception ends the run, Ctrl-C among them; the
+            exception then goes on. ``done_reason`` of such a trajectory is 0.
 
     Returns:
         The episode; its deadline is the period.
@@ -148,34 +164,41 @@ def control_async(
             the controller returns what is no action.
         Exception: Whatever the controller raises.
     """
-    period = _seconds("period", env.timestep if period is None else period)
+    period = seconds_of("period", env.timestep if period is None else period)
     if seconds is not None:
-        ticks = max(1, math.ceil(_seconds("seconds", seconds) / period - 1e-9))
+        ticks = max(1, math.ceil(seconds_of("seconds", seconds) / period - 1e-9))
         steps = ticks if steps is None else min(whole_number("steps", steps, low=1), ticks)
     limit = _limit(env, steps)
-    plan = _Controller(controller, env)
+    plan = CheckedController(controller, env)
     _begin(env, plan, seed, reset)
     _warm_up(env)
-    recording = _Recording(env, "async", period)
+    recording = _Recording(env, "async", period, plan, seed)
     clock = _Clock()
     planner = _Planner(plan, clock, seed, reset)
+    start = clock.now()
     with _quick_switches():
         try:
             planner.publish(0, recording.states[0], recording.obs[0])
             planner.wait()
             start = clock.now()
             wall = _run_plant(env, plan, planner, clock, recording, start, limit, on_step)
-        finally:
             planner.stop()
-    planner.check()
-    for made in planner.plans:
-        recording.plan(made, start)
-    return recording.trajectory(wall)
+            planner.check()
+        except BaseException:
+            wall = clock.now() - start
+            planner.stop(_PATIENCE)
+            planner.record(recording, start)
+            recording.abort(on_abort, wall)
+            raise
+    planner.record(recording, start)
+    return recording.trajectory(wall, int(env.done_reason.item()))
 
 
 # the clock and the plant
 
 _SPIN = 0.0005  # seconds before its time that a sleep ends; the rest is waited for awake
+_PATIENCE = 0.2  # seconds that a plan which nobody wants any more may still take
+_LAST_PATIENCE = 5.0  # seconds that it holds up the end of the program at most
 _SWITCH_INTERVAL = 0.0005  # seconds; Python's own 5 ms would be most of a fast plant's period
 
 
@@ -212,7 +235,7 @@ class _Plans(Protocol):
 
 def _run_plant(
     env: Env,
-    controller: "_Controller",
+    controller: CheckedController,
     planner: _Plans,
     clock: _Clock,
     recording: "_Recording",
@@ -235,7 +258,7 @@ def _run_plant(
         if k > 0:
             planner.publish(k, recording.states[k], recording.obs[k])
         env.step()
-        recording.after_step(on_step)
+        recording.after_step(on_step, clock, start)
         if env.done.item():
             break
     clock.wait_until(start + (k + 1) * period)
@@ -264,8 +287,9 @@ def _quick_switches() -> Iterator[None]:
 class _Planner:
     """A thread that plans from the newest state that was published."""
 
-    def __init__(self, controller: "_Controller", clock: _Clock, seed: int | None, reset: bool) -> None:
+    def __init__(self, controller: CheckedController, clock: _Clock, seed: int | None, reset: bool) -> None:
         self.plans: list[_Plan] = []
+        self._qualities: list[tuple[float, float]] = []  # of the plans; the last one's may be missing yet
         self._controller, self._clock, self._seed, self._reset = controller, clock, seed, reset
         self._error: BaseException | None = None
         self._begun = threading.Event()  # set by the first plan, or an error
@@ -292,10 +316,23 @@ class _Planner:
         self.check()
         return self.plans[-1]
 
-    def stop(self) -> None:
-        """End the thread, with the plan that it is at."""
+    def stop(self, patience: float | None = None) -> None:
+        """End the thread, with the plan that it is at; don't wait for that one longer than so many seconds.
+
+        A plan that takes longer is left to itself, and the thread ends after it.
+        """
         self._jobs.put(None)
-        self._thread.join()
+        self._thread.join(patience)
+        if self._thread.is_alive():
+            atexit.register(_end, self._thread)
+
+    def record(self, recording: "_Recording", start: float) -> None:
+        """Note the plans that are finished."""
+        qualities = list(self._qualities)
+        plans = self.plans[: len(qualities) + 1]  # those that have one, and the one that may be about to get it
+        qualities += [(math.nan, math.nan)] * (len(plans) - len(qualities))
+        for plan, quality in zip(plans, qualities, strict=True):
+            recording.plan(plan, start, quality)
 
     def _newest_job(self) -> tuple[int, torch.Tensor, torch.Tensor] | None:
         job = self._jobs.get()
@@ -326,66 +363,29 @@ class _Planner:
         begun = self._clock.now()
         actions = controller(state, obs, controller.steps(step) - controller.steps(last), step)
         self.plans.append(_Plan(len(self.plans), step, begun, self._clock.now() - begun, actions))
+        self._qualities.append(controller.quality())  # after the plant has got its actions
+
+
+def _end(thread: threading.Thread) -> None:
+    """Stop a planner's thread, because the program ends.
+
+    Python would take away the memory that the engine is computing on, and crash. An exception in the thread ends the
+    plan when the engine's call is done, which is an improvement of the plan, not all of it.
+    """
+    if thread.is_alive() and thread.ident is not None:
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread.ident), ctypes.py_object(SystemExit))
+        thread.join(_LAST_PATIENCE)
 
 
 # what both ways share
 
 
-class _Controller:
-    """A controller as the loops call it: told the shift if it takes one, and checked."""
-
-    def __init__(self, controller: Controller, env: Env) -> None:
-        if not callable(controller):
-            raise ValueError(
-                f"a controller is called with (state, obs) and returns an action, which {described(controller)} can't"
-            )
-        self._controller = controller
-        self._names = list(env.action_space.parts)
-        timestep = getattr(controller, "timestep", env.timestep)
-        self._ratio = env.timestep / _seconds("the timestep of a controller", timestep)
-        try:
-            self._shifts = "shift" in inspect.signature(controller).parameters
-        except (TypeError, ValueError):  # some functions in C have none
-            self._shifts = False
-
-    def __call__(self, state: torch.Tensor, obs: torch.Tensor, shift: int, step: int) -> torch.Tensor:
-        """A plan, (horizon, nu) float32 on the CPU, the action to take now first; without a plan that alone."""
-        action = self._controller(state, obs, **({"shift": shift} if self._shifts else {}))
-        plan = self._checked(action, 1, step)[None]
-        rest = getattr(self._controller, "actions", None)
-        return plan if rest is None else torch.cat([plan, self._checked(rest, 2, step)[1:]])
-
-    def reset(self, seed: int | None) -> None:
-        """Begin an episode, if the controller wants to be told."""
-        if callable(reset := getattr(self._controller, "reset", None)):
-            reset(seed)
-
-    def steps(self, plant_steps: int) -> int:
-        """The plant's steps in steps of the controller, rounded."""
-        return math.floor(plant_steps * self._ratio + 0.5 + 1e-9)
-
-    def index(self, plant_steps: int, horizon: int) -> int:
-        """Which action of a plan is for now, so many of the plant's steps after its state."""
-        return min(self.steps(plant_steps), horizon - 1)
-
-    def _checked(self, value: Any, ndim: int, step: int) -> torch.Tensor:
-        nu, axes = len(self._names), tuple(value.shape) if isinstance(value, torch.Tensor) else ()
-        if len(axes) != ndim or axes[-1] != nu or axes[0] == 0:
-            wanted = f"return an action of shape ({nu},)" if ndim == 1 else f"have actions of shape (horizon, {nu})"
-            raise ValueError(f"a controller has to {wanted}, not {described(value)}")
-        plan: torch.Tensor = value.detach().to("cpu", torch.float32, copy=True)  # the next one may be written over it
-        if not (finite := torch.isfinite(plan)).all():
-            where = (~finite).nonzero()[0].tolist()
-            number, name = plan[tuple(where)].item(), self._names[where[-1]]
-            raise ValueError(f"the controller wants {name!r} to be {number} at step {step}: it has to be finite")
-        return plan
-
-
 class _Recording:
     """A trajectory in the making."""
 
-    def __init__(self, env: Env, mode: str, period: float) -> None:
-        self.env, self.mode, self.period = env, mode, period
+    def __init__(self, env: Env, mode: str, period: float, controller: CheckedController, seed: int | None) -> None:
+        self.env, self.mode, self.period, self.seed = env, mode, period, seed
+        self.controller = controller.description()
         self.states, self.obs = [env.get_state()[0]], [env.obs[0].clone()]
         self.actions: list[torch.Tensor] = []
         self.outcomes: list[tuple[float, float, bool]] = []
@@ -393,13 +393,13 @@ class _Recording:
         self.ages: list[float] = []
         self.late: list[bool] = []
         self.plan_of: list[int] = []
-        self.plans: list[tuple[int, float, float]] = []
+        self.plans: list[tuple[int, float, float, float, float]] = []
         self.newest: _Plan | None = None
 
-    def plan(self, plan: _Plan, start: float) -> None:
-        """Note a plan."""
+    def plan(self, plan: _Plan, start: float, quality: tuple[float, float]) -> None:
+        """Note a plan, and how good its samples were."""
         self.newest = plan
-        self.plans.append((plan.step, plan.begun - start, plan.seconds))
+        self.plans.append((plan.step, plan.begun - start, plan.seconds, *quality))
 
     def apply(self, plan: int, now: float, age: float, *, late: bool) -> None:
         """Note the action that is about to be applied."""
@@ -409,7 +409,7 @@ class _Recording:
         self.late.append(late)
         self.plan_of.append(plan)
 
-    def after_step(self, on_step: OnStep | None) -> None:
+    def after_step(self, on_step: OnStep | None, clock: _Clock, start: float) -> None:
         """Note what a step led to."""
         env = self.env
         self.states.append(env.get_state()[0])
@@ -417,23 +417,29 @@ class _Recording:
         self.outcomes.append((env.reward.item(), env.eval.item(), bool(env.success.item())))
         if on_step is not None:
             assert self.newest is not None
-            at, plan_time = len(self.outcomes), self.newest.seconds
-            on_step(ControlProgress(at, self.times[-1], *self.outcomes[-1], plan_time, self.ages[-1]))
+            at, plan_time, now = len(self.outcomes), self.newest.seconds, clock.now() - start
+            on_step(ControlProgress(at, now, *self.outcomes[-1], plan_time, self.ages[-1], self.newest.index + 1))
 
-    def trajectory(self, wall: float) -> Trajectory:
-        """All of it."""
+    def abort(self, on_abort: OnAbort | None, wall: float) -> None:
+        """Hand out the steps so far, if there are any."""
+        if on_abort is not None and self.outcomes and self.plans:
+            on_abort(self.trajectory(wall, 0))
+
+    def trajectory(self, wall: float, done_reason: int) -> Trajectory:
+        """All of it; of a step that was interrupted, nothing."""
+        steps = len(self.outcomes)  # they are noted last
         rewards, evals, success = zip(*self.outcomes, strict=True)
-        plan_steps, plan_starts, plan_times = zip(*self.plans, strict=True)
-        double = torch.float64
+        plan_steps, *plans = zip(*self.plans, strict=True)
+        plan_starts, plan_times, failed, effective = (torch.tensor(column, dtype=torch.float64) for column in plans)
+        times, ages = (torch.tensor(column[:steps], dtype=torch.float64) for column in (self.times, self.ages))
         return Trajectory(
-            states=torch.stack(self.states).cpu(), obs=torch.stack(self.obs).cpu(),
-            actions=torch.stack(self.actions).cpu(), rewards=torch.tensor(rewards), evals=torch.tensor(evals),
-            success=torch.tensor(success), times=torch.tensor(self.times, dtype=double),
-            ages=torch.tensor(self.ages, dtype=double), late=torch.tensor(self.late),
-            plan_of=torch.tensor(self.plan_of), plan_steps=torch.tensor(plan_steps),
-            plan_starts=torch.tensor(plan_starts, dtype=double), plan_times=torch.tensor(plan_times, dtype=double),
-            timestep=self.env.timestep, period=self.period, wall_seconds=wall, mode=self.mode,
-            done_reason=int(self.env.done_reason.item()), **provenance(self.env),
+            states=torch.stack(self.states[: steps + 1]).cpu(), obs=torch.stack(self.obs[: steps + 1]).cpu(),
+            actions=torch.stack(self.actions[:steps]).cpu(), rewards=torch.tensor(rewards), evals=torch.tensor(evals),
+            success=torch.tensor(success), times=times, ages=ages, late=torch.tensor(self.late[:steps]),
+            plan_of=torch.tensor(self.plan_of[:steps]), plan_steps=torch.tensor(plan_steps), plan_starts=plan_starts,
+            plan_times=plan_times, plan_failed=failed, plan_effective=effective, timestep=self.env.timestep,
+            period=self.period, wall_seconds=wall, mode=self.mode, done_reason=done_reason, seed=self.seed,
+            controller=self.controller, **provenance(self.env),
         )  # fmt: skip
 
 
@@ -448,7 +454,7 @@ def _limit(env: Env, steps: int | None) -> int:
     return env.horizon
 
 
-def _begin(env: Env, controller: _Controller, seed: int | None, reset: bool) -> None:
+def _begin(env: Env, controller: CheckedController, seed: int | None, reset: bool) -> None:
     if reset:
         env.rand_reset(seed)
         controller.reset(seed)
@@ -456,9 +462,3 @@ def _begin(env: Env, controller: _Controller, seed: int | None, reset: bool) -> 
         raise ValueError("a seed needs a reset: leave out one of them")
     if env.done.item():
         raise ValueError("the episode is over before its first step: reset the environment, or let reset=True do it")
-
-
-def _seconds(name: str, value: Any) -> float:
-    if not isinstance(value, (int, float)) or not 0 < value < math.inf:
-        raise ValueError(f"{name} has to be a positive number of seconds, not {value!r}")
-    return float(value)

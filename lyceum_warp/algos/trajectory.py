@@ -1,10 +1,9 @@
-"""Trajectories of controlled worlds: what happened, when, and a report of how well the controller kept up."""
+"""Trajectories of controlled worlds: what happened, and when."""
 
 import dataclasses
 import json
-import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +25,12 @@ _ARRAYS = {
     "times": (torch.float64, ("steps",)), "ages": (torch.float64, ("steps",)), "late": (torch.bool, ("steps",)),
     "plan_of": (torch.int64, ("steps",)), "plan_steps": (torch.int64, ("plans",)),
     "plan_starts": (torch.float64, ("plans",)), "plan_times": (torch.float64, ("plans",)),
+    "plan_failed": (torch.float64, ("plans",)), "plan_effective": (torch.float64, ("plans",)),
 }  # fmt: skip
-_SCALARS = {
+_SCALARS: dict[str, Callable[[Any], Any]] = {
     "timestep": float, "period": float, "wall_seconds": float, "mode": str, "done_reason": int, "task": str,
-    "engine": str, "params": dict, "versions": dict,
+    "engine": str, "params": dict, "versions": dict, "seed": lambda seed: seed if seed is None else int(seed),
+    "controller": dict, "state_parts": dict, "obs_parts": dict, "action_names": list,
 }  # fmt: skip
 
 
@@ -72,6 +73,10 @@ class Trajectory:
     """When each plan was begun, (plans,) float64, seconds; negative for the first one of an asynchronous run."""
     plan_times: torch.Tensor
     """How long each plan took until its actions were there, (plans,) float64, seconds."""
+    plan_failed: torch.Tensor
+    """How many of the samples of each plan failed, (plans,) float64; NaN of controllers that don't tell."""
+    plan_effective: torch.Tensor
+    """The effective number of the samples of each plan, (plans,) float64: 0 if all failed; NaN where unknown."""
     timestep: float
     """Simulated seconds in a step."""
     period: float
@@ -81,7 +86,7 @@ class Trajectory:
     mode: str
     """"sync" if the plant waited for its plans, "async" if it kept its rate."""
     done_reason: int
-    """Bits of ``Done``: why the episode ended; 0 if it went on."""
+    """Bits of ``Done``: why the episode ended; 0 if it went on, or was interrupted."""
     task: str
     """Name of the task."""
     engine: str
@@ -90,6 +95,16 @@ class Trajectory:
     """The task's parameters."""
     versions: Mapping[str, Any]
     """Packages, Python, machine and commit."""
+    seed: int | None
+    """Seed of the initial state and of the controller, None if none was given."""
+    controller: Mapping[str, Any]
+    """What planned: its ``name``, and its settings, ``engine`` and ``device`` if it has them."""
+    state_parts: Mapping[str, Sequence[int]]
+    """Where the named parts of a state lie: [start, stop] in its columns."""
+    obs_parts: Mapping[str, Sequence[int]]
+    """Where those of an observation lie."""
+    action_names: Sequence[str]
+    """Names of the actions' columns."""
 
     @property
     def steps(self) -> int:
@@ -126,8 +141,9 @@ class Trajectory:
 
         The file is a compressed ``.npz``, which numpy reads by itself, without pickle. Each array has the name, the
         shape, the type and the unit of the attribute; ``info`` is JSON text, a string of no axis, with ``format``
-        (1), ``task``, ``engine``, ``params``, ``versions``, ``mode``, ``timestep``, ``period``, ``wall_seconds`` and
-        ``done_reason``.
+        (1), ``task``, ``engine``, ``params``, ``versions``, ``mode``, ``timestep``, ``period``, ``wall_seconds``,
+        ``done_reason``, ``seed``, ``controller``, ``state_parts``, ``obs_parts`` and ``action_names``: with
+        ``start, stop = info["state_parts"]["qpos"]``, the positions are ``states[:, start:stop]``.
 
         Returns:
             The file's path.
@@ -187,251 +203,11 @@ def _check(arrays: Mapping[str, torch.Tensor]) -> None:
 
 
 def provenance(env: Env) -> dict[str, Any]:
-    """What a trajectory tells of where it comes from: ``task``, ``engine``, ``params`` and ``versions``."""
+    """What a trajectory tells of where it comes from: the task, the engine, versions, and the columns' names."""
     params = {name: np.asarray(value).tolist() for name, value in env.task.params.items()}
-    device = env.device.alias
-    return {"task": env.task.name, "engine": env.engine.name, "params": params, "versions": versions(device)}
-
-
-# the report
-
-# of how many plans a quantile can be told: of fewer, none would lie beyond it
-_QUANTILES = {"p50": (0.5, 2), "p90": (0.9, 10), "p99": (0.99, 100), "p99_9": (0.999, 1000)}
-
-
-@dataclasses.dataclass(frozen=True)
-class ControlReport:
-    """How a controller did, and how well it kept up with its plant; see ``control_report``.
-
-    None stands for what there is too little of, or what there is not. The first plan of each trajectory is told of
-    apart, and in no other number about plans: it alone loads kernels and makes recordings.
-    """
-
-    task: str
-    """Name of the task."""
-    engine: str
-    """Name of the engine of the plant."""
-    mode: str
-    """"sync" if the plant waited for its plans, "async" if it kept its rate."""
-    episodes: int
-    """Trajectories."""
-    steps: int
-    """Steps of them all."""
-    plans: int
-    """Plans without the first ones."""
-    first_plan_ms: float | None
-    """The slowest of the first plans, milliseconds."""
-    plan_mean_ms: float | None
-    """Mean planning time, milliseconds."""
-    plan_p50_ms: float | None
-    """Quantiles of the planning time, milliseconds, interpolated; of 2, 10, 100 and 1000 plans or more."""
-    plan_p90_ms: float | None
-    """See ``plan_p50_ms``."""
-    plan_p99_ms: float | None
-    """See ``plan_p50_ms``."""
-    plan_p99_9_ms: float | None
-    """See ``plan_p50_ms``."""
-    plan_max_ms: float | None
-    """Longest planning time, milliseconds."""
-    plan_jitter_ms: float | None
-    """Standard deviation of the planning time, milliseconds."""
-    plans_per_second: float | None
-    """Plans finished in a second of the wall clock."""
-    deadline_ms: float
-    """What a plan has, milliseconds: 1 / rate, or the plant's period."""
-    misses: int
-    """Plans that took longer than that."""
-    miss_share: float | None
-    """Their share of the plans."""
-    tick_jitter_ms: float | None
-    """Standard deviation of how late the plant's steps began, milliseconds; None if it waits for its plans."""
-    tick_delay_max_ms: float | None
-    """The most that a step began after its time, milliseconds."""
-    late_ticks: int | None
-    """Steps that began late because the plant had not done the one before."""
-    age_mean_ms: float
-    """Mean age of the applied actions, milliseconds; see ``Trajectory.ages``."""
-    age_max_ms: float
-    """Greatest age of them."""
-    age_steps_mean: float
-    """Mean age in steps of the plant, of which each lasts a period; 0 if it waits for its plans."""
-    age_steps_max: int
-    """Greatest age in steps."""
-    real_time_factor: float
-    """Simulated seconds in a second of the wall clock, over everything."""
-    episode_seconds_mean: float
-    """Mean duration of an episode by the wall clock, seconds."""
-    return_mean: float
-    """Mean return."""
-    return_std: float | None
-    """Standard deviation of the returns, of a sample (n - 1)."""
-    eval_mean: float
-    """Mean of the evaluation metric at the end."""
-    success: float
-    """Share of the episodes whose goal was met at the end."""
-    success_low: float
-    """Lower bound of Wilson's 95 % interval of that share (Wilson 1927)."""
-    success_high: float
-    """Upper bound of it."""
-    params: Mapping[str, Any]
-    """The task's parameters, of the first trajectory."""
-    versions: Mapping[str, Any]
-    """Packages, Python and machine, of the first trajectory."""
-
-    def to_json(self) -> str:
-        """Everything as JSON, of finite numbers only: null stands for what is missing or infinite."""
-        return json.dumps(_finite(dataclasses.asdict(self)), indent=2, allow_nan=False)
-
-    def write(self, path: str | Path) -> Path:
-        """Write the JSON into a file, in one go.
-
-        Returns:
-            The file's path.
-        """
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(path.name + ".tmp")
-        try:
-            temporary.write_text(self.to_json() + "\n")
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
-        return path
-
-    def rows(self) -> list[tuple[str, str]]:
-        """What to print: labels, and numbers with their units; "-" for what is missing."""
-        rows = [
-            ("episodes", f"{self.episodes} of {self.task} ({self.steps} steps, {self.mode})"),
-            ("return", _text(self.return_mean, ".4g") + _text(self.return_std, ".2g", " ± {}", "")),
-            ("evaluation at the end", _text(self.eval_mean, ".3g")),
-            ("success", f"{self.success:.0%} (95 %: {self.success_low:.0%} to {self.success_high:.0%})"),
-            ("seconds an episode", _text(self.episode_seconds_mean, ".3g", "{} s")),
-            ("real-time factor", _text(self.real_time_factor, ".3g", "{} ×")),
-            ("plans", f"{self.plans}" + _text(self.plans_per_second, ".4g", ", {} a second", "")),
-            ("first plan", _text(self.first_plan_ms, ".3g", "{} ms")),
-        ]
-        for label, name in (("p50", "p50"), ("p90", "p90"), ("p99", "p99"), ("p99.9", "p99_9"), ("max", "max")):
-            rows.append((f"planning time {label}", _text(getattr(self, f"plan_{name}_ms"), ".3g", "{} ms")))
-        missed = f"{self.misses} of {self.plans}" + _text(self.miss_share, ".1%", " ({})", "")
-        rows += [
-            ("planning jitter (std)", _text(self.plan_jitter_ms, ".2g", "{} ms")),
-            (f"missed deadlines ({self.deadline_ms:.4g} ms)", missed),
-            ("age of the action, mean", _text(self.age_mean_ms, ".3g", f"{{}} ms ({self.age_steps_mean:.3g} steps)")),
-            ("age of the action, max", _text(self.age_max_ms, ".3g", f"{{}} ms ({self.age_steps_max} steps)")),
-        ]
-        if self.mode == "async":
-            rows += [
-                ("tick jitter (std)", _text(self.tick_jitter_ms, ".2g", "{} ms")),
-                ("tick delay, max", _text(self.tick_delay_max_ms, ".2g", "{} ms")),
-                ("late ticks", f"{self.late_ticks} of {self.steps}"),
-            ]
-        return rows
-
-
-def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: float | None = None) -> ControlReport:
-    """Sum up how a controller did in one or many episodes.
-
-    Args:
-        trajectories: Episodes of one task, with plants that ran alike.
-        rate: Plans a second that the controller is asked for, which makes the deadline; by default the plant's.
-
-    Raises:
-        ValueError: There are none, they don't belong together, or the rate is no positive number.
-    """
-    episodes = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
-    if not episodes:
-        raise ValueError("a report needs a trajectory at least")
-    first = episodes[0]
-    for name in ("task", "engine", "mode", "timestep", "period"):
-        if len(values := {getattr(episode, name) for episode in episodes}) > 1:
-            raise ValueError(f"these trajectories differ in their {name} ({values}): make a report of each kind")
-    if rate is not None and not (isinstance(rate, (int, float)) and 0 < rate < math.inf):
-        raise ValueError(f"rate has to be plans a second, a positive number, not {rate!r}")
-    deadline = first.period if rate is None else 1 / rate
-    times = _joined(episode.plan_times[1:] for episode in episodes)
-    ages = _joined(episode.ages for episode in episodes)
-    age_steps = _joined(episode.age_steps for episode in episodes)
-    returns = np.array([episode.episode_return for episode in episodes])
-    wall, steps = sum(episode.wall_seconds for episode in episodes), sum(episode.steps for episode in episodes)
-    misses, successes = int((times > deadline).sum()), sum(episode.succeeded for episode in episodes)
-    low, high = wilson(successes, len(episodes))
-    return ControlReport(
-        task=first.task, engine=first.engine, mode=first.mode, episodes=len(episodes), steps=steps, plans=len(times),
-        first_plan_ms=1000 * max(float(episode.plan_times[0]) for episode in episodes),
-        plan_mean_ms=1000 * float(times.mean()) if len(times) else None,
-        **_quantiles(1000 * times),
-        plan_max_ms=1000 * float(times.max()) if len(times) else None,
-        plan_jitter_ms=_std(1000 * times),
-        plans_per_second=_plans_per_second(episodes),
-        deadline_ms=1000 * deadline, misses=misses, miss_share=misses / len(times) if len(times) else None,
-        **_ticks(episodes),
-        age_mean_ms=1000 * float(ages.mean()), age_max_ms=1000 * float(ages.max()),
-        age_steps_mean=float(age_steps.mean()), age_steps_max=int(age_steps.max()),
-        real_time_factor=steps * first.timestep / wall, episode_seconds_mean=wall / len(episodes),
-        return_mean=float(returns.mean()), return_std=_std(returns),
-        eval_mean=float(np.mean([float(episode.evals[-1]) for episode in episodes])),
-        success=successes / len(episodes), success_low=low, success_high=high,
-        params=first.params, versions=first.versions,
-    )  # fmt: skip
-
-
-def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's interval of a share at 95 % (Wilson 1927): within 0 and 1, and of some width even at 0 and 1."""
-    z = 1.959963984540054
-    share = successes / trials
-    middle = share + z * z / (2 * trials)
-    spread = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
-    low, high = ((middle + sign * spread) / (1 + z * z / trials) for sign in (-1, 1))
-    return max(0.0, low), min(1.0, high)
-
-
-def _quantiles(times: np.ndarray) -> dict[str, Any]:
     return {
-        f"plan_{name}_ms": float(np.quantile(times, q)) if len(times) >= enough else None
-        for name, (q, enough) in _QUANTILES.items()
-    }
-
-
-def _ticks(episodes: Sequence[Trajectory]) -> dict[str, Any]:
-    """How the steps of a plant that keeps its rate began, against its schedule."""
-    if episodes[0].mode == "sync":
-        return {"tick_jitter_ms": None, "tick_delay_max_ms": None, "late_ticks": None}
-    delays = 1000 * _joined(episode.times - episode.period * torch.arange(episode.steps) for episode in episodes)
-    return {
-        "tick_jitter_ms": _std(delays),
-        "tick_delay_max_ms": float(delays.max()),
-        "late_ticks": sum(int(episode.late.sum()) for episode in episodes),
-    }
-
-
-def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
-    """Without the first plans, and without the time that they took of the clock."""
-    plans, seconds = 0, 0.0
-    for episode in episodes:
-        ends = episode.plan_starts + episode.plan_times
-        plans += int((ends[1:] <= episode.wall_seconds).sum())  # one may have ended after the plant
-        seconds += episode.wall_seconds - max(0.0, float(ends[0]))
-    return plans / seconds if plans and seconds > 0 else None
-
-
-def _std(values: np.ndarray) -> float | None:
-    """Standard deviation of a sample; None of one, and of numbers that are not finite."""
-    return float(values.std(ddof=1)) if len(values) > 1 and np.isfinite(values).all() else None
-
-
-def _joined(parts: Any) -> np.ndarray:
-    return torch.cat(list(parts)).numpy()
-
-
-def _text(value: float | None, form: str, around: str = "{}", missing: str = "-") -> str:
-    if value is None or not math.isfinite(value):
-        return missing
-    return around.format(format(value, form if abs(value) < 1000 else ".0f"))
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        "task": env.task.name, "engine": env.engine.name, "params": params, "versions": versions(env.device.alias),
+        "state_parts": {name: [part.start, part.stop] for name, part in env.state_space.parts.items()},
+        "obs_parts": {name: [part.start, part.stop] for name, part in env.obs_space.parts.items()},
+        "action_names": list(env.action_space.parts),
+    }  # fmt: skip

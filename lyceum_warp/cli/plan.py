@@ -11,7 +11,8 @@ import tyro
 
 from lyceum_warp.algos.control import control, control_async
 from lyceum_warp.algos.mppi import MPPI
-from lyceum_warp.algos.trajectory import Trajectory, control_report
+from lyceum_warp.algos.report import control_report
+from lyceum_warp.algos.trajectory import Trajectory
 from lyceum_warp.cli.common import Interrupted, parameter, portable
 from lyceum_warp.env import Env
 from lyceum_warp.registry import find_task, task_name
@@ -28,7 +29,8 @@ class Plan:
 
     The folder then holds config.json, versions.json, a file for each episode (episode-000.npz: states, actions,
     rewards, evaluations, times; numpy reads it), report.json, plan.png and video.mp4 of the first episode. What is
-    not given of the planner's settings comes from the task.
+    not given of the planner's settings comes from the task. After Ctrl-C, the episode under way has a file, too, but
+    no part in the report.
 
     $ lyceum-warp plan reach
     $ lyceum-warp plan reach --real-time --episodes 10
@@ -58,15 +60,15 @@ class Plan:
     temperature: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """In units of reward: low ones follow the best sample, high ones average all."""
     noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
-    """Standard deviation of the noise, one number or one for each action."""
+    """Standard deviation of the noise, one number or one for each action (a covariance only from Python)."""
     smoothing: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="B0 B1 B2")] = None
     """Weights of the noise, of the last step's and of the one before it; 1 0 0 is white noise."""
     discount: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Of rewards and of the terminal value, a step."""
     iterations: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Improvements of the plan at every step."""
-    fill: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """What fills the end of a plan that moves forward: zero, or repeat."""
+    fill: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="WORD|FLOAT ...")] = None
+    """What fills the end of a plan that moves forward: zero, repeat, or an action, one number or one for each."""
     termination: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """Whether a sample that ends its episode stops earning (stop) or not (ignore)."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
@@ -98,19 +100,21 @@ _SETTINGS = (
 def plan(options: Plan) -> int:
     """The command."""
     whole_number("episodes", options.episodes, low=1)
+    whole_number("seed", options.seed, low=0)
+    whole_number("seed of the last episode", options.seed + options.episodes - 1, low=0)
     if options.rate is not None and not 0 < options.rate < float("inf"):
         raise ValueError(f"rate has to be a positive number of plans a second, not {options.rate}")
     out = options.out or Path(
         "runs", f"plan-{task_name(find_task(options.task))}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
     )
-    Run.check_free(out)
+    Run.check_free(out, resumable=False)
     # all that can be wrong with the options comes to light before the folder is made
     torch.set_num_threads(1)
     plant, planner = _worlds(options)
     config = {
         "algorithm": "mppi", "task": portable(options.task), "params": dict(map(parameter, options.param)),
         "planner": planner.settings, "planner_params": dict(map(parameter, options.planner_param)),
-        "planner_model": options.planner_model and str(options.planner_model.resolve()),
+        "planner_model": options.planner_model and str(_model(options.planner_model)),
         "value": options.value and str(options.value.resolve()), "engine": planner.env.engine.name,
         "device": options.device, "nthread": options.nthread, "episodes": options.episodes, "steps": options.steps,
         "seed": options.seed, "real_time": options.real_time, "rate": options.rate,
@@ -127,11 +131,13 @@ def _worlds(options: Plan) -> tuple[Env, MPPI]:
     settings = {name: getattr(options, name) for name in _SETTINGS}
     if options.noise is not None and len(options.noise) == 1:
         settings["noise"] = options.noise[0]
+    if options.fill is not None:
+        settings["fill"] = _fill(options.fill, plant.action_space.size)
     more: dict[str, Any] = {}
     if options.nthread is not None:
         more["nthread"] = options.nthread
     if options.planner_model is not None:
-        more["model"] = options.planner_model
+        more["model"] = _model(options.planner_model)
     if options.value is not None:
         more["value"] = load_value(options.value, device=options.device)
     planner = MPPI(
@@ -139,6 +145,23 @@ def _worlds(options: Plan) -> tuple[Env, MPPI]:
         **(params | dict(map(parameter, options.planner_param))),
     )  # fmt: skip
     return plant, planner
+
+
+def _fill(words: tuple[str, ...], nu: int) -> str | list[float]:
+    """What the option says: a word, or numbers, of which one stands for all."""
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        return " ".join(words)  # the planner knows the words, and says so
+    return numbers * nu if len(numbers) == 1 else numbers
+
+
+def _model(path: Path) -> Path:
+    """A model's file: here a path is meant, where a task may also name one that a package ships."""
+    path = path.expanduser().resolve()
+    if not path.is_file():
+        raise FileNotFoundError(f"--planner-model: there is no file {path}")
+    return path
 
 
 def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
@@ -150,26 +173,45 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
         soft_wrap=True,
     )  # fmt: skip
     trajectories: list[Trajectory] = []
+    part: list[Trajectory] = []
     method: Any = control_async if options.real_time else control
+    shown: dict[str, Any] = dict(steps=plant.horizon, timestep=plant.timestep, real_time=options.real_time)
     try:
         for episode in range(options.episodes):
-            with PlanDisplay(console, episode, options.episodes, plant.horizon, plant.timestep) as display:
-                trajectory = method(plant, planner, seed=options.seed + episode, on_step=display)
+            with PlanDisplay(console, episode, options.episodes, **shown) as display:
+                seed = options.seed + episode
+                trajectory = method(plant, planner, seed=seed, on_step=display, on_abort=part.append)
             trajectories.append(trajectory)
             display.done(trajectory)
             _save(run, trajectories, options)
-    except Interrupted as signalled:
+    except BaseException as error:  # a second signal does not disturb what follows
         if trajectories:
-            _save(run, trajectories, options)  # a second signal does not disturb it
-        told = f"interrupted by {signal.Signals(signalled.number).name} after {len(trajectories)} episodes"
-        console.print(f"{told}; they are in {run.folder}", soft_wrap=True, markup=False)
+            _save(run, trajectories, options)
+        path = part[0].save(_file(run, len(trajectories))) if part else None
+        if isinstance(error, Interrupted):
+            told = f"interrupted by {signal.Signals(error.number).name} "
+            console.print(told + _left(run, len(trajectories), part, path), soft_wrap=True, markup=False)
         raise
     return _tell(run, plant, trajectories, options)
 
 
+def _left(run: Run, whole: int, part: list[Trajectory], path: Path | None) -> str:
+    """What an interrupted run leaves behind."""
+    steps = f"after {part[0].steps} step{'s' * (part[0].steps != 1)}" if part else "before its first step"
+    if not whole:
+        where = f"it is in {path}" if path else f"{run.folder} holds no episode"
+        return f"in the first episode, {steps}; {where}"
+    told = f"after {whole} episode{'s' * (whole != 1)}; in {run.folder}"
+    return f"{told}; the episode under way is in {path.name}, {steps}" if path else told
+
+
+def _file(run: Run, episode: int) -> Path:
+    return run.folder / f"episode-{episode:03d}.npz"
+
+
 def _save(run: Run, trajectories: list[Trajectory], options: Plan) -> None:
     """Write the last episode, and the report of all."""
-    trajectories[-1].save(run.folder / f"episode-{len(trajectories) - 1:03d}.npz")
+    trajectories[-1].save(_file(run, len(trajectories) - 1))
     control_report(trajectories, rate=options.rate).write(run.folder / "report.json")
 
 
