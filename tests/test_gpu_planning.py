@@ -42,7 +42,9 @@ def test_plans_are_those_of_the_cpu(task: str, horizon: int) -> None:
 
 def test_a_replay_equals_the_unrecorded_plan() -> None:
     env = plant("reach")
-    recorded, plain = (lw.MPPI("reach", device=CUDA, deterministic=True, record=record) for record in (True, False))
+    recorded, plain = (
+        lw.MPPI("reach", device=CUDA, engine="warp", deterministic=True, record=record) for record in (True, False)
+    )
     for _ in range(4):
         state = env.get_state()[0]
         assert torch.equal(recorded(state), plain(state))
@@ -53,7 +55,7 @@ def test_a_replay_equals_the_unrecorded_plan() -> None:
 @pytest.mark.parametrize("kind", ["none", "warp", "torch"])
 def test_plans_do_not_wait(kind: str) -> None:
     value = {"none": None, "warp": first_squared, "torch": lambda obs: 3.0 * obs[:, 0] ** 2}[kind]
-    plan = lw.MPPI("reach", device=CUDA, samples=256, value=value)
+    plan = lw.MPPI("reach", device=CUDA, engine="warp", samples=256, value=value)
     state = plan.state_of(mocap_pos=[0.1, 0.1, 0.2])
     for _ in range(3):
         plan(state)
@@ -66,7 +68,7 @@ def test_plans_do_not_wait(kind: str) -> None:
 
 def test_values_agree() -> None:
     warp, tensor = (
-        lw.MPPI("reach", device=CUDA, samples=64, value=value, temperature=10.0, deterministic=True)
+        lw.MPPI("reach", device=CUDA, engine="warp", samples=64, value=value, temperature=10.0, deterministic=True)
         for value in (first_squared, lambda obs: 3.0 * obs[:, 0] ** 2)
     )
     state = warp.state_of(mocap_pos=[0.1, 0.1, 0.2])
@@ -76,5 +78,11 @@ def test_values_agree() -> None:
 
 
 def test_a_planner_on_the_gpu_controls_a_plant_on_the_cpu() -> None:
-    done = lw.control(plant("reach"), lw.MPPI("reach", device=CUDA, samples=128), seed=0)
+    done = lw.control(plant("reach"), lw.MPPI("reach", device=CUDA, engine="warp", samples=128), seed=0)
     assert done.succeeded
+
+
+def test_few_samples_are_rolled_out_by_the_cpu() -> None:
+    assert lw.MPPI("reach", device=CUDA, samples=8).env.engine.name == "mujoco"
+    assert lw.MPPI("reach", device=CUDA, samples=8, nthread=1).env.device.is_cpu
+    assert lw.MPPI("reach", device=CUDA, samples=64, nthread=1).env.engine.name == "warp"

@@ -4,6 +4,7 @@ The planner's own arithmetic is float32; the plain version's is float64, and so 
 """
 
 import re
+import types
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +16,7 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp import MPPI, Row
+from lyceum_warp.algos import mppi
 from lyceum_warp.tasks.reach import arm
 
 ENGINES = ["mujoco", "warp"]
@@ -803,3 +805,13 @@ def test_a_planner_is_not_disturbed_by_resets_of_its_worlds() -> None:
         assert torch.equal(first, second)
         env.step(first[None])
     assert plans[0].env.episode_step.tolist() == [2, 2, 2, 2]
+
+
+def test_auto_chooses_by_the_number_of_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a GPU; what was chosen by hand stays."""
+    monkeypatch.setattr(mppi, "find_device", lambda name: types.SimpleNamespace(is_cuda=str(name).startswith("cuda")))
+    given = {"device": "cuda:0", "nthread": 2}
+    assert mppi._placed(given, 127) == {"device": "cpu", "engine": "mujoco", "nthread": 2}
+    assert mppi._placed(given, 128) == {"device": "cuda:0", "engine": "warp", "nthread": 2}
+    assert mppi._placed({"device": "cuda", "engine": "warp"}, 1) == {"device": "cuda", "engine": "warp"}
+    assert mppi._placed({}, 1) == {}

@@ -13,7 +13,8 @@ arm is an inverse temperature, and stands for 0.2.
 """
 
 import math
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ import torch
 import warp as wp
 
 from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.engines import find_device
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import planning
 from lyceum_warp.kernels.arrays import torch_view
@@ -66,7 +68,9 @@ class MPPI:
             (nsample, nobs) observations, or a Warp function of one observation, ``value(obs: Row[float]) -> float``,
             which on the Warp engine becomes part of the recording.
         seed: Of the noise.
-        options: Options and parameters of the planner's environment, as for ``lw.make``.
+        options: Options and parameters of the planner's environment, as for ``lw.make``. With a CUDA device and
+            engine="auto", few samples are rolled out by the C engine on the CPU all the same, because it is faster
+            there; then plans and actions lie on the CPU, too.
 
     Raises:
         ValueError: An argument makes no sense; the message says which and why.
@@ -130,6 +134,7 @@ class MPPI:
         if value is not None and not callable(value):
             raise ValueError(f"value has to be a function of observations, or None, not {described(value)}")
 
+        options = _placed(options, self.samples)
         self.env = Env(task, nworld=self.samples, autoreset=False, **({"horizon": 0} | options))
         self.env.reset()
         self._initial = self.env.get_state()[0]
@@ -317,6 +322,20 @@ class MPPI:
             part = next(n for n, part in self.env.state_space.parts.items() if part.start <= column < part.stop)
             raise ValueError(f"the state to plan from has {state[column].item()} in its {part!r}: it has to be finite")
         return state
+
+
+_SAMPLES_A_CORE = 64
+"""Below so many samples for each core of the CPU, its C engine plans faster than an H100: measured with 2 and 16 cores
+on reach, half_cheetah and adroit_pen (bench/results/planning-*.json)."""
+
+
+def _placed(options: Mapping[str, Any], samples: int) -> dict[str, Any]:
+    """Where to roll out: engine="auto" on a GPU chooses by the number of samples."""
+    placed = dict(options)
+    if placed.get("engine", "auto") == "auto" and find_device(placed.get("device")).is_cuda:
+        few = samples < _SAMPLES_A_CORE * (placed.get("nthread") or os.cpu_count() or 1)
+        placed |= {"engine": "mujoco", "device": "cpu"} if few else {"engine": "warp"}
+    return placed
 
 
 _DEFAULTS: dict[str, Any] = dict(
