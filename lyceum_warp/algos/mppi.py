@@ -317,8 +317,8 @@ class MPPI:
                 "(env.field() of an acceleration or of its like makes an environment's states longer.)"
             )
         # on a GPU this would wait for the device: there every sample fails, and the plan stays
-        if state.device.type == "cpu" and not (finite := torch.isfinite(state)).all():
-            column = int((~finite).nonzero()[0])
+        if state.device.type == "cpu" and not (finite := np.isfinite(state.numpy())).all():
+            column = int(np.flatnonzero(~finite)[0])
             part = next(n for n, part in self.env.state_space.parts.items() if part.start <= column < part.stop)
             raise ValueError(f"the state to plan from has {state[column].item()} in its {part!r}: it has to be finite")
         return state

@@ -61,7 +61,7 @@ class MujocoEngine(Engine):
         # a world in trouble is to be seen, not silently reset in the middle of a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.nthread = nthread
-        self._rollouts: dict[Any, NativeRollout] = {}
+        self._rollouts: dict[Any, NativeRollout | None] = {}
         self._open(persistent=False)
         self.ctrl = self.field("ctrl")
 
@@ -154,15 +154,15 @@ class MujocoEngine(Engine):
 
     @_overflow_ignored
     def rollout(self, state: wp.array, controls: wp.array, nstep: int, records: Mapping[str, wp.array]) -> None:
-        fields = [self.fields[name] for name in records]
-        if not is_exact(self.model, fields):
-            super().rollout(state, controls, nstep, records)
-            return
-        key = (len(controls), nstep, *fields)
+        key = (len(controls), nstep, *records)
         if key not in self._rollouts:
-            self._rollouts[key] = NativeRollout(self, len(controls), nstep, records)
-        targets = {name: record.numpy() for name, record in records.items()}
-        self._rollouts[key].run(state.numpy(), controls.numpy(), targets)
+            exact = is_exact(self.model, [self.fields[name] for name in records])
+            self._rollouts[key] = NativeRollout(self, len(controls), nstep, records) if exact else None
+        native = self._rollouts[key]
+        if native is None:
+            super().rollout(state, controls, nstep, records)
+        else:
+            native(state, controls, records)
 
     def find_faults(self, mask: wp.array) -> None:
         nphysics = 1 + self.model.nq + self.model.nv + self.model.na

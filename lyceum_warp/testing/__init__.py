@@ -83,7 +83,8 @@ def check_task(
         steps: Steps of the long checks (determinism, memory).
         seed: Of the worlds and of the random actions.
         checks: Which rules to check, out of ``CHECKS``.
-        options: Other options of ``make`` and parameters of the task.
+        options: Other options of ``make`` and parameters of the task. On a CUDA device ``deterministic`` is True
+            unless it is given: the rules compare to the bit.
 
     Returns:
         What was checked; print it.
@@ -96,6 +97,9 @@ def check_task(
     """
     if nworld < 2:
         raise ValueError(f"the checks compare worlds with one another: nworld has to be at least 2, not {nworld}")
+
+    if str(device or "").startswith("cuda"):
+        options = {"deterministic": True} | options
 
     def make(**changes: Any) -> Env:
         return Env(task, **{"nworld": nworld, "device": device, "engine": engine, "seed": seed, **options, **changes})
