@@ -23,6 +23,8 @@ from lyceum_warp.runs import Run, load
 TINY = ["--samples", "512", "--nworld", "2", "--hidden", "8", "--value-hidden", "8", "--mean-every", "2",
         "--mean-episodes", "2"]  # fmt: skip
 QUIET = ["--no-video", "--no-plot"]
+# tests may run in the background, where a shell has its children ignore SIGINT
+HEAR_SIGINT = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
 
 
 def train(out: Path, *options: str, task: str = "point_mass") -> int:
@@ -240,7 +242,7 @@ def test_an_interrupted_run_goes_on(number: int, code: int, trained: Path, tmp_p
         pytest.skip("signals are POSIX's")
     out = tmp_path / "run"
     argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "100000"]
-    program = f"import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
+    program = f"{HEAR_SIGINT}import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:

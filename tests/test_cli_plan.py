@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from rich.console import Console
-from test_cli import QUIET, TINY, refused
+from test_cli import HEAR_SIGINT, QUIET, TINY, refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
@@ -142,7 +142,7 @@ def test_a_used_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_an_interrupt_keeps_whole_episodes(tmp_path: Path) -> None:
     out = tmp_path / "run"
     argv = ["plan", "point_mass", "--out", str(out), *SMALL, *QUIET, "--episodes", "100000"]
-    program = f"import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
+    program = f"{HEAR_SIGINT}import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
@@ -163,8 +163,8 @@ def test_an_interrupt_keeps_whole_episodes(tmp_path: Path) -> None:
 def test_an_interrupt_keeps_the_episode_under_way(mode: list[str], tmp_path: Path) -> None:
     out = tmp_path / "run"
     options = ["--horizon", "10", "--samples", "8", "--steps", "100000", *QUIET, *mode]
-    program = f"""
-import os, signal, sys
+    program = f"""{HEAR_SIGINT}
+import os, sys
 from lyceum_warp import cli, report
 def third(self, now):
     if now.step == 3:
