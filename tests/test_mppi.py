@@ -146,7 +146,9 @@ def heavy_arm() -> mujoco.MjSpec:
     return spec
 
 
-HOPPER = dict(task="hopper", horizon=12, samples=24, temperature=0.5, noise=0.8)
+# the task's own planning has other weights for the planner's worlds alone
+HOPPER = dict(task="hopper", horizon=12, samples=24, temperature=0.5, noise=0.8, healthy_reward=1.0,
+              forward_reward_weight=1.0, integrator="rk4")  # fmt: skip
 POINT = dict(task="point_mass", horizon=9, samples=40, temperature=0.3)
 REACH = dict(task="reach", horizon=16, samples=30, temperature=0.2, noise=1.0)
 CASES: dict[str, dict[str, Any]] = {

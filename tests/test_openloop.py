@@ -253,6 +253,7 @@ def test_one_native_call_or_many_steps(
     fast = run(loop, state, actions)
     assert len(native_calls) == 1, "the fast path was not taken"
     monkeypatch.setattr(c, "is_exact", lambda model, fields: False)
+    loop.env.engine._rollouts.clear()
     slow = run(loop, state, actions)
     assert len(native_calls) == 1
     for name, value in fast.items():
