@@ -1,6 +1,8 @@
 """Learning curves and videos."""
 
+import json
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -70,18 +72,26 @@ def test_episode(env: lw.Env, shared_env: SharedEnv) -> None:
 
 
 def test_record(env: lw.Env, tmp_path: Path) -> None:
-    imageio = pytest.importorskip("imageio.v2")
+    pytest.importorskip("imageio")
     states = video.episode(env, still, seed=4)
     try:
         path = video.record(env, states, tmp_path / "video.mp4", size=(160, 120))
     except video.NoVideoError as error:
         pytest.skip(str(error))
-    with imageio.get_reader(path) as reader:
-        assert reader.get_meta_data()["fps"] == pytest.approx(1 / env.timestep)
-        frames = list(reader.iter_data())
-    assert len(frames) == len(states)
-    assert frames[0].shape == (120, 160, 3)
-    assert frames[0].max() > 100  # something is lit
+    # in a small process: imageio forks, which after all other tests may be refused for want of memory
+    program = """
+import json, sys
+import imageio.v2 as imageio
+with imageio.get_reader(sys.argv[1]) as reader:
+    frames = list(reader.iter_data())
+    print(json.dumps([reader.get_meta_data()["fps"], len(frames), frames[0].shape, int(frames[0].max())]))
+"""
+    done = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True)
+    fps, count, shape, brightest = json.loads(done.stdout)
+    assert fps == pytest.approx(1 / env.timestep)
+    assert count == len(states)
+    assert shape == [120, 160, 3]
+    assert brightest > 100  # something is lit
 
 
 def test_a_machine_that_cannot_draw_says_why(env: lw.Env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
