@@ -71,12 +71,14 @@ def episode(options: Options, horizon: int, with_value: bool, temperature: float
         nthread = 1
     config = Run.open(options.run).config
     task, params = config["task"], config["params"]
+    env = lw.make(task, autoreset=False, horizon=options.steps, nthread=1, **params)
+    # what the task itself pays, with and without the value function that was fitted to it
+    own = {name: env.task.params[name] for name in env.task.task.planning if name in env.task.params}
     more: dict[str, Any] = {"value": lw.load_value(options.run)} if with_value else {}
     plan = lw.MPPI(
         task, horizon=horizon, samples=options.samples, noise=options.noise, discount=config["npg"]["gamma"], seed=seed,
-        temperature=temperature, nthread=nthread, **more, **params,
+        temperature=temperature, nthread=nthread, **more, **(own | params),
     )  # fmt: skip
-    env = lw.make(task, autoreset=False, horizon=options.steps, nthread=1, **params)
     env.rand_reset(seed)
     total, times = 0.0, []
     while not env.done.item():

@@ -12,6 +12,7 @@ and in trajopt, whose smoothing of the noise it takes over. A temperature here i
 arm is an inverse temperature, and stands for 0.2.
 """
 
+import inspect
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -46,7 +47,8 @@ class MPPI:
     many plans came before it, and on what those left as the plan to start from.
 
     Everything that is left at None comes from the task's ``planning``, if it names it, and else from the default in
-    brackets. ``planning`` may also hold options and parameters for the planner's worlds, which those given override.
+    brackets. ``planning`` may also hold options and parameters for the planner's worlds, which those given override;
+    with a ``value`` its parameters don't count, because values are of what the task itself pays.
 
     Args:
         task: Name of a task, a file with one, or its class.
@@ -118,6 +120,8 @@ class MPPI:
             discount=discount, iterations=iterations, fill=fill, termination=termination,
         )  # fmt: skip
         own = dict(task.planning)
+        if value is not None:  # it was fitted to what the task itself pays, not to what its planning pays
+            own = {name: own[name] for name in own if name in _DEFAULTS or name in _WORLDS}
         options = {name: own[name] for name in own if name not in _DEFAULTS} | options
         own = {name: own[name] for name in own if name in _DEFAULTS}
         settings = _DEFAULTS | own | {name: v for name, v in given.items() if v is not None}
@@ -360,6 +364,10 @@ def _array(value: Any) -> np.ndarray:
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         return np.array(math.nan)
+
+
+_WORLDS = frozenset(inspect.signature(Env).parameters)
+"""Options of environments, as opposed to parameters of tasks."""
 
 
 def _number(name: str, value: Any, low: float, high: float = math.inf) -> float:
