@@ -16,6 +16,7 @@ import multiprocessing
 import statistics
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 import tyro
@@ -41,6 +42,8 @@ class Options:
     """Episodes at the same time; with more than one, each has one thread."""
     plan: tuple[str, ...] = ()
     """Other settings of MPPI than the task's own, as NAME=VALUE."""
+    solver: tuple[str, ...] = ()
+    """Other limits of the planner's constraint solver, as NAME=VALUE; what is controlled keeps its own."""
     param: tuple[str, ...] = ()
     """Parameters of the task, as NAME=VALUE."""
     stop_after: float = math.inf
@@ -79,7 +82,10 @@ def run(options: Options, number: int) -> Episode:
             nthread = 1
         params = dict(map(parameter, options.param))
         env = lw.make(options.task, autoreset=False, horizon=options.steps, nthread=1, **params)
-        plan = lw.MPPI(options.task, nthread=nthread, **params, **dict(map(parameter, options.plan)))
+        more: dict[str, Any] = dict(map(parameter, options.plan))
+        if options.solver:
+            more["solver"] = dict(map(parameter, options.solver))
+        plan = lw.MPPI(options.task, nthread=nthread, **params, **more)
         _worlds[options] = env, plan
     env, plan = _worlds[options]
     summaries: list[dict[str, float]] = []
@@ -131,7 +137,7 @@ def same_experiment(options: Options) -> None:
     """Refuse to go on with a table of other settings; they lie beside it."""
     if options.out is None:
         return
-    settings = {name: getattr(options, name) for name in ("task", "steps", "plan", "param")}
+    settings = {name: getattr(options, name) for name in ("task", "steps", "plan", "solver", "param")}
     beside = options.out.with_suffix(".json")
     if options.out.exists():
         before = json.loads(beside.read_text()) if beside.exists() else {}

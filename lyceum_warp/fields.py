@@ -62,6 +62,9 @@ ON_DEMAND = {
 }
 """Fields that MuJoCo leaves at zero unless a sensor of the model needs them, with such a sensor."""
 
+SENSED = {"sensordata", *ON_DEMAND}
+"""Fields for which the model's sensors have to be on."""
+
 _TYPES = {3: wp.vec3, 4: wp.quat, 6: wp.spatial_vector, 9: wp.mat33, 10: vec10}
 
 # the objects along a field's first axis, for access by name
@@ -123,6 +126,11 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field
     Raises:
         ValueError: There is no such field, or it is not the same on both engines.
     """
+    if name in SENSED and not _sensed(model, name):
+        raise ValueError(
+            f"MuJoCo computes the field {name!r} only for a sensor, and the model has none that needs it, or they are "
+            "off, as no field in the task's World needs one: list it there"
+        )
     if name in STATE_FIELDS:
         refresh = reset = Stage.NONE
         snapshot = lagged = False
@@ -132,11 +140,6 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field
         refresh, reset = Stage(0 if lagged else current), Stage(max(stages, default=0))
         snapshot = lagged or Stage.ACCELERATION in stages
     elif name in DERIVED_FIELDS:
-        if name in ON_DEMAND and not _demanded(model, name):
-            raise ValueError(
-                f"MuJoCo computes the field {name!r} only for a sensor, and the model has none that needs it: list "
-                "it in the task's World, which adds one"
-            )
         reset = DERIVED_FIELDS[name]
         lagged = lagged and reset < Stage.ACCELERATION
         snapshot = lagged or reset == Stage.ACCELERATION
@@ -152,8 +155,12 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field
     return Field(name, shape, wp.float32, refresh, reset, lagged, snapshot)
 
 
-def _demanded(model: mujoco.MjModel, name: str) -> bool:
-    """Whether a sensor of the model makes MuJoCo compute a field."""
+def _sensed(model: mujoco.MjModel, name: str) -> bool:
+    """Whether the model's sensors make MuJoCo compute a field."""
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
+        return False
+    if name == "sensordata":
+        return True
     kind = mujoco.mjtSensor
     if ON_DEMAND[name] == kind.mjSENS_FRAMELINACC:  # one pass serves all of these
         kinds = [kind.mjSENS_ACCELEROMETER, kind.mjSENS_FORCE, kind.mjSENS_TORQUE, kind.mjSENS_FRAMELINACC,

@@ -6,13 +6,13 @@ import importlib.util
 import logging
 import sys
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import mujoco
 
-from lyceum_warp.fields import ON_DEMAND
+from lyceum_warp.fields import ON_DEMAND, SENSED
 from lyceum_warp.quiet import quiet
 from lyceum_warp.validate import whole_number
 
@@ -112,7 +112,7 @@ _SOLVER = {"iterations": 1, "ls_iterations": 1, "noslip_iterations": 0}
 
 def compile_model(
     spec: mujoco.MjSpec,
-    fields: Iterable[str],
+    fields: Collection[str],
     *,
     cone: str | None = None,
     integrator: str | None = None,
@@ -122,7 +122,7 @@ def compile_model(
 
     MuJoCo Warp has no PGS solver, so a model that asks for it gets Newton on both engines, which converges to
     the same accelerations. Fields that MuJoCo computes only where a sensor needs them get such a sensor, after
-    the model's own: without it a task would read zeros.
+    the model's own: without it a task would read zeros. Where no field needs a sensor, the model's own are turned off.
 
     Args:
         spec: The model; changed in place.
@@ -150,6 +150,8 @@ def compile_model(
             body.name = "lyceum_first_body"
         name = f"lyceum_{sensor.name.removeprefix('mjSENS_').lower()}"
         spec.add_sensor(name=name, type=sensor, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=body.name)
+    if SENSED.isdisjoint(fields):
+        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
     quiet()
     try:
         with warnings.catch_warnings(record=True) as caught:

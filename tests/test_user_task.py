@@ -306,8 +306,9 @@ def test_a_field_asked_for_later_joins_the_state(module: ModuleType, engine: str
     assert torch.equal(acceleration, kept)
     assert torch.equal(env.get_state(), state)
     torch.testing.assert_close(env.get_obs(state), env.obs, rtol=0, atol=0)
-    with pytest.raises(ValueError, match="'cfrc_ext' only for a sensor"):
-        lw.make("hopper", engine=engine).field("cfrc_ext")
+    for task, name in (("hopper", "cfrc_ext"), ("hopper", "sensordata"), ("adroit_pen", "sensordata")):
+        with pytest.raises(ValueError, match=f"'{name}' only for a sensor.*task's World"):
+            lw.make(task, engine="mujoco").field(name)
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -1,0 +1,164 @@
+"""What options of the physics gain, and what they lose in accuracy, on states that the model's own options lead to.
+
+    python bench/solver.py --tasks hopper half_cheetah humanoid --nworld 4096 --engine warp --device cuda
+
+Every setting makes the same steps: from each recorded state, episodes that have just begun included, one step with the
+recorded action. A step's error is the largest of a world's velocities, relative to the larger of 1 and the largest
+velocity; its scale is what the model's own options differ by when they make the same steps once more ("own, again":
+on a GPU sums are taken in any order). Settings take turns, so that all see a machine of the same mood.
+"""
+
+import dataclasses
+import statistics
+from pathlib import Path
+from typing import Any
+
+import records
+import torch
+import tyro
+from rich.console import Console
+from rich.table import Table
+from throughput import seconds
+
+import lyceum_warp as lw
+from lyceum_warp.engines.warp import WarpEngine
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """Options of ``lw.make``, and whether the solver's loops are unrolled into the graph instead of ending early."""
+
+    make: dict[str, Any] = dataclasses.field(default_factory=dict)
+    unrolled: bool = False
+
+
+def limits(iterations: int, ls_iterations: int | None = None) -> dict[str, Any]:
+    return {"solver": {"iterations": iterations} | ({"ls_iterations": ls_iterations} if ls_iterations else {})}
+
+
+SETTINGS = {
+    "own": Setting(),
+    "own, again": Setting(),
+    "5 iterations": Setting(limits(5)),
+    "4 iterations": Setting(limits(4)),
+    "4, line search 6": Setting(limits(4, 6)),
+    "4, line search 6, unrolled": Setting(limits(4, 6), unrolled=True),
+    "3 iterations": Setting(limits(3)),
+    "3, line search 6, unrolled": Setting(limits(3, 6), unrolled=True),
+    "Euler": Setting({"integrator": "euler"}),
+    "Euler, 4 iterations": Setting({"integrator": "euler", **limits(4)}),
+    "implicitfast": Setting({"integrator": "implicitfast"}),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Gain and loss of options of the physics, as a table and as JSON."""
+
+    tasks: tuple[str, ...] = ("hopper", "half_cheetah", "humanoid")
+    """Tasks."""
+    nworld: tuple[int, ...] = (256,)
+    """Numbers of worlds."""
+    engine: str = "auto"
+    """Engine."""
+    device: str = "cpu"
+    """Device."""
+    states: int = 20
+    """Steps that each setting makes, five steps of the environment apart."""
+    out: Path | None = None
+    """JSON file for the record."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One setting; errors are quantiles over worlds and steps."""
+
+    task: str
+    nworld: int
+    setting: str
+    step_ms: float
+    gain: float
+    """Time with the model's own options by time with these, median over the steps."""
+    error_median: float
+    error_99: float
+    error_max: float
+    not_finite: int
+    """Worlds whose step ended in no number, or in a fault."""
+
+
+def recorded(task: str, nworld: int, options: Options) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """States with the actions that are taken there, under uniformly random ones."""
+    env = lw.make(task, nworld=nworld, engine=options.engine, device=options.device)
+    generator = torch.Generator(env.obs.device).manual_seed(0)
+    low, high = (torch.as_tensor(x, device=env.obs.device) for x in (env.action_space.low, env.action_space.high))
+    found = []
+    for step in range(5 * (options.states + 4)):
+        draws = torch.rand(env.action.shape, generator=generator, device=env.obs.device)
+        env.action.copy_(draws * (high - low) + low)
+        if step >= 20 and step % 5 == 0:
+            found.append((env.get_state(), env.action.clone()))
+        env.step()
+    return found
+
+
+def measure(task: str, nworld: int, options: Options) -> list[Row]:
+    steps = recorded(task, nworld, options)
+    envs: dict[str, lw.Env] = {}
+    for name, setting in SETTINGS.items():
+        env = lw.make(
+            task, nworld=nworld, engine=options.engine, device=options.device, autoreset=False, **setting.make
+        )
+        if setting.unrolled:
+            if not isinstance(env.engine, WarpEngine) or env.device.is_cpu:
+                continue
+            env.engine.m.opt.graph_conditional = False
+        if "integrator" in setting.make and env.model.opt.integrator == envs["own"].model.opt.integrator:
+            continue
+        envs[name] = env
+    velocity = envs["own"].state_space.parts["qvel"]
+    times: dict[str, list[float]] = {name: [] for name in envs}
+    errors: dict[str, list[torch.Tensor]] = {name: [] for name in envs}
+    for state, action in [*steps[:3], *steps]:  # three to warm up, recordings included
+        wanted = None
+        for name, env in envs.items():
+            env.set_state(state)
+            env.action.copy_(action)
+            times[name].append(seconds(env, env.step))
+            found = env.get_state()[:, velocity].double()
+            wanted = found if wanted is None else wanted
+            scale = wanted.abs().amax(1).clamp(min=1.0)
+            errors[name].append((found - wanted).abs().amax(1) / scale)
+    rows = []
+    for name in envs:
+        mine = times[name][3:]
+        gain = statistics.median(a / b for a, b in zip(times["own"][3:], mine, strict=True))
+        error = torch.cat(errors[name][3:])
+        finite = error.isfinite()
+        ordered = error[finite].sort().values
+        at = [ordered[int(q * (len(ordered) - 1))].item() for q in (0.5, 0.99, 1.0)]
+        rows.append(
+            Row(task, nworld, name, 1e3 * statistics.median(mine), gain, at[0], at[1], at[2], int((~finite).sum()))
+        )
+    return rows
+
+
+def main(options: Options) -> None:
+    torch.set_num_threads(1)
+    table = Table("task", "worlds", "setting", "step, ms", "gain", "error: median", "99 %", "max", "no number")
+    for column in table.columns[3:]:
+        column.justify = "right"
+    rows: list[Row] = []
+    for task in options.tasks:
+        for nworld in options.nworld:
+            for row in measure(task, nworld, options):
+                rows.append(row)
+                table.add_row(row.task, str(row.nworld), row.setting, f"{row.step_ms:.3f}", f"{row.gain:.2f}",
+                              f"{row.error_median:.0e}", f"{row.error_99:.0e}", f"{row.error_max:.0e}",
+                              str(row.not_finite))  # fmt: skip
+    Console(width=120).print(table)
+    if options.out is not None:
+        records.write(options.out, rows, options.device, states=options.states)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
