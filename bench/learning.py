@@ -12,13 +12,13 @@ import time
 from pathlib import Path
 from typing import Any
 
+import records
 import torch
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 import lyceum_warp as lw
-from lyceum_warp.versions import versions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +96,7 @@ def main(options: Options) -> None:
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         record = {
-            "versions": versions(),
+            "versions": records.context(options.device),
             "options": dataclasses.asdict(options) | {"out": str(options.out)},
             "rows": [row for rows in runs for row in rows],
         }
