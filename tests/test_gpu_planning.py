@@ -84,5 +84,5 @@ def test_a_planner_on_the_gpu_controls_a_plant_on_the_cpu() -> None:
 
 def test_few_samples_are_rolled_out_by_the_cpu() -> None:
     assert lw.MPPI("reach", device=CUDA, samples=8).env.engine.name == "mujoco"
-    assert lw.MPPI("reach", device=CUDA, samples=8, nthread=1).env.device.is_cpu
+    assert lw.MPPI("reach", device=CUDA, samples=8, nthread=1, nconmax=16).env.device.is_cpu
     assert lw.MPPI("reach", device=CUDA, samples=64, nthread=1).env.engine.name == "warp"

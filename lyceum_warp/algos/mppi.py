@@ -338,7 +338,11 @@ def _placed(options: Mapping[str, Any], samples: int) -> dict[str, Any]:
     placed = dict(options)
     if placed.get("engine", "auto") == "auto" and find_device(placed.get("device")).is_cuda:
         few = samples < _SAMPLES_A_CORE * (placed.get("nthread") or os.cpu_count() or 1)
-        placed |= {"engine": "mujoco", "device": "cpu"} if few else {"engine": "warp"}
+        # what is said of the other engine, for whichever case, has nothing to say here
+        if few:
+            placed |= {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None}
+        else:
+            placed |= {"engine": "warp", "nthread": None}
     return placed
 
 
