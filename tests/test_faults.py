@@ -119,7 +119,9 @@ def test_warp_engine_warning() -> None:
         )
         sensor.intprm[:] = [1, 0, 1]
         env = hopper("warp", model=spec, nconmax=16, njmax=64)
-        env.engine.m.opt.contact_sensor_maxmatch = 1  # type: ignore[attr-defined]
+        options = env.engine.m.opt  # type: ignore[attr-defined]
+        options.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # as for a task that reads it
+        options.contact_sensor_maxmatch = 1
         return env
 
     env, clean = make(), make()
