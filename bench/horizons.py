@@ -70,8 +70,8 @@ def episode(options: Options, horizon: int, with_value: bool, temperature: float
         torch.set_num_threads(1)
         nthread = 1
     config = Run.open(options.run).config
-    task, params = config["task"], config["params"]
-    env = lw.make(task, autoreset=False, horizon=options.steps, nthread=1, **params)
+    task, params, physics = config["task"], config["params"], config.get("physics", {})
+    env = lw.make(task, autoreset=False, horizon=options.steps, nthread=1, **(physics | params))
     # what the task itself pays, with and without the value function that was fitted to it
     own = {name: env.task.params[name] for name in env.task.task.planning if name in env.task.params}
     more: dict[str, Any] = {"value": lw.load_value(options.run)} if with_value else {}

@@ -26,7 +26,7 @@ class Run:
     """A training run's folder.
 
     =================== ======================================================================================
-    ``config.json``     the task, its parameters, the engine, the seed and every hyperparameter
+    ``config.json``     the task, its parameters, the engine, its physics, the seed and every hyperparameter
     ``versions.json``   what it ran with: packages, Python, machine, commit
     ``metrics.csv``     one row an iteration
     ``checkpoint.pt``   the policy, and all that is needed to continue exactly

@@ -35,6 +35,20 @@ def shared_env() -> SharedEnv:
     return get
 
 
+@pytest.fixture
+def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
+    """Every environment that the test makes, in turn."""
+    made: list[lw.Env] = []
+    init = lw.Env.__init__
+
+    def remembered(env: lw.Env, *args: Any, **options: Any) -> None:
+        init(env, *args, **options)
+        made.append(env)
+
+    monkeypatch.setattr(lw.Env, "__init__", remembered)
+    return made
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what is marked ``gpu`` on machines without one."""
     if wp.is_cuda_available():

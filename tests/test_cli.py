@@ -2,6 +2,7 @@
 
 import csv
 import inspect
+import json
 import os
 import signal
 import subprocess
@@ -9,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import mujoco
 import pytest
 import torch
 import warp as wp
@@ -72,6 +74,7 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert "$ lyceum-warp" in out  # an example
     if command == ["train"]:
         assert all(f"--{name}" in out for name in ("iterations", "resume", "gamma", "value-hidden", "require-return"))
+        assert all(f"--{name}" in out for name in ("integrator", "solver", "deterministic"))
         assert "Discount." in out
 
 
@@ -139,6 +142,49 @@ def test_resume_refuses(trained: Path, tmp_path: Path, capsys: pytest.CaptureFix
     refused(capsys, "there is no run in")
 
 
+def physics(env: lw.Env) -> tuple[int, int, int, bool]:
+    opt = env.model.opt
+    return opt.integrator, opt.iterations, opt.ls_iterations, env._options["deterministic"]
+
+
+def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    options = ["--integrator", "euler", "--solver", "iterations=7", "--solver", "ls_iterations=9", "--deterministic"]
+    assert train(out, "--iterations", "1", *options, task="hopper") == 0  # whose own integrator is RK4
+    solver = {"iterations": 7, "ls_iterations": 9}
+    assert Run.open(out).config["physics"] == {"integrator": "euler", "solver": solver, "deterministic": True}
+    resume = ["train", "--resume", str(out), *QUIET, "--iterations"]
+    assert cli.main([*resume, "2"]) == 0
+    assert cli.main([*resume, "3", "--solver", "iterations=7", "--integrator", "euler"]) == 0
+    assert cli.main(["eval", str(out), "--episodes", "2", "--video"]) == 0
+    assert {physics(env) for env in made_envs} == {(mujoco.mjtIntegrator.mjINT_EULER, 7, 9, True)}
+    assert {env.nworld for env in made_envs} == {1, 2, 32}  # a video, all iterations and eval, the report
+    capsys.readouterr()
+    for other, words in [
+        (["--integrator", "rk4"], "has integrator euler, not rk4"),
+        (["--solver", "iterations=8"], "has solver {'iterations': 7, 'ls_iterations': 9}, not {'iterations': 8,"),
+        (["--no-deterministic"], "has deterministic True, not False"),
+    ]:
+        assert cli.main([*resume, "4", *other]) == 2
+        refused(capsys, words, "without --resume")
+
+
+def test_a_run_from_before_there_was_a_choice_of_physics(
+    trained: Path, tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in trained.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    config = Run.open(trained).config
+    del config["physics"]
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    resume = ["train", "--resume", str(tmp_path), "--iterations", "5", *QUIET]
+    assert cli.main([*resume, "--integrator", "rk4"]) == 2
+    refused(capsys, "has integrator None, not rk4")
+    assert cli.main(resume) == 0
+    assert cli.main(["eval", str(tmp_path), "--episodes", "2"]) == 0
+    assert {physics(env) for env in made_envs} == {physics(lw.make("point_mass"))}
+
+
 def test_resume_from_a_broken_checkpoint(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("config.json", "metrics.csv", "versions.json"):
         (tmp_path / name).write_bytes((trained / name).read_bytes())
@@ -178,6 +224,10 @@ def test_train_refuses_to_overwrite(trained: Path, capsys: pytest.CaptureFixture
         ("point_mass", ["--param", "success_distance"], ["NAME=VALUE", "'success_distance'"]),
         ("point_mass", ["--param", "success_distance="], ["NAME=VALUE"]),
         ("point_mass", ["--param", "success_distance=near"], ["'success_distance=near' is no number"]),
+        ("point_mass", ["--integrator", "rk5"], ["no integrator 'rk5'", "'euler'"]),
+        ("point_mass", ["--solver", "iteration=3"], ["no limit 'iteration'", "'iterations'"]),
+        ("point_mass", ["--solver", "iterations=0"], ["solver's iterations", "not 0"]),
+        ("point_mass", ["--solver", "iterations"], ["'iterations' has to be written as NAME=VALUE"]),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_no_folder(

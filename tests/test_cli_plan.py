@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -97,6 +98,26 @@ def test_world_and_planner_may_differ(tmp_path: Path) -> None:
     assert Trajectory.load(tmp_path / "run" / "episode-000.npz").params["success_distance"] == pytest.approx(0.2)
 
 
+@pytest.mark.parametrize("options, name, integrator", [
+    ([], "euler", mujoco.mjtIntegrator.mjINT_EULER),  # as the task suggests
+    (["--integrator", "implicitfast"], "implicitfast", mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
+])  # fmt: skip
+def test_the_planners_physics_are_its_own(
+    options: list[str], name: str, integrator: int, tmp_path: Path, made_envs: list[lw.Env]
+) -> None:
+    out = tmp_path / "run"
+    options = [*options, "--solver", "iterations=5", "--solver", "noslip_iterations=0", "--deterministic"]
+    assert plan(out, *QUIET, "--steps", "3", "--episodes", "2", *options, task="hopper") == 0
+    plant, planner = made_envs
+    own = lw.make("hopper").model.opt
+    assert (plant.model.opt.integrator, plant.model.opt.iterations) == (own.integrator, own.iterations)
+    assert (planner.model.opt.integrator, planner.model.opt.iterations) == (integrator, 5)
+    assert planner._options["deterministic"] and not plant._options["deterministic"]
+    settings = json.loads((out / "config.json").read_text())["planner"]
+    assert settings["solver"] == {"iterations": 5, "noslip_iterations": 0}
+    assert (settings["integrator"], settings["deterministic"]) == (name, True)
+
+
 @pytest.mark.parametrize("options, words", [
     (["--horizon", "0"], ["horizon", "0"]),
     (["--samples", "0"], ["samples", "0"]),
@@ -117,6 +138,8 @@ def test_world_and_planner_may_differ(tmp_path: Path) -> None:
     (["--seed", "-1"], ["seed", "-1"]),
     (["--seed", "2147483647", "--episodes", "2"], ["seed of the last episode", "2147483648"]),
     (["--engine", "bullet"], ["bullet"]),
+    (["--integrator", "rk5"], ["no integrator 'rk5'", "'euler'"]),
+    (["--solver", "iterations=0"], ["solver's iterations", "not 0"]),
     (["--device", "cuda:7"], ["cuda:7"]),
 ])  # fmt: skip
 def test_bad_options_leave_nothing_behind(

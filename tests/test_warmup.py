@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mujoco
 import pytest
 import torch
 import warp as wp
@@ -138,3 +139,17 @@ def test_warmup_says_what_it_did(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["warmup", "point_mass", "--nworld", "8", "--plan", "--npg"]) == 0
     assert "kB a world of 8\n" in capsys.readouterr().out
     assert main(["warmup", "nothing"]) == 2
+
+
+def test_warmup_with_other_physics(made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]) -> None:
+    warmup = ["warmup", "point_mass", "--nworld", "8", "--plan"]
+    options = ["--integrator", "implicitfast", "--solver", "ls_iterations=9", "--deterministic"]
+    assert main([*warmup, *options]) == 0
+    assert len(made_envs) == 2  # the environment's and the planner's
+    for env in made_envs:
+        opt = env.model.opt
+        assert (opt.integrator, opt.ls_iterations) == (mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 9)
+        assert env._options["deterministic"]
+    capsys.readouterr()
+    assert main([*warmup, "--integrator", "rk5"]) == 2
+    assert "there is no integrator 'rk5'" in capsys.readouterr().err

@@ -357,6 +357,8 @@ _SMALLEST = float(np.finfo(np.float32).tiny)
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):  # limits of the solver
+        return dict(value)
     return value if isinstance(value, (int, float, str)) else _array(value).tolist()
 
 

@@ -2,10 +2,45 @@
 
 import ast
 import contextlib
+import dataclasses
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import tyro
+
+Words = tyro.conf.UseAppendAction[tuple[str, ...]]
+"""What may be given several times."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Physics:
+    """How the worlds are simulated."""
+
+    integrator: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Another integrator than the model's: euler, rk4, implicit or implicitfast."""
+    solver: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Another limit of the constraint solver than the model's, as iterations=4, ls_iterations=10 or
+    noslip_iterations=0; may be given several times."""
+    deterministic: bool = False
+    """Whether runs on a GPU are equal to the bit, at many times the cost; on the CPU they are anyway."""
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> "Physics":
+        """That of a run; one from before there was a choice has the model's own."""
+        saved = dict(config.get("physics", {}))
+        if "solver" in saved:
+            saved["solver"] = tuple(f"{name}={limit}" for name, limit in saved["solver"].items())
+        return cls(**saved)
+
+    def options(self) -> dict[str, Any]:
+        """As an environment takes it."""
+        return dataclasses.asdict(self) | {"solver": dict(map(parameter, self.solver))}
+
+    def given(self) -> dict[str, Any]:
+        """The same without what was not given: a planner then has what the task suggests."""
+        return {name: value for name, value in self.options().items() if value not in (None, {}, False)}
 
 
 class Interrupted(BaseException):
@@ -47,17 +82,17 @@ def portable(task: str) -> str:
 
 
 def parameter(text: str) -> tuple[str, Any]:
-    """A parameter of a task as it is given, NAME=VALUE, a vector as NAME=0.7,inf.
+    """A parameter of a task, or a limit of the solver, as it is given: NAME=VALUE, a vector as NAME=0.7,inf.
 
     Raises:
         ValueError: It is written otherwise.
     """
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
-        raise ValueError(f"a parameter is given as NAME=VALUE, not {text!r}")
+        raise ValueError(f"{text!r} has to be written as NAME=VALUE")
     parts = [_value(part, text) for part in value.strip().strip("[]()").split(",") if part.strip()]
     if not parts:
-        raise ValueError(f"a parameter is given as NAME=VALUE, not {text!r}")
+        raise ValueError(f"{text!r} has to be written as NAME=VALUE")
     return name.strip(), parts[0] if len(parts) == 1 else parts
 
 

@@ -9,6 +9,7 @@ import tyro
 from rich.table import Table
 
 from lyceum_warp.algos.rollout import Episodes, evaluate
+from lyceum_warp.cli.common import Physics
 from lyceum_warp.env import Env
 from lyceum_warp.report import filmed, make_console
 from lyceum_warp.runs import Run, load
@@ -17,7 +18,7 @@ from lyceum_warp.viz.video import check_video
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Eval:
-    """Run the mean policy of a run for whole episodes and print what came of them.
+    """Run the mean policy of a run for whole episodes, in the run's own physics, and print what came of them.
 
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
     """
@@ -49,8 +50,9 @@ def evaluate_run(options: Eval) -> int:
     nworld = min(options.nworld, options.episodes)
     device = options.device or config["device"]
     env = Env(
-        config["task"], nworld=nworld, engine=options.engine or config["engine"], device=device, **config["params"]
-    )
+        config["task"], nworld=nworld, engine=options.engine or config["engine"], device=device,
+        **(Physics.of(config).options() | config["params"]),
+    )  # fmt: skip
     policy = load(run, device=env.obs.device)
     sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
     if sizes != wanted:

@@ -13,14 +13,12 @@ from lyceum_warp.algos.control import control, control_async
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.report import control_report
 from lyceum_warp.algos.trajectory import Trajectory
-from lyceum_warp.cli.common import Interrupted, parameter, portable
+from lyceum_warp.cli.common import Interrupted, Physics, Words, parameter, portable
 from lyceum_warp.env import Env
 from lyceum_warp.registry import find_task, task_name
 from lyceum_warp.report import PlanDisplay, filmed_states, make_console, plotted_control, report_table
 from lyceum_warp.runs import Run, load_value
 from lyceum_warp.validate import whole_number
-
-Words = tyro.conf.UseAppendAction[tuple[str, ...]]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,10 +30,13 @@ class Plan:
     not given of the planner's settings comes from the task. After Ctrl-C, the episode under way has a file, too, but
     no part in the report.
 
+    --integrator, --solver and --deterministic are the planner's: what is controlled keeps its own physics.
+
     $ lyceum-warp plan reach
     $ lyceum-warp plan reach --real-time --episodes 10
     $ lyceum-warp plan half_cheetah --steps 200 --samples 128 --temperature 1
     $ lyceum-warp plan hopper --steps 300 --horizon 16 --value runs/hopper-20260101-120000 --discount 0.995
+    $ lyceum-warp plan adroit_pen --device cuda:0 --samples 1024 --solver noslip_iterations=0
     """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
@@ -90,6 +91,8 @@ class Plan:
     """Whether to film the first episode."""
     plot: bool = True
     """Whether to draw rewards, planning times and ages."""
+    planner_physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
+    """How the planner simulates; the world itself stays as it is."""
 
 
 _SETTINGS = (
@@ -142,7 +145,7 @@ def _worlds(options: Plan) -> tuple[Env, MPPI]:
         more["value"] = load_value(options.value, device=options.device)
     planner = MPPI(
         options.task, **settings, engine=options.engine, device=options.device, **more,
-        **(params | dict(map(parameter, options.planner_param))),
+        **(options.planner_physics.given() | params | dict(map(parameter, options.planner_param))),
     )  # fmt: skip
     return plant, planner
 

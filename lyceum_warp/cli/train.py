@@ -15,7 +15,7 @@ from rich.console import Console
 from lyceum_warp.algos.distributed import Team, join
 from lyceum_warp.algos.npg import NPG, NPGConfig
 from lyceum_warp.algos.rollout import Episodes, evaluate
-from lyceum_warp.cli.common import Interrupted, parameter, portable, spelled
+from lyceum_warp.cli.common import Interrupted, Physics, Words, parameter, portable, spelled
 from lyceum_warp.env import Env
 from lyceum_warp.registry import find_task, task_name, task_names
 from lyceum_warp.report import Display, curve_table, filmed, make_console, plotted
@@ -36,6 +36,7 @@ class Train:
     $ lyceum-warp train hopper --iterations 100 --seed 1
     $ lyceum-warp train half_cheetah --param ctrl_cost_weight=0.05 --param reset_noise_scale=0 --hidden 32 32
     $ lyceum-warp train path/to/my_task.py --samples 4000 --out runs/mine
+    $ lyceum-warp train humanoid --device cuda --integrator euler --solver iterations=4
     $ lyceum-warp train --resume runs/mine --iterations 200
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda --nworld 8192 --samples 262144
 
@@ -64,7 +65,7 @@ class Train:
     threads: int = 1
     """Threads of torch on the CPU. Small networks gain little from more, and a number that is the same everywhere
     keeps runs the same to the bit. The mujoco engine uses all cores in any case."""
-    param: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    param: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf; may be given several times."""
     video: bool = True
     """Whether to film an episode of the trained policy at the end."""
@@ -72,6 +73,7 @@ class Train:
     """Whether to draw the learning curve at the end."""
     require_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Exit with code 1 unless the trained mean policy's return exceeds this."""
+    physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
     npg: tyro.conf.OmitArgPrefixes[NPGConfig] = dataclasses.field(default_factory=NPGConfig)
 
 
@@ -100,6 +102,7 @@ def _config(options: Train) -> dict[str, Any]:
         "algorithm": "npg",
         "task": portable(options.task),
         "params": dict(parameter(text) for text in options.param),
+        "physics": options.physics.options(),
         "engine": options.engine,
         "device": options.device,
         "nworld": options.nworld,
@@ -124,7 +127,8 @@ def saved_options(folder: Path) -> Train:
             task=config["task"], iterations=config["iterations"], seed=config["seed"], resume=folder,
             engine=config["engine"], device=config["device"], nworld=config["nworld"],
             threads=config["threads"],
-            param=tuple(f"{name}={spelled(value)}" for name, value in config["params"].items()), npg=npg,
+            param=tuple(f"{name}={spelled(value)}" for name, value in config["params"].items()),
+            physics=Physics.of(config), npg=npg,
         )  # fmt: skip
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{folder / 'config.json'} is not the configuration of an NPG run ({error})") from error
@@ -171,11 +175,11 @@ def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, NPG]:
 
 def _settings(options: Train) -> dict[str, Any]:
     """What a resumed run has to keep."""
-    free = ("iterations", "out", "resume", "video", "plot", "require_return", "npg", "param")
+    free = ("iterations", "out", "resume", "video", "plot", "require_return", "npg", "param", "physics")
     settings = {f.name: getattr(options, f.name) for f in dataclasses.fields(options) if f.name not in free}
     settings["task"] = portable(options.task or "")
     settings["param"] = dict(parameter(text) for text in options.param)
-    return settings | dataclasses.asdict(options.npg)
+    return settings | options.physics.options() | dataclasses.asdict(options.npg)
 
 
 def _hyperparameters(config: dict[str, Any]) -> NPGConfig:
@@ -187,7 +191,7 @@ def _algorithm(config: dict[str, Any], team: Team) -> NPG:
     if config["threads"] < 1:
         raise ValueError(f"threads has to be at least 1, not {config['threads']}")
     torch.set_num_threads(config["threads"])
-    options = dict(config["params"])
+    options = Physics.of(config).options() | config["params"]
     if team.neighbours > 1 and _engine(config) == "mujoco":
         options["nthread"] = max(1, (os.cpu_count() or 1) // team.neighbours)
     nworld = team.share(config["nworld"])

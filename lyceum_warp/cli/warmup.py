@@ -8,7 +8,7 @@ import tyro
 
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.npg import NPG, NPGConfig
-from lyceum_warp.cli.common import parameter
+from lyceum_warp.cli.common import Physics, Words, parameter
 from lyceum_warp.engines.memory import free_memory
 from lyceum_warp.engines.warp import WarpEngine
 from lyceum_warp.env import Env
@@ -21,10 +21,12 @@ class Warmup:
     """Compile a task's kernels ahead of time, so that no later run waits for them, and say what a world costs.
 
     Warp keeps what it has compiled in its cache, for each kind of device. Sizes of the model's arrays are part of some
-    kernels, numbers of worlds are not.
+    kernels, numbers of worlds are not. Which kernels a step needs depends on --integrator, --solver and
+    --deterministic, too: give those of the run to come.
 
     $ lyceum-warp warmup hopper --device cuda:0 --nworld 4096 --npg
     $ lyceum-warp warmup reach --device cuda:0 --plan
+    $ lyceum-warp warmup humanoid --device cuda:0 --integrator euler --solver ls_iterations=10
     """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
@@ -39,21 +41,22 @@ class Warmup:
     """Whether to compile what MPPI needs, too."""
     npg: bool = False
     """Whether to compile what NPG needs, too."""
-    param: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    param: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf; may be given several times."""
+    physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
 
 def warm_up(options: Warmup) -> int:
     """The command."""
-    params = dict(parameter(text) for text in options.param)
+    more = options.physics.given() | dict(parameter(text) for text in options.param)
     start, before = time.perf_counter(), cached()
-    env = Env(options.task, nworld=options.nworld, engine=options.engine, device=options.device, **params)
+    env = Env(options.task, nworld=options.nworld, engine=options.engine, device=options.device, **more)
     for _ in range(3):  # unrecorded, recorded, replayed
         env.step()
     if options.npg:
         next(NPG(env, config=NPGConfig(samples=2 * env.nworld, mean_every=0)))
     if options.plan:
-        plan = MPPI(options.task, engine=options.engine, device=options.device, **params)
+        plan = MPPI(options.task, engine=options.engine, device=options.device, **more)
         for _ in range(3):
             plan(plan.state_of())
     new = cached().keys() - before.keys()
