@@ -7,6 +7,7 @@ but for the rounding of sums, how many processes there are.
 
 import contextlib
 import os
+import weakref
 from collections.abc import Iterable, Iterator
 
 import torch
@@ -27,6 +28,7 @@ class Team:
 
     def __init__(self, rank: int = 0, size: int = 1, device: str | None = None, neighbours: int = 1) -> None:
         self.rank, self.size, self.device, self.neighbours = rank, size, device, neighbours
+        self._graphs: weakref.WeakSet[torch.cuda.CUDAGraph] = weakref.WeakSet()
 
     @property
     def leads(self) -> bool:
@@ -37,6 +39,16 @@ class Team:
     def records(self) -> bool:
         """Whether a CUDA graph can hold what the processes do with each other."""
         return self.size == 1 or distributed.get_backend() == "nccl"
+
+    def hold(self, graph: torch.cuda.CUDAGraph) -> None:
+        """Take note of a graph that holds what the processes do with each other, for ``part``."""
+        self._graphs.add(graph)
+
+    def part(self) -> None:
+        """Leave the others. What ``hold`` was told of can't be replayed any more."""
+        for graph in list(self._graphs):
+            graph.reset()  # NCCL's end waits for the end of all graphs that it is part of, for ever
+        distributed.destroy_process_group()
 
     def share(self, nworld: int) -> int:
         """Number of worlds of each process, of ``nworld`` in all.
@@ -141,12 +153,12 @@ def join(device: str = "cpu") -> Iterator[Team]:
         distributed.init_process_group("nccl", device_id=torch.device(device))
     else:
         distributed.init_process_group("gloo")
-    clean = False
+    team, clean = Team(distributed.get_rank(), size, device, neighbours), False
     try:
-        yield Team(distributed.get_rank(), size, device, neighbours)
+        yield team
         clean = True
     finally:
         # after an error NCCL may wait in vain for those who are not there any more: the end of the process is the
         # end of its group. Gloo waits for nobody, but its threads must be gone before Python is.
         if clean or distributed.get_backend() == "gloo":
-            distributed.destroy_process_group()
+            team.part()

@@ -205,6 +205,7 @@ class _CapturedStep:
         # other threads, such as NCCL's, go on calling CUDA meanwhile
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):
             self.learn()
+        self.fit.team.hold(graph)
         self.graph = graph
 
     def learn(self) -> None:
