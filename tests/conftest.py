@@ -1,6 +1,7 @@
 """What all tests share: environments, which are slow to make, and the GPU, which is often not there."""
 
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -15,12 +16,13 @@ torch.set_num_threads(1)
 SharedEnv = Callable[..., lw.Env]
 
 
-@pytest.fixture(scope="session")
-def shared_env() -> SharedEnv:
-    """``shared_env("hopper", engine="warp", nworld=4, ...)``: ``lw.make``, made once for the same arguments.
+@pytest.fixture(scope="module")
+def shared_env() -> Iterator[SharedEnv]:
+    """``shared_env("hopper", engine="warp", nworld=4, ...)``: ``lw.make``, made once a file for the same arguments.
 
     Every call starts the worlds afresh with ``rand_reset(0)``, so tests may leave them anywhere. A test that
-    asks for another field, changes a parameter or an attribute makes an environment of its own.
+    asks for another field, changes a parameter or an attribute makes an environment of its own, and so does one
+    that wants many worlds for itself alone: they go with the test.
     """
     made: dict[tuple[Any, ...], lw.Env] = {}
 
@@ -32,7 +34,24 @@ def shared_env() -> SharedEnv:
         made[key].rand_reset(0)
         return made[key]
 
-    return get
+    yield get
+    made.clear()
+    gc.collect()
+
+
+def settle() -> None:
+    """Take all that lives on from the garbage collector: imports and kernels are a million objects to look through.
+
+    What is made later is collected, and counted, as ever. Nothing that is to go may be alive.
+    """
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def settled() -> None:
+    """Between two files nothing lives but what stays."""
+    settle()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -207,14 +207,14 @@ def random_steps(env: lw.Env, n: int, seed: int = 0) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_keeps_the_rules(module: ModuleType, engine: str) -> None:
-    check_task("follow_target", engine=engine, steps=300, gain=np.array([0.5, 1.0, 1.5, 2.0]))
+    check_task("follow_target", engine=engine, steps=100, gain=np.array([0.5, 1.0, 1.5, 2.0]))
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_keeps_the_rules_under_rk4_with_scaled_actions(module: ModuleType, path: Path, engine: str) -> None:
     spec = mujoco.MjSpec.from_string(module.XML)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    check_task(f"{path}:ScaledActions", engine=engine, steps=200, model=spec, nworld=3)
+    check_task(f"{path}:ScaledActions", engine=engine, steps=100, model=spec, nworld=3)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
