@@ -2,6 +2,7 @@
 
 import gc
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ import lyceum_warp as lw
 torch.set_num_threads(1)
 
 SharedEnv = Callable[..., lw.Env]
+TaskFile = Callable[[str, str], Path]
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +39,24 @@ def shared_env() -> Iterator[SharedEnv]:
     yield get
     made.clear()
     gc.collect()
+
+
+@pytest.fixture(scope="session")
+def task_file(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> TaskFile:
+    """``task_file("mine.py", source)``: a file with a task, in the same place in every run of the tests.
+
+    The kernels of a task are known by its file's path: from the second run on they are in Warp's cache.
+    """
+    cache = getattr(pytestconfig, "cache", None)
+    folder = cache.mkdir("tasks") if cache else tmp_path_factory.mktemp("tasks")
+
+    def write(name: str, source: str) -> Path:
+        file: Path = folder / name
+        if not file.exists() or file.read_text() != source:
+            file.write_text(source)
+        return file
+
+    return write
 
 
 def settle() -> None:

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from conftest import TaskFile
 
 import lyceum_warp as lw
 from lyceum_warp.testing import check_task
@@ -188,10 +189,8 @@ def load(path: Path, name: str) -> ModuleType:
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    file = tmp_path_factory.mktemp("task") / "follow_target.py"
-    file.write_text(SOURCE)
-    return file
+def path(task_file: TaskFile) -> Path:
+    return task_file("follow_target.py", SOURCE)
 
 
 @pytest.fixture(scope="module")
