@@ -37,7 +37,7 @@ def test_warp_engine(task: str) -> None:
     if task == "hopper":
         check_task(task, engine="warp", steps=1000)
     else:
-        check_task(task, engine="warp", steps=150, frame_skip=min(2, find_task(task).frame_skip))
+        check_task(task, engine="warp", steps=100, frame_skip=min(2, find_task(task).frame_skip))
 
 
 @pytest.mark.parametrize("task", ["hopper", "point_mass", "humanoid"])

@@ -224,10 +224,12 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", PACKAGE)
-def test_tells_what_stepping_tells(shared_env: SharedEnv, task: str, engine: str) -> None:
+def test_tells_what_stepping_tells(task: str, engine: str) -> None:
     steps = 3 if task in ("humanoid", "adroit_pen") else 5
-    env = shared_env(task, engine=engine, nworld=4, autoreset=False)
-    check_against_stepping(rollouts(task, steps, engine=engine), env)
+    # on the CPU every substep of the Warp engine is hundreds of launches, which are alike
+    options = {"frame_skip": min(2, find_task(task).frame_skip)} if engine == "warp" else {}
+    env = lw.make(task, engine=engine, nworld=4, autoreset=False, **options)
+    check_against_stepping(rollouts(task, steps, engine=engine, **options), env)
 
 
 @pytest.fixture
