@@ -68,6 +68,13 @@ def settle() -> None:
     gc.freeze()
 
 
+@pytest.fixture
+def freed() -> Iterator[None]:
+    """An environment refers to itself: one of many worlds, which is large, is collected at once after its test."""
+    yield
+    gc.collect()
+
+
 @pytest.fixture(scope="module", autouse=True)
 def settled() -> None:
     """Between two files nothing lives but what stays."""

@@ -252,6 +252,7 @@ def quats(env: lw.Env) -> np.ndarray:
     return env.state_space.split(env.get_state())["mocap_quat"][:, 4:].numpy().copy()
 
 
+@pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("scale", [None, 0.2])
 def test_reset(scale: float | None) -> None:
     """Hand and pen start where the model puts them, and the target turns as theirs does, in each world elsewhere."""

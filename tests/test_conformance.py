@@ -27,7 +27,8 @@ def settled_again() -> None:
 
 @pytest.mark.parametrize("task", PACKAGE)
 def test_mujoco_engine(task: str) -> None:
-    report = check_task(task, engine="mujoco", steps=1000)
+    # whatever an environment leaves behind in the long run, it does so with any task
+    report = check_task(task, engine="mujoco", steps=1000 if task == "hopper" else 300)
     assert list(report.seconds) == [check.__name__.removeprefix("check_") for check in CHECKS]
 
 

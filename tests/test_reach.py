@@ -144,6 +144,7 @@ def targets(env: lw.Env) -> np.ndarray:
     return env.state_space.split(env.get_state())["mocap_pos"].numpy().copy()
 
 
+@pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("scale", [None, (0.1, 0.5, 0.0)])
 def test_reset(scale: tuple[float, float, float] | None) -> None:
     """The arm starts at zero and at rest; the target anywhere in its box, in each world elsewhere."""
@@ -160,6 +161,7 @@ def test_reset(scale: tuple[float, float, float] | None) -> None:
     np.testing.assert_allclose(targets(env), np.full((2000, 3), 0.1), atol=1e-7)
 
 
+@pytest.mark.usefixtures("freed")
 def test_random_start() -> None:
     """With random_start every joint starts anywhere in its range, at rest."""
     env = lw.make("reach", engine="mujoco", nworld=2000, random_start=True)
