@@ -36,7 +36,7 @@ def test_mujoco_engine(task: str) -> None:
 def test_warp_engine(task: str) -> None:
     # on the CPU, where a step takes milliseconds, this engine is there for tests: one task for long and as it is
     if task == "hopper":
-        check_task(task, engine="warp", steps=1000)
+        check_task(task, engine="warp", steps=600)  # enough to see a number that each step keeps
     else:
         check_task(task, engine="warp", steps=100, frame_skip=min(2, find_task(task).frame_skip))
 
