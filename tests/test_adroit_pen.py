@@ -252,10 +252,11 @@ def quats(env: lw.Env) -> np.ndarray:
     return env.state_space.split(env.get_state())["mocap_quat"][:, 4:].numpy().copy()
 
 
+@pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("scale", [None, 0.2])
-def test_reset(shared_env: SharedEnv, scale: float | None) -> None:
+def test_reset(scale: float | None) -> None:
     """Hand and pen start where the model puts them, and the target turns as theirs does, in each world elsewhere."""
-    env = shared_env("adroit_pen", nworld=2000, **({} if scale is None else {"target_range": scale}))
+    env = lw.make("adroit_pen", engine="mujoco", nworld=2000, **({} if scale is None else {"target_range": scale}))
     found = quats(env)
     euler = 2.0 * np.arctan2(found[:, 1:3], found[:, [0, 0]])  # both half angles are under a right angle
     np.testing.assert_allclose(euler2quat(np.concatenate([euler, np.zeros((2000, 1))], axis=1)), found, atol=1e-6)

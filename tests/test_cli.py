@@ -9,11 +9,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import pytest
 import torch
 import warp as wp
+from conftest import TaskFile
 
 import lyceum_warp as lw
 from lyceum_warp import cli, report
@@ -25,8 +27,6 @@ from lyceum_warp.runs import Run, load
 TINY = ["--samples", "512", "--nworld", "2", "--hidden", "8", "--value-hidden", "8", "--mean-every", "2",
         "--mean-episodes", "2"]  # fmt: skip
 QUIET = ["--no-video", "--no-plot"]
-# tests may run in the background, where a shell has its children ignore SIGINT
-HEAR_SIGINT = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
 
 
 def train(out: Path, *options: str, task: str = "point_mass") -> int:
@@ -79,14 +79,14 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_train_and_eval_a_task_of_ones_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    task_file: TaskFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = Path(inspect.getfile(find_task("point_mass"))).read_text()
     source = source.replace("@lw.register\n", "").replace("PointMass", "Mine").replace("horizon = 256", "horizon = 20")
-    (tmp_path / "mine.py").write_text(source)
+    mine = task_file("mine.py", source)
     monkeypatch.chdir(tmp_path)
     options = ["--iterations", "2", "--param", "success_distance=0.1", "--seed", "5"]
-    assert cli.main(["train", "mine.py", "--out", "deep/run", *TINY, *options]) == 0
+    assert cli.main(["train", os.path.relpath(mine), "--out", "deep/run", *TINY, *options]) == 0
     told = capsys.readouterr().out
     out = Path("deep/run")
     assert "iteration    2/2" in told
@@ -94,7 +94,7 @@ def test_train_and_eval_a_task_of_ones_own(
     for name, file in (("curve", out / "curve.png"), ("video", out / "video.mp4")):
         assert f"{name}:      {file if file.exists() else 'none: '}" in told
     config = Run.open(out).config
-    assert (config["task"], config["seed"]) == (str(tmp_path / "mine.py"), 5)
+    assert (config["task"], config["seed"]) == (str(mine.resolve()), 5)
     assert config["params"] == {"success_distance": 0.1}
     assert config["npg"]["hidden"] == [8]
     rows = table(out)
@@ -286,29 +286,63 @@ def test_the_loaded_policy_is_the_trained_one(trained: Path) -> None:
     assert repr(episodes.returns.mean().item()) == table(trained)[-1]["mean_return"]
 
 
-@pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_an_interrupted_run_goes_on(number: int, code: int, trained: Path, tmp_path: Path) -> None:
-    if os.name == "nt":
-        pytest.skip("signals are POSIX's")
-    out = tmp_path / "run"
-    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "100000"]
-    program = f"{HEAR_SIGINT}import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if "iteration    3/" in line:
-                process.send_signal(number)
-                break
-        rest = process.stdout.read()
-    assert process.returncode == code
+def interrupted(argv: list[str]) -> int:
+    """The exit code of a command that gets a SIGINT as it runs: one that is not heard is no end of all tests."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return cli.main(argv)
+    except KeyboardInterrupt:
+        pytest.fail("SIGINT was left to Python")
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def check_goes_on(out: Path, said: str, trained: Path) -> None:
+    """A run that was ended after its third iteration has lost nothing, and says how to go on."""
     done = Run.open(out).read()["iteration"]
-    assert f"after {done} of 100000 iterations" in rest
-    assert f"lyceum-warp train --resume {out} --iterations 100000" in rest
+    assert f"after {done} of 100000 iterations" in said
+    assert f"lyceum-warp train --resume {out} --iterations 100000" in said
     rows = table(out)
     assert [int(row["iteration"]) for row in rows] == list(range(1, done + 1))
     assert rows[:3] == table(trained)[:3]
     assert cli.main(["train", "--resume", str(out), "--iterations", str(done + 1), *QUIET]) == 0
     assert len(table(out)) == done + 1
+
+
+def test_a_terminated_run_goes_on(trained: Path, tmp_path: Path) -> None:
+    if os.name == "nt":
+        pytest.skip("signals are POSIX's")
+    out = tmp_path / "run"
+    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "100000"]
+    program = f"import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if "iteration    3/" in line:
+                process.send_signal(signal.SIGTERM)
+                break
+        rest = process.stdout.read()
+    assert process.returncode == 143
+    check_goes_on(out, rest, trained)
+
+
+def test_an_interrupted_run_goes_on(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Within this process; what plans, and ends as a whole, is interrupted from outside in test_cli_plan."""
+    out = tmp_path / "run"
+    save = Run.save
+
+    def interrupting(run: Run, iteration: int, *args: Any) -> None:
+        save(run, iteration, *args)
+        if iteration == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Run, "save", interrupting)
+    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "100000"]
+    assert interrupted(argv) == 130
+    monkeypatch.undo()
+    check_goes_on(out, capsys.readouterr().out, trained)
 
 
 def test_a_killed_run_goes_on(trained: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from rich.console import Console
-from test_cli import HEAR_SIGINT, QUIET, TINY, refused
+from test_cli import QUIET, TINY, interrupted, refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
@@ -20,6 +20,8 @@ from lyceum_warp.algos.control import ControlProgress
 from lyceum_warp.algos.trajectory import Trajectory
 from lyceum_warp.report import PlanDisplay
 
+# tests may run in the background, where a shell has its children ignore SIGINT
+HEAR_SIGINT = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
 SMALL = ["--horizon", "10", "--samples", "8", "--temperature", "0.01", "--noise", "0.3", "--steps", "40"]
 
 
@@ -183,22 +185,19 @@ def test_an_interrupt_keeps_whole_episodes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", [[], ["--real-time"]])
-def test_an_interrupt_keeps_the_episode_under_way(mode: list[str], tmp_path: Path) -> None:
+def test_an_interrupt_keeps_the_episode_under_way(
+    mode: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def third(display: PlanDisplay, now: ControlProgress) -> None:
+        if now.step == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(PlanDisplay, "__call__", third)
     out = tmp_path / "run"
     options = ["--horizon", "10", "--samples", "8", "--steps", "100000", *QUIET, *mode]
-    program = f"""{HEAR_SIGINT}
-import os, sys
-from lyceum_warp import cli, report
-def third(self, now):
-    if now.step == 3:
-        os.kill(os.getpid(), signal.SIGINT)
-report.PlanDisplay.__call__ = third
-sys.exit(cli.main(["plan", "point_mass", "--out", {str(out)!r}, *{options!r}]))
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 130, done.stderr
+    assert interrupted(["plan", "point_mass", "--out", str(out), *options]) == 130
     path = out / "episode-000.npz"
-    assert f"interrupted by SIGINT in the first episode, after 3 steps; it is in {path}" in done.stdout
+    assert f"interrupted by SIGINT in the first episode, after 3 steps; it is in {path}" in capsys.readouterr().out
     part = Trajectory.load(path)
     assert part.steps == 3 and part.done_reason == 0 and len(part.states) == 4
     assert not (out / "report.json").exists()

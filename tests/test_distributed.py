@@ -110,13 +110,16 @@ def test_an_error_in_one_process_ends_all_and_two_go_on_with_the_run_of_one(tmp_
     run, other = tmp_path / "run", tmp_path / "other"
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations"]
     assert cli.main([*arguments, "1", "--out", str(run)]) == 0
-    assert cli.main([*arguments, "2", "--out", str(other)]) == 0
-    [(code, out, error)] = ended([torchrun(*arguments, "1", "--out", str(run), options=launch)])
-    assert code != 0 and out == "", (code, out, error)
+    resume = ["train", "--resume", str(run), "--iterations", "2", *QUIET]
+    processes = [torchrun(*command, options=launch) for command in ([*arguments, "1", "--out", str(run)], resume)]
+    assert cli.main([*arguments, "2", "--out", str(other)]) == 0  # meanwhile
+    refused, resumed = ended(processes)
+    code, out, error = refused
+    assert code != 0 and out == "", refused
     assert error.count(f"lyceum-warp: {run} holds a run") == 1
     assert "lyceum_warp/algos" not in error  # no traceback of the other
-    [(code, out, error)] = ended([torchrun("train", "--resume", str(run), "--iterations", "2", *QUIET, options=launch)])
-    assert code == 0 and out.count("iteration    2/2") == 1, (code, out, error)
+    code, out, error = resumed
+    assert code == 0 and out.count("iteration    2/2") == 1, resumed
     assert_alike(run, other, tolerance=2e-3)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from conftest import TaskFile
 
 import lyceum_warp as lw
 from lyceum_warp.engines.order import CanonicalOrder
@@ -77,10 +78,8 @@ class Filtered(lw.Task):
 
 
 @pytest.fixture(scope="module")
-def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    file = tmp_path_factory.mktemp("tasks") / "filtered.py"
-    file.write_text(TASK)
-    return file
+def file(task_file: TaskFile) -> Path:
+    return task_file("filtered.py", TASK)
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])

@@ -119,9 +119,9 @@ def test_warp_engine_warning() -> None:
         )
         sensor.intprm[:] = [1, 0, 1]
         env = hopper("warp", model=spec, nconmax=16, njmax=64)
-        options = env.engine.m.opt  # type: ignore[attr-defined]
-        options.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # as for a task that reads it
-        options.contact_sensor_maxmatch = 1
+        opt = env.engine.m.opt  # type: ignore[attr-defined]
+        opt.contact_sensor_maxmatch = 1
+        opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # the task needs none, so that they are off
         return env
 
     env, clean = make(), make()

@@ -297,6 +297,7 @@ def check_samples(samples: np.ndarray, scale: float, *, normal: bool) -> None:
 DEFAULT_NOISE = {"hopper": 5e-3, "walker2d": 5e-3, "half_cheetah": 0.1, "swimmer": 0.1, "humanoid": 1e-2}
 
 
+@pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("times", [1.0, 0.2, 3.0])
 @pytest.mark.parametrize("task", TASKS)
 def test_reset_noise(task: str, times: float) -> None:

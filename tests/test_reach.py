@@ -144,10 +144,11 @@ def targets(env: lw.Env) -> np.ndarray:
     return env.state_space.split(env.get_state())["mocap_pos"].numpy().copy()
 
 
+@pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("scale", [None, (0.1, 0.5, 0.0)])
-def test_reset(shared_env: SharedEnv, scale: tuple[float, float, float] | None) -> None:
+def test_reset(scale: tuple[float, float, float] | None) -> None:
     """The arm starts at zero and at rest; the target anywhere in its box, in each world elsewhere."""
-    env = shared_env("reach", nworld=2000, **({} if scale is None else {"target_range": scale}))
+    env = lw.make("reach", engine="mujoco", nworld=2000, **({} if scale is None else {"target_range": scale}))
     env.rand_reset(0)
     size = np.array(scale or (0.3, 0.2, 0.25))
     found = targets(env)
@@ -160,9 +161,10 @@ def test_reset(shared_env: SharedEnv, scale: tuple[float, float, float] | None) 
     np.testing.assert_allclose(targets(env), np.full((2000, 3), 0.1), atol=1e-7)
 
 
-def test_random_start(shared_env: SharedEnv) -> None:
+@pytest.mark.usefixtures("freed")
+def test_random_start() -> None:
     """With random_start every joint starts anywhere in its range, at rest."""
-    env = shared_env("reach", nworld=2000, random_start=True)
+    env = lw.make("reach", engine="mujoco", nworld=2000, random_start=True)
     qpos, qvel = positions(env)
     assert not qvel.any()
     low, high = RANGES.T.astype(np.float32).astype(np.float64)

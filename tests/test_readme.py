@@ -4,21 +4,18 @@ import re
 from pathlib import Path
 
 import pytest
+from conftest import TaskFile
 
 import lyceum_warp as lw
 
 README = Path(__file__).parent.parent / "README.md"
 
 
-def test_the_readmes_python_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_the_readmes_python_runs(task_file: TaskFile, capsys: pytest.CaptureFixture) -> None:
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     assert len(blocks) == 4
     # Warp compiles the source of functions: it has to lie in a file, as a user's does
-    file = tmp_path / "my_hopper.py"
-    file.write_text(blocks[0])
-    env = lw.make(str(file), nworld=2)
+    env = lw.make(str(task_file("my_hopper.py", blocks[0])), nworld=2)
     assert env.task.name == "my_hopper"
     scope = {"lw": lw, "MyHopper": env.task.task}
     for block in blocks[1:]:

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from conftest import TaskFile
 
 import lyceum_warp as lw
 from lyceum_warp.testing import check_task
@@ -188,10 +189,8 @@ def load(path: Path, name: str) -> ModuleType:
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    file = tmp_path_factory.mktemp("task") / "follow_target.py"
-    file.write_text(SOURCE)
-    return file
+def path(task_file: TaskFile) -> Path:
+    return task_file("follow_target.py", SOURCE)
 
 
 @pytest.fixture(scope="module")
@@ -207,14 +206,14 @@ def random_steps(env: lw.Env, n: int, seed: int = 0) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_keeps_the_rules(module: ModuleType, engine: str) -> None:
-    check_task("follow_target", engine=engine, steps=300, gain=np.array([0.5, 1.0, 1.5, 2.0]))
+    check_task("follow_target", engine=engine, steps=100, frame_skip=2, gain=np.array([0.5, 1.0, 1.5, 2.0]))
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_keeps_the_rules_under_rk4_with_scaled_actions(module: ModuleType, path: Path, engine: str) -> None:
     spec = mujoco.MjSpec.from_string(module.XML)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    check_task(f"{path}:ScaledActions", engine=engine, steps=200, model=spec, nworld=3)
+    check_task(f"{path}:ScaledActions", engine=engine, steps=100, model=spec, nworld=3)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
