@@ -103,6 +103,18 @@ def test_two_machines_make_the_update_of_one_process(tmp_path: Path) -> None:
     assert_alike(two, one, tolerance=2e-3)
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+def test_gpu_two_make_the_update_of_one_and_end(tmp_path: Path) -> None:
+    """Through NCCL, which is part of the value fit's graph."""
+    two, one = tmp_path / "two", tmp_path / "one"
+    arguments = ["train", "hopper", *OPTIONS, *QUIET, "--device", "cuda", "--iterations", "1", "--out"]
+    assert cli.main([*arguments, str(one)]) == 0
+    [(code, _, error)] = ended([torchrun(*arguments, str(two), options=["--standalone", "--nproc-per-node=2"])])
+    assert code == 0, error
+    assert_alike(two, one, tolerance=1e-3)
+
+
 @pytest.mark.slow
 def test_an_error_in_one_process_ends_all_and_two_go_on_with_the_run_of_one(tmp_path: Path) -> None:
     """The error is one that only the first process can see: the folder is taken."""

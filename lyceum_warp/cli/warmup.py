@@ -10,7 +10,6 @@ from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.npg import NPG, NPGConfig
 from lyceum_warp.cli.common import Physics, Words, parameter
 from lyceum_warp.engines.memory import free_memory
-from lyceum_warp.engines.warp import WarpEngine
 from lyceum_warp.env import Env
 from lyceum_warp.report import make_console
 from lyceum_warp.warmup import cached
@@ -66,8 +65,8 @@ def warm_up(options: Warmup) -> int:
     console.print(f"{env.task.name} on {env.device.alias}: {built}, {seconds:.1f} s in all", soft_wrap=True)
     text = f"memory: {env.bytes_per_world / 1e3:.1f} kB a world of {env.nworld}"
     free = free_memory(env.device)
-    if isinstance(env.engine, WarpEngine) and free is not None:
-        footprint = env.engine.footprint()
+    if env.engine.name == "warp" and free is not None:
+        footprint = env.engine.footprint()  # type: ignore[attr-defined]
         text += f"; at most some {footprint.largest(free):,d} worlds fit into the {free / 1e9:.1f} GB that are free"
     console.print(text, soft_wrap=True)
     return 0
