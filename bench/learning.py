@@ -4,7 +4,6 @@ python bench/learning.py hopper --seeds 0 1 2 --iterations 100 --out curves
 """
 
 import concurrent.futures
-import copy
 import dataclasses
 import json
 import math
@@ -21,6 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 import lyceum_warp as lw
+from lyceum_warp.algos.rollout import at
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +65,7 @@ def run(options: Options, seed: int) -> list[dict[str, Any]]:
         integrator=options.integrator, nthread=nthread,
     )  # fmt: skip
     npg = lw.NPG(env, config=options.config, seed=seed)
-    judge = None if options.target is None else Judge(options, nthread)
+    judge = None if options.target is None else Judge(env)
     seconds, rows = 0.0, []
     for number in range(1, options.iterations + 1):
         start = time.perf_counter()
@@ -81,19 +81,18 @@ def run(options: Options, seed: int) -> list[dict[str, Any]]:
 
 
 class Judge:
-    """Evaluates a policy with its noise, in worlds of its own on the CPU."""
+    """Evaluates a policy with its noise, in worlds of its own."""
 
-    def __init__(self, options: Options, nthread: int | None) -> None:
-        self.env = lw.make(options.task, nworld=16, integrator=options.integrator, nthread=nthread)
+    def __init__(self, env: lw.Env) -> None:
+        self.env = env.few(16)
 
     def __call__(self, policy: lw.GaussianPolicy) -> float:
         """Mean return; the same initial states and the same noise each time."""
-        policy = copy.deepcopy(policy).cpu()
-        generator = torch.Generator().manual_seed(0)
-        out = torch.empty_like(self.env.action)
+        policy, out = at(policy, self.env), torch.empty_like(self.env.action)
+        generator = torch.Generator(out.device).manual_seed(0)
 
         def noisy(obs: torch.Tensor) -> torch.Tensor:
-            return policy.sample(obs, torch.randn(out.shape, generator=generator), out)
+            return policy.sample(obs, torch.randn(out.shape, generator=generator, device=out.device), out)
 
         return lw.evaluate(self.env, noisy, self.env.nworld, seed=0).returns.mean().item()
 

@@ -14,6 +14,7 @@ from lyceum_warp.algos.control import ControlProgress
 from lyceum_warp.algos.npg import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.report import ControlReport
+from lyceum_warp.algos.rollout import at
 from lyceum_warp.algos.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs import Run
@@ -106,9 +107,9 @@ def filmed(env: Env, policy: GaussianPolicy, path: Path, seed: int) -> str:
     """Film an episode of a policy; the video's path, or why there is none."""
     from lyceum_warp.viz import video
 
-    one = env.replicate(nworld=1, autoreset=False)
+    one = env.few(1, autoreset=False)
     try:
-        return filmed_states(one, video.episode(one, policy, seed=seed), path)
+        return filmed_states(one, video.episode(one, at(policy, one), seed=seed), path)
     except ValueError as error:
         return f"none: {error}"
 

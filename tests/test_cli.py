@@ -4,6 +4,7 @@ import csv
 import inspect
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -258,6 +259,19 @@ def test_require_return(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert train(tmp_path / "hard", "--iterations", "1", "--require-return", "1e6") == 1
     assert "--require-return asks for more than 1e+06" in capsys.readouterr().err
     assert (tmp_path / "hard" / "checkpoint.pt").exists()
+
+
+def test_a_run_of_a_gpu_is_evaluated_anywhere(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    config = json.loads((run / "config.json").read_text())
+    (run / "config.json").write_text(json.dumps(config | {"device": "cuda:7"}))
+    assert cli.main(["eval", str(run), "--episodes", "2"]) == 0
+    assert "2 episodes of the mean policy" in capsys.readouterr().out
+    assert cli.main(["eval", str(run), "--episodes", "2", "--engine", "warp"]) == 2
+    assert "no device 'cuda:7'" in capsys.readouterr().err
 
 
 def test_eval(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,7 @@
 """What only a GPU can show: steps without a word to the host, graphs that equal what they recorded, determinism."""
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -156,6 +157,16 @@ def test_humanoids_in_trouble_leave_few_others_alone() -> None:
 
     checks = [check for check in CHECKS if check.__name__ in ("check_bad_state", "check_bad_action")]
     check_task("humanoid", engine="warp", device=CUDA, nworld=4, deterministic=True, steps=50, checks=checks)
+
+
+def test_an_evaluation_s_few_worlds_are_on_the_cpu() -> None:
+    env = lw.make("hopper", nworld=8, device=CUDA, deterministic=True, nconmax=16, integrator="euler")
+    few = env.few(2, autoreset=False)
+    assert (few.engine.name, few.device.is_cpu, few.nworld, few.autoreset) == ("mujoco", True, 2, False)
+    assert few.model.opt.integrator == env.model.opt.integrator
+    assert lw.make("hopper", device=CUDA, engine="warp").few(2).device.is_cuda
+    npg = lw.NPG(lw.make("point_mass", nworld=64, device=CUDA), config=lw.NPGConfig(samples=256, mean_every=1))
+    assert math.isfinite(next(npg).mean_return or math.nan)
 
 
 def test_memory_is_as_announced() -> None:

@@ -1,8 +1,10 @@
 """Rollouts of a policy: recorded for learning, or summed up for evaluation."""
 
+import copy
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import TypeVar
 
 import torch
 import warp as wp
@@ -13,6 +15,8 @@ from lyceum_warp.env import Env
 from lyceum_warp.kernels import record
 from lyceum_warp.kernels.arrays import torch_view
 from lyceum_warp.kernels.recorder import Recorder
+
+Policy = TypeVar("Policy", bound=torch.nn.Module)
 
 
 class Rollout:
@@ -179,6 +183,14 @@ def pooled(parts: Sequence[tuple[float, float, float]]) -> tuple[float, float, f
 
 
 @torch.no_grad()
+def at(policy: Policy, env: Env) -> Policy:
+    """A policy where an environment's observations are: itself, or a copy if it is elsewhere."""
+    device = env.obs.device
+    if all(parameter.device == device for parameter in policy.parameters()):
+        return policy
+    return copy.deepcopy(policy).to(device)
+
+
 def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | None = None) -> Episodes:
     """Run a policy's mean action for whole episodes from random initial states.
 

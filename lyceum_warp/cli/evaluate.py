@@ -34,7 +34,7 @@ class Eval:
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """Another engine than the run's: mujoco, warp or auto."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """Another device than the run's."""
+    """By default the run's, or CPU cores if it left the engine to choice: they step a few worlds fastest."""
     video: bool = False
     """Whether to film the first episode of one world, into eval.mp4 in the run's folder."""
 
@@ -48,9 +48,10 @@ def evaluate_run(options: Eval) -> int:
     run = Run.open(options.run)
     config = run.config
     nworld = min(options.nworld, options.episodes)
-    device = options.device or config["device"]
+    engine = options.engine or config["engine"]
+    device = options.device or ("cpu" if engine == "auto" else config["device"])
     env = Env(
-        config["task"], nworld=nworld, engine=options.engine or config["engine"], device=device,
+        config["task"], nworld=nworld, engine=engine, device=device,
         **(Physics.of(config).options() | config["params"]),
     )  # fmt: skip
     policy = load(run, device=env.obs.device)
