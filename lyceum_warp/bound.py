@@ -95,9 +95,8 @@ class BoundTask:
         for name in ("obs", "model"):
             if not hasattr(task, name) and (name == "obs" or model is None):
                 raise ValueError(f"the task {self.name!r} has no {name}: add {_MISSING[name]} to its class")
-        source = model if model is not None else task.model() if callable(task.model) else task.model
         engine_fields = [name for name in self.fields if name != "memory"]
-        spec = models.load_spec(source, task if model is None else None)
+        spec = models.task_spec(task, model)
         self.model = models.compile_model(spec, engine_fields, cone=cone, integrator=integrator, solver=solver)
         if self.model.nu == 0:
             raise ValueError(f"the model of the task {self.name!r} has no actuators, so there is nothing to act on")

@@ -307,11 +307,18 @@ def test_a_planner_is_not_disturbed_by_resets_of_its_worlds() -> None:
 def test_auto_chooses_by_the_number_of_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a GPU; what was chosen by hand stays."""
     monkeypatch.setattr(mppi, "find_device", lambda name: types.SimpleNamespace(is_cuda=str(name).startswith("cuda")))
-    given = {"device": "cuda:0", "nthread": 2}
-    assert mppi._placed(given, 127) == {"device": "cpu", "engine": "mujoco", "nthread": 2}
-    assert mppi._placed(given, 128) == {"device": "cuda:0", "engine": "warp", "nthread": 2}
-    assert mppi._placed({"device": "cuda", "engine": "warp"}, 1) == {"device": "cuda", "engine": "warp"}
-    assert mppi._placed({}, 1) == {}
+
+    def chosen(task: str, samples: int, **options: Any) -> tuple[str | None, str | None]:
+        placed = mppi._placed(task, {"device": "cuda:0", "nthread": 2} | options, samples)
+        return placed.get("engine"), placed.get("device")
+
+    cpu, gpu = ("mujoco", "cpu"), ("warp", "cuda:0")
+    assert [chosen("reach", n) for n in (95, 96)] == [cpu, gpu]
+    assert chosen("reach", 95, nthread=1) == gpu and chosen("reach", 1, engine="warp") == gpu
+    assert chosen("reach", 4096, device="cpu") == (None, "cpu")
+    # the hand's noslip solver is slow on a GPU, unless it is turned off
+    assert [chosen("adroit_pen", n) for n in (160, 479, 480)] == [cpu, cpu, gpu]
+    assert chosen("adroit_pen", 160, solver={"noslip_iterations": 0}) == gpu
 
 
 def test_a_value_is_of_what_the_task_itself_pays() -> None:

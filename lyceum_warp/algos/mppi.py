@@ -27,6 +27,7 @@ from lyceum_warp.engines import find_device
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import planning
 from lyceum_warp.kernels.arrays import torch_view
+from lyceum_warp.models import task_spec
 from lyceum_warp.openloop import OpenLoop
 from lyceum_warp.registry import find_task
 from lyceum_warp.spaces import Space
@@ -138,7 +139,7 @@ class MPPI:
         if value is not None and not callable(value):
             raise ValueError(f"value has to be a function of observations, or None, not {described(value)}")
 
-        options = _placed(options, self.samples)
+        options = _placed(task, options, self.samples)
         self.env = Env(task, nworld=self.samples, autoreset=False, **({"horizon": 0} | options))
         self.env.reset()
         self._initial = self.env.get_state()[0]
@@ -328,22 +329,26 @@ class MPPI:
         return state
 
 
-_SAMPLES_A_CORE = 64
+_SAMPLES_A_CORE = 48
 """Below so many samples for each core of the CPU, its C engine plans faster than an H100: measured with 2 and 16 cores
-on reach, half_cheetah and adroit_pen (bench/results/planning-*.json)."""
+on reach, half_cheetah and adroit_pen without noslip (bench/results/planning-*.json)."""
+
+_NOSLIP = 5
+"""Times as many with the noslip solver, for which a GPU takes six times as long and the CPU hardly longer."""
 
 
-def _placed(options: Mapping[str, Any], samples: int) -> dict[str, Any]:
-    """Where to roll out: engine="auto" on a GPU chooses by the number of samples."""
+def _placed(task: str | type[Task], options: Mapping[str, Any], samples: int) -> dict[str, Any]:
+    """Where to roll out: engine="auto" on a GPU chooses by the number of samples and by the solver."""
     placed = dict(options)
-    if placed.get("engine", "auto") == "auto" and find_device(placed.get("device")).is_cuda:
-        few = samples < _SAMPLES_A_CORE * (placed.get("nthread") or os.cpu_count() or 1)
-        # what is said of the other engine, for whichever case, has nothing to say here
-        if few:
-            placed |= {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None}
-        else:
-            placed |= {"engine": "warp", "nthread": None}
-    return placed
+    if placed.get("engine", "auto") != "auto" or not find_device(placed.get("device")).is_cuda:
+        return placed
+    noslip = task_spec(find_task(task), placed.get("model")).option.noslip_iterations
+    if (placed.get("solver") or {}).get("noslip_iterations", noslip):
+        samples = samples // _NOSLIP
+    # what is said of the other engine, for whichever case, has nothing to say here
+    if samples < _SAMPLES_A_CORE * (placed.get("nthread") or os.cpu_count() or 1):
+        return placed | {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None}
+    return placed | {"engine": "warp", "nthread": None}
 
 
 _DEFAULTS: dict[str, Any] = dict(
