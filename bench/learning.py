@@ -1,9 +1,11 @@
 """Learning curves of NPG over several seeds, each in a process of its own.
 
-python bench/learning.py hopper --seeds 0 1 2 --iterations 100 --out curves
+python bench/learning.py hopper --seeds 0 1 2 --iterations 100 --out hopper.csv
+python bench/curves.py hopper=hopper.csv --out hopper.png
 """
 
 import concurrent.futures
+import csv
 import dataclasses
 import json
 import math
@@ -51,7 +53,7 @@ class Options:
     processes: int = 1
     """Runs at the same time; each then has one thread."""
     out: Path | None = None
-    """Folder for the curves as JSON."""
+    """Table (CSV) of the iterations."""
 
 
 def run(options: Options, seed: int) -> list[dict[str, Any]]:
@@ -124,13 +126,25 @@ def main(options: Options) -> None:
             spent = f"{last['seconds']:.1f} s and {last['samples']:,} samples"
             console.print(f"a mean return of {options.target:g}, seed {seed}: {'' if reached else 'not '}after {spent}")
     if options.out is not None:
-        options.out.mkdir(parents=True, exist_ok=True)
-        record = {
-            "versions": records.context(options.device),
-            "options": dataclasses.asdict(options) | {"out": str(options.out)},
-            "rows": [row for rows in runs for row in rows],
-        }
-        (options.out / f"{options.task}.json").write_text(json.dumps(record, indent=1) + "\n")
+        write(options, [row for rows in runs for row in rows])
+
+
+KEPT = ("seed", "iteration", "samples", "seconds", "return_mean", "length_mean", "mean_return", "judged",
+        "terminal_reward")  # fmt: skip
+"""Columns of the table."""
+
+
+def write(options: Options, rows: list[dict[str, Any]]) -> None:
+    """The table, and beside it the settings and what they ran on, as JSON."""
+    assert options.out is not None
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    with options.out.open("w", newline="") as file:
+        writer = csv.DictWriter(file, KEPT, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+    settings = {name: value for name, value in dataclasses.asdict(options).items() if name != "out"}
+    record = {"options": settings, "versions": records.context(options.device)}
+    options.out.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n")
 
 
 def spread(rows: list[dict[str, Any]], key: str) -> tuple[str, str]:
