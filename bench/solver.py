@@ -21,34 +21,26 @@ from rich.table import Table
 from throughput import seconds
 
 import lyceum_warp as lw
-from lyceum_warp.engines.warp import WarpEngine
-
-
-@dataclasses.dataclass(frozen=True)
-class Setting:
-    """Options of ``lw.make``, and whether the solver's loops are unrolled into the graph instead of ending early."""
-
-    make: dict[str, Any] = dataclasses.field(default_factory=dict)
-    unrolled: bool = False
 
 
 def limits(iterations: int, ls_iterations: int | None = None) -> dict[str, Any]:
     return {"solver": {"iterations": iterations} | ({"ls_iterations": ls_iterations} if ls_iterations else {})}
 
 
-SETTINGS = {
-    "own": Setting(),
-    "own, again": Setting(),
-    "5 iterations": Setting(limits(5)),
-    "4 iterations": Setting(limits(4)),
-    "4, line search 6": Setting(limits(4, 6)),
-    "4, line search 6, unrolled": Setting(limits(4, 6), unrolled=True),
-    "3 iterations": Setting(limits(3)),
-    "3, line search 6, unrolled": Setting(limits(3, 6), unrolled=True),
-    "Euler": Setting({"integrator": "euler"}),
-    "Euler, 4 iterations": Setting({"integrator": "euler", **limits(4)}),
-    "implicitfast": Setting({"integrator": "implicitfast"}),
+SETTINGS: dict[str, dict[str, Any]] = {
+    "own": {},
+    "own, again": {},
+    "5 iterations": limits(5),
+    "4 iterations": limits(4),
+    "4, line search 6": limits(4, 6),
+    "4, line search 6, unrolled": limits(4, 6) | {"unroll": True},
+    "3 iterations": limits(3),
+    "3, line search 6, unrolled": limits(3, 6) | {"unroll": True},
+    "Euler": {"integrator": "euler"},
+    "Euler, 4 iterations": {"integrator": "euler"} | limits(4),
+    "implicitfast": {"integrator": "implicitfast"},
 }
+"""Options of ``lw.make``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,14 +97,10 @@ def measure(task: str, nworld: int, options: Options) -> list[Row]:
     steps = recorded(task, nworld, options)
     envs: dict[str, lw.Env] = {}
     for name, setting in SETTINGS.items():
-        env = lw.make(
-            task, nworld=nworld, engine=options.engine, device=options.device, autoreset=False, **setting.make
-        )
-        if setting.unrolled:
-            if not isinstance(env.engine, WarpEngine) or env.device.is_cpu:
-                continue
-            env.engine.m.opt.graph_conditional = False
-        if "integrator" in setting.make and env.model.opt.integrator == envs["own"].model.opt.integrator:
+        if "unroll" in setting and options.device == "cpu":
+            continue
+        env = lw.make(task, nworld=nworld, engine=options.engine, device=options.device, autoreset=False, **setting)
+        if "integrator" in setting and env.model.opt.integrator == envs["own"].model.opt.integrator:
             continue
         envs[name] = env
     velocity = envs["own"].state_space.parts["qvel"]

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import mujoco
 import numpy as np
 import warp as wp
 
@@ -33,7 +34,7 @@ _SIGNATURES = {
 
 _OPTIONS = (
     "nworld", "device", "engine", "seed", "autoreset", "horizon", "record", "model", "frame_skip", "cone", "integrator",
-    "solver", "deterministic", "nvtx",
+    "solver", "deterministic", "unroll", "nvtx",
 )  # fmt: skip
 _OTHER_WORDS = {
     "num_envs": ["nworld"], "n_envs": ["nworld"], "xml_file": ["model"], "max_episode_steps": ["horizon"],
@@ -47,6 +48,13 @@ _SPELLED = {
 }  # fmt: skip
 
 _MISSING = {"obs": 'the parts of its observation, as obs = {"position": 5}', "model": 'a model, as model = "robot.xml"'}
+
+
+def task_spec(task: type[Task], model: models.ModelSource | None = None) -> mujoco.MjSpec:
+    """A task's model, or another one that is given for it, editable; see ``models.load_spec``."""
+    if model is not None:
+        return models.load_spec(model)
+    return models.load_spec(task.model() if callable(task.model) else task.model, task)
 
 
 class BoundTask:
@@ -96,7 +104,7 @@ class BoundTask:
             if not hasattr(task, name) and (name == "obs" or model is None):
                 raise ValueError(f"the task {self.name!r} has no {name}: add {_MISSING[name]} to its class")
         engine_fields = [name for name in self.fields if name != "memory"]
-        spec = models.task_spec(task, model)
+        spec = task_spec(task, model)
         self.model = models.compile_model(spec, engine_fields, cone=cone, integrator=integrator, solver=solver)
         if self.model.nu == 0:
             raise ValueError(f"the model of the task {self.name!r} has no actuators, so there is nothing to act on")

@@ -62,6 +62,8 @@ class Env(Worlds):
         nconmax: Contacts that the Warp engine has room for in each world, on average; probed by default.
         njmax: Constraints that the Warp engine has room for in each world; probed by default.
         deterministic: True makes two runs on a CUDA device equal to the bit, for a price; on the CPU they are anyway.
+        unroll: True records all iterations of the solver on a CUDA device, instead of a loop that ends early: a few
+            percent faster with a ``solver`` of a handful of iterations. On the CPU it makes no difference.
         nvtx: True marks the phases of a step for NVIDIA's profilers (act, physics, judge, restart, refresh, look), and
             records each by itself.
         params: The task's parameters; a scalar may also be given as one value a world.
@@ -113,13 +115,14 @@ class Env(Worlds):
         nconmax: int | None = None,
         njmax: int | None = None,
         deterministic: bool = False,
+        unroll: bool = False,
         nvtx: bool = False,
         **params: Any,
     ) -> None:
         self._options: dict[str, Any] = dict(
             device=device, engine=engine, record=record, model=model, frame_skip=frame_skip, cone=cone,
             integrator=integrator, solver=solver, nthread=nthread, nconmax=nconmax, njmax=njmax,
-            deterministic=deterministic, nvtx=nvtx,
+            deterministic=deterministic, unroll=unroll, nvtx=nvtx,
         )  # fmt: skip
         self.nworld = whole_number("nworld", nworld, low=1)
         self._first_world = whole_number("first_world", first_world, low=0)
@@ -136,7 +139,7 @@ class Env(Worlds):
         self.model: mujoco.MjModel = self.task.model
         self.engine = open_engine(
             engine, self.model, self.nworld, self.device, nthread=nthread, nconmax=nconmax, njmax=njmax,
-            deterministic=deterministic,
+            deterministic=deterministic, unroll=unroll,
         )  # fmt: skip
         self.record = record
         if nvtx and not torch.backends.cuda.is_built():
@@ -424,7 +427,7 @@ class Env(Worlds):
         """
         if self.device.is_cpu or self._options["engine"] != "auto":
             return self.replicate(nworld=nworld, **changes)
-        here = {"device": "cpu", "nconmax": None, "njmax": None, "deterministic": False}
+        here = {"device": "cpu", "nconmax": None, "njmax": None}
         return self.replicate(nworld=nworld, **(here | changes))
 
     def _params_for(self, nworld: int) -> dict[str, Any]:

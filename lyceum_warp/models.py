@@ -8,16 +8,13 @@ import sys
 import warnings
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import mujoco
 
 from lyceum_warp.fields import ON_DEMAND, SENSED
 from lyceum_warp.quiet import quiet
 from lyceum_warp.validate import whole_number
-
-if TYPE_CHECKING:
-    from lyceum_warp.task import Task
 
 log = logging.getLogger(__name__)
 
@@ -100,18 +97,6 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise ValueError(f"MuJoCo can't read the model {path}: {error}") from error
-
-
-def task_spec(task: type["Task"], model: ModelSource | None = None) -> mujoco.MjSpec:
-    """A task's model, or another one that is given for it, editable.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: MuJoCo can't read the file, or the source is a compiled model.
-    """
-    if model is not None:
-        return load_spec(model)
-    return load_spec(task.model() if callable(task.model) else task.model, task)
 
 
 _CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}

@@ -199,6 +199,23 @@ def test_deterministic_is_given_on_the_cpu() -> None:
         env.step()
 
 
+def test_an_unrolled_solver_gives_the_same_numbers() -> None:
+    """Iterations that a world does not need leave it as it is."""
+    looped, unrolled = (
+        lw.make("half_cheetah", nworld=3, engine="warp", solver={"iterations": 6}, unroll=unroll)
+        for unroll in (False, True)
+    )
+    actions = 2 * torch.rand(12, *looped.action.shape, generator=torch.Generator().manual_seed(0)) - 1
+    for env in (looped, unrolled):
+        for action in actions:
+            env.step(action)
+    assert torch.equal(looped.get_state(), unrolled.get_state())
+    assert not unrolled.replicate().engine.m.opt.graph_conditional  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match=r"unroll=True repeats all of the solver's 100 iterations .*'iterations': 4"):
+        lw.make("half_cheetah", engine="warp", unroll=True)
+    lw.make("half_cheetah", engine="mujoco", unroll=True).step()
+
+
 PHASES = ["act", "physics", "judge", "restart", "refresh", "look"]
 
 

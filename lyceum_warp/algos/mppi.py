@@ -23,11 +23,11 @@ import torch
 import warp as wp
 
 from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.bound import task_spec
 from lyceum_warp.engines import find_device
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import planning
 from lyceum_warp.kernels.arrays import torch_view
-from lyceum_warp.models import task_spec
 from lyceum_warp.openloop import OpenLoop
 from lyceum_warp.registry import find_task
 from lyceum_warp.spaces import Space

@@ -15,6 +15,9 @@ _ENGINES = {
     "warp": ("lyceum_warp.engines.warp", "WarpEngine"),
 }
 
+_FLAGS = {"deterministic", "unroll"}
+"""Options that are given to an engine only if they are True."""
+
 
 def find_device(device: str | None) -> wp.Device:
     """The Warp device of a name.
@@ -53,8 +56,8 @@ def open_engine(
         model: The compiled model.
         nworld: Number of worlds.
         device: Where it runs.
-        options: Engine options: ``nthread`` of the C engine, ``nconmax``, ``njmax`` and ``deterministic`` of the
-            Warp engine. None leaves an engine its default.
+        options: Engine options: ``nthread`` of the C engine, ``nconmax``, ``njmax``, ``deterministic`` and ``unroll``
+            of the Warp engine. None leaves an engine its default.
 
     Raises:
         ValueError: There is no such engine, or it refuses the model, the device or an option.
@@ -64,17 +67,17 @@ def open_engine(
     given: dict[str, int | bool] = {
         key: whole_number(key, value, low=0 if key == "nthread" else 1)
         for key, value in options.items()
-        if value is not None and key != "deterministic"
+        if value is not None and key not in _FLAGS
     }
-    if options.get("deterministic") and engine != "mujoco":  # which is so anyway
-        given["deterministic"] = True
+    if engine != "mujoco":  # which is deterministic anyway, and has nothing to unroll
+        given |= {key: True for key in _FLAGS if options.get(key)}
     if not callable(engine):
         if engine not in _ENGINES:
             raise ValueError(f"there is no engine {engine!r}: use one of 'auto', {', '.join(map(repr, _ENGINES))}")
         module, attribute = _ENGINES[engine]
-        known = {"mujoco": {"nthread"}, "warp": {"nconmax", "njmax", "deterministic"}}[engine]
+        known = {"mujoco": {"nthread"}, "warp": {"nconmax", "njmax", *_FLAGS}}[engine]
         if unknown := given.keys() - known:
-            names = sorted(known - {"deterministic"})
+            names = sorted(known - _FLAGS)
             raise ValueError(f"the {engine} engine takes no {', '.join(sorted(unknown))}; it takes {names}")
         return getattr(importlib.import_module(module), attribute)(model, nworld, device, **given)
     return engine(model, nworld, device, **given)

@@ -30,6 +30,9 @@ _CONSTRAINT_BITS = int(_OVERFLOW.NEFC | _OVERFLOW.NJMAX_NNZ | _OVERFLOW.NVMAX)
 # a solver that ran into its iteration limit has still given an answer
 _IGNORED_BITS = int(_OVERFLOW.ITERATIONS | _OVERFLOW.LS_ITERATIONS)
 
+_MOST_UNROLLED = 20
+"""Iterations of the solver that fit a recording; more would take minutes to record and gain nothing."""
+
 _FEW = 256
 """Worlds that fit anywhere, so that nobody has to ask."""
 
@@ -46,6 +49,8 @@ class WarpEngine(Engine):
         njmax: Constraints a world has room for; None probes the model.
         deterministic: Whether the same worlds take the same steps to the bit on a CUDA device, too, as they always do
             on the CPU.
+        unroll: Whether the solver's iterations are all in a recording, instead of a loop that ends with the last
+            world's; those that a world does not need leave it as it is.
 
     Raises:
         ValueError: MuJoCo Warp refuses the model, or so many worlds do not fit into memory.
@@ -66,13 +71,19 @@ class WarpEngine(Engine):
         nconmax: int | None = None,
         njmax: int | None = None,
         deterministic: bool = False,
+        unroll: bool = False,
     ) -> None:
         spare = nconmax is None
         if nconmax is None or njmax is None:
             contacts, constraints = probe_sizes(model)
             nconmax, njmax = nconmax or contacts, njmax or constraints
         self.model, self.device, self.nconmax, self.njmax = model, device, nconmax, njmax
-        self.deterministic = deterministic
+        self.deterministic, self.unroll = deterministic, unroll
+        if unroll and model.opt.iterations > _MOST_UNROLLED:
+            raise ValueError(
+                f"unroll=True repeats all of the solver's {model.opt.iterations} iterations in every substep: give it "
+                "fewer, as with solver={'iterations': 4, 'ls_iterations': 6}"
+            )
         try:
             self.m = self._put_model()
             self.spare = _one_world(self.m) if spare else 0
@@ -103,6 +114,7 @@ class WarpEngine(Engine):
         model.opt.warn_overflow = 0
         if self.deterministic and self.device.is_cuda:
             model.opt.deterministic = mjw.DeterminismType.ALL
+        model.opt.graph_conditional = not self.unroll
         return model
 
     def _make_data(self, nworld: int, device: str | wp.Device | None = None) -> mjw.Data:
