@@ -153,8 +153,8 @@ def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys
     options = ["--integrator", "euler", "--solver", "iterations=7", "--solver", "ls_iterations=9", "--deterministic"]
     assert train(out, "--iterations", "1", *options, task="hopper") == 0  # whose own integrator is RK4
     solver = {"iterations": 7, "ls_iterations": 9}
-    physics = {"integrator": "euler", "solver": solver, "deterministic": True, "unroll": False}
-    assert Run.open(out).config["physics"] == physics
+    given = {"integrator": "euler", "solver": solver, "deterministic": True, "unroll": False}
+    assert Run.open(out).config["physics"] == given
     resume = ["train", "--resume", str(out), *QUIET, "--iterations"]
     assert cli.main([*resume, "2"]) == 0
     assert cli.main([*resume, "3", "--solver", "iterations=7", "--integrator", "euler"]) == 0
