@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 import lyceum_warp as lw
-from lyceum_warp.algos.rollout import at
+from lyceum_warp.algos.rollout import moved
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,11 +86,11 @@ class Judge:
     """Evaluates a policy with its noise, in worlds of its own."""
 
     def __init__(self, env: lw.Env) -> None:
-        self.env = env.few(16)
+        self.env = env.replicate_few(16)
 
     def __call__(self, policy: lw.GaussianPolicy) -> float:
         """Mean return; the same initial states and the same noise each time."""
-        policy, out = at(policy, self.env), torch.empty_like(self.env.action)
+        policy, out = moved(policy, self.env), torch.empty_like(self.env.action)
         generator = torch.Generator(out.device).manual_seed(0)
 
         def noisy(obs: torch.Tensor) -> torch.Tensor:

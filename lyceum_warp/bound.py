@@ -4,7 +4,7 @@ import difflib
 import linecache
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -34,7 +34,7 @@ _SIGNATURES = {
 
 _OPTIONS = (
     "nworld", "device", "engine", "seed", "autoreset", "horizon", "record", "model", "frame_skip", "cone", "integrator",
-    "solver", "deterministic", "unroll", "nvtx",
+    "solver", "deterministic", "unroll", "fields", "nvtx",
 )  # fmt: skip
 _OTHER_WORDS = {
     "num_envs": ["nworld"], "n_envs": ["nworld"], "xml_file": ["model"], "max_episode_steps": ["horizon"],
@@ -65,6 +65,7 @@ class BoundTask:
         nworld: Number of worlds, for parameters that differ between them.
         model: Another model than the task's own.
         frame_skip: Another number of substeps.
+        fields: Further fields that the engine has to keep.
         cone, integrator, solver: Other physics options than the model's, see ``models.compile_model``.
         params: Values for the fields of ``Params``; for a scalar also one value a world.
 
@@ -82,6 +83,7 @@ class BoundTask:
         cone: str | None = None,
         integrator: str | None = None,
         solver: Mapping[str, int] | None = None,
+        fields: Collection[str] = (),
         **params: Any,
     ) -> None:
         self.task = task
@@ -103,7 +105,11 @@ class BoundTask:
         for name in ("obs", "model"):
             if not hasattr(task, name) and (name == "obs" or model is None):
                 raise ValueError(f"the task {self.name!r} has no {name}: add {_MISSING[name]} to its class")
-        engine_fields = [name for name in self.fields if name != "memory"]
+        if isinstance(fields, str) or not all(isinstance(name, str) for name in fields):
+            raise ValueError(f"fields has to be names of fields, as in fields=['sensordata'], not {fields!r}")
+        self.further = tuple(fields)
+        """Fields that are kept for others than the task."""
+        engine_fields = [*(name for name in self.fields if name != "memory"), *self.further]
         spec = task_spec(task, model)
         self.model = models.compile_model(spec, engine_fields, cone=cone, integrator=integrator, solver=solver)
         if self.model.nu == 0:

@@ -129,7 +129,7 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field
     if name in SENSED and not _sensed(model, name):
         raise ValueError(
             f"MuJoCo computes the field {name!r} only for a sensor, and the model has none that needs it, or they are "
-            "off, as no field in the task's World needs one: list it there"
+            f"off, as nobody needs them: list it in the task's World, or give make() fields=[{name!r}]"
         )
     if name in STATE_FIELDS:
         refresh = reset = Stage.NONE

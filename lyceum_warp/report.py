@@ -14,7 +14,7 @@ from lyceum_warp.algos.control import ControlProgress
 from lyceum_warp.algos.npg import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.report import ControlReport
-from lyceum_warp.algos.rollout import at
+from lyceum_warp.algos.rollout import moved
 from lyceum_warp.algos.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs import Run
@@ -107,9 +107,9 @@ def filmed(env: Env, policy: GaussianPolicy, path: Path, seed: int) -> str:
     """Film an episode of a policy; the video's path, or why there is none."""
     from lyceum_warp.viz import video
 
-    one = env.few(1, autoreset=False)
+    one = env.replicate_few(1, autoreset=False)
     try:
-        return filmed_states(one, video.episode(one, at(policy, one), seed=seed), path)
+        return filmed_states(one, video.episode(one, moved(policy, one), seed=seed), path)
     except ValueError as error:
         return f"none: {error}"
 

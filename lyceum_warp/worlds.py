@@ -54,6 +54,9 @@ class Worlds:
             setattr(self._before, name, copy)
             self._pairs.append((copy, live))
 
+        for name in self.task.further:
+            self.engine.field(name)
+
         self.action_space = action_space(self.engine.model, task.action_range)
         self.obs_space = Space.of(self.task.obs_layout)
         self.reward_space = self.eval_space = Space()

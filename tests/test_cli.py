@@ -268,7 +268,8 @@ def test_a_run_of_a_gpu_is_evaluated_anywhere(
     run = tmp_path / "run"
     shutil.copytree(trained, run)
     config = json.loads((run / "config.json").read_text())
-    (run / "config.json").write_text(json.dumps(config | {"device": "cuda:7"}))
+    config |= {"device": "cuda:7", "params": config["params"] | {"nconmax": 16}}
+    (run / "config.json").write_text(json.dumps(config))
     assert cli.main(["eval", str(run), "--episodes", "2"]) == 0
     assert "2 episodes of the mean policy" in capsys.readouterr().out
     assert cli.main(["eval", str(run), "--episodes", "2", "--engine", "warp"]) == 2

@@ -108,7 +108,7 @@ BREAKS: list[tuple[str, type, str, Callable[[Method], Method]]] = [
     ("truncation", lw.Env, "step", then(lambda env: env.terminated.copy_(env.done))),
     ("no_autoreset", lw.Env, "step", then(lambda env: env.done.zero_())),
     ("recording", Recorder, "__call__", skip_some),
-    ("memory", lw.Env, "step", then(lambda env: leak.append(bytes(1000)))),
+    ("memory", lw.Env, "step", then(lambda env: leak.append(float(env.nworld)))),  # 32 bytes
     ("memory", lw.Env, "get_state", then(lambda env: env.__dict__.setdefault("kept", []).append(env.obs.clone()))),
     ("bad_state", MujocoEngine, "find_faults", nothing),
     ("bad_action", lw.Env, "_judge", lambda method: lambda self, mask, fault, action_fault, **how: method(

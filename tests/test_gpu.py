@@ -161,10 +161,10 @@ def test_humanoids_in_trouble_leave_few_others_alone() -> None:
 
 def test_an_evaluation_s_few_worlds_are_on_the_cpu() -> None:
     env = lw.make("hopper", nworld=8, device=CUDA, deterministic=True, nconmax=16, integrator="euler")
-    few = env.few(2, autoreset=False)
+    few = env.replicate_few(2, autoreset=False)
     assert (few.engine.name, few.device.is_cpu, few.nworld, few.autoreset) == ("mujoco", True, 2, False)
     assert few.model.opt.integrator == env.model.opt.integrator
-    assert lw.make("hopper", device=CUDA, engine="warp").few(2).device.is_cuda
+    assert lw.make("hopper", device=CUDA, engine="warp").replicate_few(2).device.is_cuda
     npg = lw.NPG(lw.make("point_mass", nworld=64, device=CUDA), config=lw.NPGConfig(samples=256, mean_every=1))
     assert math.isfinite(next(npg).mean_return or math.nan)
 

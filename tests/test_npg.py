@@ -276,6 +276,12 @@ def test_bad_hyperparameters_are_named(env: lw.Env, name: str, value: float) -> 
         lw.NPG(env, config=dataclasses.replace(SMALL, **{name: value}))
 
 
+def test_an_evaluation_leaves_no_gradients() -> None:
+    env = lw.make("point_mass", nworld=2)
+    lw.evaluate(env, lw.GaussianPolicy(env.obs_space.size, env.action_space.size), 2)
+    assert not env.action.requires_grad
+
+
 def test_evaluation_counts_the_same_number_of_episodes_of_every_world() -> None:
     """Short episodes do not crowd out long ones, and the numbers are those of a plain loop."""
     env = lw.make("hopper", nworld=4, horizon=60)

@@ -305,6 +305,13 @@ def test_a_field_asked_for_later_joins_the_state(module: ModuleType, engine: str
     assert torch.equal(acceleration, kept)
     assert torch.equal(env.get_state(), state)
     torch.testing.assert_close(env.get_obs(state), env.obs, rtol=0, atol=0)
+    env = lw.make("adroit_pen", engine=engine, fields=["sensordata", "cfrc_ext"])
+    size = env.state_space.size  # contact forces belong to the state, and are there from the start
+    env.step()
+    assert env.field("sensordata").abs().max() > 0 and env.replicate(nworld=2).field("cfrc_ext").shape[0] == 2
+    assert env.state_space.size == size
+    with pytest.raises(ValueError, match=r"names of fields, as in fields=\['sensordata'\], not 'sensordata'"):
+        lw.make("adroit_pen", engine=engine, fields="sensordata")
     for task, name in (("hopper", "cfrc_ext"), ("hopper", "sensordata"), ("adroit_pen", "sensordata")):
         with pytest.raises(ValueError, match=f"'{name}' only for a sensor.*task's World"):
             lw.make(task, engine="mujoco").field(name)

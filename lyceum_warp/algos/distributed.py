@@ -41,14 +41,13 @@ class Team:
         return self.size == 1 or distributed.get_backend() == "nccl"
 
     def hold(self, graph: torch.cuda.CUDAGraph) -> None:
-        """Take note of a graph that holds what the processes do with each other, for ``part``."""
+        """Take note of a graph that holds what the processes do with each other, for ``release``."""
         self._graphs.add(graph)
 
-    def part(self) -> None:
-        """Leave the others. What ``hold`` was told of can't be replayed any more."""
+    def release(self) -> None:
+        """End all graphs that ``hold`` was told of: NCCL's end waits for them, for ever."""
         for graph in list(self._graphs):
-            graph.reset()  # NCCL's end waits for the end of all graphs that it is part of, for ever
-        distributed.destroy_process_group()
+            graph.reset()
 
     def share(self, nworld: int) -> int:
         """Number of worlds of each process, of ``nworld`` in all.
@@ -158,7 +157,8 @@ def join(device: str = "cpu") -> Iterator[Team]:
         yield team
         clean = True
     finally:
+        team.release()
         # after an error NCCL may wait in vain for those who are not there any more: the end of the process is the
         # end of its group. Gloo waits for nobody, but its threads must be gone before Python is.
         if clean or distributed.get_backend() == "gloo":
-            team.part()
+            distributed.destroy_process_group()

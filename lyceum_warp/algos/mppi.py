@@ -14,8 +14,8 @@ arm is an inverse temperature, and stands for 0.2.
 
 import inspect
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ import warp as wp
 
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.bound import task_spec
-from lyceum_warp.engines import find_device
+from lyceum_warp.engines import ON_CPU_CORES, find_device
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import planning
 from lyceum_warp.kernels.arrays import torch_view
@@ -33,6 +33,7 @@ from lyceum_warp.registry import find_task
 from lyceum_warp.spaces import Space
 from lyceum_warp.task import Task
 from lyceum_warp.validate import described, whole_number
+from lyceum_warp.warmup import workers
 
 _BLOCK = 256
 
@@ -329,12 +330,15 @@ class MPPI:
         return state
 
 
-_SAMPLES_A_CORE = 48
-"""Below so many samples for each core of the CPU, its C engine plans faster than an H100: measured with 2 and 16 cores
-on reach, half_cheetah and adroit_pen without noslip (bench/results/planning-*.json)."""
+_SAMPLES_A_CORE = 40
+"""Below so many samples for each core of the CPU, its C engine plans faster than an H100. Measured with 16 cores, where
+the two meet at 27 a core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah (bench/README.md)."""
 
-_NOSLIP = 5
-"""Times as many with the noslip solver, for which a GPU takes six times as long and the CPU hardly longer."""
+_MOST_CORES = 16
+"""More were not measured, and what a plan does besides physics runs on one."""
+
+_NOSLIP = 6
+"""Times as many where the planner's model has the noslip solver: so much longer a substep then takes on a GPU."""
 
 
 def _placed(task: str | type[Task], options: Mapping[str, Any], samples: int) -> dict[str, Any]:
@@ -342,13 +346,19 @@ def _placed(task: str | type[Task], options: Mapping[str, Any], samples: int) ->
     placed = dict(options)
     if placed.get("engine", "auto") != "auto" or not find_device(placed.get("device")).is_cuda:
         return placed
-    noslip = task_spec(find_task(task), placed.get("model")).option.noslip_iterations
-    if (placed.get("solver") or {}).get("noslip_iterations", noslip):
-        samples = samples // _NOSLIP
-    # what is said of the other engine, for whichever case, has nothing to say here
-    if samples < _SAMPLES_A_CORE * (placed.get("nthread") or os.cpu_count() or 1):
-        return placed | {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None}
-    return placed | {"engine": "warp", "nthread": None}
+    enough = _SAMPLES_A_CORE * min(_MOST_CORES, placed.get("nthread") or workers())
+    if samples >= enough and (samples >= _NOSLIP * enough or not _has_noslip(task, placed)):
+        return placed | {"engine": "warp", "nthread": None}
+    return placed | ON_CPU_CORES
+
+
+def _has_noslip(task: str | type[Task], options: Mapping[str, Any]) -> bool:
+    solver, found = options.get("solver"), find_task(task)
+    if isinstance(solver, Mapping) and "noslip_iterations" in solver:
+        return bool(solver["noslip_iterations"])
+    if options.get("model") is None and not hasattr(found, "model"):
+        return False  # the environment will tell what is missing
+    return task_spec(found, options.get("model")).option.noslip_iterations > 0
 
 
 _DEFAULTS: dict[str, Any] = dict(
@@ -364,7 +374,12 @@ _SMALLEST = float(np.finfo(np.float32).tiny)
 def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):  # limits of the solver
         return dict(value)
-    return value if isinstance(value, (int, float, str)) else _array(value).tolist()
+    if value is None or isinstance(value, (int, float, str)):
+        return value
+    if isinstance(value, Path):  # of another model
+        return str(value)
+    names = isinstance(value, (list, tuple)) and all(isinstance(part, str) for part in value)
+    return list(value) if names else _array(value).tolist()
 
 
 def _array(value: Any) -> np.ndarray:

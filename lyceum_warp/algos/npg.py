@@ -16,7 +16,7 @@ import warp as wp
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.policy import GaussianPolicy, Normalizer
-from lyceum_warp.algos.rollout import Rollout, at, evaluate, finished, pooled, summary
+from lyceum_warp.algos.rollout import Rollout, evaluate, finished, moved, pooled, summary
 from lyceum_warp.algos.timing import Clock, one_thread
 from lyceum_warp.algos.value import ValueFit, ValueFunction
 from lyceum_warp.env import Env
@@ -350,10 +350,10 @@ class NPG:
         means = torch.zeros(len(names), dtype=torch.float64, device=self.env.obs.device)
         if self.team.leads:
             if self._mean_env is None:
-                self._mean_env = self.env.few(config.mean_episodes)
+                self._mean_env = self.env.replicate_few(config.mean_episodes)
             # the same initial states each time, and none of those that are trained on: what changes is the policy
             self._mean_env.follow(self.env)
-            policy = at(self.policy, self._mean_env)
+            policy = moved(self.policy, self._mean_env)
             episodes = evaluate(self._mean_env, policy, config.mean_episodes, seed=MEAN_SEED)
             parts = (episodes.returns, episodes.lengths, episodes.rewards, episodes.evals, episodes.success)
             means.copy_(torch.stack([part.mean() for part in parts]))

@@ -182,15 +182,15 @@ def pooled(parts: Sequence[tuple[float, float, float]]) -> tuple[float, float, f
     return count, mean, sum(s + n * (m - mean) ** 2 for n, m, s in parts)
 
 
-@torch.no_grad()
-def at(policy: Policy, env: Env) -> Policy:
-    """A policy where an environment's observations are: itself, or a copy if it is elsewhere."""
+def moved(policy: Policy, env: Env) -> Policy:
+    """A policy that is where an environment's observations are: itself, or a copy if it is elsewhere."""
     device = env.obs.device
     if all(parameter.device == device for parameter in policy.parameters()):
         return policy
     return copy.deepcopy(policy).to(device)
 
 
+@torch.no_grad()
 def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | None = None) -> Episodes:
     """Run a policy's mean action for whole episodes from random initial states.
 

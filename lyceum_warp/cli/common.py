@@ -26,8 +26,8 @@ class Physics:
     deterministic: bool = False
     """Whether runs on a GPU are equal to the bit, at many times the cost; on the CPU they are anyway."""
     unroll: bool = False
-    """Whether a GPU's recordings hold all iterations of the solver instead of a loop: a few percent faster with a
-    --solver of a handful of iterations."""
+    """Whether the Warp engine goes through all iterations of the solver instead of a loop that ends early, which may
+    gain a few percent on a GPU: with --solver iterations=4 or the like."""
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> "Physics":

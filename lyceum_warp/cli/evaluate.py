@@ -10,6 +10,7 @@ from rich.table import Table
 
 from lyceum_warp.algos.rollout import Episodes, evaluate
 from lyceum_warp.cli.common import Physics
+from lyceum_warp.engines import ON_CPU_CORES
 from lyceum_warp.env import Env
 from lyceum_warp.report import filmed, make_console
 from lyceum_warp.runs import Run, load
@@ -48,12 +49,11 @@ def evaluate_run(options: Eval) -> int:
     run = Run.open(options.run)
     config = run.config
     nworld = min(options.nworld, options.episodes)
-    engine = options.engine or config["engine"]
-    device = options.device or ("cpu" if engine == "auto" else config["device"])
-    env = Env(
-        config["task"], nworld=nworld, engine=engine, device=device,
-        **(Physics.of(config).options() | config["params"]),
-    )  # fmt: skip
+    engine, device = options.engine or config["engine"], options.device or config["device"]
+    where = {"engine": engine, "device": device} | Physics.of(config).options() | config["params"]
+    if engine == "auto" and options.device is None:
+        where |= ON_CPU_CORES
+    env = Env(config["task"], nworld=nworld, **where)
     policy = load(run, device=env.obs.device)
     sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
     if sizes != wanted:

@@ -30,7 +30,7 @@ class Plan:
     not given of the planner's settings comes from the task. After Ctrl-C, the episode under way has a file, too, but
     no part in the report.
 
-    --integrator, --solver and --deterministic are the planner's: what is controlled keeps its own physics.
+    --integrator, --solver, --deterministic and --unroll are the planner's: what is controlled keeps its own physics.
 
     $ lyceum-warp plan reach
     $ lyceum-warp plan reach --real-time --episodes 10

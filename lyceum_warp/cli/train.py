@@ -14,7 +14,7 @@ from rich.console import Console
 
 from lyceum_warp.algos.distributed import Team, join
 from lyceum_warp.algos.npg import NPG, NPGConfig
-from lyceum_warp.algos.rollout import Episodes, at, evaluate
+from lyceum_warp.algos.rollout import Episodes, evaluate, moved
 from lyceum_warp.cli.common import Interrupted, Physics, Words, parameter, portable, spelled
 from lyceum_warp.env import Env
 from lyceum_warp.registry import find_task, task_name, task_names
@@ -245,8 +245,8 @@ def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:
     """What came of it: the table, the curve, the video, and whether it is enough."""
     rows = run.rows()
     console.print(curve_table(rows))
-    few = npg.env.few(_FINAL_EPISODES)
-    episodes = evaluate(few, at(npg.policy, few), _FINAL_EPISODES, seed=options.seed + 1)
+    few = npg.env.replicate_few(_FINAL_EPISODES)
+    episodes = evaluate(few, moved(npg.policy, few), _FINAL_EPISODES, seed=options.seed + 1)
     console.print(f"mean policy, {len(episodes.returns)} new episodes: {_returns(episodes)}", soft_wrap=True)
     paths = [("checkpoint", str(run.checkpoint)), ("metrics", str(run.metrics))]
     if options.plot:

@@ -20,8 +20,8 @@ class Warmup:
     """Compile a task's kernels ahead of time, so that no later run waits for them, and say what a world costs.
 
     Warp keeps what it has compiled in its cache, for each kind of device. Sizes of the model's arrays are part of some
-    kernels, numbers of worlds are not. Which kernels a step needs depends on --integrator, --solver and
-    --deterministic, too: give those of the run to come.
+    kernels, numbers of worlds are not. Which kernels a step needs depends on the options of physics
+    (--integrator, --solver, ...), too: give those of the run to come.
 
     $ lyceum-warp warmup hopper --device cuda:0 --nworld 4096 --npg
     $ lyceum-warp warmup reach --device cuda:0 --plan
@@ -54,8 +54,10 @@ def warm_up(options: Warmup) -> int:
         env.step()
     if options.npg:
         next(NPG(env, config=NPGConfig(samples=2 * env.nworld, mean_every=0)))
+        env.replicate_few(1).step()  # evaluations of the mean policy
     if options.plan:
-        plan = MPPI(options.task, engine=options.engine, device=options.device, **more)
+        engine = env.engine.name  # not what suits the number of samples, which is not known here
+        plan = MPPI(options.task, engine=engine, device=options.device, **more)
         for _ in range(3):
             plan(plan.state_of())
     new = cached().keys() - before.keys()

@@ -18,6 +18,10 @@ _ENGINES = {
 _FLAGS = {"deterministic", "unroll"}
 """Options that are given to an engine only if they are True."""
 
+ON_CPU_CORES = {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None}
+"""Options of an environment that a GPU was meant for, and which is better off on the CPU: what was said of the Warp
+engine has nothing to say there."""
+
 
 def find_device(device: str | None) -> wp.Device:
     """The Warp device of a name.
@@ -84,6 +88,7 @@ def open_engine(
 
 
 __all__ = [
+    "ON_CPU_CORES",
     "Engine",
     "EngineFactory",
     "Field",

@@ -84,6 +84,8 @@ class WarpEngine(Engine):
                 f"unroll=True repeats all of the solver's {model.opt.iterations} iterations in every substep: give it "
                 "fewer, as with solver={'iterations': 4, 'ls_iterations': 6}"
             )
+        if unroll and model.nflex:
+            raise ValueError("unroll=True would unroll the collisions of the model's flexes, too: leave it out")
         try:
             self.m = self._put_model()
             self.spare = _one_world(self.m) if spare else 0
