@@ -130,8 +130,8 @@ def main(options: Options) -> None:
 
 
 KEPT = ("seed", "iteration", "samples", "seconds", "return_mean", "length_mean", "mean_return", "judged",
-        "terminal_reward")  # fmt: skip
-"""Columns of the table."""
+        "terminal_reward", "time_mean")  # fmt: skip
+"""Columns of the table; "seconds" counts those of the mean policy's evaluations, "time_mean", but not the judge's."""
 
 
 def write(options: Options, rows: list[dict[str, Any]]) -> None:
