@@ -6,6 +6,8 @@ Environment and bare engine take turns of ten steps: the bare engine is given ea
 has left, by a copy outside the clock, so that both step the same states, resets included, on a machine of the
 same mood. The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the
 same model, controls and number of substeps. ``kept`` is bare time by environment time; ``added`` the difference.
+``refresh`` is what the Warp engine spends on fields that ``mj_step`` leaves behind, as a share of the step: those of
+the new state where the task reads positions, a forward pass of the worlds that begin again where it reads forces.
 """
 
 import dataclasses
@@ -29,6 +31,7 @@ from rich.table import Table
 import lyceum_warp as lw
 from lyceum_warp.engines.c import MujocoEngine
 from lyceum_warp.engines.warp import WarpEngine
+from lyceum_warp.fields import Stage
 
 GYMNASIUM = {
     "hopper": "Hopper-v5",
@@ -146,6 +149,9 @@ class Row:
     physics_steps_per_second: float
     """Substeps of all worlds."""
     bytes_per_world: float
+    refresh: float | None
+    """Share of the step for fields that the bare engine does not bring up to date; None on the C engine, whose native
+    step does that, too."""
     first_step_seconds: float
     """Until the environment was made and its first step was done: with a cold cache, mostly compilation."""
 
@@ -192,8 +198,21 @@ def measure(
     rate = env.nworld / step
     return Row(
         name, env.engine.name, env.nworld, rate, env.nworld / step_alone, kept, added, rate * env.task.frame_skip,
-        env.bytes_per_world, first,
+        env.bytes_per_world, refresh_seconds(env) / step if isinstance(env.engine, WarpEngine) else None, first,
     )  # fmt: skip
+
+
+def refresh_seconds(env: lw.Env) -> float:
+    """Seconds that a step's refreshes take by themselves, for the worlds that began again in the last step."""
+    engine = env.engine
+    assert isinstance(engine, WarpEngine)
+    if engine.stage == engine.reset_stage == Stage.NONE:
+        return 0.0
+    with wp.ScopedDevice(env.device), wp.ScopedCapture() as capture:
+        engine._refresh_current()
+        engine.refresh(env._restarting)
+    times = [seconds(env, lambda: wp.capture_launch(capture.graph)) for _ in range(30)]
+    return statistics.median(times)
 
 
 def first_step(task: str, nworld: int, options: Options) -> tuple[lw.Env, float]:
@@ -252,9 +271,9 @@ def measure_gymnasium(name: str, steps: int) -> tuple[str, float]:
 def main(options: Options) -> None:
     console = Console(width=160)
     rows: list[Row] = []
-    table = Table("task", "engine", "worlds", "env steps/s", "bare steps/s", "kept", "added, µs", "physics/s",
-                  "kB/world", "first, s", "Gymnasium", "ratio")  # fmt: skip
-    for column in table.columns[2:10]:
+    table = Table("task", "engine", "worlds", "env steps/s", "bare steps/s", "kept", "added, µs", "refresh",
+                  "physics/s", "kB/world", "first, s", "Gymnasium", "ratio")  # fmt: skip
+    for column in table.columns[2:11]:
         column.justify = "right"
     baseline: dict[str, tuple[str, float]] = {}
     for task in options.tasks:
@@ -280,7 +299,9 @@ def main(options: Options) -> None:
 def cells(row: Row) -> list[str]:
     rates = f"{row.env_steps_per_second:,.0f}", f"{row.bare_steps_per_second:,.0f}"
     more = f"{row.physics_steps_per_second:,.0f}", f"{row.bytes_per_world / 1e3:,.1f}", f"{row.first_step_seconds:.1f}"
-    return [row.task, row.engine, str(row.nworld), *rates, f"{row.kept:.3f}", f"{row.added_microseconds:,.0f}", *more]
+    refresh = "" if row.refresh is None else f"{row.refresh:.1%}"
+    numbers = f"{row.kept:.3f}", f"{row.added_microseconds:,.0f}", refresh
+    return [row.task, row.engine, str(row.nworld), *rates, *numbers, *more]
 
 
 if __name__ == "__main__":
