@@ -105,7 +105,8 @@ class BoundTask:
         for name in ("obs", "model"):
             if not hasattr(task, name) and (name == "obs" or model is None):
                 raise ValueError(f"the task {self.name!r} has no {name}: add {_MISSING[name]} to its class")
-        if isinstance(fields, str) or not all(isinstance(name, str) for name in fields):
+        names = isinstance(fields, Collection) and not isinstance(fields, str)
+        if not names or not all(isinstance(name, str) for name in fields):
             raise ValueError(f"fields has to be names of fields, as in fields=['sensordata'], not {fields!r}")
         self.further = tuple(fields)
         """Fields that are kept for others than the task."""
