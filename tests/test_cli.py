@@ -1,6 +1,7 @@
 """The command line, called as a shell would."""
 
 import csv
+import dataclasses
 import inspect
 import json
 import os
@@ -20,8 +21,10 @@ from conftest import TaskFile
 
 import lyceum_warp as lw
 from lyceum_warp import cli, report
+from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.npg import MEAN_SEED
 from lyceum_warp.cli.common import parameter, spelled
+from lyceum_warp.cli.train import Train, _config
 from lyceum_warp.registry import find_task, task_names
 from lyceum_warp.runs import Run, load
 
@@ -402,6 +405,15 @@ def test_the_table_is_short() -> None:
     for i in range(9, 100, 10):
         rows[i]["mean_return"] = 1.0
     assert [row["iteration"] for row in report._spread(rows)] == [1, *range(10, 101, 10)]
+
+
+def test_as_many_worlds_as_the_device_is_good_for() -> None:
+    options = Train(task="hopper")
+    found = []
+    for device, size, given in (("cpu", 2, None), ("cuda:0", 1, None), ("cuda", 2, None), ("cuda", 2, 96)):
+        config = _config(dataclasses.replace(options, device=device, nworld=given), Team(0, size))
+        found.append((config["nworld"], config["npg"]["samples"]))
+    assert found == [(64, 10_000), (4096, 65_536), (8192, 131_072), (96, 10_000)]
 
 
 @pytest.mark.gpu

@@ -276,6 +276,12 @@ def test_bad_hyperparameters_are_named(env: lw.Env, name: str, value: float) -> 
         lw.NPG(env, config=dataclasses.replace(SMALL, **{name: value}))
 
 
+def test_samples_by_default() -> None:
+    """The paper's 10,000, and at least 16 steps of every world."""
+    counts = [lw.NPG(lw.make("point_mass", nworld=n)).count for n in (10, 64, 1000)]
+    assert counts == [10_000, 10_048, 16_000]
+
+
 def test_an_evaluation_leaves_no_gradients() -> None:
     env = lw.make("point_mass", nworld=2)
     lw.evaluate(env, lw.GaussianPolicy(env.obs_space.size, env.action_space.size), 2)

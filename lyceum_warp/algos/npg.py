@@ -32,8 +32,9 @@ MEAN_SEED = 2**31 - 1
 class NPGConfig:
     """Hyperparameters; the defaults are the paper's where it gives them."""
 
-    samples: int = 10_000
-    """Samples in an iteration; rounded up to whole steps of all worlds."""
+    samples: int | None = None
+    """Samples in an iteration, rounded up to whole steps of all worlds; by default the paper's 10,000, or 16 steps of
+    every world where those are more."""
     rollout: Literal["auto", "episodes", "segments"] = "auto"
     """"episodes" begins new episodes in every iteration, as in the paper; "segments" goes on with those of the
     last iteration, for many worlds and few steps of each; "auto" takes episodes where whole ones fit, that is
@@ -75,6 +76,11 @@ class NPGConfig:
     """Iterations between two evaluations of the mean policy; 0 for never."""
     mean_episodes: int = 16
     """Episodes in such an evaluation."""
+
+
+def enough_samples(config: NPGConfig, nworld: int) -> int:
+    """Samples in an iteration of so many worlds, those of all processes."""
+    return max(10_000, 16 * nworld) if config.samples is None else config.samples
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -187,7 +193,8 @@ class NPG:
         self.value.discount = config.gamma
         self.policy.to(device)
         self.value.to(device)
-        self.rollout = Rollout(env, -(-config.samples // nworld))
+        samples = enough_samples(config, nworld)
+        self.rollout = Rollout(env, -(-samples // nworld))
         self.count = self.rollout.steps * nworld
         self.fit = ValueFit(
             self.value, self.count, n, rate=config.value_rate, epochs=config.value_epochs,
@@ -198,7 +205,7 @@ class NPG:
         if not self.segments and not whole and team.leads:
             log.warning(
                 "%d samples of %d worlds are %d steps: no episode will reach its horizon of %d; take fewer worlds, "
-                "more samples, or rollout='segments'", config.samples, nworld, self.rollout.steps, env.horizon,
+                "more samples, or rollout='segments'", samples, nworld, self.rollout.steps, env.horizon,
             )  # fmt: skip
         self.noise = torch.empty(self.rollout.steps, nworld, nact, device=device)
         places = torch.arange(0, self.count, max(1, round(1.0 / max(config.fisher_fraction, 1e-9))))

@@ -2,7 +2,6 @@
 
 import dataclasses
 import datetime
-import os
 import signal
 import sys
 from pathlib import Path
@@ -13,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from lyceum_warp.algos.distributed import Team, join
-from lyceum_warp.algos.npg import NPG, NPGConfig
+from lyceum_warp.algos.npg import NPG, NPGConfig, enough_samples
 from lyceum_warp.algos.rollout import Episodes, evaluate, moved
 from lyceum_warp.cli.common import Interrupted, Physics, Words, parameter, portable, spelled
 from lyceum_warp.env import Env
@@ -21,6 +20,7 @@ from lyceum_warp.registry import find_task, task_name, task_names
 from lyceum_warp.report import Display, curve_table, filmed, make_console, plotted
 from lyceum_warp.runs import Run
 from lyceum_warp.versions import versions
+from lyceum_warp.warmup import workers
 
 _FINAL_EPISODES = 32
 
@@ -38,7 +38,7 @@ class Train:
     $ lyceum-warp train path/to/my_task.py --samples 4000 --out runs/mine
     $ lyceum-warp train humanoid --device cuda --integrator euler --solver iterations=4
     $ lyceum-warp train --resume runs/mine --iterations 200
-    $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda --nworld 8192 --samples 262144
+    $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
     Processes that torchrun starts share the worlds, on several machines, too. Their number makes no difference to
     the run but for rounding, and a run may go on with another one; the first process writes and speaks.
@@ -58,10 +58,10 @@ class Train:
     """mujoco (C, on CPU cores), warp, or auto: warp on CUDA and mujoco on the CPU."""
     device: str = "cpu"
     """cpu, or a CUDA device such as cuda:0. Under torchrun each process takes the GPU of its own number."""
-    nworld: int = 64
+    nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Worlds that step at once, those of all processes together, each samples / nworld steps in an iteration: whole
     episodes where those fit (the paper's way: 10 worlds for 10,000 samples and episodes of 1,000 steps), segments of
-    them elsewhere."""
+    them elsewhere. By default 64, or 4096 for each GPU."""
     threads: int = 1
     """Threads of torch on the CPU. Small networks gain little from more, and a number that is the same everywhere
     keeps runs the same to the bit. The mujoco engine uses all cores in any case."""
@@ -82,7 +82,7 @@ def train(options: Train) -> int:
     with join(options.device) as team:
         with team.together():
             # all that can be wrong with the options comes to light before the folder is made
-            config, out = _config(options), _folder(options)
+            config, out = _config(options, team), _folder(options)
             if team.leads:
                 Run.check_free(out)
             npg = _algorithm(config, team)
@@ -93,11 +93,14 @@ def train(options: Train) -> int:
         return _learn(run, npg, options)
 
 
-def _config(options: Train) -> dict[str, Any]:
+def _config(options: Train, team: Team) -> dict[str, Any]:
     if options.task is None:
         raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
     _check_iterations(options.iterations)
     find_task(options.task)
+    nworld = options.nworld
+    if nworld is None:
+        nworld = 4096 * team.size if options.device.startswith("cuda") else 64
     return {
         "algorithm": "npg",
         "task": portable(options.task),
@@ -105,11 +108,11 @@ def _config(options: Train) -> dict[str, Any]:
         "physics": options.physics.options(),
         "engine": options.engine,
         "device": options.device,
-        "nworld": options.nworld,
+        "nworld": nworld,
         "threads": options.threads,
         "seed": options.seed,
         "iterations": options.iterations,
-        "npg": dataclasses.asdict(options.npg),
+        "npg": dataclasses.asdict(options.npg) | {"samples": enough_samples(options.npg, nworld)},
     }
 
 
@@ -193,7 +196,7 @@ def _algorithm(config: dict[str, Any], team: Team) -> NPG:
     torch.set_num_threads(config["threads"])
     options = Physics.of(config).options() | config["params"]
     if team.neighbours > 1 and _engine(config) == "mujoco":
-        options["nthread"] = max(1, (os.cpu_count() or 1) // team.neighbours)
+        options["nthread"] = max(1, workers() // team.neighbours)
     nworld = team.share(config["nworld"])
     env = Env(
         config["task"], nworld=nworld, first_world=team.rank * nworld, engine=config["engine"],
