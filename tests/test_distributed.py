@@ -1,5 +1,6 @@
 """NPG in several processes: the same worlds, the same update, and a run that any number of processes goes on with."""
 
+import contextlib
 import csv
 import os
 import socket
@@ -173,6 +174,31 @@ def test_each_process_wants_a_gpu_of_its_own(monkeypatch: pytest.MonkeyPatch) ->
     wanted = pytest.raises(ValueError, match="2 processes on this machine want a GPU each, and it has 1")
     with wanted, distributed.join("cuda"):
         pass
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_graphs_end_before_the_processes_part(fails: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """NCCL would wait for them; after an error it may wait for the others, too, and is left to the process's end."""
+    order = []
+
+    class Graph:
+        def reset(self) -> None:
+            order.append("graph")
+
+    group = torch.distributed
+    for name, answer in {"init_process_group": None, "get_rank": 0, "get_backend": "nccl"}.items():
+        monkeypatch.setattr(group, name, lambda *args, answer=answer, **options: answer)
+    monkeypatch.setattr(group, "destroy_process_group", lambda: order.append("group"))
+    for name in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"):
+        monkeypatch.setenv(name, "2")
+    monkeypatch.setenv("MASTER_ADDR", "127.0.0.1")
+    graph = Graph()
+    with contextlib.suppress(KeyError), distributed.join("cpu") as team:
+        team.hold(graph)  # type: ignore[arg-type]
+        team.hold(Graph())  # type: ignore[arg-type]  # nobody's any more
+        if fails:
+            raise KeyError
+    assert order == (["graph"] if fails else ["graph", "group"])
 
 
 def test_a_team_of_one_is_alone() -> None:
