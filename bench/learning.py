@@ -46,8 +46,8 @@ class Options:
     integrator: str | None = None
     """Another integrator than the model's: euler, rk4, implicit or implicitfast."""
     target: float | None = None
-    """A mean return at which a run ends: that of the policy with its noise over 16 new episodes, which are off the
-    clock. An iteration's own episodes would not do: with short segments, the long ones among them end late."""
+    """A mean return at which a run ends: that of the policy with its noise over 16 episodes of its own, off the clock.
+    An iteration's episodes would not do: with short segments, the long ones among them end late."""
     judge_every: int = 5
     """Iterations from one such judgement to the next."""
     processes: int = 1

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import gc
+import re
 from pathlib import Path
 
 import mujoco
@@ -190,6 +191,25 @@ def test_options_that_make_no_sense(options: dict[str, object], message: str) ->
         pytest.skip("this torch can")
     with pytest.raises(ValueError, match=message):
         lw.make("point_mass", **options)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_fields_that_the_task_does_not_read(engine: str) -> None:
+    """Where a sensor is needed for one, it has to be said beforehand: else nobody pays for sensors."""
+    env = lw.make("adroit_pen", engine=engine, fields=["sensordata", "cfrc_ext"])
+    size = env.state_space.size  # contact forces belong to the state, and are there from the start
+    env.step()
+    assert env.field("sensordata").abs().max() > 0
+    assert env.field("cfrc_ext").shape == (1, env.model.nbody, 6)
+    assert env.state_space.size == env.replicate(nworld=2).state_space.size == size
+    for task, name in (("hopper", "cfrc_ext"), ("hopper", "sensordata"), ("adroit_pen", "sensordata")):
+        with pytest.raises(ValueError, match=f"'{name}' only for a sensor.*task's World.*fields=\\['{name}'\\]"):
+            lw.make(task, engine=engine).field(name)
+    for wrong in ("sensordata", 7, ["qpos", 7]):
+        with pytest.raises(ValueError, match=f"as in fields=.*, not {re.escape(repr(wrong))}"):
+            lw.make("adroit_pen", engine=engine, fields=wrong)
+    with pytest.raises(ValueError, match="there is no field 'qacceleration'"):
+        lw.make("adroit_pen", engine=engine, fields=["qacceleration"])
 
 
 def test_deterministic_is_given_on_the_cpu() -> None:

@@ -82,6 +82,16 @@ def test_a_planner_on_the_gpu_controls_a_plant_on_the_cpu() -> None:
     assert done.succeeded
 
 
+@pytest.mark.parametrize("samples", [8, 2048])
+def test_a_value_function_goes_where_the_plans_are(samples: int) -> None:
+    env = lw.make("hopper")
+    for device in ("cpu", CUDA):
+        value = lw.ValueFunction(env.obs_space.size, (8,), scale=1.0).to(device)
+        plan = lw.MPPI("hopper", device=CUDA, horizon=2, samples=samples, nthread=1, value=value)
+        assert plan.env.device.is_cpu == (samples == 8)
+        assert torch.isfinite(plan(plan.state_of())).all()
+
+
 def test_few_samples_are_rolled_out_by_the_cpu() -> None:
     assert lw.MPPI("reach", device=CUDA, samples=8).env.engine.name == "mujoco"
     assert lw.MPPI("reach", device=CUDA, samples=8, nthread=1, nconmax=16).env.device.is_cpu

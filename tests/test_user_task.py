@@ -1,7 +1,6 @@
 """A user's own task in the user's own file: all that a task may use, on both engines, with the package as it is."""
 
 import importlib.util
-import re
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -306,25 +305,6 @@ def test_a_field_asked_for_later_joins_the_state(module: ModuleType, engine: str
     assert torch.equal(acceleration, kept)
     assert torch.equal(env.get_state(), state)
     torch.testing.assert_close(env.get_obs(state), env.obs, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_fields_that_the_task_does_not_read(engine: str) -> None:
-    """Where a sensor is needed for one, it has to be said beforehand: else nobody pays for sensors."""
-    env = lw.make("adroit_pen", engine=engine, fields=["sensordata", "cfrc_ext"])
-    size = env.state_space.size  # contact forces belong to the state, and are there from the start
-    env.step()
-    assert env.field("sensordata").abs().max() > 0
-    assert env.field("cfrc_ext").shape == (1, env.model.nbody, 6)
-    assert env.state_space.size == env.replicate(nworld=2).state_space.size == size
-    for task, name in (("hopper", "cfrc_ext"), ("hopper", "sensordata"), ("adroit_pen", "sensordata")):
-        with pytest.raises(ValueError, match=f"'{name}' only for a sensor.*task's World.*fields=\\['{name}'\\]"):
-            lw.make(task, engine=engine).field(name)
-    for wrong in ("sensordata", 7, ["qpos", 7]):
-        with pytest.raises(ValueError, match=f"as in fields=.*, not {re.escape(repr(wrong))}"):
-            lw.make("adroit_pen", engine=engine, fields=wrong)
-    with pytest.raises(ValueError, match="there is no field 'qacceleration'"):
-        lw.make("adroit_pen", engine=engine, fields=["qacceleration"])
 
 
 @pytest.mark.parametrize("engine", ENGINES)

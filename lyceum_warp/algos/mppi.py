@@ -22,6 +22,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from lyceum_warp.algos.rollout import moved
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.bound import task_spec
 from lyceum_warp.engines import ON_CPU_CORES, find_device
@@ -146,7 +147,7 @@ class MPPI:
         self._initial = self.env.get_state()[0]
         self.timestep = self.env.timestep
         self._loop = OpenLoop(self.env, self.horizon)
-        self.value = value
+        self.value = moved(value, self.env) if isinstance(value, ValueFunction) else value
         self.seed = seed
         self._value_kernel = planning.value_kernel(value) if isinstance(value, wp.Function) else None
         space = self.env.action_space

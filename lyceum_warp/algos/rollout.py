@@ -16,7 +16,7 @@ from lyceum_warp.kernels import record
 from lyceum_warp.kernels.arrays import torch_view
 from lyceum_warp.kernels.recorder import Recorder
 
-Policy = TypeVar("Policy", bound=torch.nn.Module)
+Module = TypeVar("Module", bound=torch.nn.Module)
 
 
 class Rollout:
@@ -182,12 +182,12 @@ def pooled(parts: Sequence[tuple[float, float, float]]) -> tuple[float, float, f
     return count, mean, sum(s + n * (m - mean) ** 2 for n, m, s in parts)
 
 
-def moved(policy: Policy, env: Env) -> Policy:
-    """A policy that is where an environment's observations are: itself, or a copy if it is elsewhere."""
+def moved(module: Module, env: Env) -> Module:
+    """A policy or value function where an environment's observations are: itself, or a copy if it is elsewhere."""
     device = env.obs.device
-    if all(parameter.device == device for parameter in policy.parameters()):
-        return policy
-    return copy.deepcopy(policy).to(device)
+    if all(parameter.device == device for parameter in module.parameters()):
+        return module
+    return copy.deepcopy(module).to(device)
 
 
 @torch.no_grad()

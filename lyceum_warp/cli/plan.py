@@ -142,7 +142,7 @@ def _worlds(options: Plan) -> tuple[Env, MPPI]:
     if options.planner_model is not None:
         more["model"] = _model(options.planner_model)
     if options.value is not None:
-        more["value"] = load_value(options.value, device=options.device)
+        more["value"] = load_value(options.value)
     planner = MPPI(
         options.task, **settings, engine=options.engine, device=options.device, **more,
         **(options.planner_physics.given() | params | dict(map(parameter, options.planner_param))),
@@ -168,10 +168,10 @@ def _model(path: Path) -> Path:
 
 
 def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
-    console = make_console()
+    console, simulated = make_console(), planner.env
     console.print(
         f"[bold]{plant.task.name}[/]: {planner.samples} samples of {planner.horizon} steps "
-        f"({planner.horizon * planner.timestep:.3g} s), {planner.env.engine.name} engine on {options.device}; "
+        f"({planner.horizon * planner.timestep:.3g} s), {simulated.engine.name} engine on {simulated.device.alias}; "
         f"{'real time' if options.real_time else 'the world waits'}; files in {run.folder}",
         soft_wrap=True,
     )  # fmt: skip
