@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -26,9 +27,11 @@ OPTIONS = ["--samples", "600", "--nworld", "12", "--hidden", "8", "--value-hidde
 QUIET = ["--no-video", "--no-plot"]
 
 
-def torchrun(*arguments: str, options: list[str]) -> subprocess.Popen[str]:
+def torchrun(
+    *arguments: str, options: list[str], program: tuple[str, ...] = ("-m", "lyceum_warp.cli")
+) -> subprocess.Popen[str]:
     """``torchrun``, from this Python, on the loopback interface."""
-    command = [sys.executable, "-m", "torch.distributed.run", *options, "-m", "lyceum_warp.cli", *arguments]
+    command = [sys.executable, "-m", "torch.distributed.run", *options, *program, *arguments]
     environment = os.environ | {"GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
@@ -114,6 +117,58 @@ def test_gpu_two_make_the_update_of_one_and_end(tmp_path: Path) -> None:
     [(code, _, error)] = ended([torchrun(*arguments, str(two), options=["--standalone", "--nproc-per-node=2"])])
     assert code == 0, error
     assert_alike(two, one, tolerance=1e-3)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+def test_gpu_two_end_when_torchrun_is_interrupted(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    arguments = ["train", "hopper", *OPTIONS, *QUIET, "--device", "cuda", "--iterations", "100000", "--out", str(run)]
+    process = torchrun(*arguments, options=["--standalone", "--nproc-per-node=2"])
+    assert process.stdout is not None
+    said = ""
+    for line in process.stdout:
+        said += line
+        if "iteration    2/" in line:
+            process.send_signal(signal.SIGTERM)
+            break
+    rest, error = process.communicate(timeout=25)  # after 30 s torchrun kills them
+    rows = table(run)
+    assert f"interrupted by SIGTERM after {len(rows)} of 100000 iterations" in said + rest, (said, rest, error)
+    assert Run.open(run).read()["iteration"] == len(rows) >= 2
+
+
+STOPS = """
+import os, signal, sys
+from lyceum_warp import NPG
+from lyceum_warp.cli import main
+
+state_dict = NPG.state_dict
+
+def interrupting(npg):
+    state = state_dict(npg)
+    if npg.iteration == 2:
+        signal.raise_signal(signal.SIGTERM)
+    return state
+
+if os.environ["RANK"] == "1":
+    NPG.state_dict = interrupting
+sys.exit(main())
+"""
+
+
+@pytest.mark.slow
+def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
+    """It is the second, which has no run to write; the first makes the iteration whole and says how to go on."""
+    run, program = tmp_path / "run", tmp_path / "stops.py"
+    program.write_text(STOPS)
+    arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations", "100000", "--out", str(run)]
+    options = ["--standalone", "--nproc-per-node=2"]
+    [(code, out, error)] = ended([torchrun(*arguments, options=options, program=(str(program),))])
+    assert code != 0
+    assert "interrupted by SIGTERM after 2 of 100000 iterations; continue with" in out, (out, error)
+    assert len(table(run)) == Run.open(run).read()["iteration"] == 2
+    assert "lyceum_warp/" not in error, error  # no traceback
 
 
 @pytest.mark.slow

@@ -79,6 +79,14 @@ class Team:
             distributed.all_reduce(tensor)
         return tensor
 
+    def largest(self, number: int) -> int:
+        """The largest of the processes' numbers."""
+        if self.size == 1:
+            return number
+        numbers = torch.tensor(number, device=self.device)
+        distributed.all_reduce(numbers, distributed.ReduceOp.MAX)
+        return int(numbers)
+
     def gather(self, rows: torch.Tensor) -> torch.Tensor:
         """The rows of all processes, (size * n, ...) from (n, ...), in every process."""
         if self.size == 1:

@@ -4,7 +4,7 @@ import ast
 import contextlib
 import dataclasses
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -63,19 +63,35 @@ def signals() -> Iterator[None]:
             signal.signal(other, signal.SIG_IGN)
         raise Interrupted(number)
 
-    previous: dict[int, Any] = {}
-    try:
-        for number in (int(signal.SIGINT), int(signal.SIGTERM)):
-            # whoever started us in the background with SIGINT ignored means it
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                previous[number] = signal.signal(number, interrupt)
-    except ValueError:  # not the main thread: signals are somebody else's
-        pass
+    previous = _handled_by(interrupt)
     try:
         yield
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def postponed() -> Iterator[list[int]]:
+    """Within ``signals``: Ctrl-C and SIGTERM are noted in the list, and later ones ignored once it holds one."""
+    noted: list[int] = []
+    previous = _handled_by(lambda number, frame: noted.append(number))
+    try:
+        yield noted
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, signal.SIG_IGN if noted else handler)
+
+
+def _handled_by(handler: Callable[[int, Any], None]) -> dict[int, Any]:
+    """Handle Ctrl-C and SIGTERM, and return who did before."""
+    previous: dict[int, Any] = {}
+    with contextlib.suppress(ValueError):  # not the main thread: signals are somebody else's
+        for number in (int(signal.SIGINT), int(signal.SIGTERM)):
+            # whoever started us in the background with SIGINT ignored means it
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                previous[number] = signal.signal(number, handler)
+    return previous
 
 
 def portable(task: str) -> str:

@@ -1,9 +1,11 @@
 """lyceum-warp train."""
 
+import contextlib
 import dataclasses
 import datetime
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,9 +14,9 @@ import tyro
 from rich.console import Console
 
 from lyceum_warp.algos.distributed import Team, join
-from lyceum_warp.algos.npg import NPG, NPGConfig, enough_samples
+from lyceum_warp.algos.npg import NPG, Iteration, NPGConfig, enough_samples
 from lyceum_warp.algos.rollout import Episodes, evaluate, moved
-from lyceum_warp.cli.common import Interrupted, Physics, Words, parameter, portable, spelled
+from lyceum_warp.cli.common import Interrupted, Physics, Words, parameter, portable, postponed, spelled
 from lyceum_warp.env import Env
 from lyceum_warp.registry import find_task, task_name, task_names
 from lyceum_warp.report import Display, curve_table, filmed, make_console, plotted
@@ -31,7 +33,7 @@ class Train:
 
     The run's folder then holds config.json, versions.json, metrics.csv (a row an iteration), checkpoint.pt,
     curve.png and video.mp4. The checkpoint is renewed after every iteration: Ctrl-C loses only the one that
-    is under way.
+    is under way, and nothing of several processes, which finish it together.
 
     $ lyceum-warp train hopper --iterations 100 --seed 1
     $ lyceum-warp train half_cheetah --param ctrl_cost_weight=0.05 --param reset_noise_scale=0 --hidden 32 32
@@ -213,9 +215,11 @@ def _engine(config: dict[str, Any]) -> str:
 def _learn(run: Run | None, npg: NPG, options: Train) -> int:
     """Iterate; the process that has the run writes and speaks."""
     if run is None:
-        while npg.iteration < options.iterations:
-            next(npg)
-            npg.state_dict()  # the run's checkpoint takes everybody's worlds
+        try:
+            for _ in _iterations(npg, options.iterations):
+                npg.state_dict()  # the run's checkpoint takes everybody's worlds
+        except Interrupted as signalled:
+            return 128 + signalled.number
         return 0
     console = make_console()
     env = npg.env
@@ -228,8 +232,7 @@ def _learn(run: Run | None, npg: NPG, options: Train) -> int:
     )  # fmt: skip
     try:
         with Display(console, npg.iteration, options.iterations) as display:
-            while npg.iteration < options.iterations:
-                record = next(npg)
+            for record in _iterations(npg, options.iterations):
                 run.write(dataclasses.asdict(record))
                 run.save(npg.iteration, npg.policy, npg.state_dict(), npg.value)
                 display(record)
@@ -238,10 +241,29 @@ def _learn(run: Run | None, npg: NPG, options: Train) -> int:
         done = run.read()["iteration"]
         run.cut(done)
         told = f"interrupted by {signal.Signals(signalled.number).name} after {done} of {options.iterations} iterations"
-        mend = f"lyceum-warp train --resume {run.folder} --iterations {options.iterations}"
-        console.print(f"{told}; continue with\n  {mend}", soft_wrap=True, markup=False)
-        raise
+        if done < options.iterations:
+            told += f"; continue with\n  lyceum-warp train --resume {run.folder} --iterations {options.iterations}"
+        console.print(told, soft_wrap=True, markup=False)
+        return 128 + signalled.number
     return _report(run, npg, options, console)
+
+
+def _iterations(npg: NPG, total: int) -> Iterator[Iteration]:
+    """The iterations that are still to be made.
+
+    Raises:
+        Interrupted: A signal came. Processes that learn together finish the iteration and end together: one that
+            left in the middle of it would have the others wait for ever.
+    """
+    team = npg.team
+    with contextlib.ExitStack() as stack:
+        noted = stack.enter_context(postponed()) if team.size > 1 else []
+        while npg.iteration < total:
+            yield next(npg)
+            number = team.largest(max(noted, default=0))
+            if number:
+                noted.append(number)  # another process's, too
+                raise Interrupted(number)
 
 
 def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:
