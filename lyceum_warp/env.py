@@ -62,7 +62,7 @@ class Env(Worlds):
         nconmax: Contacts that the Warp engine has room for in each world, on average; probed by default.
         njmax: Constraints that the Warp engine has room for in each world; probed by default.
         deterministic: True makes two runs on a CUDA device equal to the bit, for a price: 9 to 16 times the time, and
-            buffers of Warp's in every recording that no announced memory counts. On the CPU two runs are equal anyway.
+            many times the memory. On the CPU two runs are equal anyway.
         unroll: True has the Warp engine go through all iterations of the solver, instead of a loop that ends with the
             last world's. The numbers stay the same. With a ``solver`` of at most 20 iterations only; with some four it
             gained 3 to 5 % on half_cheetah and humanoid, and lost 1 to 2 % on hopper. The C engine takes no notice.
@@ -157,6 +157,8 @@ class Env(Worlds):
         try:
             if self.engine.recordable:
                 compile_ahead(self._rehearsal, self.device, self.task.name)
+                if record:
+                    self.engine.prepare()
             self.rand_reset(seed)
         except Exception as error:
             raise self.task.explained(error) from None

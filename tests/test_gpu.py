@@ -1,7 +1,9 @@
 """What only a GPU can show: steps without a word to the host, graphs that equal what they recorded, determinism."""
 
 import contextlib
+import gc
 import math
+import re
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -128,6 +130,28 @@ def test_deterministic_runs_are_the_same_to_the_bit(task: str) -> None:
     first = run(env, 50)
     for a, b in zip(first, run(env, 50), strict=True):
         assert torch.equal(a, b)
+
+
+def test_memory_of_the_deterministic_mode_is_known_before_it_is_taken() -> None:
+    def free() -> int:
+        gc.collect()
+        torch.cuda.empty_cache()
+        torch.cuda.synchronize()
+        return torch.cuda.mem_get_info(CUDA)[0]
+
+    lw.make("hopper", nworld=256, device=CUDA, deterministic=True).step()  # what any number of worlds takes
+    before = free()
+    env = lw.make("hopper", nworld=16384, device=CUDA, deterministic=True)
+    for _ in range(3):
+        env.step()
+    taken, announced = before - free(), env.bytes_per_world * env.nworld
+    assert 0.7 * announced < taken < 1.3 * announced + 1e8, (taken, announced)
+    most = env.engine.footprint().largest(free())  # type: ignore[attr-defined]
+    del env
+    with pytest.raises(ValueError, match="worlds do not fit into the memory of cuda:0") as refused:
+        lw.make("hopper", nworld=2 * most, device=CUDA, deterministic=True)
+    named = re.search(r"use nworld=(\d+) at most", str(refused.value))
+    assert named and 0.8 * most < int(named[1]) < 1.5 * most
 
 
 @pytest.mark.parametrize("deterministic", [False, True])

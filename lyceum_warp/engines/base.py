@@ -110,6 +110,13 @@ class Engine(abc.ABC):
         """Bytes that all worlds together have in memory that no array of this object shows."""
         return 0
 
+    def prepare(self) -> None:  # noqa: B027
+        """Called when every kernel is compiled and before the first recording: set aside what recordings need.
+
+        Raises:
+            ValueError: So many worlds do not fit into memory.
+        """
+
     # physics
 
     @abc.abstractmethod

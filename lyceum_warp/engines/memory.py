@@ -23,6 +23,15 @@ class Footprint:
     fixed: int
     each: int
 
+    @classmethod
+    def of(cls, few: int, bytes_of_few: int, more: int, bytes_of_more: int) -> "Footprint":
+        """From what two numbers of worlds take."""
+        each = -(-(bytes_of_more - bytes_of_few) // (more - few))
+        return cls(max(0, bytes_of_few - few * each), each)
+
+    def __add__(self, other: "Footprint") -> "Footprint":
+        return Footprint(self.fixed + other.fixed, self.each + other.each)
+
     def largest(self, free: int) -> int:
         """The largest number of worlds for so many free bytes; a tenth of them is left for everything else."""
         return max(0, int(((1 - _KEPT_FREE) * free - self.fixed) // max(1, self.each)))
@@ -39,18 +48,24 @@ def free_memory(device: wp.Device) -> int | None:
         return None
 
 
-def check_fit(footprint: Footprint, nworld: int, device: wp.Device) -> None:
-    """Refuse a batch that does not fit into what is free, before anything is allocated.
+def check_fit(footprint: Footprint, nworld: int, device: wp.Device, held: int = 0) -> None:
+    """Refuse a batch that does not fit into what is free, before more is allocated.
+
+    Args:
+        footprint: What the batch takes in all.
+        nworld: Number of worlds.
+        device: Where.
+        held: Bytes of it that the batch has already.
 
     Raises:
         ValueError: It does not; the message names the largest that would.
     """
     free = free_memory(device)
-    if free is not None and nworld > footprint.largest(free) and device.is_cuda:
+    if free is not None and nworld > footprint.largest(free + held) and device.is_cuda:
         gc.collect()  # environments that nobody has any more, and what torch keeps for later
         torch.cuda.empty_cache()
         free = free_memory(device)
-    if free is None or nworld <= (most := footprint.largest(free)):
+    if free is None or nworld <= (most := footprint.largest(free := free + held)):
         return
     need = footprint.fixed + nworld * footprint.each
     hint = f"use nworld={most} at most" if most else "not even one does"
@@ -108,7 +123,25 @@ def temporaries(function: Callable[[], None]) -> int:
 _ALIGNED = 512
 
 
-class Arena:
+class _SetAside:
+    """Memory that was set aside, and the part of Warp's protocol for allocators that gives back."""
+
+    def __init__(self, device: wp.Device) -> None:
+        self._below = device.get_allocator()
+        self._device = device
+        self._memory: list[wp.array] = []  # all of it that there ever was: recordings hold its address
+
+    def _set_aside(self, size: int) -> None:
+        with wp.ScopedAllocator(self._device, self._below):
+            self._memory.append(wp.empty(max(size, _ALIGNED), dtype=wp.uint8, device=self._device))
+
+    def deallocate(self, ptr: int, size_in_bytes: int) -> None:
+        """Give an address back."""
+        if not any(memory.ptr <= ptr < memory.ptr + memory.size for memory in self._memory):
+            self._below.deallocate(ptr, size_in_bytes)
+
+
+class Arena(_SetAside):
     """An allocator for what may not allocate: it counts what an unrecorded run asks for, and sets that much aside.
 
     While it counts, memory comes from the device as ever. Recordings are served from what was set aside; they never
@@ -119,11 +152,9 @@ class Arena:
     """
 
     def __init__(self, device: wp.Device) -> None:
-        self._below = device.get_allocator()
-        self._device = device
+        super().__init__(device)
         self._size, self._used = 0, 0
         self._serving = False
-        self._memory: list[wp.array] = []  # all of it that was ever set aside: older recordings still hold its address
 
     def open(self) -> None:
         """Begin again at the start."""
@@ -136,7 +167,7 @@ class Arena:
         with wp.ScopedAllocator(self._device, self):
             yield
         if not self._memory or self._memory[-1].size < self._size:
-            self._memory.append(wp.empty(max(self._size, _ALIGNED), dtype=wp.uint8, device=self._device))
+            self._set_aside(self._size)
 
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
@@ -149,9 +180,9 @@ class Arena:
             self._serving = False
 
     def allocate(self, size_in_bytes: int) -> int:
-        """An address with so many bytes behind it; part of Warp's protocol for allocators."""
+        """An address with so many bytes behind it."""
         start = self._used
-        self._used += -(-size_in_bytes // _ALIGNED) * _ALIGNED
+        self._used += _aligned(size_in_bytes)
         if not self._serving:
             self._size = max(self._size, self._used)
             return int(self._below.allocate(size_in_bytes))
@@ -159,7 +190,53 @@ class Arena:
             raise RuntimeError("a recording asks for more memory than was set aside: it has to run unrecorded before")
         return int(self._memory[-1].ptr) + start
 
-    def deallocate(self, ptr: int, size_in_bytes: int) -> None:
-        """Give an address back; part of Warp's protocol for allocators."""
-        if not any(memory.ptr <= ptr < memory.ptr + memory.size for memory in self._memory):
-            self._below.deallocate(ptr, size_in_bytes)
+
+class Scratch(_SetAside):
+    """An allocator for the buffers that Warp's deterministic launches sort their atomic additions in.
+
+    Warp has a recording keep those of each of its launches, which takes hundreds of times a world's own memory. But
+    launches follow one another, and each begins by clearing its buffers, so that all may have the same memory.
+
+    Args:
+        device: A CUDA device.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        super().__init__(device)
+        self._block, self._used, self._now = 0, 0, 0
+        self.peak = 0
+        """Bytes that were handed out, at most, between one ``open`` and the next."""
+
+    def set_aside(self, size: int) -> None:
+        """Have so many bytes ready; more are taken when they are asked for."""
+        self._set_aside(size)
+
+    def open(self) -> None:
+        """Begin again at the start: the launches before are over when those that follow run."""
+        self._block, self._used, self._now = 0, 0, 0
+
+    @contextlib.contextmanager
+    def serving(self) -> Iterator[None]:
+        """Hand out what was set aside to launches that are being recorded; nothing changes for others."""
+        self.open()
+        with wp.ScopedAllocator(self._device, self):
+            yield
+
+    def allocate(self, size_in_bytes: int) -> int:
+        """An address with so many bytes behind it."""
+        # Warp makes these buffers beside the recording, on a stream of their own; all else belongs into it
+        if not self._device.is_capturing or self._device.stream.is_capturing:
+            return int(self._below.allocate(size_in_bytes))
+        size = _aligned(size_in_bytes)
+        self._now += size
+        self.peak = max(self.peak, self._now)
+        while self._block < len(self._memory) and self._used + size > self._memory[self._block].size:
+            self._block, self._used = self._block + 1, 0
+        if self._block == len(self._memory):
+            self._set_aside(size)
+        self._used += size
+        return int(self._memory[self._block].ptr) + self._used - size
+
+
+def _aligned(size: int) -> int:
+    return -(-size // _ALIGNED) * _ALIGNED

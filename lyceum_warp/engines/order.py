@@ -1,6 +1,7 @@
 """What MuJoCo Warp 4.0 leaves to chance on a GPU, put in order: see ``kernels.order``."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import mujoco_warp as mjw
@@ -21,20 +22,28 @@ class CanonicalOrder:
     Args:
         model: MuJoCo Warp's model; its callbacks are taken.
         data: MuJoCo Warp's data.
+        between: Called between launches, twice in a forward pass.
 
     Raises:
         ValueError: The model has what is not sorted, flexes.
     """
 
-    def __init__(self, model: mjw.Model, data: mjw.Data) -> None:
+    def __init__(self, model: mjw.Model, data: mjw.Data, between: Callable[[], None] = lambda: None) -> None:
+        self._between = between
         if model.nflex > 0:
             raise ValueError("deterministic=True can't sort the contacts of flexes: use engine='mujoco'")
         self._contacts, self._sorted_contacts = order.Contacts(), order.Contacts()
+        self._own: list[wp.array] = []  # what Warp's structures hold cannot be counted
+
+        def like(array: wp.array) -> wp.array:
+            self._own.append(wp.empty_like(array))
+            return self._own[-1]
+
         for field in dataclasses.fields(data.contact):
             if field.name in order.Contacts.vars:  # type: ignore[attr-defined]
                 words = _words(getattr(data.contact, field.name))
                 setattr(self._contacts, field.name, words)
-                setattr(self._sorted_contacts, field.name, wp.empty_like(words))
+                setattr(self._sorted_contacts, field.name, like(words))
         self._rows, self._sorted_rows = order.Rows(), order.Rows()
         for name in order.Rows.vars:  # type: ignore[attr-defined]
             array = getattr(data.efc, name)
@@ -42,7 +51,7 @@ class CanonicalOrder:
             if name == "J" and model.is_sparse:  # its entries stay where they are
                 array = wp.empty((0, 0, 0), dtype=float)
             elif name != "jtdaj_nblock":
-                array = wp.empty_like(array)
+                array = like(array)
             setattr(self._sorted_rows, name, array)
         self._key = wp.empty(2 * data.naconmax, dtype=wp.int64)
         self._place = wp.empty(2 * data.naconmax, dtype=int)
@@ -52,6 +61,7 @@ class CanonicalOrder:
 
     def sort_contacts(self, model: mjw.Model, data: mjw.Data) -> None:
         """Sort the contacts."""
+        self._between()
         n, count = data.naconmax, data.nacon
         wp.launch(order.contact_keys, n, [count, self._contacts, n, self._key, self._place])
         wp.utils.radix_sort_pairs(self._key, self._place, n)
@@ -61,6 +71,7 @@ class CanonicalOrder:
 
     def sort_rows(self, model: mjw.Model, data: mjw.Data) -> None:
         """Sort the constraint rows of every world."""
+        self._between()
         nrow, shape = data.nefc, self._rank.shape
         wp.launch(order.rank_rows, shape, [nrow, model.eq_type, self._rows, self._rank])
         args = [self._rows, self._sorted_rows]

@@ -1,6 +1,7 @@
 """The Warp engine: MuJoCo Warp, float32, on a CUDA device or on the CPU."""
 
-from collections.abc import Collection
+import contextlib
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import mujoco
@@ -8,7 +9,7 @@ import mujoco_warp as mjw
 import warp as wp
 
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.engines.memory import Footprint, bytes_of, check_fit, temporaries
+from lyceum_warp.engines.memory import Footprint, Scratch, bytes_of, check_fit, temporaries
 from lyceum_warp.engines.order import CanonicalOrder
 from lyceum_warp.engines.partial import PartialForward, group_size, report_overflow
 from lyceum_warp.engines.sizes import probe_sizes
@@ -86,11 +87,12 @@ class WarpEngine(Engine):
             )
         if unroll and model.nflex:
             raise ValueError("unroll=True would unroll the collisions of the model's flexes, too: leave it out")
+        self._scratch = Scratch(device) if deterministic and device.is_cuda else None
         try:
             self.m = self._put_model()
             self.spare = _one_world(self.m) if spare else 0
             if nworld >= _FEW:
-                check_fit(self.footprint(), nworld, device)
+                check_fit(self._arrays_footprint(), nworld, device)
             self.naconmax = nworld * nconmax + self.spare
             self.d = self._make_data(nworld)
         except (NotImplementedError, ValueError) as error:
@@ -101,7 +103,7 @@ class WarpEngine(Engine):
             ) from error
         super().__init__(model, nworld, device)
         with wp.ScopedDevice(device):
-            self._order = self._in_order(self.m, self.d)
+            self._order = self._in_order(self.m, self.d, self._scratch)
             self._state = wp.zeros((nworld, self.integration_size), dtype=float)
         self._own: dict[str, wp.array] = {}
         # sorting pairs of geoms, as for large models, takes memory that can't be set aside
@@ -124,8 +126,11 @@ class WarpEngine(Engine):
             naconmax = nworld * self.nconmax + self.spare
             return mjw.make_data(self.model, nworld=nworld, naconmax=naconmax, njmax=self.njmax)
 
-    def _in_order(self, model: mjw.Model, data: mjw.Data) -> CanonicalOrder | None:
-        return CanonicalOrder(model, data) if self.deterministic and self.device.is_cuda else None
+    def _in_order(self, model: mjw.Model, data: mjw.Data, scratch: Scratch | None = None) -> CanonicalOrder | None:
+        if not (self.deterministic and self.device.is_cuda):
+            return None
+        between: Callable[[], None] = (lambda: None) if scratch is None else scratch.open
+        return CanonicalOrder(model, data, between)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
         """Another model and data of MuJoCo Warp with the same options and sizes, to measure it alone."""
@@ -139,15 +144,43 @@ class WarpEngine(Engine):
         return bytes_of(self.m)
 
     def footprint(self) -> Footprint:
-        """The engine's memory, from the arrays that one world and two worlds have on the CPU."""
+        """The engine's memory, that of its recordings included; this compiles their kernels in deterministic mode."""
+        return self._arrays_footprint() + self._recordings_footprint()
+
+    def prepare(self) -> None:
+        if self._scratch is not None and self.nworld >= _FEW:
+            recordings = self._recordings_footprint()
+            everything = self._arrays_footprint() + recordings
+            check_fit(everything, self.nworld, self.device, held=bytes_of(self))
+            self._scratch.set_aside(recordings.fixed + self.nworld * recordings.each)
+
+    def _arrays_footprint(self) -> Footprint:
+        """Memory of the arrays, from those that one world and two worlds have on the CPU."""
         sizes = []
+        model = self.m if self._scratch is None else self._put_model()  # one whose callbacks nobody else needs
         for nworld in (1, 2):
             data = self._make_data(nworld, "cpu")
+            with wp.ScopedDevice("cpu"):
+                order = self._in_order(model, data)
             with wp.ScopedDevice(self.device):
-                within = temporaries(lambda data=data: mjw.step(self.m, data))  # type: ignore[misc]
-            sizes.append(bytes_of(data) + within)
-        each = sizes[1] - sizes[0]
-        return Footprint(sizes[0] - each + bytes_of(self.m), each)
+                within = temporaries(lambda data=data: mjw.step(model, data))  # type: ignore[misc]
+            sizes.append(bytes_of(data, order) + within)
+        return Footprint.of(1, sizes[0], 2, sizes[1]) + Footprint(bytes_of(self.m), 0)
+
+    def _recordings_footprint(self) -> Footprint:
+        """Memory that Warp's deterministic launches keep in recordings, from those of a few worlds."""
+        if self._scratch is None:
+            return Footprint(0, 0)
+        sizes = []
+        for nworld in (_FEW, 2 * _FEW):
+            model, data, scratch = self._put_model(), self._make_data(nworld), Scratch(self.device)
+            with wp.ScopedDevice(self.device), scratch.serving():
+                self._in_order(model, data, scratch)
+                mjw.step(model, data)
+                with wp.ScopedCapture(self.device):
+                    mjw.step(model, data)
+            sizes.append(scratch.peak)
+        return Footprint.of(_FEW, sizes[0], 2 * _FEW, sizes[1])
 
     # fields
 
@@ -170,8 +203,14 @@ class WarpEngine(Engine):
 
     # physics
 
+    @contextlib.contextmanager
+    def _launching(self) -> Iterator[None]:
+        """For calls of MuJoCo Warp: on the engine's device, with memory for what deterministic launches need."""
+        with wp.ScopedDevice(self.device), self._scratch.serving() if self._scratch else contextlib.nullcontext():
+            yield
+
     def step(self, nstep: int) -> None:
-        with wp.ScopedDevice(self.device):
+        with self._launching():
             for _ in range(nstep):
                 mjw.step(self.m, self.d)
             self._copy_snapshots(self._everyone, lagged=True)
@@ -181,7 +220,7 @@ class WarpEngine(Engine):
     def _forward(self, names: Collection[str], stage: Stage, data: mjw.Data | None = None) -> None:
         """Run the part of a forward pass that the named fields need; it covers every world of a data."""
         m, d = self.m, self.d if data is None else data
-        with wp.ScopedDevice(self.device):
+        with self._launching():
             if stage == Stage.ACCELERATION:
                 mjw.forward(m, d)
             elif _is_kinematic(names, stage):
@@ -204,7 +243,7 @@ class WarpEngine(Engine):
         wp.launch(faults.faults_of_fields, self.nworld, args, device=self.device)
 
     def reset(self, mask: wp.array) -> None:
-        with wp.ScopedDevice(self.device):
+        with self._launching():
             mjw.reset_data(self.m, self.d, reset=mask)
 
     def commit(self, mask: wp.array) -> None:
@@ -229,13 +268,13 @@ class WarpEngine(Engine):
     # state
 
     def _get_integration(self, state_out: wp.array, mask: wp.array) -> None:
-        with wp.ScopedDevice(self.device):
+        with self._launching():
             mjw.get_state(self.m, self.d, self._state, _SPEC)
         launch_rows(widen, mask, self._state, state_out)
 
     def _set_integration(self, state_in: wp.array, mask: wp.array) -> None:
         launch_rows(narrow, mask, state_in, self._state)
-        with wp.ScopedDevice(self.device):
+        with self._launching():
             mjw.set_state(self.m, self.d, self._state, _SPEC, mask)
 
 
