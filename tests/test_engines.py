@@ -212,6 +212,25 @@ def test_fields_that_the_task_does_not_read(engine: str) -> None:
         lw.make("adroit_pen", engine=engine, fields=["qacceleration"])
 
 
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_fields_are_current_however_little_is_computed_for_them(engine: str) -> None:
+    """Each needs more of a forward pass than those before it, and all are asked for as time goes on."""
+    env = lw.make("hopper", nworld=2, engine=engine, horizon=2, seed=1)
+    parts = env.state_space.parts
+    asked = []
+    for name in ("xipos", "cinert", "cvel", "qfrc_bias"):
+        env.field(name)
+        asked.append(name)
+        for _ in range(3):  # an episode ends, and another begins
+            env.step(torch.ones_like(env.action))
+            state, data = env.get_state()[1].numpy(), mujoco.MjData(env.model)
+            data.qpos[:], data.qvel[:] = state[parts["qpos"]], state[parts["qvel"]]
+            mujoco.mj_forward(env.model, data)
+            for known in asked:
+                found, wanted = env.field(known)[1].numpy(), getattr(data, known)
+                np.testing.assert_allclose(found.reshape(wanted.shape), wanted, atol=1e-4, rtol=1e-4, err_msg=known)
+
+
 def test_deterministic_is_given_on_the_cpu() -> None:
     for engine in ("mujoco", "warp"):
         env = lw.make("point_mass", engine=engine, deterministic=True)

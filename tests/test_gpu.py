@@ -152,6 +152,8 @@ def test_memory_of_the_deterministic_mode_is_known_before_it_is_taken() -> None:
         lw.make("hopper", nworld=2 * most, device=CUDA, deterministic=True)
     named = re.search(r"use nworld=(\d+) at most", str(refused.value))
     assert named and 0.8 * most < int(named[1]) < 1.5 * most
+    with pytest.raises(ValueError, match=r"16384 worlds do not fit into the buffers of 2.15 GB .* nworld=\d+ at most"):
+        lw.make("adroit_pen", nworld=16384, device=CUDA, deterministic=True)
 
 
 @pytest.mark.parametrize("deterministic", [False, True])

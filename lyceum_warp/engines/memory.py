@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,10 @@ class Footprint:
     each: int
 
     @classmethod
-    def of(cls, few: int, bytes_of_few: int, more: int, bytes_of_more: int) -> "Footprint":
-        """From what two numbers of worlds take."""
-        each = -(-(bytes_of_more - bytes_of_few) // (more - few))
-        return cls(max(0, bytes_of_few - few * each), each)
+    def of(cls, few: int, more: int, sizes: Sequence[int]) -> "Footprint":
+        """From what few worlds and more worlds take."""
+        each = -(-(sizes[1] - sizes[0]) // (more - few))
+        return cls(max(0, sizes[0] - few * each), each)
 
     def __add__(self, other: "Footprint") -> "Footprint":
         return Footprint(self.fixed + other.fixed, self.each + other.each)
@@ -132,8 +132,9 @@ class _SetAside:
         self._memory: list[wp.array] = []  # all of it that there ever was: recordings hold its address
 
     def _set_aside(self, size: int) -> None:
+        rows = -(-max(size, 1) // _ALIGNED)  # an axis may be no longer than 2**31
         with wp.ScopedAllocator(self._device, self._below):
-            self._memory.append(wp.empty(max(size, _ALIGNED), dtype=wp.uint8, device=self._device))
+            self._memory.append(wp.empty((rows, _ALIGNED), dtype=wp.uint8, device=self._device))
 
     def deallocate(self, ptr: int, size_in_bytes: int) -> None:
         """Give an address back."""
@@ -206,6 +207,8 @@ class Scratch(_SetAside):
         self._block, self._used, self._now = 0, 0, 0
         self.peak = 0
         """Bytes that were handed out, at most, between one ``open`` and the next."""
+        self.largest = 0
+        """Bytes that were handed out at once, at most."""
 
     def set_aside(self, size: int) -> None:
         """Have so many bytes ready; more are taken when they are asked for."""
@@ -229,7 +232,7 @@ class Scratch(_SetAside):
             return int(self._below.allocate(size_in_bytes))
         size = _aligned(size_in_bytes)
         self._now += size
-        self.peak = max(self.peak, self._now)
+        self.peak, self.largest = max(self.peak, self._now), max(self.largest, size)
         while self._block < len(self._memory) and self._used + size > self._memory[self._block].size:
             self._block, self._used = self._block + 1, 0
         if self._block == len(self._memory):

@@ -20,10 +20,12 @@ from lyceum_warp.kernels.state import copy_rows, launch_rows, narrow, widen
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
-# fields that kinematics and com_pos compute, without collisions and the constraint Jacobian
-_KINEMATIC = frozenset(
-    "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat subtree_com cdof cinert".split()
+_PARTS = (
+    (mjw.kinematics, "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat".split()),
+    (mjw.com_pos, "subtree_com cdof cinert".split()),
+    (mjw.com_vel, "cvel cdof_dot".split()),
 )
+"""The cheap parts of a forward pass in their order, and what each computes; each needs those before it."""
 
 _OVERFLOW = mjw.OverflowType
 _CONTACT_BITS = int(_OVERFLOW.BROADPHASE | _OVERFLOW.NARROWPHASE)
@@ -36,6 +38,9 @@ _MOST_UNROLLED = 20
 
 _FEW = 256
 """Worlds that fit anywhere, so that nobody has to ask."""
+
+_LARGEST_BUFFER = 2**31 - 1
+"""Bytes of an array that Warp makes for bytes: an axis may be no longer."""
 
 
 class WarpEngine(Engine):
@@ -145,14 +150,19 @@ class WarpEngine(Engine):
 
     def footprint(self) -> Footprint:
         """The engine's memory, that of its recordings included; this compiles their kernels in deterministic mode."""
-        return self._arrays_footprint() + self._recordings_footprint()
+        return self._arrays_footprint() + self._recordings_footprint()[0]
 
     def prepare(self) -> None:
-        if self._scratch is not None and self.nworld >= _FEW:
-            recordings = self._recordings_footprint()
-            everything = self._arrays_footprint() + recordings
-            check_fit(everything, self.nworld, self.device, held=bytes_of(self))
-            self._scratch.set_aside(recordings.fixed + self.nworld * recordings.each)
+        if self._scratch is None or self.nworld < _FEW:
+            return
+        recordings, buffer = self._recordings_footprint()
+        if self.nworld > (most := (_LARGEST_BUFFER - buffer.fixed) // max(1, buffer.each)):
+            raise ValueError(
+                f"{self.nworld} worlds do not fit into the buffers of {_LARGEST_BUFFER / 1e9:.3g} GB at most in which "
+                f"Warp sorts what worlds add up with deterministic=True: use nworld={most} at most, or leave it out"
+            )
+        check_fit(self._arrays_footprint() + recordings, self.nworld, self.device, held=bytes_of(self))
+        self._scratch.set_aside(recordings.fixed + self.nworld * recordings.each)
 
     def _arrays_footprint(self) -> Footprint:
         """Memory of the arrays, from those that one world and two worlds have on the CPU."""
@@ -165,13 +175,13 @@ class WarpEngine(Engine):
             with wp.ScopedDevice(self.device):
                 within = temporaries(lambda data=data: mjw.step(model, data))  # type: ignore[misc]
             sizes.append(bytes_of(data, order) + within)
-        return Footprint.of(1, sizes[0], 2, sizes[1]) + Footprint(bytes_of(self.m), 0)
+        return Footprint.of(1, 2, sizes) + Footprint(bytes_of(self.m), 0)
 
-    def _recordings_footprint(self) -> Footprint:
-        """Memory that Warp's deterministic launches keep in recordings, from those of a few worlds."""
+    def _recordings_footprint(self) -> tuple[Footprint, Footprint]:
+        """Memory that Warp's deterministic launches keep in recordings, and the largest piece: from a few worlds."""
         if self._scratch is None:
-            return Footprint(0, 0)
-        sizes = []
+            return Footprint(0, 0), Footprint(0, 0)
+        sizes, pieces = [], []
         for nworld in (_FEW, 2 * _FEW):
             model, data, scratch = self._put_model(), self._make_data(nworld), Scratch(self.device)
             with wp.ScopedDevice(self.device), scratch.serving():
@@ -180,7 +190,8 @@ class WarpEngine(Engine):
                 with wp.ScopedCapture(self.device):
                     mjw.step(model, data)
             sizes.append(scratch.peak)
-        return Footprint.of(_FEW, sizes[0], 2 * _FEW, sizes[1])
+            pieces.append(scratch.largest)
+        return Footprint.of(_FEW, 2 * _FEW, sizes), Footprint.of(_FEW, 2 * _FEW, pieces)
 
     # fields
 
@@ -221,12 +232,12 @@ class WarpEngine(Engine):
         """Run the part of a forward pass that the named fields need; it covers every world of a data."""
         m, d = self.m, self.d if data is None else data
         with self._launching():
-            if stage == Stage.ACCELERATION:
+            if (parts := _parts(names)) is not None:
+                for part in parts:
+                    part(m, d)
+            elif stage == Stage.ACCELERATION:
                 mjw.forward(m, d)
-            elif _is_kinematic(names, stage):
-                mjw.kinematics(m, d)
-                mjw.com_pos(m, d)
-            elif stage > Stage.NONE:
+            else:
                 mjw.fwd_position(m, d)
                 mjw.sensor_pos(m, d)
                 if stage == Stage.VELOCITY:
@@ -252,11 +263,11 @@ class WarpEngine(Engine):
     def refresh(self, mask: wp.array) -> None:
         names = [field.name for field in self.fields.values() if field.reset > Stage.NONE]
         stage = self.reset_stage
-        cheap = stage == Stage.NONE or _is_kinematic(names, stage)
+        cheap = _parts(names) is not None
         if cheap or not self.partial_refresh or self._order is not None or self._sorts:
             self._forward(names, stage)
             self._copy_snapshots(mask)
-            if stage > Stage.NONE and not _is_kinematic(names, stage):
+            if not cheap:
                 report_overflow(self.d, mask)
             return
         if self._partial is None:
@@ -278,8 +289,15 @@ class WarpEngine(Engine):
             mjw.set_state(self.m, self.d, self._state, _SPEC, mask)
 
 
-def _is_kinematic(names: Collection[str], stage: Stage) -> bool:
-    return stage == Stage.POSITION and _KINEMATIC.issuperset(names)
+def _parts(names: Collection[str]) -> list[Callable[[mjw.Model, mjw.Data], None]] | None:
+    """The parts of a forward pass that compute the named fields, or None if it takes collisions and constraints."""
+    last = -1
+    for name in names:
+        place = next((i for i, (_, fields) in enumerate(_PARTS) if name in fields), None)
+        if place is None:
+            return None
+        last = max(last, place)
+    return [part for part, _ in _PARTS[: last + 1]]
 
 
 def _one_world(model: mjw.Model) -> int:
