@@ -40,8 +40,12 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "Euler": {"integrator": "euler"},
     "Euler, 4 iterations": {"integrator": "euler"} | limits(4),
     "implicitfast": {"integrator": "implicitfast"},
+    "deterministic": {"deterministic": True},
 }
 """Options of ``lw.make``."""
+
+ON_A_GPU = ("unroll", "deterministic")
+"""Options that make a difference on a GPU alone."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +60,8 @@ class Options:
     """Engine."""
     device: str = "cpu"
     """Device."""
+    settings: tuple[str, ...] = tuple(SETTINGS)
+    """What to compare with the model's own options."""
     states: int = 20
     """Steps that each setting makes, five steps of the environment apart."""
     out: Path | None = None
@@ -77,6 +83,7 @@ class Row:
     error_max: float
     faults: int
     """Worlds whose step ended in a fault; they don't count among the errors."""
+    bytes_per_world: float
 
 
 def recorded(task: str, nworld: int, options: Options) -> list[tuple[torch.Tensor, torch.Tensor]]:
@@ -97,8 +104,9 @@ def recorded(task: str, nworld: int, options: Options) -> list[tuple[torch.Tenso
 def measure(task: str, nworld: int, options: Options) -> list[Row]:
     steps = recorded(task, nworld, options)
     envs: dict[str, lw.Env] = {}
-    for name, setting in SETTINGS.items():
-        if "unroll" in setting and options.device == "cpu":
+    for name in dict.fromkeys(("own", *options.settings)):
+        setting = SETTINGS[name]
+        if options.device == "cpu" and any(option in setting for option in ON_A_GPU):
             continue
         env = lw.make(task, nworld=nworld, engine=options.engine, device=options.device, autoreset=False, **setting)
         if "integrator" in setting and env.model.opt.integrator == envs["own"].model.opt.integrator:
@@ -125,15 +133,18 @@ def measure(task: str, nworld: int, options: Options) -> list[Row]:
         finite = error.isfinite()
         ordered = error[finite].sort().values
         at = [ordered[int(q * (len(ordered) - 1))].item() for q in (0.5, 0.99, 1.0)]
-        rows.append(
-            Row(task, nworld, name, 1e3 * statistics.median(mine), gain, at[0], at[1], at[2], int((~finite).sum()))
-        )
+        rows.append(Row(
+            task, nworld, name, 1e3 * statistics.median(mine), gain, *at, int((~finite).sum()),
+            envs[name].bytes_per_world,
+        ))  # fmt: skip
     return rows
 
 
 def main(options: Options) -> None:
+    if unknown := set(options.settings) - SETTINGS.keys():
+        raise SystemExit(f"there is no setting {', '.join(sorted(unknown))}: choose among {', '.join(SETTINGS)}")
     torch.set_num_threads(1)
-    table = Table("task", "worlds", "setting", "step, ms", "gain", "error: median", "99 %", "max", "faults")
+    table = Table("task", "worlds", "setting", "step, ms", "gain", "error: median", "99 %", "max", "faults", "kB/world")
     for column in table.columns[3:]:
         column.justify = "right"
     rows: list[Row] = []
@@ -143,7 +154,7 @@ def main(options: Options) -> None:
                 rows.append(row)
                 table.add_row(row.task, str(row.nworld), row.setting, f"{row.step_ms:.3f}", f"{row.gain:.2f}",
                               f"{row.error_median:.0e}", f"{row.error_99:.0e}", f"{row.error_max:.0e}",
-                              str(row.faults))  # fmt: skip
+                              str(row.faults), f"{row.bytes_per_world / 1e3:,.1f}")  # fmt: skip
     Console(width=120).print(table)
     if options.out is not None:
         records.write(options.out, rows, options.device, states=options.states)

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import gc
+import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,11 @@ _KEPT_FREE = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Footprint:
-    """Bytes that a batch takes: some in any case, and some for each world."""
+    """Bytes that a batch takes: some in any case, and some for each world; and how many worlds there can be at all."""
 
     fixed: int
     each: int
+    most: float = math.inf
 
     @classmethod
     def of(cls, few: int, more: int, sizes: Sequence[int]) -> "Footprint":
@@ -30,11 +32,11 @@ class Footprint:
         return cls(max(0, sizes[0] - few * each), each)
 
     def __add__(self, other: "Footprint") -> "Footprint":
-        return Footprint(self.fixed + other.fixed, self.each + other.each)
+        return Footprint(self.fixed + other.fixed, self.each + other.each, min(self.most, other.most))
 
     def largest(self, free: int) -> int:
         """The largest number of worlds for so many free bytes; a tenth of them is left for everything else."""
-        return max(0, int(((1 - _KEPT_FREE) * free - self.fixed) // max(1, self.each)))
+        return max(0, int(min(self.most, ((1 - _KEPT_FREE) * free - self.fixed) // max(1, self.each))))
 
 
 def free_memory(device: wp.Device) -> int | None:

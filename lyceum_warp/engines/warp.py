@@ -1,6 +1,7 @@
 """The Warp engine: MuJoCo Warp, float32, on a CUDA device or on the CPU."""
 
 import contextlib
+import dataclasses
 from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
@@ -150,16 +151,16 @@ class WarpEngine(Engine):
 
     def footprint(self) -> Footprint:
         """The engine's memory, that of its recordings included; this compiles their kernels in deterministic mode."""
-        return self._arrays_footprint() + self._recordings_footprint()[0]
+        return self._arrays_footprint() + self._recordings_footprint()
 
     def prepare(self) -> None:
         if self._scratch is None or self.nworld < _FEW:
             return
-        recordings, buffer = self._recordings_footprint()
-        if self.nworld > (most := (_LARGEST_BUFFER - buffer.fixed) // max(1, buffer.each)):
+        recordings = self._recordings_footprint()
+        if self.nworld > recordings.most:
             raise ValueError(
-                f"{self.nworld} worlds do not fit into the buffers of {_LARGEST_BUFFER / 1e9:.3g} GB at most in which "
-                f"Warp sorts what worlds add up with deterministic=True: use nworld={most} at most, or leave it out"
+                f"{self.nworld} worlds do not fit into the buffers in which Warp sorts with deterministic=True, of "
+                f"{_LARGEST_BUFFER / 1e9:.3g} GB at most: use nworld={recordings.most} at most, or leave it out"
             )
         check_fit(self._arrays_footprint() + recordings, self.nworld, self.device, held=bytes_of(self))
         self._scratch.set_aside(recordings.fixed + self.nworld * recordings.each)
@@ -177,11 +178,11 @@ class WarpEngine(Engine):
             sizes.append(bytes_of(data, order) + within)
         return Footprint.of(1, 2, sizes) + Footprint(bytes_of(self.m), 0)
 
-    def _recordings_footprint(self) -> tuple[Footprint, Footprint]:
-        """Memory that Warp's deterministic launches keep in recordings, and the largest piece: from a few worlds."""
+    def _recordings_footprint(self) -> Footprint:
+        """Memory that Warp's deterministic launches keep in recordings, from those of a few worlds."""
         if self._scratch is None:
-            return Footprint(0, 0), Footprint(0, 0)
-        sizes, pieces = [], []
+            return Footprint(0, 0)
+        sizes, largest = [], []
         for nworld in (_FEW, 2 * _FEW):
             model, data, scratch = self._put_model(), self._make_data(nworld), Scratch(self.device)
             with wp.ScopedDevice(self.device), scratch.serving():
@@ -190,8 +191,10 @@ class WarpEngine(Engine):
                 with wp.ScopedCapture(self.device):
                     mjw.step(model, data)
             sizes.append(scratch.peak)
-            pieces.append(scratch.largest)
-        return Footprint.of(_FEW, 2 * _FEW, sizes), Footprint.of(_FEW, 2 * _FEW, pieces)
+            largest.append(scratch.largest)
+        buffer = Footprint.of(_FEW, 2 * _FEW, largest)
+        most = (_LARGEST_BUFFER - buffer.fixed) // max(1, buffer.each)
+        return dataclasses.replace(Footprint.of(_FEW, 2 * _FEW, sizes), most=most)
 
     # fields
 
