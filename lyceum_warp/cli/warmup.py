@@ -69,6 +69,9 @@ def warm_up(options: Warmup) -> int:
     free = free_memory(env.device)
     if env.engine.name == "warp" and free is not None:
         footprint = env.engine.footprint()  # type: ignore[attr-defined]
-        text += f"; at most some {footprint.largest(free):,d} worlds fit into the {free / 1e9:.1f} GB that are free"
+        most = footprint.largest(free)
+        text += f"; at most some {most:,d} worlds fit into the {free / 1e9:.1f} GB that are free"
+        if most == footprint.most:
+            text += ", and into Warp's buffers for --deterministic"
     console.print(text, soft_wrap=True)
     return 0
