@@ -61,8 +61,8 @@ class Env(Worlds):
         nthread: Threads of the C engine; all cores by default.
         nconmax: Contacts that the Warp engine has room for in each world, on average; probed by default.
         njmax: Constraints that the Warp engine has room for in each world; probed by default.
-        deterministic: True makes two runs on a CUDA device equal to the bit, for a price: 5 to 18 times the time, and
-            five to seven times the memory. On the CPU two runs are equal anyway.
+        deterministic: True makes two runs on a CUDA device equal to the bit, for a price: 5 to 18 times the time and
+            5 to 7 times the memory on hopper, half_cheetah and humanoid. On the CPU two runs are equal anyway.
         unroll: True has the Warp engine go through all iterations of the solver, instead of a loop that ends with the
             last world's. The numbers stay the same. With a ``solver`` of at most 20 iterations only; with some four it
             gained 3 to 5 % on half_cheetah and humanoid, and lost 1 to 2 % on hopper. The C engine takes no notice.

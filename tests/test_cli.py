@@ -23,7 +23,7 @@ import lyceum_warp as lw
 from lyceum_warp import cli, report
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.npg import MEAN_SEED
-from lyceum_warp.cli.common import parameter, spelled
+from lyceum_warp.cli.common import Interrupted, parameter, postponed, signals, spelled
 from lyceum_warp.cli.train import Train, _config
 from lyceum_warp.registry import find_task, task_names
 from lyceum_warp.runs import Run, load
@@ -378,6 +378,32 @@ def test_a_killed_run_goes_on(trained: Path, tmp_path: Path) -> None:
     assert cli.main(["train", "--resume", str(out), "--iterations", str(total), *QUIET]) == 0
     assert table(out)[:4] == table(trained)[:4]
     assert len(table(out)) == total
+
+
+def test_a_postponed_signal_is_not_forgotten() -> None:
+    """One that nobody asked about is raised at the end; once it is raised, a second one disturbs nobody."""
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        with signals():
+            with pytest.raises(Interrupted) as raised, postponed() as noted:
+                signal.raise_signal(signal.SIGTERM)
+                signal.raise_signal(signal.SIGINT)
+                assert noted == [signal.SIGTERM, signal.SIGINT]
+            assert raised.value.number == signal.SIGTERM
+            signal.raise_signal(signal.SIGTERM)
+        with signals():
+            with pytest.raises(Interrupted), postponed() as noted:
+                signal.raise_signal(signal.SIGTERM)
+                raise Interrupted(max(noted))
+            signal.raise_signal(signal.SIGTERM)
+        with signals():
+            with postponed():
+                pass
+            with pytest.raises(Interrupted), postponed(False) as noted:
+                signal.raise_signal(signal.SIGTERM)
+            assert noted == []
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_signals_are_left_as_they_were(trained: Path) -> None:

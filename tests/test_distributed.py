@@ -138,11 +138,12 @@ def test_gpu_two_end_when_torchrun_is_interrupted(tmp_path: Path) -> None:
     assert Run.open(run).read()["iteration"] == len(rows) >= 2
 
 
-STOPS = """
+INTERRUPTED = """
 import os, signal, sys
 from lyceum_warp import NPG
 from lyceum_warp.cli import main
 
+where, rank = sys.argv.pop(1), sys.argv.pop(1)
 state_dict = NPG.state_dict
 
 def interrupting(npg):
@@ -151,24 +152,35 @@ def interrupting(npg):
         signal.raise_signal(signal.SIGTERM)
     return state
 
-if os.environ["RANK"] == "1":
-    NPG.state_dict = interrupting
+def interrupted(*args):
+    signal.raise_signal(signal.SIGTERM)
+
+if os.environ["RANK"] == rank:
+    if where == "learning":
+        NPG.state_dict = interrupting
+    else:
+        sys.modules["lyceum_warp.cli.train"]._algorithm = interrupted
 sys.exit(main())
 """
 
 
 @pytest.mark.slow
 def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
-    """It is the second, which has no run to write; the first makes the iteration whole and says how to go on."""
-    run, program = tmp_path / "run", tmp_path / "stops.py"
-    program.write_text(STOPS)
-    arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations", "100000", "--out", str(run)]
+    """One that learns makes the iteration whole, with the others; one that only begins leaves nothing behind."""
+    program, run = tmp_path / "interrupted.py", tmp_path / "learning"
+    program.write_text(INTERRUPTED)
+    arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations", "100000", "--out"]
     options = ["--standalone", "--nproc-per-node=2"]
-    [(code, out, error)] = ended([torchrun(*arguments, options=options, program=(str(program),))])
-    assert code != 0
+    processes = [
+        torchrun(*arguments, str(tmp_path / where), options=options, program=(str(program), where, rank))
+        for where, rank in (("learning", "1"), ("beginning", "0"))
+    ]
+    (code, out, error), (early, nothing, told) = ended(processes)
+    assert code != 0 and early != 0
     assert "interrupted by SIGTERM after 2 of 100000 iterations; continue with" in out, (out, error)
     assert len(table(run)) == Run.open(run).read()["iteration"] == 2
-    assert "lyceum_warp/" not in error, error  # no traceback
+    assert nothing == "" and not (tmp_path / "beginning").exists()
+    assert "lyceum_warp/" not in error + told, (error, told)  # no traceback
 
 
 @pytest.mark.slow

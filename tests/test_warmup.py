@@ -1,9 +1,12 @@
 """Before the first step: compiling ahead with progress, and whether the worlds fit into memory."""
 
+import contextlib
+import itertools
 import os
 import runpy
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import mujoco
@@ -14,7 +17,7 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp.cli import main
 from lyceum_warp.engines import memory
-from lyceum_warp.engines.memory import Footprint, bytes_of, check_fit
+from lyceum_warp.engines.memory import Footprint, Scratch, bytes_of, check_fit
 from lyceum_warp.kernels.rehearsal import rehearse
 from lyceum_warp.kernels.state import rank_worlds
 
@@ -102,6 +105,59 @@ def test_what_does_not_fit_is_refused_before_it_is_allocated(monkeypatch: pytest
         check_fit(Footprint(20_000_000, 1000), 1, cpu)
     monkeypatch.setattr(memory, "free_memory", lambda device: None)
     check_fit(footprint, 10**9, cpu)
+
+
+def test_footprints_from_two_batches_and_together() -> None:
+    footprint = Footprint.of(256, 512, [1000 + 256 * 7, 1000 + 512 * 7])
+    assert footprint == Footprint(fixed=1000, each=7)
+    limited = footprint + Footprint(fixed=0, each=3, most=50)
+    assert limited == Footprint(fixed=1000, each=10, most=50)
+    assert limited.largest(1000 + 1200) == 50 and limited.largest(1000 + 200) == 8
+
+
+class Recording:
+    """In the place of a CUDA device that is being recorded: Warp asks for some memory within it, for some beside."""
+
+    is_capturing = True
+
+    def __init__(self) -> None:
+        self.stream = types.SimpleNamespace(is_capturing=False)
+        self.given_back: list[int] = []
+
+    def get_allocator(self) -> "Recording":
+        return self
+
+    def allocate(self, size: int) -> int:
+        return -size
+
+    def deallocate(self, address: int, size: int) -> None:
+        self.given_back.append(address)
+
+
+def test_recorded_launches_share_their_scratch(monkeypatch: pytest.MonkeyPatch) -> None:
+    device, empty = Recording(), wp.empty
+    monkeypatch.setattr(wp, "ScopedAllocator", lambda *args: contextlib.nullcontext())
+    monkeypatch.setattr(wp, "empty", lambda shape, dtype, device: empty(shape, dtype=dtype, device="cpu"))
+    scratch = Scratch(device)  # type: ignore[arg-type]
+    scratch.set_aside(5000)
+    launches = []
+    for sizes in ([1000, 2000], [512, 1500, 1000], [4000]):
+        scratch.open()
+        launches.append([range(start := scratch.allocate(size), start + size) for size in sizes])
+    for pieces in launches:  # those of one launch lie beside each other, within what was set aside
+        for before, after in itertools.pairwise(pieces):
+            assert before.stop <= after.start
+        assert pieces[0].start == launches[0][0].start and pieces[-1].stop <= pieces[0].start + 5120
+    assert (scratch.peak, scratch.largest) == (4096, 4096)
+    more = scratch.allocate(2000)  # what was set aside is used up
+    assert more not in range(launches[0][0].start, launches[0][0].start + 5120)
+    scratch.deallocate(more, 2000)
+    assert not device.given_back
+    for within in (True, False):
+        device.stream.is_capturing, device.is_capturing = within, within  # part of a recording, or none
+        assert scratch.allocate(300) == -300
+        scratch.deallocate(-300, 300)
+    assert device.given_back == [-300, -300] and scratch.peak == 4096 + 2048
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])

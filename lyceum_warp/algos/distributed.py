@@ -113,7 +113,7 @@ class Team:
     def together(self) -> Iterator[None]:
         """What all processes have to get through: an error in one ends the others, too, and those quietly.
 
-        Within it nobody may sum, gather or follow: a process that has failed would not take part.
+        Within it nobody may do anything else together: a process that has failed would not take part.
 
         Raises:
             SystemExit: There was an error in another process, which has told of it.
@@ -124,7 +124,7 @@ class Team:
         failed = torch.zeros(1, device=self.device)
         try:
             yield
-        except Exception:
+        except BaseException:  # signals, too
             self.sum(failed.fill_(1.0))
             raise
         if self.sum(failed).item() > 0:

@@ -72,15 +72,29 @@ def signals() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def postponed() -> Iterator[list[int]]:
-    """Within ``signals``: Ctrl-C and SIGTERM are noted in the list, and later ones ignored once it holds one."""
+def postponed(when: bool = True) -> Iterator[list[int]]:
+    """Within ``signals``: Ctrl-C and SIGTERM are noted in the list, for who raises Interrupted at a better time.
+
+    What is still noted at the end raises it there. Once it is raised, later signals are ignored.
+
+    Args:
+        when: False leaves signals alone.
+
+    Raises:
+        Interrupted: A signal came that nobody asked the list about.
+    """
     noted: list[int] = []
-    previous = _handled_by(lambda number, frame: noted.append(number))
+    previous = _handled_by(lambda number, frame: noted.append(number)) if when else {}
     try:
         yield noted
+    except Interrupted:
+        previous = dict.fromkeys(previous, signal.SIG_IGN)
+        raise
     finally:
         for number, handler in previous.items():
-            signal.signal(number, signal.SIG_IGN if noted else handler)
+            signal.signal(number, handler)
+    if noted:
+        signal.raise_signal(signal.Signals(noted[0]))
 
 
 def _handled_by(handler: Callable[[int, Any], None]) -> dict[int, Any]:

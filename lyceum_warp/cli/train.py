@@ -5,7 +5,6 @@ import dataclasses
 import datetime
 import signal
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from lyceum_warp.algos.distributed import Team, join
-from lyceum_warp.algos.npg import NPG, Iteration, NPGConfig, enough_samples
+from lyceum_warp.algos.npg import NPG, NPGConfig, enough_samples
 from lyceum_warp.algos.rollout import Episodes, evaluate, moved
 from lyceum_warp.cli.common import Interrupted, Physics, Words, parameter, portable, postponed, spelled
 from lyceum_warp.env import Env
@@ -33,7 +32,7 @@ class Train:
 
     The run's folder then holds config.json, versions.json, metrics.csv (a row an iteration), checkpoint.pt,
     curve.png and video.mp4. The checkpoint is renewed after every iteration: Ctrl-C loses only the one that
-    is under way, and nothing of several processes, which finish it together.
+    is under way.
 
     $ lyceum-warp train hopper --iterations 100 --seed 1
     $ lyceum-warp train half_cheetah --param ctrl_cost_weight=0.05 --param reset_noise_scale=0 --hidden 32 32
@@ -43,7 +42,9 @@ class Train:
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
     Processes that torchrun starts share the worlds, on several machines, too. Their number makes no difference to
-    the run but for rounding, and a run may go on with another one; the first process writes and speaks.
+    the run but for rounding, and a run may go on with another one; the first process writes and speaks. After Ctrl-C
+    or SIGTERM, to torchrun or to any of them, they finish the iteration and end together; torchrun waits 30 s for that,
+    or as long as its --shutdown-timeout says.
     """
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
@@ -89,9 +90,6 @@ def train(options: Train) -> int:
                 Run.check_free(out)
             npg = _algorithm(config, team)
             run = Run.create(out, config, device=options.device) if team.leads else None
-        state = npg.state_dict()
-        if run is not None:
-            run.save(0, npg.policy, state, npg.value)
         return _learn(run, npg, options)
 
 
@@ -213,57 +211,59 @@ def _engine(config: dict[str, Any]) -> str:
 
 
 def _learn(run: Run | None, npg: NPG, options: Train) -> int:
-    """Iterate; the process that has the run writes and speaks."""
-    if run is None:
-        try:
-            for _ in _iterations(npg, options.iterations):
-                npg.state_dict()  # the run's checkpoint takes everybody's worlds
-        except Interrupted as signalled:
-            return 128 + signalled.number
-        return 0
-    console = make_console()
+    """Iterate; the process that has the run writes and speaks.
+
+    Processes that learn together finish the iteration in which a signal comes to one of them, and end together: one
+    that left in the middle of it would have the others wait for ever.
+    """
+    console, team = make_console(), npg.team
+    display = None
+    if run is not None:
+        console.print(_told(run, npg, options), soft_wrap=True)
+        display = Display(console, npg.iteration, options.iterations)
+    try:
+        with postponed(team.size > 1) as noted, display or contextlib.nullcontext():
+            if npg.iteration == 0:
+                _save(run, npg)
+            while npg.iteration < options.iterations:
+                record = next(npg)
+                if run is not None:
+                    run.write(dataclasses.asdict(record))
+                _save(run, npg)
+                if display is not None:
+                    display(record)
+                if number := team.largest(max(noted, default=0)):
+                    raise Interrupted(number)
+    except Interrupted as signalled:
+        if run is not None and run.checkpoint.exists():
+            # iterations count when their checkpoint is complete; what is under way is lost
+            done = run.read()["iteration"]
+            run.cut(done)
+            name = signal.Signals(signalled.number).name
+            told = f"interrupted by {name} after {done} of {options.iterations} iterations"
+            if done < options.iterations:
+                told += f"; continue with\n  lyceum-warp train --resume {run.folder} --iterations {options.iterations}"
+            console.print(told, soft_wrap=True, markup=False)
+        return 128 + signalled.number
+    return 0 if run is None else _report(run, npg, options, console)
+
+
+def _told(run: Run, npg: NPG, options: Train) -> str:
+    """What is going to be done."""
     env = npg.env
     processes = f" each in {npg.team.size} processes" if npg.team.size > 1 else ""
-    console.print(
+    return (
         f"[bold]{env.task.name}[/]: {env.obs_space.size} observations, {env.action_space.size} actions; "
         f"{env.nworld} worlds{processes}, {_engine(run.config)} engine on {options.device}, "
-        f"{'segments' if npg.segments else 'episodes'} of {npg.rollout.steps} steps; run in {run.folder}",
-        soft_wrap=True,
-    )  # fmt: skip
-    try:
-        with Display(console, npg.iteration, options.iterations) as display:
-            for record in _iterations(npg, options.iterations):
-                run.write(dataclasses.asdict(record))
-                run.save(npg.iteration, npg.policy, npg.state_dict(), npg.value)
-                display(record)
-    except Interrupted as signalled:
-        # iterations count when their checkpoint is complete; what is under way is lost
-        done = run.read()["iteration"]
-        run.cut(done)
-        told = f"interrupted by {signal.Signals(signalled.number).name} after {done} of {options.iterations} iterations"
-        if done < options.iterations:
-            told += f"; continue with\n  lyceum-warp train --resume {run.folder} --iterations {options.iterations}"
-        console.print(told, soft_wrap=True, markup=False)
-        return 128 + signalled.number
-    return _report(run, npg, options, console)
+        f"{'segments' if npg.segments else 'episodes'} of {npg.rollout.steps} steps; run in {run.folder}"
+    )
 
 
-def _iterations(npg: NPG, total: int) -> Iterator[Iteration]:
-    """The iterations that are still to be made.
-
-    Raises:
-        Interrupted: A signal came. Processes that learn together finish the iteration and end together: one that
-            left in the middle of it would have the others wait for ever.
-    """
-    team = npg.team
-    with contextlib.ExitStack() as stack:
-        noted = stack.enter_context(postponed()) if team.size > 1 else []
-        while npg.iteration < total:
-            yield next(npg)
-            number = team.largest(max(noted, default=0))
-            if number:
-                noted.append(number)  # another process's, too
-                raise Interrupted(number)
+def _save(run: Run | None, npg: NPG) -> None:
+    """Renew the checkpoint, which takes every process's worlds."""
+    state = npg.state_dict()
+    if run is not None:
+        run.save(npg.iteration, npg.policy, state, npg.value)
 
 
 def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:

@@ -70,8 +70,7 @@ def warm_up(options: Warmup) -> int:
     if env.engine.name == "warp" and free is not None:
         footprint = env.engine.footprint()  # type: ignore[attr-defined]
         most = footprint.largest(free)
-        text += f"; at most some {most:,d} worlds fit into the {free / 1e9:.1f} GB that are free"
-        if most == footprint.most:
-            text += ", and into Warp's buffers for --deterministic"
+        place = f"the {free / 1e9:.1f} GB that are free" if most != footprint.most else "Warp's --deterministic buffers"
+        text += f"; at most some {most:,d} worlds fit into {place}"
     console.print(text, soft_wrap=True)
     return 0

@@ -111,7 +111,7 @@ class Engine(abc.ABC):
         return 0
 
     def prepare(self) -> None:  # noqa: B027
-        """Called when every kernel is compiled and before the first recording: set aside what recordings need.
+        """Set aside what recordings need; called when every kernel is compiled, before the first of them.
 
         Raises:
             ValueError: So many worlds do not fit into memory.

@@ -197,8 +197,9 @@ class Arena(_SetAside):
 class Scratch(_SetAside):
     """An allocator for the buffers that Warp's deterministic launches sort their atomic additions in.
 
-    Warp has a recording keep those of each of its launches, which takes hundreds of times a world's own memory. But
-    launches follow one another, and each begins by clearing its buffers, so that all may have the same memory.
+    Warp has a recording keep those of each of its launches, which takes about a hundred times a world's own memory. But
+    launches follow one another, and each begins by clearing its buffers, so that all may have the same memory. Warp
+    clears them while it records, too: no recording may run then.
 
     Args:
         device: A CUDA device.
@@ -213,7 +214,7 @@ class Scratch(_SetAside):
         """Bytes that were handed out at once, at most."""
 
     def set_aside(self, size: int) -> None:
-        """Have so many bytes ready; more are taken when they are asked for."""
+        """Have so many bytes ready, in one piece; more are taken when they are asked for, piece by piece."""
         self._set_aside(size)
 
     def open(self) -> None:

@@ -38,7 +38,7 @@ _MOST_UNROLLED = 20
 """Iterations of the solver that fit a recording; more would take minutes to record and gain nothing."""
 
 _FEW = 256
-"""Worlds that fit anywhere, so that nobody has to ask."""
+"""Worlds that fit anywhere, so that nobody has to ask, and that tell what more of them take."""
 
 _LARGEST_BUFFER = 2**31 - 1
 """Bytes of an array that Warp makes for bytes: an axis may be no longer."""
@@ -67,7 +67,7 @@ class WarpEngine(Engine):
     recordable = True
 
     partial_refresh = True
-    """Whether worlds that begin again get a forward pass of their own, beyond kinematics, instead of one with all."""
+    """Whether worlds that begin again get a forward pass of their own, where cheap parts of it are not enough."""
 
     def __init__(
         self,
@@ -103,7 +103,8 @@ class WarpEngine(Engine):
             self.d = self._make_data(nworld)
         except (NotImplementedError, ValueError) as error:
             if "do not fit" in str(error):
-                raise
+                more = "; deterministic=True takes several times as much" if self._scratch is not None else ""
+                raise ValueError(f"{error}{more}") from None
             raise ValueError(
                 f"MuJoCo Warp refuses the model: {error}; change the model, or use engine='mujoco'"
             ) from error
@@ -139,7 +140,10 @@ class WarpEngine(Engine):
         return CanonicalOrder(model, data, between)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
-        """Another model and data of MuJoCo Warp with the same options and sizes, to measure it alone."""
+        """Another model and data of MuJoCo Warp with the same options and sizes, to measure it alone.
+
+        In deterministic mode their recordings take about a hundred times the memory, as nothing is shared.
+        """
         model, data = self._put_model(), self._make_data(self.nworld)
         with wp.ScopedDevice(self.device):
             self._in_order(model, data)  # lives on in the model's callbacks
@@ -160,7 +164,7 @@ class WarpEngine(Engine):
         if self.nworld > recordings.most:
             raise ValueError(
                 f"{self.nworld} worlds do not fit into the buffers in which Warp sorts with deterministic=True, of "
-                f"{_LARGEST_BUFFER / 1e9:.3g} GB at most: use nworld={recordings.most} at most, or leave it out"
+                f"{_LARGEST_BUFFER / 1e9:.3g} GB at most: use nworld={recordings.most} at most, or do without it"
             )
         check_fit(self._arrays_footprint() + recordings, self.nworld, self.device, held=bytes_of(self))
         self._scratch.set_aside(recordings.fixed + self.nworld * recordings.each)

@@ -47,6 +47,8 @@ class Recorder:
             function(*args)
             return
         if self._graphs[key] is None:
+            if self.device.is_cuda:  # what a recording sets aside may be cleared at once: nobody may still work in it
+                wp.synchronize_device(self.device)
             self._recording = True
             try:
                 with wp.ScopedCapture(device=self.device) as capture:
