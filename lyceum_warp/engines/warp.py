@@ -38,7 +38,10 @@ _MOST_UNROLLED = 20
 """Iterations of the solver that fit a recording; more would take minutes to record and gain nothing."""
 
 _FEW = 256
-"""Worlds that fit anywhere, so that nobody has to ask, and that tell what more of them take."""
+"""Worlds that fit anywhere, so that nobody has to ask."""
+
+_PROBED = 1024, 2048
+"""Numbers of worlds that tell what any number takes: enough of them that Warp makes no buffer larger than it has to."""
 
 _LARGEST_BUFFER = 2**31 - 1
 """Bytes of an array that Warp makes for bytes: an axis may be no longer."""
@@ -187,7 +190,7 @@ class WarpEngine(Engine):
         if self._scratch is None:
             return Footprint(0, 0)
         sizes, largest = [], []
-        for nworld in (_FEW, 2 * _FEW):
+        for nworld in _PROBED:
             model, data, scratch = self._put_model(), self._make_data(nworld), Scratch(self.device)
             with wp.ScopedDevice(self.device), scratch.serving():
                 self._in_order(model, data, scratch)
@@ -196,9 +199,9 @@ class WarpEngine(Engine):
                     mjw.step(model, data)
             sizes.append(scratch.peak)
             largest.append(scratch.largest)
-        buffer = Footprint.of(_FEW, 2 * _FEW, largest)
+        buffer = Footprint.of(*_PROBED, largest)
         most = (_LARGEST_BUFFER - buffer.fixed) // max(1, buffer.each)
-        return dataclasses.replace(Footprint.of(_FEW, 2 * _FEW, sizes), most=most)
+        return dataclasses.replace(Footprint.of(*_PROBED, sizes), most=most)
 
     # fields
 
