@@ -1,9 +1,13 @@
 """A task bound to its parameters and its model, and how its functions become kernels."""
 
+import ast
 import difflib
+import inspect
 import linecache
+import math
 import re
 import sys
+import textwrap
 from collections.abc import Collection, Mapping
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -47,7 +51,19 @@ _SPELLED = {
     "spatial_vectorf": "wp.spatial_vector",
 }  # fmt: skip
 
+_UNWRITTEN = 7.25e33
+"""A number that no observation is likely to be."""
+
 _MISSING = {"obs": 'the parts of its observation, as obs = {"position": 5}', "model": 'a model, as model = "robot.xml"'}
+
+
+def _returns(function: wp.Function) -> bool:
+    """Whether a function returns something anywhere; true, too, where its source is not known."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function.func)))  # type: ignore[arg-type]
+    except (OSError, SyntaxError, TypeError):
+        return True
+    return any(isinstance(node, ast.Return) and node.value is not None for node in ast.walk(tree))
 
 
 def task_spec(task: type[Task], model: models.ModelSource | None = None) -> mujoco.MjSpec:
@@ -119,6 +135,7 @@ class BoundTask:
         self.frame_skip = whole_number("frame_skip", task.frame_skip if frame_skip is None else frame_skip, low=1)
         self.timestep = self.model.opt.timestep * self.frame_skip
         self.nworld = nworld
+        self._sizes: dict[str, int] = {}
         self.params = self._default_params()
         self.params.update(self.checked_params(params))
         self.obs_layout = self.layout()
@@ -161,7 +178,15 @@ class BoundTask:
         if structs and self.world_struct not in structs and self.params_struct not in structs:
             return None  # another task's, left over in a notebook
         found = "".join(map(self._kind, types))
-        returned = function.func.__annotations__.get("return")
+        annotations = function.func.__annotations__
+        if any(isinstance(annotation, str) for annotation in annotations.values()):
+            raise ValueError(
+                f"{name} of the task {self.name!r} has annotations that are text, not types: leave out "
+                "'from __future__ import annotations', and quotes around types"
+            )
+        returned = annotations.get("return")
+        if result is not None and not _returns(function):
+            raise ValueError(f"{name} of the task {self.name!r} has no return: it is written as {signature}")
         if found != kinds or (returned is not None and returned is not result):
             raise ValueError(f"{name} of the task {self.name!r} has to be written as {signature}")
         return function
@@ -218,9 +243,19 @@ class BoundTask:
 
     def _converted(self, name: str, value: Any) -> Any:
         """A parameter as what its field holds: a scalar or vector, or an array with one a world."""
-        if isinstance(value, Element):
-            return elements(self.model, value.field, value.name).start
         kind = self.params_struct.vars[name].type
+        default = getattr(self.params_struct.cls, name, None)
+        if isinstance(value, Element):
+            if not isinstance(default, Element) or default.field != value.field:
+                raise ValueError(
+                    f"the parameter {name} of {self.name!r} can't be an element of {value.field!r}: it is "
+                    + (f"one of {default.field!r}" if isinstance(default, Element) else "a number")
+                )
+            if kind is not wp.int32:
+                raise ValueError(f"the parameter {name} of {self.name!r} has to be declared as int: it is an index")
+            return elements(self.model, value.field, value.name).start
+        if isinstance(default, Element) and isinstance(value, str):
+            return elements(self.model, default.field, value).start
         width = getattr(kind, "_shape_", ())
         is_number = not width
         try:
@@ -229,6 +264,13 @@ class BoundTask:
             raise ValueError(f"the parameter {name}={value!r} of {self.name!r} is no number: {error}") from error
         if np.isnan(array).any():
             raise ValueError(f"the parameter {name}={value!r} of {self.name!r} is not a number")
+        if isinstance(default, Element):
+            count = self._places(default.field)
+            if ((array < 0) | (array >= count)).any():
+                raise ValueError(
+                    f"the parameter {name}={value!r} of {self.name!r} is an index of {default.field!r}, of which the "
+                    f"model has {count}: give one from 0 to {count - 1}, or a name"
+                )
         if array.shape == tuple(width):
             if not is_number:
                 return kind(*array.ravel())
@@ -242,6 +284,12 @@ class BoundTask:
             f"the parameter {name} of {self.name!r} has shape {array.shape}; it takes {tuple(width) or 'one number'}"
             f", or one a world, {per_world}"
         )
+
+    def _places(self, field: str) -> int:
+        """How many places a field has, of which an index names one."""
+        if field not in self._sizes:
+            self._sizes[field] = len(getattr(mujoco.MjData(self.model), field))
+        return self._sizes[field]
 
     def _instance(self, world: int) -> Any:
         instance = self.params_struct()
@@ -281,16 +329,22 @@ class BoundTask:
         """
         nobs = sum(self.obs_layout.values())
         device = params.device
-        row = wp.full((1, nobs + 64), float("nan"), dtype=float, device=device)
         mask = wp.full(1, True, dtype=bool, device=device)
-        wp.launch(self.kernels.look, 1, [mask, batch, params, row], device=device)
-        written = ~np.isnan(row.numpy()[0])
+        written = np.zeros(nobs + 64, dtype=bool)
+        for unwritten in (math.nan, _UNWRITTEN):
+            row = wp.full((1, nobs + 64), unwritten, dtype=float, device=device)
+            wp.launch(self.kernels.look, 1, [mask, batch, params, row], device=device)
+            found = row.numpy()[0]
+            written |= ~np.isnan(found) if math.isnan(unwritten) else found != np.float32(unwritten)
         if written[nobs:].any():
             last = int(np.flatnonzero(written).max()) + 1
             raise ValueError(f"observe of the task {self.name!r} writes {last} numbers, but obs declares {nobs}")
         if not written[:nobs].all():
             places = np.flatnonzero(~written[:nobs]).tolist()
             raise ValueError(f"observe of the task {self.name!r} leaves the places {places} of obs unwritten")
+        if np.isnan(found[:nobs]).any():
+            places = np.flatnonzero(np.isnan(found[:nobs])).tolist()
+            raise ValueError(f"observe of the task {self.name!r} makes the places {places} of obs not a number (NaN)")
 
     def params_array(self, device: wp.Device) -> wp.array:
         """The parameters as the kernels read them: one entry, or one a world where any differs."""

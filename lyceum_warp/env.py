@@ -141,6 +141,7 @@ class Env(Worlds):
         self._given_params = dict(params)
         whole_number("seed", seed, low=0)  # before anything large is made
         self.timestep: float = self.task.timestep  # seconds in a step
+        # what both engines were made of: changes here reach neither, an MjSpec that was changed is given as model=
         self.model: mujoco.MjModel = self.task.model
         self.engine = open_engine(
             engine, self.model, self.nworld, self.device, nthread=nthread, nconmax=nconmax, njmax=njmax,

@@ -92,7 +92,14 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
     if not path.is_file():
         if Path(source).name != str(source):
             raise FileNotFoundError(f"there is no model file {str(source)!r}")
-        path = _GYMNASIUM.path(str(source))
+        try:
+            path = _GYMNASIUM.path(str(source))
+        except FileNotFoundError as error:
+            close = difflib.get_close_matches(path.name, [file.name for file in path.parent.glob("*.xml")], 3)
+            hint = f" (did you mean {' or '.join(close)}?)" if close else ""
+            raise FileNotFoundError(
+                f"there is no model file {path}{hint}, and of Gymnasium's models: {error}"
+            ) from None
     try:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:

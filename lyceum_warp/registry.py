@@ -6,12 +6,17 @@ import importlib.util
 import pkgutil
 import re
 import sys
+import traceback
 import zlib
 from pathlib import Path
+from types import ModuleType
 
 from lyceum_warp.task import Task
 
 _tasks: dict[str, type[Task]] = {}
+
+_loaded: dict[str, tuple[int, int]] = {}
+"""What the files of tasks were when they were run, by the names of their modules: when written, and how long."""
 
 
 def register(task: type[Task]) -> type[Task]:
@@ -65,8 +70,10 @@ def task_names() -> list[str]:
 def find_task(task: str | Path | type[Task]) -> type[Task]:
     """The class of a task, by name, by file (``path/to/file.py`` or ``path/to/file.py:Class``), or itself.
 
+    A file that has changed since is run again; environments that are there keep what they were made of.
+
     Raises:
-        ValueError: There is no such task.
+        ValueError: There is no such task, or its file can't be run.
         FileNotFoundError: There is no such file.
     """
     if isinstance(task, type) and issubclass(task, Task):
@@ -87,21 +94,37 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
     return _tasks[task]
 
 
+def _run(path: Path, name: str) -> None:
+    """Make a file a module, in the place of what it was before."""
+    module = ModuleType(name)
+    module.__file__ = str(path)
+    before = sys.modules.get(name)
+    sys.modules[name] = module
+    try:
+        # not through an importer, whose bytecode is of the same second
+        exec(compile(path.read_bytes(), str(path), "exec"), vars(module))
+    except BaseException as error:
+        del sys.modules[name]
+        if before is not None:
+            sys.modules[name] = before
+        if not isinstance(error, Exception) or isinstance(error, ImportError):
+            raise
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
+        where = str(path) if line is None else f"{path}, line {line}"
+        raise ValueError(f"the task file {where}: {type(error).__name__}: {str(error).strip()}") from error
+
+
 def _task_of_file(path: Path, attribute: str) -> type[Task]:
     if not path.is_file():
         raise FileNotFoundError(f"there is no task file {str(path)!r}")
     name = f"{_FILE}{path.stem}_{zlib.crc32(str(path.resolve()).encode()):08x}"
-    module = sys.modules.get(name)
-    if module is None:
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec is not None and spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[name] = module
-        try:
-            spec.loader.exec_module(module)
-        except BaseException:
-            del sys.modules[name]
-            raise
+    stat = path.stat()
+    version = stat.st_mtime_ns, stat.st_size
+    if name not in sys.modules or _loaded.get(name) != version:
+        _run(path, name)
+        _loaded[name] = version
+    module = sys.modules[name]
     found = {
         key: value
         for key, value in vars(module).items()

@@ -21,6 +21,29 @@ def whole_number(name: str, value: Any, *, low: int, high: int = 2**31 - 1) -> i
     return number
 
 
+def check_kind(name: str, value: Any, kind: Any, example: str) -> None:
+    """Refuse something of another type.
+
+    Raises:
+        ValueError: It is.
+    """
+    if not isinstance(value, kind):
+        wanted = getattr(kind, "__name__", str(kind).rpartition(".")[2])
+        raise ValueError(f"{name} has to be of type {wanted}, {example}, not {described(value)}")
+
+
+def layer_sizes(hidden: Any) -> list[int]:
+    """Widths of hidden layers.
+
+    Raises:
+        ValueError: They are none.
+    """
+    try:
+        return [whole_number("a width", width, low=1) for width in hidden]
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"hidden layers are given by their widths, as in (64, 64), not as {hidden!r}") from error
+
+
 def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:
     """Compare something given with the buffer that it is meant for.
 

@@ -203,6 +203,9 @@ def test_resume_from_a_broken_checkpoint(trained: Path, tmp_path: Path, capsys: 
     (tmp_path / "checkpoint.pt").write_bytes(whole)
     assert cli.main(resume) == 2
     refused(capsys, "does not fit the configuration beside it")
+    (tmp_path / "config.json").write_text(config.replace('"nworld": 2', '"nworld": "many"'))
+    assert cli.main(["train", "--resume", str(tmp_path), "--iterations", "9"]) == 2
+    refused(capsys, "config.json is not the configuration of an NPG run (nworld is 'many')")
     assert (tmp_path / "metrics.csv").read_bytes() == (trained / "metrics.csv").read_bytes()
 
 

@@ -321,6 +321,13 @@ def test_an_episode_ends_by_itself_when_it_is_over(env: lw.Env) -> None:
     assert episode.steps == 40 and episode.truncated
 
 
+def test_a_policy_alone_is_no_controller(env: lw.Env) -> None:
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
+    with pytest.raises(ValueError, match=r"GaussianPolicy takes one argument: give lambda state, obs: policy\(obs\)"):
+        control(env, policy, steps=2)
+    assert control(env, lambda state, obs: policy(obs), steps=2).steps == 2
+
+
 def test_an_error_of_the_controller_is_raised(env: lw.Env) -> None:
     calls = []
 

@@ -414,3 +414,14 @@ def test_gpu_resumes() -> None:
     assert again.kl == pytest.approx(first.kl, rel=1e-2)
     assert again.value_error == pytest.approx(first.value_error, rel=1e-2)
     assert again.gradient_norm == pytest.approx(first.gradient_norm, rel=1e-2)
+
+
+def test_what_is_no_environment_or_no_configuration_is_refused() -> None:
+    env = lw.make("point_mass", nworld=2)
+    with pytest.raises(ValueError, match=r"env of NPG has to be of type Env, as lw.make\(...\) .*, not str 'hopper'"):
+        lw.NPG("hopper")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"config of NPG has to be of type NPGConfig .* not dict"):
+        lw.NPG(env, config={"samples": 3})  # type: ignore[arg-type]
+    for hidden in (8, (8, 0), "wide"):
+        with pytest.raises(ValueError, match=r"hidden layers are given by their widths, as in \(64, 64\), not as "):
+            lw.NPG(env, config=lw.NPGConfig(hidden=hidden))  # type: ignore[arg-type]

@@ -29,6 +29,11 @@ class CheckedController:
                 "the controller plans in the very environment that it is to control, whose state its roll-outs move "
                 "on: control another one, made with lw.make(..., autoreset=False)"
             )
+        if isinstance(controller, torch.nn.Module) and _takes_one(controller.forward):
+            raise ValueError(
+                f"a controller is called with (state, obs), and {type(controller).__name__} takes one argument: give "
+                "lambda state, obs: policy(obs)"
+            )
         self._controller = controller
         self._names = list(env.action_space.parts)
         timestep = getattr(controller, "timestep", env.timestep)
@@ -92,6 +97,14 @@ class CheckedController:
             number, name = plan[tuple(where)].item(), self._names[where[-1]]
             raise ValueError(f"the controller wants {name!r} to be {number} at step {step}: it has to be finite")
         return plan
+
+
+def _takes_one(function: Callable[..., Any]) -> bool:
+    try:
+        inspect.signature(function).bind(None, None)
+    except TypeError:
+        return True
+    return False
 
 
 def seconds_of(name: str, value: Any) -> float:

@@ -21,6 +21,7 @@ from lyceum_warp.algos.timing import Clock, one_thread
 from lyceum_warp.algos.value import ValueFit, ValueFunction
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import returns
+from lyceum_warp.validate import check_kind
 
 log = logging.getLogger(__name__)
 
@@ -168,6 +169,8 @@ class NPG:
         seed: int = 0,
         team: Team | None = None,
     ) -> None:
+        check_kind("env of NPG", env, Env, "as lw.make(...) makes it")
+        check_kind("config of NPG", config, NPGConfig | None, "as lw.NPGConfig(samples=10000)")
         self.env = env
         self.team = team = team or Team()
         self.config = config = config or NPGConfig()
@@ -213,8 +216,7 @@ class NPG:
         self._fisher_count, self._fisher_rows = len(places), rows[own].to(device)
         # a seed of its own: the same numbers should not make both the weights and the noise
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
-        self.iteration = 0
-        self.samples = 0
+        self.iteration = self.samples = 0
         self._advantage = torch.empty_like(self.rollout.reward)
         self._return = torch.empty_like(self.rollout.reward)
         self._mean_env: Env | None = None

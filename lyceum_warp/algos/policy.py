@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
+from lyceum_warp.validate import layer_sizes
 
 
 def mlp(sizes: Sequence[int], *, last_scale: float = 1.0, generator: torch.Generator | None = None) -> nn.Sequential:
@@ -96,7 +97,7 @@ class GaussianPolicy(nn.Module):
     ) -> None:
         super().__init__()
         self.nobs, self.nact = nobs, nact
-        self.shape = {"nobs": nobs, "nact": nact, "hidden": list(hidden), "normalize": normalize}
+        self.shape = {"nobs": nobs, "nact": nact, "hidden": layer_sizes(hidden), "normalize": normalize}
         self.normalizer: nn.Module = Normalizer(nobs) if normalize else nn.Identity()
         # a last layer near zero starts every mean near the middle of its range (mjrl)
         self.network = mlp([nobs, *hidden, nact], last_scale=1e-2, generator=generator)

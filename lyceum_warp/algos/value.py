@@ -9,6 +9,7 @@ from torch import nn
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.policy import Normalizer, mlp
 from lyceum_warp.algos.timing import one_thread
+from lyceum_warp.validate import layer_sizes
 
 
 class ValueFunction(nn.Module):
@@ -45,7 +46,8 @@ class ValueFunction(nn.Module):
         super().__init__()
         self.scale, self.discount = scale, discount
         self._shape = {
-            "nobs": nobs, "hidden": list(hidden), "scale": scale, "time_orders": time_orders, "normalize": normalize,
+            "nobs": nobs, "hidden": layer_sizes(hidden), "scale": scale, "time_orders": time_orders,
+            "normalize": normalize,
         }  # fmt: skip
         self.normalizer: nn.Module = Normalizer(nobs) if normalize else nn.Identity()
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)

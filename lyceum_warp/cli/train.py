@@ -126,6 +126,9 @@ def saved_options(folder: Path) -> Train:
     config = Run.open(folder).config
     try:
         npg = _hyperparameters(config)
+        for name in ("iterations", "seed", "nworld", "threads"):
+            if not isinstance(config[name], int):
+                raise TypeError(f"{name} is {config[name]!r}")
         return Train(
             task=config["task"], iterations=config["iterations"], seed=config["seed"], resume=folder,
             engine=config["engine"], device=config["device"], nworld=config["nworld"],
@@ -171,8 +174,9 @@ def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, NPG]:
     try:
         npg.load_state_dict(run.read(npg.env.obs.device)["state"])
     except (KeyError, RuntimeError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {reason}") from error
+        raise ValueError(
+            f"{run.checkpoint} does not fit the configuration beside it: {' '.join(str(error).split())}"
+        ) from error
     return run, npg
 
 
