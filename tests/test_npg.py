@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from conftest import TaskFile
 
 import lyceum_warp as lw
 from lyceum_warp.algos.distributed import Team
@@ -262,7 +263,7 @@ def test_gradient_that_is_not_finite_leaves_the_policy_alone(env: lw.Env) -> Non
         npg.policy.log_std.fill_(-4.0)  # below its limit, which is only kept to by a step
         npg.value.network[0].weight[0, 0] = math.nan
     before = [p.clone() for p in (*npg.policy.parameters(), *npg.value.parameters())]
-    with pytest.raises(FloatingPointError, match="gradient of iteration 1 is not finite"):
+    with pytest.raises(FloatingPointError, match="gradient of iteration 1 is not finite; .* finite: make the step"):
         next(npg)
     after = (*npg.policy.parameters(), *npg.value.parameters())
     assert all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(before, after, strict=True))
@@ -425,3 +426,51 @@ def test_what_is_no_environment_or_no_configuration_is_refused() -> None:
     for hidden in (8, (8, 0), "wide"):
         with pytest.raises(ValueError, match=r"hidden layers are given by their widths, as in \(64, 64\), not as "):
             lw.NPG(env, config=lw.NPGConfig(hidden=hidden))  # type: ignore[arg-type]
+
+
+NAN = """
+import warp as wp
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    qvel: Row[float]
+
+@wp.struct
+class Params:
+    dt: float
+    where: int = 0
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    obs[0] = s.qpos[0]
+    obs[1] = s.qpos[1]
+    if p.where == 1:
+        obs[2] = wp.sqrt(s.qpos[1] - 1.2)
+    else:
+        obs[2] = 0.0
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    if p.where == 0 and s1.qpos[1] < 1.2:
+        return wp.sqrt(s1.qpos[1] - 1.2)
+    return 0.0
+
+class Fragile(lw.Task):
+    model = "hopper.xml"
+    obs = {"place": 2, "root": 1}
+"""
+
+
+@pytest.mark.parametrize("where, what", [
+    (0, r"The reward of the task 'fragile' is -?nan, \d+ steps after a reset of world \d, and not finite in \d+ of 32"),
+    (1, r"The observation of the task 'fragile' is -?nan in 'root', \d+ steps after a reset of world \d, and not"),
+])  # fmt: skip
+def test_what_is_not_finite_is_named(where: int, what: str, task_file: TaskFile) -> None:
+    env = lw.make(str(task_file("fragile.py", NAN)), nworld=4, where=where, horizon=80)
+    npg = lw.NPG(env, config=dataclasses.replace(SMALL, mean_every=0))
+    with pytest.raises(FloatingPointError, match=what):
+        for _ in range(5):
+            next(npg)

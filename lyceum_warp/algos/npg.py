@@ -261,8 +261,8 @@ class NPG:
         rows = team.gather(torch.cat([torch.stack([x.double() for x in own]), finished(rollout)])[None]).tolist()
         if not rows[0][0]:
             raise FloatingPointError(
-                f"the policy gradient of iteration {self.iteration + 1} is not finite; the policy was left as it "
-                "was. Check the task's rewards and observations, or make the step (delta) smaller"
+                f"the policy gradient of iteration {self.iteration + 1} is not finite; the policy was left as it was. "
+                f"{rollout.trouble()}"
             )
 
         # 5. The value function, on the returns of these samples.

@@ -115,6 +115,24 @@ class Rollout:
         env.set_state(state)
         self.running_return.masked_fill_(first > 0, torch.nan)
 
+    def trouble(self) -> str:
+        """In a sentence, what in the record is not finite; waits for the device."""
+        for name, values in (("reward", self.reward), ("observation", self.obs), ("observation", self.final_obs)):
+            bad = ~values.isfinite()
+            if not bad.any():
+                continue
+            samples = bad.view(*bad.shape[:2], -1).any(-1)
+            t, world, *place = bad.nonzero()[0].tolist()
+            number, step = values[t, world, *place].item(), int(self.step[t, world])
+            spans = self.env.obs_space.parts.items()
+            part = [f" in {part!r}" for part, span in spans for i in place if span.start <= i < span.stop]
+            return (
+                f"The {name} of the task {self.env.task.name!r} is {number}{''.join(part)}, {step} steps after a reset "
+                f"of world {self.env.first_world + world}, and not finite in {int(samples.sum())} of "
+                f"{samples.numel()} samples"
+            )
+        return "Rewards and observations are finite: make the step (delta) smaller"
+
     def _before_step(self) -> None:
         n, width = self.env.nworld, max(self.env.obs_space.size, self.env.action_space.size)
         args = [self._index, *self._inputs, self._record]
