@@ -97,19 +97,19 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
 def _run(path: Path, name: str) -> None:
     """Make a file a module, in the place of what it was before."""
     module = ModuleType(name)
-    module.__file__ = str(path)
+    module.__file__ = file = str(path.resolve())
     before = sys.modules.get(name)
     sys.modules[name] = module
     try:
         # not through an importer, whose bytecode is of the same second
-        exec(compile(path.read_bytes(), str(path), "exec"), vars(module))
+        exec(compile(path.read_bytes(), file, "exec"), vars(module))
     except BaseException as error:
         del sys.modules[name]
         if before is not None:
             sys.modules[name] = before
         if not isinstance(error, Exception) or isinstance(error, ImportError):
             raise
-        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
         where = str(path) if line is None else f"{path}, line {line}"
         raise ValueError(f"the task file {where}: {type(error).__name__}: {str(error).strip()}") from error
