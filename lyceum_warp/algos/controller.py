@@ -29,7 +29,8 @@ class CheckedController:
                 "the controller plans in the very environment that it is to control, whose state its roll-outs move "
                 "on: control another one, made with lw.make(..., autoreset=False)"
             )
-        if isinstance(controller, torch.nn.Module) and _takes_one(controller.forward):
+        forward = controller.forward if isinstance(controller, torch.nn.Module) else controller
+        if _takes(forward, 1) and not _takes(forward, 2):
             raise ValueError(
                 f"a controller is called with (state, obs), and {type(controller).__name__} takes one argument: give "
                 "lambda state, obs: policy(obs)"
@@ -99,12 +100,13 @@ class CheckedController:
         return plan
 
 
-def _takes_one(function: Callable[..., Any]) -> bool:
+def _takes(function: Callable[..., Any], count: int) -> bool:
+    """Whether a function can be called with so many arguments."""
     try:
-        inspect.signature(function).bind(None, None)
-    except TypeError:
-        return True
-    return False
+        inspect.signature(function).bind(*[None] * count)
+    except (TypeError, ValueError):  # of some functions in C nothing is known
+        return False
+    return True
 
 
 def seconds_of(name: str, value: Any) -> float:

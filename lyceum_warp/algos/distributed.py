@@ -80,7 +80,7 @@ class Team:
         return tensor
 
     def largest(self, number: int) -> int:
-        """The largest of the processes' numbers."""
+        """The largest of the processes' numbers; several wait for their devices."""
         if self.size == 1:
             return number
         numbers = torch.tensor(number, device=self.device)
