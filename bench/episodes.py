@@ -23,8 +23,8 @@ import tyro
 from rich.console import Console
 
 import lyceum_warp as lw
-from lyceum_warp.algos.report import wilson
-from lyceum_warp.cli.common import parameter
+from lyceum_warp.cli.arguments import parameter
+from lyceum_warp.control.control_report import wilson
 from lyceum_warp.versions import versions
 
 

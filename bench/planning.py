@@ -34,9 +34,9 @@ from rich.console import Console
 from rich.table import Table
 
 import lyceum_warp as lw
-from lyceum_warp.cli.common import parameter
-from lyceum_warp.engines.c import MujocoEngine
-from lyceum_warp.engines.warp import WarpEngine
+from lyceum_warp.cli.arguments import parameter
+from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
+from lyceum_warp.engines.warp.warp_engine import WarpEngine
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 

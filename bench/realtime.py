@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 import lyceum_warp as lw
-from lyceum_warp.viz.control import control_plot
+from lyceum_warp.viz.control_plot import control_plot
 
 
 @dataclasses.dataclass(frozen=True)

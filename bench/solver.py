@@ -21,7 +21,7 @@ from rich.table import Table
 from throughput import seconds
 
 import lyceum_warp as lw
-from lyceum_warp.kernels.faults import FAULTS
+from lyceum_warp.done import FAULTS
 
 
 def limits(iterations: int, ls_iterations: int | None = None) -> dict[str, Any]:

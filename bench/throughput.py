@@ -29,8 +29,8 @@ from rich.console import Console
 from rich.table import Table
 
 import lyceum_warp as lw
-from lyceum_warp.engines.c import MujocoEngine
-from lyceum_warp.engines.warp import WarpEngine
+from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
+from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import Stage
 
 GYMNASIUM = {

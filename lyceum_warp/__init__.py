@@ -5,21 +5,21 @@ import warp as _wp
 if _wp.config.log_level == _wp.LOG_INFO:  # Warp's default, at which it greets and reports every kernel
     _wp.config.log_level = _wp.LOG_WARNING
 
-from lyceum_warp.algos.control import ControlProgress, control, control_async
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.npg import NPG, Iteration, NPGConfig
 from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.algos.report import ControlReport, control_report
-from lyceum_warp.algos.rollout import Episodes, Rollout, evaluate
-from lyceum_warp.algos.trajectory import Trajectory
+from lyceum_warp.algos.rollout_buffer import Episodes, Rollout, evaluate
 from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.binding.models import gymnasium_model, gymnasium_robotics_model
+from lyceum_warp.binding.registry import register, task_names
+from lyceum_warp.control.control_report import ControlReport, control_report
+from lyceum_warp.control.loop import ControlProgress, control, control_async
+from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.done import Done
 from lyceum_warp.env import Env, make
 from lyceum_warp.fields import vec10
-from lyceum_warp.kernels.faults import Done
 from lyceum_warp.kernels.random import normal, uniform
-from lyceum_warp.models import gymnasium_model, gymnasium_robotics_model
 from lyceum_warp.openloop import OpenLoop
-from lyceum_warp.registry import register, task_names
 from lyceum_warp.runs import load, load_value
 from lyceum_warp.task import Row, Task, body, dof, geom, mocap, qpos, sensor, site
 

@@ -8,19 +8,19 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.bound import BoundTask
+from lyceum_warp.arrays import torch_view
+from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.models import ModelSource
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.done import FAULTS
 from lyceum_warp.engines import ON_CPU_CORES, EngineFactory, find_device, open_engine
 from lyceum_warp.engines.memory import bytes_of
 from lyceum_warp.fields import elements
+from lyceum_warp.graphs.compile_ahead import compile_ahead
+from lyceum_warp.graphs.recorder import Recorder
 from lyceum_warp.kernels import random, steps
-from lyceum_warp.kernels.arrays import torch_view
-from lyceum_warp.kernels.faults import FAULTS
-from lyceum_warp.kernels.recorder import Recorder
-from lyceum_warp.models import ModelSource
-from lyceum_warp.registry import find_task
 from lyceum_warp.task import Task
 from lyceum_warp.validate import check_tensor, whole_number
-from lyceum_warp.warmup import compile_ahead
 from lyceum_warp.worlds import PHASES, Worlds
 
 

@@ -5,9 +5,9 @@ from collections.abc import Callable, Hashable
 import torch
 import warp as wp
 
+from lyceum_warp.arrays import launch_rows, torch_view
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import planning, state
-from lyceum_warp.kernels.arrays import torch_view
 from lyceum_warp.spaces import COUNTERS
 from lyceum_warp.validate import whole_number
 
@@ -104,7 +104,7 @@ class OpenLoop:
         counters = [env._everyone, rest, env._step, env._key, env._episode, env._out.done_reason]
         wp.launch(state.unpack_counters, env.nworld, counters, device=env.device)
         if self._memory is not None:
-            state.launch_rows(state.narrow, env._everyone, rest[:, len(COUNTERS) :], env._memory)
+            launch_rows(state.narrow, env._everyone, rest[:, len(COUNTERS) :], env._memory)
             wp.copy(self._memory[0], env._memory)
         self._fault.zero_()
         args = [self._actions, env._ranges, env._scale, self._fault, self._controls]

@@ -5,13 +5,13 @@ from collections.abc import Callable, Hashable
 import torch
 import warp as wp
 
-from lyceum_warp.bound import BoundTask
+from lyceum_warp.arrays import launch_rows, torch_view
+from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.done import FAULTS
 from lyceum_warp.engines import Engine
 from lyceum_warp.fields import Stage
+from lyceum_warp.graphs.recorder import Recorder
 from lyceum_warp.kernels import random, state, steps
-from lyceum_warp.kernels.arrays import torch_view
-from lyceum_warp.kernels.faults import FAULTS
-from lyceum_warp.kernels.recorder import Recorder
 from lyceum_warp.spaces import COUNTERS, Space, action_space, control_map, state_space
 from lyceum_warp.validate import check_tensor
 
@@ -166,7 +166,7 @@ class Worlds:
         """Put the masked worlds into an initial state of the task."""
         self.engine.reset(mask)
         if self.task.task.memory:
-            state.launch_rows(state.copy_rows, mask, self._no_memory, self._memory)
+            launch_rows(state.copy_rows, mask, self._no_memory, self._memory)
         wp.launch(self.task.kernels.restart, self.nworld, [
             mask, randomly, self._after, self._params, self._key, self._rng, self._step, self._episode,
         ], device=self.device)  # fmt: skip
@@ -221,7 +221,7 @@ class Worlds:
         counters = [self._step, self._key, self._episode, ended, self._state[:, size:]]
         wp.launch(state.pack_counters, self.nworld, counters, device=self.device)
         if self.task.task.memory:
-            state.launch_rows(state.widen, self._everyone, self._memory, self._state[:, size + len(COUNTERS) :])
+            launch_rows(state.widen, self._everyone, self._memory, self._state[:, size + len(COUNTERS) :])
 
     def _unpack(self) -> None:
         """Put the masked worlds into the state vector's states; every getter tells of them afterwards."""
@@ -235,4 +235,4 @@ class Worlds:
         counters = [self._mask, self._state[:, size:], self._step, self._key, self._episode, self._out.done_reason]
         wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)
         if self.task.task.memory:
-            state.launch_rows(state.narrow, self._mask, self._state[:, size + len(COUNTERS) :], self._memory)
+            launch_rows(state.narrow, self._mask, self._state[:, size + len(COUNTERS) :], self._memory)

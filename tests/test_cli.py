@@ -20,12 +20,13 @@ import warp as wp
 from conftest import TaskFile
 
 import lyceum_warp as lw
-from lyceum_warp import cli, report
+from lyceum_warp import cli
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.npg import MEAN_SEED
-from lyceum_warp.cli.common import Interrupted, parameter, postponed, signals, spelled
+from lyceum_warp.binding.registry import find_task, task_names
+from lyceum_warp.cli import display as report
+from lyceum_warp.cli.arguments import Interrupted, parameter, postponed, signals, spelled
 from lyceum_warp.cli.train import Train, _config
-from lyceum_warp.registry import find_task, task_names
 from lyceum_warp.runs import Run, load
 
 TINY = ["--samples", "512", "--nworld", "2", "--hidden", "8", "--value-hidden", "8", "--mean-every", "2",

@@ -16,9 +16,9 @@ from test_cli import QUIET, TINY, interrupted, refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.algos.control import ControlProgress
-from lyceum_warp.algos.trajectory import Trajectory
-from lyceum_warp.report import PlanDisplay
+from lyceum_warp.cli.display import PlanDisplay
+from lyceum_warp.control.loop import ControlProgress
+from lyceum_warp.control.trajectory import Trajectory
 
 # tests may run in the background, where a shell has its children ignore SIGINT
 HEAR_SIGINT = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "

@@ -11,9 +11,9 @@ from conftest import settle
 from toy_engine import ToyEngine
 
 import lyceum_warp as lw
-from lyceum_warp.engines.c import MujocoEngine
-from lyceum_warp.kernels.recorder import Recorder
-from lyceum_warp.registry import find_task
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
+from lyceum_warp.graphs.recorder import Recorder
 from lyceum_warp.testing import CHECKS, check_task
 
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]

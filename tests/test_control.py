@@ -12,11 +12,11 @@ import pytest
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.algos import control as module
-from lyceum_warp.algos.control import ControlProgress, control, control_async
-from lyceum_warp.algos.controller import CheckedController
-from lyceum_warp.algos.report import control_report
-from lyceum_warp.algos.trajectory import Trajectory
+from lyceum_warp.control import loop as module
+from lyceum_warp.control.control_report import control_report
+from lyceum_warp.control.controller import CheckedController
+from lyceum_warp.control.loop import ControlProgress, control, control_async
+from lyceum_warp.control.trajectory import Trajectory
 
 
 @pytest.fixture(scope="module")

@@ -15,9 +15,9 @@ import pytest
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.algos.control import ControlProgress, control, control_async
-from lyceum_warp.algos.report import control_report
-from lyceum_warp.algos.trajectory import Trajectory
+from lyceum_warp.control.control_report import control_report
+from lyceum_warp.control.loop import ControlProgress, control, control_async
+from lyceum_warp.control.trajectory import Trajectory
 
 Run = Callable[..., Trajectory]
 BOTH = pytest.mark.parametrize("run", [control, control_async])

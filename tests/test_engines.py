@@ -15,9 +15,9 @@ import warp as wp
 from conftest import TaskFile
 
 import lyceum_warp as lw
-from lyceum_warp.engines.order import CanonicalOrder
-from lyceum_warp.engines.warp import WarpEngine
-from lyceum_warp.kernels import order
+from lyceum_warp.engines.deterministic import order_kernels as order
+from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
+from lyceum_warp.engines.warp.warp_engine import WarpEngine
 
 TASK = """
 import mujoco

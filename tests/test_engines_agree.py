@@ -15,7 +15,7 @@ import torch
 
 import lyceum_warp as lw
 import lyceum_warp.tasks
-from lyceum_warp.kernels.arrays import torch_view
+from lyceum_warp.arrays import torch_view
 
 NWORLD = 32
 TASKS = [module.name for module in pkgutil.iter_modules(lyceum_warp.tasks.__path__)]

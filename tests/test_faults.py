@@ -20,8 +20,8 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp import Done
+from lyceum_warp.done import FAULTS
 from lyceum_warp.engines import find_device, open_engine
-from lyceum_warp.kernels.faults import FAULTS
 from lyceum_warp.testing import OUTCOMES
 
 ENGINES = ["mujoco", "warp"]

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp.engines.warp import WarpEngine
+from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.testing import check_task
 
 pytestmark = pytest.mark.gpu

@@ -15,7 +15,7 @@ import lyceum_warp as lw
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.npg import FisherProduct, conjugate_gradient
 from lyceum_warp.algos.policy import Normalizer
-from lyceum_warp.algos.rollout import finished, summary
+from lyceum_warp.algos.rollout_buffer import finished, summary
 from lyceum_warp.algos.value import ValueFit, _CapturedStep
 from lyceum_warp.kernels import returns
 from lyceum_warp.runs import Run

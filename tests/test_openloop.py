@@ -11,10 +11,10 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp import Done, Row
-from lyceum_warp.engines import c
-from lyceum_warp.engines.native import NativeRollout
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.engines.c import mujoco_engine as c
+from lyceum_warp.engines.c.native_rollout import NativeRollout
 from lyceum_warp.openloop import OpenLoop
-from lyceum_warp.registry import find_task
 
 SharedEnv = Callable[..., lw.Env]
 ENGINES = ["mujoco", "warp"]

@@ -12,10 +12,10 @@ import torch
 from test_control import clocked, towards
 
 import lyceum_warp as lw
-from lyceum_warp.algos.control import control
-from lyceum_warp.algos.report import control_report, wilson
-from lyceum_warp.algos.trajectory import Trajectory
-from lyceum_warp.viz.control import control_plot
+from lyceum_warp.control.control_report import control_report, wilson
+from lyceum_warp.control.loop import control
+from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.viz.control_plot import control_plot
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp.runs import Run
-from lyceum_warp.viz import plot, video
+from lyceum_warp.viz import learning_curve as plot
+from lyceum_warp.viz import video
 from lyceum_warp.viz._render import camera
 
 

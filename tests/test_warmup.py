@@ -18,12 +18,12 @@ import lyceum_warp as lw
 from lyceum_warp.cli import main
 from lyceum_warp.engines import memory
 from lyceum_warp.engines.memory import Footprint, Scratch, bytes_of, check_fit
-from lyceum_warp.kernels.rehearsal import rehearse
+from lyceum_warp.graphs.rehearsal import rehearse
 from lyceum_warp.kernels.state import rank_worlds
 
 SCRIPT = """
 import warp as wp
-from lyceum_warp.warmup import compile_ahead
+from lyceum_warp.graphs.compile_ahead import compile_ahead
 
 @wp.kernel(module="unique", enable_backward=False)
 def one(a: wp.array[float]):

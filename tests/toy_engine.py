@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage
 from lyceum_warp.kernels import faults, state
-from lyceum_warp.kernels.arrays import flat
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
@@ -94,16 +94,16 @@ class ToyEngine(Engine):
         wp.launch(faults.faults_of_rows, self.nworld, [mask, self._rows, nphysics, self._warning, self.fault])
 
     def reset(self, mask: wp.array) -> None:
-        state.launch_rows(state.fill_rows64, mask, self._initial, self._rows)
+        launch_rows(state.fill_rows64, mask, self._initial, self._rows)
         self._read_state_fields(mask)
 
     def _read_state_fields(self, mask: wp.array) -> None:
         for name, column in self._columns.items():
-            state.launch_rows(state.narrow, mask, column, flat(self.arrays[name]))
+            launch_rows(state.narrow, mask, column, flat(self.arrays[name]))
 
     def commit(self, mask: wp.array) -> None:
         for name, column in self._columns.items():
-            state.launch_rows(state.widen, mask, flat(self.arrays[name]), column)
+            launch_rows(state.widen, mask, flat(self.arrays[name]), column)
 
     def refresh(self, mask: wp.array) -> None:
         self._forward(mask, self.reset_stage, list(self.fields.values()))
@@ -121,7 +121,7 @@ class ToyEngine(Engine):
     # state
 
     def _get_integration(self, state_out: wp.array, mask: wp.array) -> None:
-        state.launch_rows(state.copy_rows64, mask, self._rows, state_out)
+        launch_rows(state.copy_rows64, mask, self._rows, state_out)
 
     def _set_integration(self, state_in: wp.array, mask: wp.array) -> None:
-        state.launch_rows(state.copy_rows64, mask, state_in, self._rows)
+        launch_rows(state.copy_rows64, mask, state_in, self._rows)

@@ -22,19 +22,19 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.algos.rollout import moved
+from lyceum_warp.algos.rollout_buffer import moved
 from lyceum_warp.algos.value import ValueFunction
-from lyceum_warp.bound import task_spec
+from lyceum_warp.arrays import torch_view
+from lyceum_warp.binding.bound_task import task_spec
+from lyceum_warp.binding.registry import find_task
 from lyceum_warp.engines import ON_CPU_CORES, find_device
 from lyceum_warp.env import Env
+from lyceum_warp.graphs.compile_ahead import workers
 from lyceum_warp.kernels import planning
-from lyceum_warp.kernels.arrays import torch_view
 from lyceum_warp.openloop import OpenLoop
-from lyceum_warp.registry import find_task
 from lyceum_warp.spaces import Space
 from lyceum_warp.task import Task
 from lyceum_warp.validate import described, whole_number
-from lyceum_warp.warmup import workers
 
 _BLOCK = 256
 

@@ -16,7 +16,7 @@ import warp as wp
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.policy import GaussianPolicy, Normalizer
-from lyceum_warp.algos.rollout import Rollout, evaluate, finished, moved, pooled, summary
+from lyceum_warp.algos.rollout_buffer import Rollout, evaluate, finished, moved, pooled, summary
 from lyceum_warp.algos.timing import Clock, one_thread
 from lyceum_warp.algos.value import ValueFit, ValueFunction
 from lyceum_warp.env import Env

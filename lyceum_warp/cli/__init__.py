@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from lyceum_warp.cli.common import Interrupted, signals
+from lyceum_warp.cli.arguments import Interrupted, signals
 from lyceum_warp.cli.evaluate import Eval, evaluate_run
+from lyceum_warp.cli.list_tasks import Tasks, list_tasks
 from lyceum_warp.cli.plan import Plan, plan
-from lyceum_warp.cli.tasks import Tasks, list_tasks
 from lyceum_warp.cli.train import Train, resume, saved_options, train
 from lyceum_warp.cli.warmup import Warmup, warm_up
 from lyceum_warp.viz.video import NoVideoError

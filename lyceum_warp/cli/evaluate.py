@@ -8,11 +8,11 @@ import rich.box
 import tyro
 from rich.table import Table
 
-from lyceum_warp.algos.rollout import Episodes, evaluate
-from lyceum_warp.cli.common import Physics
+from lyceum_warp.algos.rollout_buffer import Episodes, evaluate
+from lyceum_warp.cli.arguments import Physics
+from lyceum_warp.cli.display import filmed, make_console
 from lyceum_warp.engines import ON_CPU_CORES
 from lyceum_warp.env import Env
-from lyceum_warp.report import filmed, make_console
 from lyceum_warp.runs import Run, load
 from lyceum_warp.viz.video import check_video
 

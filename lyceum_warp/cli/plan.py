@@ -9,14 +9,14 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from lyceum_warp.algos.control import control, control_async
 from lyceum_warp.algos.mppi import MPPI
-from lyceum_warp.algos.report import control_report
-from lyceum_warp.algos.trajectory import Trajectory
-from lyceum_warp.cli.common import Interrupted, Physics, Words, parameter, portable
+from lyceum_warp.binding.registry import find_task, task_name
+from lyceum_warp.cli.arguments import Interrupted, Physics, Words, parameter, portable
+from lyceum_warp.cli.display import PlanDisplay, filmed_states, make_console, plotted_control, report_table
+from lyceum_warp.control.control_report import control_report
+from lyceum_warp.control.loop import control, control_async
+from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
-from lyceum_warp.registry import find_task, task_name
-from lyceum_warp.report import PlanDisplay, filmed_states, make_console, plotted_control, report_table
 from lyceum_warp.runs import Run, load_value
 from lyceum_warp.validate import whole_number
 

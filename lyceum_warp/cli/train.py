@@ -14,14 +14,14 @@ from rich.console import Console
 
 from lyceum_warp.algos.distributed import Team, join
 from lyceum_warp.algos.npg import NPG, NPGConfig, enough_samples
-from lyceum_warp.algos.rollout import Episodes, evaluate, moved
-from lyceum_warp.cli.common import Interrupted, Physics, Words, parameter, portable, postponed, spelled
+from lyceum_warp.algos.rollout_buffer import Episodes, evaluate, moved
+from lyceum_warp.binding.registry import find_task, task_name, task_names
+from lyceum_warp.cli.arguments import Interrupted, Physics, Words, parameter, portable, postponed, spelled
+from lyceum_warp.cli.display import Display, curve_table, filmed, make_console, plotted
 from lyceum_warp.env import Env
-from lyceum_warp.registry import find_task, task_name, task_names
-from lyceum_warp.report import Display, curve_table, filmed, make_console, plotted
+from lyceum_warp.graphs.compile_ahead import workers
 from lyceum_warp.runs import Run
 from lyceum_warp.versions import versions
-from lyceum_warp.warmup import workers
 
 _FINAL_EPISODES = 32
 

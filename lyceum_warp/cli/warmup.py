@@ -8,11 +8,11 @@ import tyro
 
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.npg import NPG, NPGConfig
-from lyceum_warp.cli.common import Physics, Words, parameter
+from lyceum_warp.cli.arguments import Physics, Words, parameter
+from lyceum_warp.cli.display import make_console
 from lyceum_warp.engines.memory import free_memory
 from lyceum_warp.env import Env
-from lyceum_warp.report import make_console
-from lyceum_warp.warmup import cached
+from lyceum_warp.graphs.compile_ahead import cached
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

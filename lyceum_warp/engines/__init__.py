@@ -11,8 +11,8 @@ from lyceum_warp.fields import Field, Stage, describe, elements
 from lyceum_warp.validate import whole_number
 
 _ENGINES = {
-    "mujoco": ("lyceum_warp.engines.c", "MujocoEngine"),
-    "warp": ("lyceum_warp.engines.warp", "WarpEngine"),
+    "mujoco": ("lyceum_warp.engines.c.mujoco_engine", "MujocoEngine"),
+    "warp": ("lyceum_warp.engines.warp.warp_engine", "WarpEngine"),
 }
 
 _FLAGS = {"deterministic", "unroll"}

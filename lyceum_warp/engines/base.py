@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 import mujoco
 import warp as wp
 
+from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.fields import Field, Stage, describe
-from lyceum_warp.kernels.arrays import flat
-from lyceum_warp.kernels.state import launch_rows, narrow, widen
+from lyceum_warp.kernels.state import narrow, widen
 
 
 class Engine(abc.ABC):

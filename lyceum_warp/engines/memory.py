@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.kernels.rehearsal import rehearse
+from lyceum_warp.graphs.rehearsal import rehearse
 
 _KEPT_FREE = 0.1
 

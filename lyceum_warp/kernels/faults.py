@@ -1,34 +1,8 @@
-"""What makes a world unfit to go on, per world and as bits.
-
-Both engines report the same bits for the same trouble, so that a task, a log and a test need not know which
-engine ran. Bits below ``NAN`` are ordinary ends of an episode.
-"""
-
-import enum
+"""Faults: what makes a world unfit to go on, found in each world as bits of ``Done``."""
 
 import warp as wp
 
-
-class Done(enum.IntFlag):
-    """Why an episode ended; ``env.done_reason`` holds these bits for each world."""
-
-    TERMINATED = 1
-    """The task said so."""
-    TRUNCATED = 2
-    """The time limit was reached."""
-    NAN = 4
-    """The state became not-a-number or absurd (beyond 1e10)."""
-    CONTACT_OVERFLOW = 8
-    """More contacts than the engine had room for."""
-    CONSTRAINT_OVERFLOW = 16
-    """More constraints than the engine had room for."""
-    ENGINE_WARNING = 32
-    """Any other warning of the engine."""
-    ACTION = 64
-    """The action was not finite; it was applied as zero."""
-
-
-FAULTS = Done.NAN | Done.CONTACT_OVERFLOW | Done.CONSTRAINT_OVERFLOW | Done.ENGINE_WARNING | Done.ACTION
+from lyceum_warp.done import Done
 
 ABSURD = wp.constant(1.0e10)
 NAN = wp.constant(int(Done.NAN))

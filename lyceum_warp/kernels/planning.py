@@ -5,10 +5,10 @@ Actions of samples are (horizon, nsample, nu), plans (horizon, nu).
 
 import warp as wp
 
-from lyceum_warp.kernels import faults
+from lyceum_warp.done import Done
 from lyceum_warp.kernels.random import stream, world_key
 
-ACTION = wp.constant(int(faults.Done.ACTION))
+ACTION = wp.constant(int(Done.ACTION))
 NOISE = wp.constant(-2)
 """In the place of an episode: with the same seed, worlds draw initial states and samples draw noise independently."""
 

@@ -52,14 +52,6 @@ def fill_rows64(
             target_out[w, i] = source_in[i]
 
 
-def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.array) -> None:
-    """Launch one of the kernels above over the masked rows of the target, (nworld, n)."""
-    if target.size == 0:
-        return
-    lanes = min(32, target.shape[1]) if wp.get_device(target.device).is_cuda else 1
-    wp.launch(kernel, (target.shape[0], lanes), [mask, source, target, lanes], device=target.device)
-
-
 @wp.kernel(enable_backward=False)
 def pack_counters(
     step_in: wp.array[int],

@@ -4,12 +4,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from lyceum_warp.done import Done
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.random import stream
 
-TERMINATED = wp.constant(int(faults.Done.TERMINATED))
-TRUNCATED = wp.constant(int(faults.Done.TRUNCATED))
-ACTION = wp.constant(int(faults.Done.ACTION))
+TERMINATED = wp.constant(int(Done.TERMINATED))
+TRUNCATED = wp.constant(int(Done.TRUNCATED))
+ACTION = wp.constant(int(Done.ACTION))
 
 
 @wp.struct

@@ -13,7 +13,10 @@ from typing import Any
 from lyceum_warp.engines import EngineFactory
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
-from lyceum_warp.testing import buffers, episodes, state, trouble
+from lyceum_warp.testing import buffer_rules as buffers
+from lyceum_warp.testing import episode_rules as episodes
+from lyceum_warp.testing import fault_rules as trouble
+from lyceum_warp.testing import state_rules as state
 from lyceum_warp.testing.context import OUTCOMES, Context
 
 log = logging.getLogger(__name__)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from lyceum_warp.arrays import torch_view
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import steps
-from lyceum_warp.kernels.arrays import torch_view
 
 OUTCOMES = tuple(steps.OUTCOMES)
 """The buffers that a step fills."""

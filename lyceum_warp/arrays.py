@@ -17,3 +17,11 @@ def flat(array: wp.array) -> wp.array:
 def torch_view(array: wp.array) -> torch.Tensor:
     """The torch tensor that shares an array's memory."""
     return wp.to_torch(array, requires_grad=False)
+
+
+def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.array) -> None:
+    """Launch one of the kernels above over the masked rows of the target, (nworld, n)."""
+    if target.size == 0:
+        return
+    lanes = min(32, target.shape[1]) if wp.get_device(target.device).is_cuda else 1
+    wp.launch(kernel, (target.shape[0], lanes), [mask, source, target, lanes], device=target.device)

@@ -7,7 +7,7 @@ from typing import Any
 import mujoco_warp as mjw
 import warp as wp
 
-from lyceum_warp.kernels import order
+from lyceum_warp.engines.deterministic import order_kernels as order
 
 _LANES = 8
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lyceum_warp.algos.trajectory import Trajectory
+from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.viz import EXTRA
 
 _LINE, _ACCENT, _GRID = "#7a8ba3", "#c8502d", "#e4e7eb"

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import mujoco
 
 from lyceum_warp.fields import ON_DEMAND, SENSED
-from lyceum_warp.quiet import quiet
+from lyceum_warp.mujoco_log import quiet
 from lyceum_warp.validate import whole_number
 
 log = logging.getLogger(__name__)

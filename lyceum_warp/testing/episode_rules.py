@@ -6,8 +6,8 @@ import tracemalloc
 import torch
 import warp as wp
 
+from lyceum_warp.done import FAULTS, Done
 from lyceum_warp.env import Env
-from lyceum_warp.kernels.faults import FAULTS, Done
 from lyceum_warp.testing.context import Context
 
 _PYTHON_BYTES = 2_048  # interned numbers, caches of the interpreter; a float that each of 100 steps kept were 3,200

@@ -2,7 +2,7 @@
 
 import torch
 
-from lyceum_warp.kernels.faults import FAULTS
+from lyceum_warp.done import FAULTS
 from lyceum_warp.spaces import COUNTERS
 from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 

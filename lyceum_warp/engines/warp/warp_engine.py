@@ -9,15 +9,15 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
 from lyceum_warp.engines.memory import Footprint, Scratch, bytes_of, check_fit, temporaries
-from lyceum_warp.engines.order import CanonicalOrder
-from lyceum_warp.engines.partial import PartialForward, group_size, report_overflow
-from lyceum_warp.engines.sizes import probe_sizes
+from lyceum_warp.engines.warp.partial import PartialForward, group_size, report_overflow
+from lyceum_warp.engines.warp.sizes import probe_sizes
 from lyceum_warp.fields import Field, Stage
 from lyceum_warp.kernels import faults
-from lyceum_warp.kernels.arrays import flat
-from lyceum_warp.kernels.state import copy_rows, launch_rows, narrow, widen
+from lyceum_warp.kernels.state import copy_rows, narrow, widen
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from lyceum_warp.done import Done
 from lyceum_warp.env import Env
-from lyceum_warp.kernels.faults import Done
 from lyceum_warp.versions import versions
 
 FORMAT = 1

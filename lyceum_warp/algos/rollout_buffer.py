@@ -11,10 +11,10 @@ import warp as wp
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.arrays import torch_view
 from lyceum_warp.env import Env
-from lyceum_warp.kernels import record
-from lyceum_warp.kernels.arrays import torch_view
-from lyceum_warp.kernels.recorder import Recorder
+from lyceum_warp.graphs.recorder import Recorder
+from lyceum_warp.kernels import collect as record
 
 Module = TypeVar("Module", bound=torch.nn.Module)
 

@@ -18,7 +18,7 @@ import warp as wp
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from lyceum_warp.kernels.rehearsal import rehearse
+from lyceum_warp.graphs.rehearsal import rehearse
 
 
 @dataclasses.dataclass(frozen=True)

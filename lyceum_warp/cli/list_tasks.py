@@ -7,9 +7,9 @@ import sys
 import rich.box
 from rich.table import Table
 
-from lyceum_warp.bound import BoundTask
-from lyceum_warp.registry import find_task, task_names
-from lyceum_warp.report import make_console
+from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.registry import find_task, task_names
+from lyceum_warp.cli.display import make_console
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

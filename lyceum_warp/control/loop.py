@@ -22,8 +22,8 @@ from typing import Protocol
 
 import torch
 
-from lyceum_warp.algos.controller import CheckedController, Controller, seconds_of
-from lyceum_warp.algos.trajectory import Trajectory, provenance
+from lyceum_warp.control.controller import CheckedController, Controller, seconds_of
+from lyceum_warp.control.trajectory import Trajectory, provenance
 from lyceum_warp.env import Env
 from lyceum_warp.validate import whole_number
 
@@ -69,7 +69,7 @@ def control(
 
     Args:
         env: The plant: one world, made with ``autoreset=False``.
-        controller: What plans; see ``lyceum_warp.algos.control``. It must not step ``env``.
+        controller: What plans; see ``lyceum_warp.control.loop``. It must not step ``env``.
         steps: Steps after which to stop, if the episode has not ended by then.
         seed: Seed of the initial state and of the controller.
         reset: False goes on from where the world and the controller's plan are.
@@ -146,7 +146,7 @@ def control_async(
 
     Args:
         env: The plant: one world, made with ``autoreset=False``.
-        controller: What plans, in an environment of its own; see ``lyceum_warp.algos.control``.
+        controller: What plans, in an environment of its own; see ``lyceum_warp.control.loop``.
         period: Seconds of the wall clock between steps; by default the simulated time step, that is, real time.
         steps: Steps after which to stop, if the episode has not ended by then.
         seconds: Seconds of the wall clock after which to stop, likewise.

@@ -10,14 +10,14 @@ import numpy as np
 import warp as wp
 from mujoco.batch import Batch, SimulationError
 
+from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
 from lyceum_warp.engines.memory import Footprint, check_fit
-from lyceum_warp.engines.native import NativeRollout, is_exact
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage
 from lyceum_warp.kernels import faults
-from lyceum_warp.kernels.arrays import flat
-from lyceum_warp.kernels.state import copy_rows64, fill_rows64, launch_rows, narrow, widen
-from lyceum_warp.quiet import quiet
+from lyceum_warp.kernels.state import copy_rows64, fill_rows64, narrow, widen
+from lyceum_warp.mujoco_log import quiet
 
 log = logging.getLogger(__name__)
 

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
+from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
-from lyceum_warp.kernels.faults import FAULTS
 from lyceum_warp.spaces import COUNTERS
 from lyceum_warp.testing.context import SHORT, Context
 

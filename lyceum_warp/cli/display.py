@@ -10,12 +10,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from lyceum_warp.algos.control import ControlProgress
 from lyceum_warp.algos.npg import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.algos.report import ControlReport
-from lyceum_warp.algos.rollout import moved
-from lyceum_warp.algos.trajectory import Trajectory
+from lyceum_warp.algos.rollout_buffer import moved
+from lyceum_warp.control.control_report import ControlReport
+from lyceum_warp.control.loop import ControlProgress
+from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs import Run
 
@@ -96,7 +96,7 @@ def _spread(rows: list[dict[str, float | None]]) -> list[dict[str, float | None]
 def plotted(run: Run) -> str:
     """Draw a run's learning curve; the picture's path, or why there is none."""
     try:
-        from lyceum_warp.viz.plot import learning_curve
+        from lyceum_warp.viz.learning_curve import learning_curve
 
         return str(learning_curve(run))
     except ImportError as error:
@@ -185,7 +185,7 @@ def report_table(report: ControlReport) -> Table:
 def plotted_control(trajectories: list[Trajectory], path: Path) -> str:
     """Draw trajectories; the picture's path, or why there is none."""
     try:
-        from lyceum_warp.viz.control import control_plot
+        from lyceum_warp.viz.control_plot import control_plot
 
         return str(control_plot(trajectories, path))
     except ImportError as error:

@@ -16,10 +16,10 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from lyceum_warp import models
+from lyceum_warp.binding import models
+from lyceum_warp.binding.registry import task_name
 from lyceum_warp.fields import elements, vec10
 from lyceum_warp.kernels import steps
-from lyceum_warp.registry import task_name
 from lyceum_warp.task import FUNCTIONS, Element, Task
 from lyceum_warp.validate import whole_number
 

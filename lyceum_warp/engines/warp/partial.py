@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 import mujoco_warp as mjw
 import warp as wp
 
+from lyceum_warp.arrays import flat
 from lyceum_warp.engines.memory import Arena
 from lyceum_warp.fields import STATE_FIELDS
 from lyceum_warp.kernels import faults, state
-from lyceum_warp.kernels.arrays import flat
 
 
 def group_size(nworld: int, device: wp.Device) -> int:

@@ -1,4 +1,4 @@
-"""A controller as the loops of ``lyceum_warp.algos.control`` call it."""
+"""A controller as the loops of ``lyceum_warp.control.loop`` call it."""
 
 import inspect
 import json

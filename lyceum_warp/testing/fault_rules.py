@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from lyceum_warp.done import FAULTS, Done
 from lyceum_warp.env import Env
-from lyceum_warp.kernels.faults import FAULTS, Done
 from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyceum_warp.algos.trajectory import Trajectory
+from lyceum_warp.control.trajectory import Trajectory
 
 # of how many plans a quantile can be told: of fewer, none would lie beyond it
 _QUANTILES = {"p50": (0.5, 2), "p90": (0.9, 10), "p99": (0.99, 100), "p99_9": (0.999, 1000)}

@@ -11,7 +11,7 @@ from mujoco.batch import Batch
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage
 
 if TYPE_CHECKING:
-    from lyceum_warp.engines.c import MujocoEngine
+    from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 
 
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:

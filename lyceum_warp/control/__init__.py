@@ -1,0 +1,1 @@
+"""Controllers at work: the loop that waits for plans, the loop against the clock, trajectories and reports."""

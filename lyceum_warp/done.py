@@ -1,0 +1,29 @@
+"""Why an episode ended, as bits.
+
+Both engines report the same bits for the same fault, so that a task, a log and a test need not know which engine ran.
+"""
+
+import enum
+
+
+class Done(enum.IntFlag):
+    """Why an episode ended; ``env.done_reason`` holds these bits for each world."""
+
+    TERMINATED = 1
+    """The task said so."""
+    TRUNCATED = 2
+    """The time limit was reached."""
+    NAN = 4
+    """The state became not-a-number or absurd (beyond 1e10)."""
+    CONTACT_OVERFLOW = 8
+    """More contacts than the engine had room for."""
+    CONSTRAINT_OVERFLOW = 16
+    """More constraints than the engine had room for."""
+    ENGINE_WARNING = 32
+    """Any other warning of the engine."""
+    ACTION = 64
+    """The action was not finite; it was applied as zero."""
+
+
+FAULTS = Done.NAN | Done.CONTACT_OVERFLOW | Done.CONSTRAINT_OVERFLOW | Done.ENGINE_WARNING | Done.ACTION
+"""The bits that are faults; the others are ordinary ends of an episode."""

@@ -1,0 +1,1 @@
+"""The C engine: MuJoCo itself, many worlds on a pool of threads."""

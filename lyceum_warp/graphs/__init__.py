@@ -1,0 +1,1 @@
+"""Host code around Warp launches: capture and replay, rehearsal, compilation ahead of time."""
