@@ -17,7 +17,7 @@ def whole_number(name: str, value: Any, *, low: int, high: int = 2**31 - 1) -> i
     except (TypeError, ValueError, OverflowError):
         fits = False
     if not fits:
-        raise ValueError(f"{name} has to be a whole number from {low} to {high}, not {value!r}")
+        raise ValueError(f"{name} must be a whole number from {low} to {high}, not {value!r}")
     return number
 
 

@@ -1,0 +1,45 @@
+"""Attribute docstrings in ``help()``.
+
+Python discards a string that follows an attribute. Editors and documentation tools read it from the source; ``help``
+does not, so ``document_attributes`` appends these strings to the docstring of the class.
+"""
+
+import ast
+import inspect
+import itertools
+import textwrap
+from typing import TypeVar
+
+Class = TypeVar("Class", bound=type)
+
+
+def attribute_docs(cls: type) -> dict[str, str]:
+    """The docstrings of a class's attributes by name, in the order of the source; empty where there is no source."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))
+    except (OSError, TypeError, SyntaxError):
+        return {}
+    docs: dict[str, str] = {}
+    body = tree.body[0].body if isinstance(tree.body[0], ast.ClassDef) else []
+    for statement, following in itertools.pairwise(body):
+        text = following.value if isinstance(following, ast.Expr) else None
+        if not (isinstance(text, ast.Constant) and isinstance(text.value, str)):
+            continue
+        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+            docs[statement.target.id] = inspect.cleandoc(text.value)
+        elif isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
+            docs[statement.targets[0].id] = inspect.cleandoc(text.value)
+    return docs
+
+
+def listed(docs: dict[str, str]) -> str:
+    """Names and their docstrings as the body of an ``Attributes:`` or ``Args:`` section."""
+    entries = (f"{name}: {text}".splitlines() for name, text in docs.items())
+    return "\n".join("\n".join(["    " + lines[0], *("        " + line for line in lines[1:])]) for lines in entries)
+
+
+def document_attributes(cls: Class) -> Class:
+    """Class decorator: append the attributes' docstrings to the class's own, where ``help`` shows them."""
+    if docs := attribute_docs(cls):
+        cls.__doc__ = f"{inspect.cleandoc(cls.__doc__ or '')}\n\nAttributes:\n{listed(docs)}\n"
+    return cls

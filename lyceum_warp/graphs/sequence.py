@@ -1,0 +1,130 @@
+"""Phases: what a step, a reset or a plan is made of, and how their launches become graphs.
+
+Whoever has something to launch lists it as phases, in order. ``Graphs.sequence`` turns the list into calls: phases that
+follow one another and are made of Warp launches become one graph, captured once and replayed. On an engine whose own
+calls are launches a whole step is one graph; on others the engine's calls stay between the graphs.
+"""
+
+import dataclasses
+import weakref
+from collections.abc import Callable, Iterable
+
+import torch
+import warp as wp
+
+Calls = tuple[Callable[[], None], ...]
+"""What ``Graphs.sequence`` returns: call them in order."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Phase:
+    """One entry of a list of phases.
+
+    A phase launches the same kernels on the same arrays each time, because a graph holds their addresses and scalar
+    arguments.
+    """
+
+    name: str
+    """What a profiler's range is called."""
+    run: Callable[[], object]
+    """Takes no arguments."""
+    engine: bool = False
+    """Whether this is a call into the engine that only some engines make of launches."""
+
+
+class Graphs:
+    """Makes sequences of calls out of phases, and can drop all their graphs.
+
+    Args:
+        device: Where the launches run; Warp captures graphs on the CPU, too.
+        enabled: False calls every phase directly.
+        capture_engine: Whether calls into the engine are made of launches.
+        nvtx: Whether to mark each phase as a range for NVIDIA's profilers.
+    """
+
+    def __init__(
+        self, device: wp.Device, *, enabled: bool = True, capture_engine: bool = True, nvtx: bool = False
+    ) -> None:
+        self.device, self.enabled, self.capture_engine, self.nvtx = device, enabled, capture_engine, nvtx
+        self._graphs: weakref.WeakSet[_Graph] = weakref.WeakSet()
+
+    def sequence(self, phases: Iterable[Phase]) -> Calls:
+        """The calls that run some phases in order."""
+        calls: list[Callable[[], object]] = []
+        together: list[Phase] = []
+
+        def close() -> None:
+            if together:
+                calls.append(self._captured(*together))
+                together.clear()
+
+        for phase in phases:
+            if self._is_captured(phase):
+                together.append(phase)
+                if self.nvtx:
+                    close()
+            else:
+                close()
+                calls.append(_Range(phase.name, phase.run) if self.nvtx else phase.run)
+        close()
+        return tuple(calls)  # type: ignore[arg-type]
+
+    def forget(self) -> None:
+        """Drop all graphs, after arrays behind them were replaced; they are captured again when next called."""
+        for graph in self._graphs:
+            graph.forget()
+
+    def _is_captured(self, phase: Phase) -> bool:
+        return self.enabled and (self.capture_engine or not phase.engine)
+
+    def _captured(self, *phases: Phase) -> Callable[[], object]:
+        graph = _Graph(self.device, [phase.run for phase in phases])
+        self._graphs.add(graph)
+        return _Range(phases[0].name, graph) if self.nvtx else graph
+
+
+class _Graph:
+    """Functions made of launches as one graph.
+
+    The first call runs them directly, which loads every module that they need; the second captures and replays; all
+    further calls replay.
+    """
+
+    def __init__(self, device: wp.Device, functions: list[Callable[[], object]]) -> None:
+        self._device, self._functions = device, functions
+        self.forget()
+
+    def forget(self) -> None:
+        self._graph: wp.Graph | None = None
+        self._loaded = False
+
+    def __call__(self) -> None:
+        if self._graph is None:
+            if not self._loaded:
+                self._loaded = True
+                self._run()
+                return
+            if self._device.is_cuda:  # a capture may clear memory that earlier launches still work in
+                wp.synchronize_device(self._device)
+            with wp.ScopedCapture(device=self._device) as capture:
+                self._run()
+            self._graph = capture.graph
+        wp.capture_launch(self._graph)
+
+    def _run(self) -> None:
+        for function in self._functions:
+            function()
+
+
+class _Range:
+    """A call marked as a range for NVIDIA's profilers."""
+
+    def __init__(self, name: str, call: Callable[[], object]) -> None:
+        self._name, self._call = name, call
+
+    def __call__(self) -> None:
+        torch.cuda.nvtx.range_push(self._name)
+        try:
+            self._call()
+        finally:
+            torch.cuda.nvtx.range_pop()

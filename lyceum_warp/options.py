@@ -1,0 +1,202 @@
+"""The options of an environment and of its physics.
+
+This is the only list of them: ``make``, ``replicate``, MPPI, the command line, the help texts and the suggestions for
+misspelt words all read these two classes. A new option is a new field here, and is read where it takes effect.
+"""
+
+import dataclasses
+import difflib
+from collections.abc import Callable, Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import mujoco
+
+from lyceum_warp.docstrings import attribute_docs, document_attributes, listed
+from lyceum_warp.validate import whole_number
+
+ModelSource: TypeAlias = str | Path | mujoco.MjSpec
+"""Where a model comes from: a file, or an MjSpec."""
+
+CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+INTEGRATORS = {
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+}
+SOLVER_LIMITS = {"iterations": 1, "ls_iterations": 1, "noslip_iterations": 0}
+"""The limits of the constraint solver that ``solver`` accepts, with the smallest value of each."""
+
+
+def _given(options: Any) -> dict[str, Any]:
+    values = {field.name: (getattr(options, field.name), field.default) for field in dataclasses.fields(options)}
+    return {name: value for name, (value, default) in values.items() if value is not default and value != default}
+
+
+def _whole(options: Any, name: str, low: int) -> None:
+    if (value := getattr(options, name)) is not None:
+        object.__setattr__(options, name, whole_number(name, value, low=low))
+
+
+def _flags(options: Any, *names: str) -> None:
+    for name in names:
+        if not isinstance(value := getattr(options, name), bool):
+            raise ValueError(f"{name} must be True or False, not {value!r}")
+
+
+def _one_of(what: str, name: Any, known: Mapping[str, Any]) -> None:
+    if name is not None and (not isinstance(name, str) or name not in known):
+        *others, last = map(repr, known)
+        raise ValueError(f"there is no {what} {name!r}: use {', '.join(others)} or {last}")
+
+
+def _checked_limits(solver: Any) -> dict[str, int]:
+    if not isinstance(solver, Mapping):
+        raise ValueError(f"solver must be a dict of limits, as solver={{'iterations': 4}}, not {solver!r}")
+    if unknown := [name for name in solver if name not in SOLVER_LIMITS]:
+        raise ValueError(f"solver has no limit {unknown[0]!r}: it takes {', '.join(map(repr, SOLVER_LIMITS))}")
+    return {name: whole_number(f"solver's {name}", value, low=SOLVER_LIMITS[name]) for name, value in solver.items()}
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PhysicsOptions:
+    """How the worlds are simulated. None keeps what the task or its model says.
+
+    Raises:
+        ValueError: A value is unknown or out of range.
+    """
+
+    frame_skip: int | None = None
+    """Substeps in a step."""
+    cone: str | None = None
+    """Friction cone: pyramidal or elliptic."""
+    integrator: str | None = None
+    """Integrator: euler, rk4, implicit or implicitfast."""
+    solver: Mapping[str, int] | None = None
+    """Limits of the constraint solver: any of iterations, ls_iterations (of its line search) and noslip_iterations
+    (0 turns the noslip solver off)."""
+    nconmax: int | None = None
+    """Contacts that the Warp engine has room for in each world, on average; by default twice the peak of a probe."""
+    njmax: int | None = None
+    """Constraints that the Warp engine has room for in each world; by default twice the peak of a probe."""
+    deterministic: bool = False
+    """Make two runs on a CUDA device equal to the bit. Costs 5 to 18 times the time and 5 to 7 times the memory on
+    hopper, half_cheetah and humanoid. Runs on the CPU are always equal to the bit."""
+    unroll: bool = False
+    """Unroll the solver's iterations in the Warp engine instead of a loop that ends with the last world's. The numbers
+    stay the same. Needs a solver limit of at most 20 iterations; with 4 it gained 3 to 5 % on half_cheetah and
+    humanoid and lost 1 to 2 % on hopper. The C engine ignores it."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        for name, low in (("frame_skip", 1), ("nconmax", 1), ("njmax", 1)):
+            _whole(self, name, low)
+        _one_of("friction cone", self.cone, CONES)
+        _one_of("integrator", self.integrator, INTEGRATORS)
+        _flags(self, "deterministic", "unroll")
+        if self.solver is not None:
+            object.__setattr__(self, "solver", _checked_limits(self.solver) or None)
+
+    def given(self) -> dict[str, Any]:
+        """The options that differ from their defaults, by name."""
+        return _given(self)
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EnvOptions:
+    """How an environment runs: how many worlds, where, and how their episodes go.
+
+    Raises:
+        ValueError: A value is of the wrong type or out of range.
+    """
+
+    nworld: int = 1
+    """Number of worlds."""
+    device: str | None = None
+    """cpu (the default), or a CUDA device such as cuda:0."""
+    engine: str | Callable[..., Any] = "auto"
+    """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU. Also a callable
+    with the signature of ``lyceum_warp.engines.base.Engine``, for an engine of your own."""
+    nthread: int | None = None
+    """Threads of the C engine; by default all cores."""
+    seed: int = 0
+    """Seed of the worlds' random streams."""
+    first_world: int = 0
+    """Number of the first world, where several processes share a batch: worlds draw the random streams of their
+    numbers."""
+    autoreset: bool = True
+    """Whether a world whose episode ended begins a new one within the same step. With False finished worlds keep
+    stepping with ``done`` set until they are reset; only a world with a fault restarts at once."""
+    horizon: int | None = None
+    """Steps after which an episode is truncated, 0 for never; by default the task's."""
+    graphs: bool = True
+    """Whether launches are captured as graphs and replayed. False is for debugging; the numbers are the same to the
+    bit."""
+    nvtx: bool = False
+    """Whether to mark the phases of a step (act, physics, judge, restart, refresh, observe) for NVIDIA's profilers.
+    Each phase then is a graph of its own."""
+    model: ModelSource | None = None
+    """Another model than the task's: a file or an MjSpec."""
+    fields: Collection[str] = ()
+    """Fields to keep beside those that the task reads, for ``env.field``."""
+    physics: PhysicsOptions = PhysicsOptions()
+    """How the worlds are simulated."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        for name, low in (("nworld", 1), ("nthread", 0), ("seed", 0), ("first_world", 0), ("horizon", 0)):
+            _whole(self, name, low)
+        _flags(self, "autoreset", "graphs", "nvtx")
+        names = isinstance(self.fields, Collection) and not isinstance(self.fields, str)
+        if not names or not all(isinstance(name, str) for name in self.fields):
+            raise ValueError(f"fields must be names of fields, as in fields=['sensordata'], not {self.fields!r}")
+        object.__setattr__(self, "fields", tuple(self.fields))
+
+    @classmethod
+    def split(cls, words: Mapping[str, Any]) -> tuple["EnvOptions", dict[str, Any]]:
+        """Sort the keyword arguments of a flat call into options and everything else, the task's parameters."""
+        rest = {name: value for name, value in words.items() if name not in OPTIONS}
+        return cls().changed({name: value for name, value in words.items() if name in OPTIONS}), rest
+
+    def changed(self, words: Mapping[str, Any]) -> "EnvOptions":
+        """The same options with some changed, those of the physics included, all by name."""
+        physics = {name: value for name, value in words.items() if name in _PHYSICS}
+        others = {name: value for name, value in words.items() if name not in _PHYSICS}
+        if physics:
+            others["physics"] = dataclasses.replace(others.get("physics", self.physics), **physics)
+        return dataclasses.replace(self, **others)
+
+    def given(self) -> dict[str, Any]:
+        """The options that differ from their defaults, those of the physics included, by name."""
+        own = _given(self)
+        own.pop("physics", None)
+        return own | self.physics.given()
+
+
+_PHYSICS = tuple(field.name for field in dataclasses.fields(PhysicsOptions))
+OPTIONS = (*(field.name for field in dataclasses.fields(EnvOptions)), *_PHYSICS)
+"""Names of all options, in the order of the help text."""
+
+OPTION_DOCS = listed({**attribute_docs(EnvOptions), **attribute_docs(PhysicsOptions)})
+"""The options with their docstrings, as the body of an ``Args:`` section."""
+
+_OTHER_WORDS = {
+    "num_envs": "nworld", "n_envs": "nworld", "xml_file": "model", "max_episode_steps": "horizon", "record": "graphs",
+    "iterations": "solver={'iterations': ...}", "ls_iterations": "solver={'ls_iterations': ...}",
+    "noslip_iterations": "solver={'noslip_iterations': ...}",
+}  # fmt: skip
+"""What other packages, and earlier releases of this one, call an option."""
+
+
+def suggestion(word: str, others: Iterable[str] = ()) -> str:
+    """What somebody who wrote an unknown word may have meant, as "did you mean ...?"; empty where nothing is close.
+
+    Args:
+        word: The word.
+        others: Names that are known beside the options.
+    """
+    close = [_OTHER_WORDS[word]] if word in _OTHER_WORDS else difflib.get_close_matches(word, [*others, *OPTIONS], 3)
+    return f"did you mean {' or '.join(close)}?" if close else ""
