@@ -157,9 +157,7 @@ class EnvOptions:
         object.__setattr__(self, "fields", tuple(self.fields))
 
     @classmethod
-    def split(
-        cls, words: Mapping[str, Any], base: "EnvOptions | None" = None
-    ) -> tuple["EnvOptions", dict[str, Any]]:
+    def split(cls, words: Mapping[str, Any], base: "EnvOptions | None" = None) -> tuple["EnvOptions", dict[str, Any]]:
         """Sort the keyword arguments of a flat call into options and everything else, the task's parameters.
 
         Args:

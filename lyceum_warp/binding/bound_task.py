@@ -1,6 +1,7 @@
 """A task bound to its model and its parameters, with its kernels."""
 
 import math
+import re
 from collections.abc import Collection, Mapping
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +17,7 @@ from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
 from lyceum_warp.fields import Field, describe, vec10
 from lyceum_warp.options import ModelSource, PhysicsOptions
-from lyceum_warp.task import Task
+from lyceum_warp.task import FUNCTIONS, Task
 from lyceum_warp.validate import whole_number
 
 _SPELLED = {
@@ -78,11 +79,9 @@ class BoundTask:
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.frame_skip = whole_number(f"frame_skip of the task {self.name!r}", skip, low=1)
         self.timestep: float = self.model.opt.timestep * self.frame_skip
-        # env.time is always there
-        self.fields: list[Field] = [
-            describe(self.model, name, lagged=name in task.lagged) for name in dict.fromkeys([*own, *fields, "time"])
-        ]
-        """The fields that the engine keeps: the task's own, further ones, and the time."""
+        names = dict.fromkeys([*own, *fields, "time", "ctrl"])
+        self.fields: list[Field] = [describe(self.model, name, lagged=name in task.lagged) for name in names]
+        """The fields that the engine keeps: the task's own, further ones, time and controls."""
         self.parameters = Parameters(
             self.source.params, self.name, self.model, nworld=nworld, timestep=self.timestep, given=params or {}
         )
@@ -147,8 +146,15 @@ class BoundTask:
         text = str(error)
         if "while parsing function" not in text and not type(error).__module__.startswith("warp"):
             return error
+        result = re.search(r"= (\w+)\(.*value argument type \((\w+)\) must be of the same type", " ".join(text.split()))
+        if result and result.group(1) in FUNCTIONS:
+            name, kind = result.groups()
+            return ValueError(
+                f"{name} of the task {self.name!r} returns {kind}: it must be written as {FUNCTIONS[name].signature}"
+            )
         lines = [line.strip() for line in text.splitlines() if line.strip()]
-        return ValueError(f"Warp can't compile the functions of the task {self.name!r}: {' '.join(lines[-3:])}")
+        hint = ": a function returns one number, not a tuple" if "'tuple_t'" in text else ""
+        return ValueError(f"Warp can't compile the functions of the task {self.name!r}: {' '.join(lines[-3:])}{hint}")
 
     def check_field(self, name: str, array: wp.array) -> None:
         """Compare the declaration of a field in World with the array that it will be bound to, (nworld, ...).

@@ -85,9 +85,9 @@ class TaskSource:
             for own_name, own in (("World", self.world), ("Params", self.params)):
                 if kind is not own and kind.key.rpartition(".")[2] == own_name:
                     raise ValueError(
-                        f"{name} of the task {self.name!r} takes the {own_name} of {kind.cls.__module__}, but the task "
-                        f"has the {own_name} of {own.cls.__module__}: import both structs from one module, or write "
-                        f"{name} for the task's own"
+                        f"{name} of the task {self.name!r} takes the {own_name} of {_origin(kind)}, but the task has "
+                        f"the {own_name} of {_origin(own)}: import both structs from one module, or write {name} for "
+                        "the task's own"
                     )
 
     def _kind(self, argument: Any) -> str:
@@ -113,6 +113,12 @@ class TaskSource:
                 close = difflib.get_close_matches(name, [f for f in FUNCTIONS if self.functions[f] is None], 1, 0.85)
                 if own and close:
                     raise ValueError(f"the task {self.name!r} has a function {name!r}: did you mean {close[0]}?")
+
+
+def _origin(struct: Any) -> str:
+    """The file that a struct comes from; its module where there is no file."""
+    module = struct.cls.__module__
+    return str(getattr(sys.modules.get(module), "__file__", None) or module)
 
 
 def _return_values(function: wp.Function) -> list[ast.expr] | None:

@@ -1,4 +1,5 @@
 """TEMPORARY until the engines branch is merged."""
+
 from lyceum_warp.engines import ON_CPU_CORES, find_device as find_device
 from lyceum_warp.engines import open_engine as _open
 
@@ -9,7 +10,17 @@ def few_worlds(engine, device):
 
 def open_engine(options, model, device, fields, *, beside=0):
     p = options.physics
-    e = _open(options.engine, model, options.nworld, device, nthread=options.nthread, nconmax=p.nconmax, njmax=p.njmax, deterministic=p.deterministic, unroll=p.unroll)
+    e = _open(
+        options.engine,
+        model,
+        options.nworld,
+        device,
+        nthread=options.nthread,
+        nconmax=p.nconmax,
+        njmax=p.njmax,
+        deterministic=p.deterministic,
+        unroll=p.unroll,
+    )
     for f in fields:
         e.field(f.name, lagged=f.lagged)
     e.capturable = e.recordable
