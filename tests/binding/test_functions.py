@@ -77,7 +77,7 @@ def test_a_class_that_is_written_wrongly_is_named(tmp_path: Path, line: str, mes
 def test_actions_can_be_scaled_to_ranges_only(tmp_path: Path) -> None:
     import mujoco
 
-    spec = mujoco.MjSpec.from_file(str(Path(__file__).parent / "data" / "unlimited.xml"))
+    spec = mujoco.MjSpec.from_file(str(Path(__file__).parents[1] / "data" / "unlimited.xml"))
     file = tmp_path / "shape.py"
     file.write_text(f"{HEAD}{CLASS}    action_range = (-1.0, 1.0)\n")
     with pytest.raises(ValueError, match=r"gives none to the controls \[0\]: set their ctrlrange"):

@@ -11,7 +11,7 @@ import pytest
 import torch
 from gymnasium_robotics.envs.adroit_hand.adroit_pen import AdroitHandPenEnv
 from gymnasium_robotics.utils.rotations import euler2quat
-from test_authored import check_uniform
+from test_cartpole_swingup import check_uniform
 
 import lyceum_warp as lw
 

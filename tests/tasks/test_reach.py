@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from test_authored import check_uniform, positions, put_at_random, same
+from test_cartpole_swingup import check_uniform, positions, put_at_random, same
 
 import lyceum_warp as lw
 
