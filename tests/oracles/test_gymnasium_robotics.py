@@ -1,29 +1,26 @@
 """The adroit_pen task against Gymnasium-Robotics' own environment, on the C engine."""
 
 import dataclasses
-import importlib.util
-from collections.abc import Callable
 
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
 import torch
+from checks import check_uniform
+from conftest import SharedEnv
 from gymnasium_robotics.envs.adroit_hand.adroit_pen import AdroitHandPenEnv
 from gymnasium_robotics.utils.rotations import euler2quat
-from test_cartpole_swingup import check_uniform
 
 import lyceum_warp as lw
-
-SharedEnv = Callable[..., lw.Env]
 
 TIPS = {"C_rfdistal", "C_lfdistal"}
 
 
 class Oracle(AdroitHandPenEnv):
-    """Their environment, but for a target that nothing touches and a pair of fingertips that is named twice there.
+    """Their environment without contacts of the target, and without a pair of fingertips that is listed twice there.
 
-    The C engine makes two contacts of such a pair, MuJoCo Warp one, so that the task does without the second.
+    The C engine makes two contacts of such a pair and MuJoCo Warp one, so the task leaves out the second entry.
     """
 
     def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -50,7 +47,7 @@ class Step:
     eval: float
 
     def check(self) -> None:
-        """The same numbers, rounded to float32."""
+        """Compare, to the rounding of float32."""
         assert relative_error(self.obs, self.gym_obs) <= 1e-5
         assert relative_error(self.reward, self.gym_reward) <= 1e-5
         assert abs(self.eval - self.gym_obs[33:36] @ self.gym_obs[36:39]) <= 1e-6
@@ -62,7 +59,7 @@ def relative_error(ours: np.ndarray | float, theirs: np.ndarray | float) -> floa
 
 
 class Pair:
-    """One of our worlds and their environment, in the same states and under the same controls."""
+    """One world and their environment, in the same states and under the same controls."""
 
     def __init__(self, ours: lw.Env, theirs: AdroitHandPenEnv, seed: int = 0) -> None:
         self.ours, self.theirs = ours, theirs
@@ -72,7 +69,7 @@ class Pair:
         self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
 
     def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:
-        # an action becomes a control in float32 here and in float64 there: over many steps that would show
+        # actions become controls in float32 here and in float64 there; over many steps the difference would show
         ours = self.ours.state_space.split(self.ours.get_state())["ctrl"][0].numpy()
         np.testing.assert_allclose(ours, ctrl, atol=2e-7)
         self._simulate(ours, frames)
@@ -80,7 +77,7 @@ class Pair:
     def put(self, target: np.ndarray = UPRIGHT, pen: np.ndarray | float = 0.0, noise: float = 0.05) -> None:
         """Put both near the initial state; every number is one of float32.
 
-        The pen's first joint moves it down, its third along x: its body lies on its side.
+        The pen's body lies on its side: its first joint moves it down, its third along x.
         """
         model, data = self.theirs.model, self.theirs.data
         mujoco.mj_resetData(model, data)
@@ -106,7 +103,7 @@ class Pair:
         return (data.site("object_top").xpos - data.site("object_bottom").xpos) / 0.13
 
     def point_target(self, away: float) -> None:
-        """Turn the target so that its axis is an angle away from the pen's, and start both from where they are."""
+        """Turn the target so that its axis is an angle away from the pen's; both environments go on from there."""
         target, sideways = np.zeros(4), np.cross(self.pen_axis(), (0.0, 1.0, 0.0))
         axis = np.cos(away) * self.pen_axis() + np.sin(away) * sideways / np.linalg.norm(sideways)
         mujoco.mju_quatZ2Vec(target, axis)
@@ -134,7 +131,7 @@ class Pair:
         return step
 
     def touched(self) -> bool:
-        """Whether something touches that makes a difference, so that the two part; never with the oracle."""
+        """Whether there is a contact that only their environment has; never with the oracle."""
         model = self.theirs.model
         touching = [{model.geom(geom).name for geom in pair} for pair in self.theirs.data.contact.geom]
         return touching.count(TIPS) > 1 or any("target" in names for names in touching)
@@ -154,8 +151,8 @@ def random_quat(rng: np.random.Generator) -> np.ndarray:
     return euler2quat([*rng.uniform(-1.0, 1.0, 2), 0.0])
 
 
-def test_random_actions(pair: Pair) -> None:
-    """The same numbers as theirs for 400 steps of random actions, some out of range, in four episodes."""
+def test_random_actions_lead_to_the_same_numbers(pair: Pair) -> None:
+    """Four episodes, 400 steps, some actions out of range."""
     for _ in range(4):
         pair.put(random_quat(pair.rng))
         for i in range(100):
@@ -164,8 +161,8 @@ def test_random_actions(pair: Pair) -> None:
             pair.step(action)
 
 
-def test_as_it_is_shipped(ours: lw.Env) -> None:
-    """The same numbers as the registered environment's, until the target or those two fingertips are touched."""
+def test_the_registered_environment_agrees_until_contacts_differ(ours: lw.Env) -> None:
+    """Until something touches the target, or those two fingertips touch each other."""
     theirs = gymnasium.make("AdroitHandPen-v1")
     assert theirs.spec is not None and theirs.spec.max_episode_steps == ours.task.task.horizon == 200
     pair = Pair(ours, theirs.unwrapped)
@@ -180,8 +177,8 @@ def test_as_it_is_shipped(ours: lw.Env) -> None:
     assert 100 < checked < 400
 
 
-def test_bonuses_and_success(pair: Pair) -> None:
-    """+10, +60 and -5 in the reward; success after more than 20 steps at their goal, in a row or not."""
+def test_bonuses_and_success_are_theirs(pair: Pair) -> None:
+    """The bonuses are +10, +60 and -5. Success needs more than 20 steps at their goal, in a row or not."""
     seen: dict[float, int] = {}
     goals_at_once, successes = 0, 0
     for angle, height in ((0.1, 0.0), (0.38, 0.0), (0.1, -0.2), (2.0, -0.2), (0.1, 0.2)):
@@ -201,8 +198,8 @@ def test_bonuses_and_success(pair: Pair) -> None:
     assert goals_at_once > 30 and 10 < successes < 100
 
 
-def test_the_target_is_no_obstacle(ours: lw.Env) -> None:
-    """A pen inside the target is thrown out there; here it falls through it."""
+def test_the_target_has_no_contacts(ours: lw.Env) -> None:
+    """A pen inside the target is pushed out in their environment and falls through it in the task."""
     heights = []
     for theirs in (AdroitHandPenEnv(), Oracle()):
         pair = Pair(ours, theirs)
@@ -213,8 +210,8 @@ def test_the_target_is_no_obstacle(ours: lw.Env) -> None:
     assert abs(heights[0][0] - heights[0][1]) > 0.01 and heights[1][0] == pytest.approx(heights[1][1], abs=1e-6)
 
 
-def test_model(shared_env: SharedEnv) -> None:
-    """Their model, whose actuators the environment sets anew, but for the target's body and a doubled pair."""
+def test_model_is_theirs_except_for_the_target_and_a_doubled_pair(shared_env: SharedEnv) -> None:
+    """Their environment sets the actuators' gains anew when it is made."""
     ours, theirs = shared_env("adroit_pen").model, AdroitHandPenEnv().model
     assert ours.npair == theirs.npair - 1
     for name in (
@@ -225,7 +222,7 @@ def test_model(shared_env: SharedEnv) -> None:
         assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
     for name in ("timestep", "integrator", "cone", "solver", "iterations", "noslip_iterations"):
         assert getattr(ours.opt, name) == getattr(theirs.opt, name), name
-    # the task reads none of the model's 65 sensors, so that nothing pays for them
+    # the task reads none of the model's 65 sensors, so they are turned off
     assert ours.nsensor == theirs.nsensor == 65
     assert ours.opt.disableflags == theirs.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR
     assert ours.opt.noslip_iterations == 20
@@ -233,10 +230,10 @@ def test_model(shared_env: SharedEnv) -> None:
     assert meshes.any() and not ours.geom_contype[meshes].any() and not ours.geom_conaffinity[meshes].any()
     target = ours.geom_bodyid == ours.body("target").id
     assert target.any() and not ours.geom_contype[target].any() and not ours.geom_conaffinity[target].any()
-    assert ours.body("target").mocapid[0] == 1, "the second mocap body: the task must not take the first"
+    assert ours.body("target").mocapid[0] == 1, "the target is the second mocap body, not the first"
 
 
-def test_spaces(pair: Pair) -> None:
+def test_spaces_are_theirs(pair: Pair) -> None:
     assert pair.ours.obs.shape == (1, *pair.theirs.observation_space.shape) == (1, 45)
     assert np.array_equal(pair.ours.action_space.low, pair.theirs.action_space.low)
     assert np.array_equal(pair.ours.action_space.high, pair.theirs.action_space.high)
@@ -254,8 +251,8 @@ def quats(env: lw.Env) -> np.ndarray:
 
 @pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("scale", [None, 0.2])
-def test_reset(scale: float | None) -> None:
-    """Hand and pen start where the model puts them, and the target turns as theirs does, in each world elsewhere."""
+def test_random_resets_turn_the_target_as_theirs_do(scale: float | None) -> None:
+    """Hand and pen start where the model puts them; each world draws a target of its own."""
     env = lw.make("adroit_pen", engine="mujoco", nworld=2000, **({} if scale is None else {"target_range": scale}))
     found = quats(env)
     euler = 2.0 * np.arctan2(found[:, 1:3], found[:, [0, 0]])  # both half angles are under a right angle
@@ -274,89 +271,11 @@ def test_reset(scale: float | None) -> None:
     assert relative_error(env.obs.numpy().astype(np.float64), np.tile(wanted, (2000, 1))) <= 1e-6
 
 
-def test_targets_of_their_resets() -> None:
-    """What their reset draws is what ``euler2quat`` makes of two angles, drawn in the order of the axes."""
+def test_their_reset_draws_two_angles_in_the_order_of_the_axes() -> None:
+    """The target's orientation is ``euler2quat`` of these angles."""
     env = AdroitHandPenEnv()
     env.reset(seed=3)
     angles = np.random.default_rng(3).uniform(-1, 1, 2)
     np.testing.assert_allclose(env.model.body("target").quat, euler2quat([*angles, 0.0]), atol=1e-12)
 
 
-# parameters and memory
-
-
-def formula(obs: np.ndarray, near: float, goal: float, reach: np.ndarray | float, drop: float) -> np.ndarray:
-    """The reward, made of the observation."""
-    distance = np.linalg.norm(obs[:, 39:42], axis=1)
-    similarity = (obs[:, 33:36] * obs[:, 36:39]).sum(axis=1)
-    reward = similarity - distance
-    reward += 10.0 * ((distance < reach) & (similarity > near)) + 50.0 * ((distance < reach) & (similarity > goal))
-    return reward - 5.0 * (obs[:, 26] < drop)
-
-
-def test_parameters() -> None:
-    """Every threshold does its work, one of them with another value in each world."""
-    n = 400
-    rng = np.random.default_rng(0)
-    reach = rng.uniform(0.02, 0.2, n)
-    env = lw.make(
-        "adroit_pen", engine="mujoco", nworld=n, autoreset=False, nthread=1, near_similarity=0.3, goal_similarity=0.7,
-        goal_distance=reach, drop_height=0.2, goal_steps=3,
-    )  # fmt: skip
-    state = env.get_state()
-    parts = env.state_space.split(state)
-    parts["qpos"][:, 24:27] = torch.from_numpy(rng.uniform(-0.1, 0.1, (n, 3)))
-    parts["qpos"][:, 27:] = torch.from_numpy(rng.uniform(-1.5, 1.5, (n, 3)))
-    env.set_state(state)
-    assert not env.reward.any()
-    # the fields that mj_step left came with the state: only a step shows the new positions
-    counts, terms = np.zeros(n), set()
-    for _ in range(6):
-        env.step(torch.zeros(n, 24))
-        obs = env.obs.numpy().astype(np.float64)
-        wanted = formula(obs, 0.3, 0.7, reach.astype(np.float32), 0.2)
-        np.testing.assert_allclose(env.reward.numpy(), wanted, rtol=1e-5, atol=1e-5)
-        similarity = (obs[:, 33:36] * obs[:, 36:39]).sum(axis=1)
-        np.testing.assert_allclose(env.eval.numpy(), similarity, atol=1e-6)
-        counts += (np.linalg.norm(obs[:, 39:42], axis=1) < reach) & (similarity > 0.7)
-        assert np.array_equal(env.success.numpy(), counts > 3)
-        terms |= set(np.round(wanted - similarity + np.linalg.norm(obs[:, 39:42], axis=1)).tolist())
-    assert terms == {-5.0, 0.0, 5.0, 10.0, 55.0, 60.0}
-    assert 10 < env.success.sum() < n - 10
-
-
-def test_success_memory() -> None:
-    """A success needs more than 20 steps at the goal; resets forget them, and states keep them."""
-    env = lw.make("adroit_pen", engine="mujoco", nworld=3, horizon=0, goal_similarity=-2.0, goal_distance=10.0)
-    still = torch.zeros(3, 24)
-    for i in range(25):
-        env.step(still)
-        assert env.success.tolist() == 3 * [i >= 20]
-    state = env.get_state()
-    assert env.state_space.split(state)["memory"].tolist() == 3 * [[25.0]]
-    env.rand_reset(mask=torch.tensor([True, False, False]))
-    assert env.success.tolist() == [False, True, True]
-    for _ in range(20):
-        env.step(still)
-        assert env.success.tolist() == [False, True, True]
-    env.step(still)
-    assert env.success.all()
-    env.reset()
-    assert not env.success.any()
-    env.set_state(state)
-    assert env.success.all()
-
-
-# the package with the model
-
-
-def test_gymnasium_robotics_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if "robotics" in name else find(name, *a))
-    with pytest.raises(FileNotFoundError, match=r"gymnasium_robotics, .*: pip install 'lyceum-warp\[hand\]'"):
-        lw.make("adroit_pen", engine="mujoco")
-
-
-def test_a_model_that_gymnasium_robotics_lacks() -> None:
-    with pytest.raises(FileNotFoundError, match=r"no model file 'adroit_hand/adroit_pan.xml'.* adroit_hand/adroit_pen"):
-        lw.gymnasium_robotics_model("adroit_hand/adroit_pan.xml")

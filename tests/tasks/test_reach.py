@@ -1,16 +1,14 @@
-"""The reach task: the published arm, its formulas, and a success that is an average over ten steps."""
-
-from collections.abc import Callable
+"""The reach task: the published arm, Lyceum's formulas, resets, and a success that is a mean over ten steps."""
 
 import mujoco
 import numpy as np
 import pytest
 import torch
-from test_cartpole_swingup import check_uniform, positions, put_at_random, same
+from checks import check_formula, check_uniform, positions, put_at_random
+from conftest import SharedEnv
 
 import lyceum_warp as lw
 
-SharedEnv = Callable[..., lw.Env]
 NWORLD = 256
 
 # the arm
@@ -38,8 +36,8 @@ JOINTS = {  # body, axis, range, damping, gear
 RANGES = np.array([joint[2] for joint in JOINTS.values()])
 
 
-def test_arm(shared_env: SharedEnv) -> None:
-    """Masses, inertias, joints and motors are those of the arm in the paper's code."""
+def test_model_has_the_published_arms_masses_joints_and_motors(shared_env: SharedEnv) -> None:
+    """The numbers are those of the arm in the paper's code."""
     env = shared_env("reach")
     model = env.model
     assert (model.nq, model.nv, model.nu, model.nmocap) == (7, 7, 7, 1)
@@ -61,7 +59,7 @@ def test_arm(shared_env: SharedEnv) -> None:
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
 
 
-def test_only_the_palm_collides_and_only_with_the_table(shared_env: SharedEnv) -> None:
+def test_only_palm_and_table_collide(shared_env: SharedEnv) -> None:
     model = shared_env("reach").model
     solid = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
     assert [model.body(model.geom_bodyid[i]).name for i in solid] == ["world", "hand"]
@@ -71,8 +69,8 @@ def test_only_the_palm_collides_and_only_with_the_table(shared_env: SharedEnv) -
     assert model.site("target").size[0] == 0.05
 
 
-def test_trajectory(shared_env: SharedEnv) -> None:
-    """Three seconds of smooth controls, against a limit, lead where they led the original arm (computed once)."""
+def test_three_seconds_of_controls_end_where_the_original_arm_ended(shared_env: SharedEnv) -> None:
+    """Smooth controls, one joint against its limit; the numbers were computed once with the original arm."""
     model = shared_env("reach").model
     data = mujoco.MjData(model)
     for i in range(300):
@@ -86,7 +84,7 @@ def test_trajectory(shared_env: SharedEnv) -> None:
 
 
 def finger(env: lw.Env, qpos: np.ndarray) -> np.ndarray:
-    """Where the finger is, by MuJoCo's kinematics in float64."""
+    """The finger's position in each world, from MuJoCo's kinematics in float64."""
     data, found = mujoco.MjData(env.model), []
     for row in qpos:
         data.qpos[:] = row
@@ -96,7 +94,7 @@ def finger(env: lw.Env, qpos: np.ndarray) -> np.ndarray:
 
 
 def errors(env: lw.Env, state: torch.Tensor | None = None) -> np.ndarray:
-    """From the target to the hand, in each world."""
+    """Vectors from the target to the hand, (nworld, 3)."""
     state = env.get_state() if state is None else state
     target = env.state_space.split(state)["mocap_pos"].numpy()
     return finger(env, positions(env, state)[0]) - target
@@ -106,8 +104,8 @@ def reward(error: np.ndarray) -> np.ndarray:
     return -np.abs(error).sum(axis=1) - 5.0 * np.sqrt((error**2).sum(axis=1))
 
 
-def test_formulas(shared_env: SharedEnv) -> None:
-    """Observation, reward and evaluation, of states that a step led to and of given ones, targets all different."""
+def test_reward_evaluation_and_observation_equal_lyceums_formulas(shared_env: SharedEnv) -> None:
+    """For states that a step led to and for given ones, with a different target in each world."""
     env = shared_env("reach", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     assert env.obs.shape == (NWORLD, 20)
@@ -117,24 +115,24 @@ def test_formulas(shared_env: SharedEnv) -> None:
         qpos, qvel = positions(env)
         error = errors(env)
         assert len(np.unique(np.round(error, 6), axis=0)) == NWORLD
-        same(env.obs, np.concatenate([qpos, qvel, finger(env, qpos), error], axis=1))
-        same(env.reward, reward(error))
-        same(env.eval, np.linalg.norm(error, axis=1))
+        check_formula(env.obs, np.concatenate([qpos, qvel, finger(env, qpos), error], axis=1))
+        check_formula(env.reward, reward(error))
+        check_formula(env.eval, np.linalg.norm(error, axis=1))
         assert not env.terminated.any()
     after = put_at_random(env, rng, position=1.0, velocity=3.0)
-    same(env.get_reward(before, torch.zeros(NWORLD, 7), after), reward(errors(env, after)))
-    same(env.get_eval(after), np.linalg.norm(errors(env, after), axis=1))
+    check_formula(env.get_reward(before, torch.zeros(NWORLD, 7), after), reward(errors(env, after)))
+    check_formula(env.get_eval(after), np.linalg.norm(errors(env, after), axis=1))
 
 
-def test_hand_at_zero(shared_env: SharedEnv) -> None:
-    """Stretched out along x, the arm reaches over its three links, and a target there is worth 0."""
+def test_reward_is_0_with_the_stretched_out_arm_at_the_target(shared_env: SharedEnv) -> None:
+    """The fixed reset stretches the arm out along x, over the length of its three links."""
     env = shared_env("reach", nworld=2, autoreset=False)
     env.reset()
-    same(env.obs[0], np.concatenate([np.zeros(14), [0.821, -0.6, 0.0], [0.721, -0.7, -0.1]]))
+    check_formula(env.obs[0], np.concatenate([np.zeros(14), [0.821, -0.6, 0.0], [0.721, -0.7, -0.1]]))
     state = env.get_state()
     env.state_space.split(state)["mocap_pos"][1] = torch.tensor([0.821, -0.6, 0.0])
     rewards = env.get_reward(state, torch.zeros(2, 7), state)
-    same(rewards, np.array([-1.521 - 5.0 * np.sqrt(0.721**2 + 0.7**2 + 0.1**2), 0.0]))
+    check_formula(rewards, np.array([-1.521 - 5.0 * np.sqrt(0.721**2 + 0.7**2 + 0.1**2), 0.0]))
 
 
 # resets
@@ -146,8 +144,8 @@ def targets(env: lw.Env) -> np.ndarray:
 
 @pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("scale", [None, (0.1, 0.5, 0.0)])
-def test_reset(scale: tuple[float, float, float] | None) -> None:
-    """The arm starts at zero and at rest; the target anywhere in its box, in each world elsewhere."""
+def test_random_resets_draw_the_target_from_its_box(scale: tuple[float, float, float] | None) -> None:
+    """The arm starts at zero and at rest; each world draws a target of its own."""
     env = lw.make("reach", engine="mujoco", nworld=2000, **({} if scale is None else {"target_range": scale}))
     env.rand_reset(0)
     size = np.array(scale or (0.3, 0.2, 0.25))
@@ -156,14 +154,14 @@ def test_reset(scale: tuple[float, float, float] | None) -> None:
     check_uniform(found[:, size > 0] / size[size > 0].astype(np.float32))
     qpos, qvel = positions(env)
     assert not qpos.any() and not qvel.any()
-    same(env.eval, np.linalg.norm(errors(env), axis=1))
+    check_formula(env.eval, np.linalg.norm(errors(env), axis=1))
     env.reset()
     np.testing.assert_allclose(targets(env), np.full((2000, 3), 0.1), atol=1e-7)
 
 
 @pytest.mark.usefixtures("freed")
-def test_random_start() -> None:
-    """With random_start every joint starts anywhere in its range, at rest."""
+def test_random_start_draws_every_joint_from_its_range() -> None:
+    """The arm starts at rest."""
     env = lw.make("reach", engine="mujoco", nworld=2000, random_start=True)
     qpos, qvel = positions(env)
     assert not qvel.any()
@@ -179,7 +177,7 @@ def test_random_start() -> None:
 
 
 def put_targets(env: lw.Env, distance: np.ndarray) -> None:
-    """Put targets at given distances from the hands, along x."""
+    """Move each world's target to a distance from its hand, along x."""
     state = env.get_state()
     parts = env.state_space.split(state)
     hand = finger(env, parts["qpos"].numpy())
@@ -187,8 +185,8 @@ def put_targets(env: lw.Env, distance: np.ndarray) -> None:
     env.set_state(state)
 
 
-def test_success_takes_ten_steps() -> None:
-    """Ten steps at the target make a success, even where far more distance is allowed; a reset forgets them."""
+def test_success_needs_ten_steps_at_the_target() -> None:
+    """Also where far more distance is allowed. A reset clears the count, and a state holds it."""
     env = lw.make("reach", engine="mujoco", nworld=3, success_distance=np.array([0.05, 0.05, 0.99]), horizon=0)
     put_targets(env, np.array([0.0, 0.06, 0.0]))
     still = torch.zeros(3, 7)
@@ -204,12 +202,12 @@ def test_success_takes_ten_steps() -> None:
     assert env.success.tolist() == [False, False, True]
     env.reset()
     assert not env.success.any()
-    env.set_state(state)  # what is remembered belongs to the state
+    env.set_state(state)  # task memory belongs to the state
     assert env.success.tolist() == [True, False, True]
 
 
-def test_success_is_an_average(shared_env: SharedEnv) -> None:
-    """Of the last ten distances, counted by hand while targets jump near and away."""
+def test_success_is_the_mean_of_the_last_ten_distances(shared_env: SharedEnv) -> None:
+    """The targets jump near and away every six steps."""
     env = shared_env("reach", nworld=64, autoreset=False, horizon=0)
     rng = np.random.default_rng(0)
     distances: list[np.ndarray] = []
@@ -226,15 +224,14 @@ def test_success_is_an_average(shared_env: SharedEnv) -> None:
     assert 300 < successes < 51 * 64 - 300
 
 
-def test_episode(shared_env: SharedEnv) -> None:
-    """An episode lasts 75 steps, and the next one has to earn its success anew."""
+def test_an_episode_lasts_75_steps_and_clears_the_success(shared_env: SharedEnv) -> None:
     env = shared_env("reach", nworld=2)
     for i in range(75):
         if i == 60:
             put_targets(env, np.zeros(2))
         env.step(torch.zeros(2, 7))
         assert bool(env.truncated.all()) == (i == 74)
-    assert env.success.all(), "the last step of an episode tells of the episode"
+    assert env.success.all(), "success belongs to the episode that ended"
     put_targets(env, np.zeros(2))
     env.step(torch.zeros(2, 7))
     assert not env.success.any()

@@ -1,0 +1,49 @@
+"""Helpers of several test files: states set at random, comparisons with formulas, and checks of random samples."""
+
+import numpy as np
+import torch
+
+import lyceum_warp as lw
+
+
+def put_at_random(env: lw.Env, rng: np.random.Generator, position: float, velocity: float) -> torch.Tensor:
+    """Put every world into a random state with qpos and qvel up to the given sizes; returns the states."""
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    for name, size in (("qpos", position), ("qvel", velocity)):
+        values = rng.uniform(-size, size, parts[name].shape).astype(np.float32)
+        parts[name].copy_(torch.from_numpy(values))
+    env.set_state(state)
+    return state
+
+
+def positions(env: lw.Env, state: torch.Tensor | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Copies of qpos and qvel, of the worlds or of given states, in float64."""
+    parts = env.state_space.split(env.get_state() if state is None else state)
+    return parts["qpos"].numpy().copy(), parts["qvel"].numpy().copy()
+
+
+def check_formula(ours: torch.Tensor, formula: np.ndarray) -> None:
+    """Compare float32 results with a formula in float64."""
+    np.testing.assert_allclose(ours.numpy(), formula, rtol=1e-6, atol=2e-6)
+
+
+def check_uniform(samples: np.ndarray) -> None:
+    """Check that each column is U(-1, 1), and independent of the others."""
+    n, k = samples.shape
+    assert np.abs(samples).max() <= 1.0
+    assert samples.max(axis=0).min() > 1.0 - 20.0 / n and samples.min(axis=0).max() < 20.0 / n - 1.0
+    expected = (np.sort(samples, axis=0) + 1.0) / 2.0
+    ranks = (np.arange(n)[:, None] + 0.5) / n
+    assert np.abs(expected - ranks).max() < 2.6 / np.sqrt(n)
+    assert np.abs(np.corrcoef(samples.T) - np.eye(k)).max() < 5.5 / np.sqrt(n)
+
+
+def check_normal(samples: np.ndarray) -> None:
+    """Check that each column is N(0, 1), and independent of the others."""
+    n, k = samples.shape
+    quantiles = torch.special.ndtr(torch.from_numpy(np.sort(samples, axis=0))).numpy()
+    ranks = (np.arange(n)[:, None] + 0.5) / n
+    assert np.abs(quantiles - ranks).max() < 2.6 / np.sqrt(n)
+    assert np.abs(samples.std(axis=0) - 1.0).max() < 5.0 / np.sqrt(2.0 * n)
+    assert np.abs(np.corrcoef(samples.T) - np.eye(k)).max() < 5.5 / np.sqrt(n)

@@ -1,0 +1,68 @@
+"""The adroit_pen task's parameters and memory. oracles/test_gymnasium_robotics.py compares it with the original."""
+
+import numpy as np
+import torch
+
+import lyceum_warp as lw
+
+
+def formula(obs: np.ndarray, near: float, goal: float, reach: np.ndarray | float, drop: float) -> np.ndarray:
+    """The reward as a formula of the observation."""
+    distance = np.linalg.norm(obs[:, 39:42], axis=1)
+    similarity = (obs[:, 33:36] * obs[:, 36:39]).sum(axis=1)
+    reward = similarity - distance
+    reward += 10.0 * ((distance < reach) & (similarity > near)) + 50.0 * ((distance < reach) & (similarity > goal))
+    return reward - 5.0 * (obs[:, 26] < drop)
+
+
+def test_every_threshold_takes_effect() -> None:
+    """One of the thresholds has another value in each world."""
+    n = 400
+    rng = np.random.default_rng(0)
+    reach = rng.uniform(0.02, 0.2, n)
+    env = lw.make(
+        "adroit_pen", engine="mujoco", nworld=n, autoreset=False, nthread=1, near_similarity=0.3, goal_similarity=0.7,
+        goal_distance=reach, drop_height=0.2, goal_steps=3,
+    )  # fmt: skip
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    parts["qpos"][:, 24:27] = torch.from_numpy(rng.uniform(-0.1, 0.1, (n, 3)))
+    parts["qpos"][:, 27:] = torch.from_numpy(rng.uniform(-1.5, 1.5, (n, 3)))
+    env.set_state(state)
+    assert not env.reward.any()
+    # set_state restores the fields that mj_step left, so only a step shows the new positions
+    counts, terms = np.zeros(n), set()
+    for _ in range(6):
+        env.step(torch.zeros(n, 24))
+        obs = env.obs.numpy().astype(np.float64)
+        wanted = formula(obs, 0.3, 0.7, reach.astype(np.float32), 0.2)
+        np.testing.assert_allclose(env.reward.numpy(), wanted, rtol=1e-5, atol=1e-5)
+        similarity = (obs[:, 33:36] * obs[:, 36:39]).sum(axis=1)
+        np.testing.assert_allclose(env.eval.numpy(), similarity, atol=1e-6)
+        counts += (np.linalg.norm(obs[:, 39:42], axis=1) < reach) & (similarity > 0.7)
+        assert np.array_equal(env.success.numpy(), counts > 3)
+        terms |= set(np.round(wanted - similarity + np.linalg.norm(obs[:, 39:42], axis=1)).tolist())
+    assert terms == {-5.0, 0.0, 5.0, 10.0, 55.0, 60.0}
+    assert 10 < env.success.sum() < n - 10
+
+
+def test_success_needs_more_than_20_steps_at_the_goal() -> None:
+    """A reset clears the count, and a state holds it."""
+    env = lw.make("adroit_pen", engine="mujoco", nworld=3, horizon=0, goal_similarity=-2.0, goal_distance=10.0)
+    still = torch.zeros(3, 24)
+    for i in range(25):
+        env.step(still)
+        assert env.success.tolist() == 3 * [i >= 20]
+    state = env.get_state()
+    assert env.state_space.split(state)["memory"].tolist() == 3 * [[25.0]]
+    env.rand_reset(mask=torch.tensor([True, False, False]))
+    assert env.success.tolist() == [False, True, True]
+    for _ in range(20):
+        env.step(still)
+        assert env.success.tolist() == [False, True, True]
+    env.step(still)
+    assert env.success.all()
+    env.reset()
+    assert not env.success.any()
+    env.set_state(state)
+    assert env.success.all()

@@ -1,0 +1,68 @@
+"""The point_mass task: Lyceum's formulas, its physics and its resets."""
+
+import numpy as np
+import torch
+from checks import check_formula, check_uniform, positions, put_at_random
+from conftest import SharedEnv
+
+import lyceum_warp as lw
+
+NWORLD = 256
+
+
+def distance_to_target(qpos: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(qpos[:, :2] - qpos[:, 2:], axis=1)
+
+
+def test_reward_evaluation_observation_and_success_equal_lyceums_formulas(shared_env: SharedEnv) -> None:
+    env = shared_env("point_mass", nworld=NWORLD, autoreset=False)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        before = put_at_random(env, rng, position=1.3, velocity=2.0)
+        qpos, qvel = positions(env, before)
+        check_formula(env.obs, np.concatenate([qpos[:, :2], qvel[:, :2], qpos[:, 2:]], axis=1))
+        check_formula(env.eval, distance_to_target(qpos))
+        assert not env.reward.any()
+
+        action = torch.from_numpy(rng.uniform(-1.5, 1.5, (NWORLD, 2)).astype(np.float32))
+        env.step(action)
+        qpos, qvel = positions(env)
+        check_formula(env.reward, 1.0 - distance_to_target(qpos))
+        check_formula(env.eval, distance_to_target(qpos))
+        check_formula(env.obs, np.concatenate([qpos[:, :2], qvel[:, :2], qpos[:, 2:]], axis=1))
+        assert not env.terminated.any()
+
+    after = put_at_random(env, rng, position=0.08, velocity=2.0)
+    distance = distance_to_target(positions(env, after)[0])
+    check_formula(env.get_reward(before, action, after), 1.0 - distance)
+    check_formula(env.get_eval(after), distance)
+    assert np.array_equal(env.success.numpy(), distance < 0.05)
+    assert 10 < env.success.sum() < NWORLD - 10
+
+
+def test_a_push_accelerates_the_agent_alone(shared_env: SharedEnv) -> None:
+    """A push of 1 accelerates by gear over mass and armature; the target stays where it is."""
+    env = shared_env("point_mass", nworld=2, autoreset=False)
+    env.reset()
+    assert env.model.opt.timestep == env.timestep == 0.02
+    assert not env.model.opt.gravity.any()
+    assert np.array_equal(env.model.jnt_range, np.tile([-1.4, 1.4], (4, 1)))
+    env.step(torch.tensor([[1.0, 0.0], [0.0, -3.0]]))  # -3 is clipped to -1
+    qpos, qvel = positions(env)
+    # one semi-implicit Euler step from rest, damping 0.1 taken implicitly
+    speed = 0.02 * 4.0 / (0.3 + 0.01 + 0.02 * 0.1)
+    np.testing.assert_allclose(qvel, [[speed, 0, 0, 0], [0, -speed, 0, 0]], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(qpos, [[0.02 * speed, 0, 1, 0], [0, -0.02 * speed, 1, 0]], rtol=1e-6, atol=1e-9)
+
+
+def test_random_resets_draw_agent_and_target_from_the_square() -> None:
+    """The fixed reset puts the agent at the origin and the target at (1, 0)."""
+    env = lw.make("point_mass", engine="mujoco", nworld=2000)
+    env.rand_reset(0)
+    qpos, qvel = positions(env)
+    check_uniform(qpos)
+    assert not qvel.any()
+    env.reset()
+    qpos, qvel = positions(env)
+    assert np.array_equal(qpos, np.tile([0.0, 0.0, 1.0, 0.0], (2000, 1)))
+    assert not qvel.any()
