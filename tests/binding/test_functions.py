@@ -1,153 +1,138 @@
-"""The form of a task: what is written wrongly is told at once, and several tasks live side by side."""
+"""A task's structs and functions: found in its class or its module, and checked against the table in ``task.py``."""
 
-import sys
-import types
 from pathlib import Path
 
 import pytest
-import torch
+import tiny_task
 
 import lyceum_warp as lw
+from lyceum_warp.binding.functions import TaskSource
+from lyceum_warp.binding.registry import find_task, task_name
+from lyceum_warp.task import FUNCTIONS, Task
 
-HEAD = """
-import warp as wp
-import lyceum_warp as lw
-from lyceum_warp import Row
-
-@wp.struct
-class World:
-    qpos: Row[float]
-
-@wp.struct
-class Params:
-    dt: float
-
-@wp.func
-def observe(s: World, p: Params, obs: Row[float]):
-    obs[0] = s.qpos[0]
-"""
-
-CLASS = """
-class Shape(lw.Task):
-    model = "hopper.xml"
-    obs = {"x": 1}
-"""
+REWARD = "def reward(s0: World, action: Row[float], s1: World, p: Params)"
+MEANT = {
+    "observe": "def observe(s: World, p: Params, obs: Row[float]):\n    obs[0] = 1.0",
+    "control": "def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):\n    ctrl[0] = 1.0",
+    "reward": f"{REWARD} -> float:\n    return 1.0",
+    "evaluate": "def evaluate(s: World, p: Params) -> float:\n    return 1.0",
+    "terminated": "def terminated(s: World, p: Params) -> bool:\n    return True",
+    "success": "def success(s: World, p: Params) -> bool:\n    return True",
+    "initialize": "def initialize(s: World, p: Params):\n    s.qpos[0] = 1.0",
+    "randomize": "def randomize(s: World, p: Params, rng: Row[wp.uint32]):\n    s.qpos[0] = lw.normal(rng)",
+    "advance": "def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):\n    pass",
+}
 
 
-def made(tmp_path: Path, source: str, name: str = "shape.py") -> lw.Env:
-    file = tmp_path / name
-    file.write_text(source)
-    return lw.make(file)
+def source_of(folder: Path, text: str) -> TaskSource:
+    task = find_task(tiny_task.write(folder, text))
+    return TaskSource(task, task_name(task))
 
 
-@pytest.mark.parametrize(
-    "written, message",
-    [
-        (
-            "def reward(s0: World, s1: World, action: Row[float], p: Params) -> float:\n    return 1.0",
-            r"reward of the task 'shape' has to be written as reward\(s0: World, action: Row\[float\], s1: World",
-        ),
-        ("def terminated(s: World, p: Params) -> float:\n    return 1.0", r"terminated .* written as .* -> bool"),
-        ("def success(s: World) -> bool:\n    return True", r"success .* written as success\(s: World, p: Params\)"),
-        ("def sucess(s: World, p: Params) -> bool:\n    return True", "'sucess': did you mean success"),
-        (
-            "def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:\n    return s1.qvel[0]",
-            "Warp can't compile the functions of the task 'shape': .*qvel",
-        ),
-    ],
-)
-def test_a_function_that_is_written_wrongly_is_named(tmp_path: Path, written: str, message: str) -> None:
+def test_the_examples_name_every_function_of_the_table() -> None:
+    assert list(MEANT) == list(FUNCTIONS)
+    for name, function in MEANT.items():
+        assert function.startswith(f"def {FUNCTIONS[name].signature}:")
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_function_written_as_in_the_table_is_found(name: str, tmp_path: Path) -> None:
+    source = source_of(tmp_path, tiny_task.with_function(MEANT[name]))
+    assert [key for key, function in source.functions.items() if function] == sorted(
+        {"observe", name}, key=list(FUNCTIONS).index
+    )
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_function_with_other_arguments_is_refused_with_the_line_to_write(name: str, tmp_path: Path) -> None:
+    text = tiny_task.TINY if name == "observe" else tiny_task.with_function(MEANT[name])
+    with pytest.raises(ValueError) as caught:
+        source_of(tmp_path, text.replace(f"def {name}(", f"def {name}(more: float, "))
+    assert str(caught.value) == f"{name} of the task 'tiny' must be written as {FUNCTIONS[name].signature}"
+
+
+WRITTEN_OTHERWISE = {
+    "order of arguments": (
+        "def reward(s0: World, s1: World, action: Row[float], p: Params) -> float:\n    return 1.0",
+        r"reward of the task 'tiny' must be written as reward\(s0: World, action: Row\[float\], s1: World",
+    ),
+    "another result": (
+        "def terminated(s: World, p: Params) -> float:\n    return 1.0",
+        r"terminated of the task 'tiny' must be written as terminated\(s: World, p: Params\) -> bool",
+    ),
+    "an argument missing": (
+        "def success(s: World) -> bool:\n    return True",
+        r"success of the task 'tiny' must be written as success\(s: World, p: Params\) -> bool",
+    ),
+    "misspelt": (
+        "def sucess(s: World, p: Params) -> bool:\n    return True",
+        "the task 'tiny' has a function 'sucess': did you mean success?",
+    ),
+    "no return": (
+        "def evaluate(s: World, p: Params) -> float:\n    wp.abs(s.qpos[0])",
+        r"evaluate of the task 'tiny' has no return: it is written as evaluate\(s: World, p: Params\) -> float",
+    ),
+    "a tuple": (
+        f"{REWARD}:\n    return 1.0, 2.0",
+        "reward of the task 'tiny' returns a tuple, and must return a single float",
+    ),
+}
+
+
+@pytest.mark.parametrize(("function", "message"), WRITTEN_OTHERWISE.values(), ids=WRITTEN_OTHERWISE)
+def test_a_function_written_otherwise_is_refused(function: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
-        made(tmp_path, f"{HEAD}\n@wp.func\n{written}\n{CLASS}")
+        source_of(tmp_path, tiny_task.with_function(function))
+
+
+INCOMPLETE = {
+    "no observe": ("def observe", "def look", r"the task 'tiny' has no observe\(s, p, obs\)"),
+    "no wp.func": ("@wp.func\n", "", "observe of the task 'tiny' must be a @wp.func"),
+    "annotations as text": (
+        "obs: Row[float]):", "obs: 'Row[float]'):", "observe of the task 'tiny' has annotations that are text"
+    ),
+    "no World": ("class World", "class Fields", "NameError: name 'World' is not defined"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "message"), INCOMPLETE.values(), ids=INCOMPLETE)
+def test_an_incomplete_file_says_what_is_missing(old: str, new: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        source_of(tmp_path, tiny_task.changed((old, new)))
+
+
+@pytest.mark.parametrize("name", ["World", "Params"])
+def test_a_class_in_the_place_of_a_struct_is_refused(name: str, tmp_path: Path) -> None:
+    text = tiny_task.TINY.replace("    model =", f"    class {name}:\n        qpos: Row[float]\n\n    model =")
+    with pytest.raises(ValueError, match=f"{name} of the task 'tiny' must be a Warp struct: decorate it with @wp.st"):
+        source_of(tmp_path, text)
 
 
 @pytest.mark.parametrize(
-    "line, message",
+    ("line", "message"),
     [
         ("frameskip = 5", "'frameskip' in its class: did you mean frame_skip"),
-        ("horizon = -1", "horizon of the task 'shape' has to be a whole number"),
-        ("obs = 10", "obs of the task 'shape' is 10: add the parts of its observation"),
+        ("horzon = 10", "'horzon' in its class: did you mean horizon"),
     ],
 )
-def test_a_class_that_is_written_wrongly_is_named(tmp_path: Path, line: str, message: str) -> None:
+def test_a_misspelt_attribute_of_the_class_is_refused(line: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
-        made(tmp_path, f"{HEAD}{CLASS}    {line}\n")
+        source_of(tmp_path, f"{tiny_task.TINY}    {line}\n")
 
 
-def test_actions_can_be_scaled_to_ranges_only(tmp_path: Path) -> None:
-    import mujoco
-
-    spec = mujoco.MjSpec.from_file(str(Path(__file__).parents[1] / "data" / "unlimited.xml"))
-    file = tmp_path / "shape.py"
-    file.write_text(f"{HEAD}{CLASS}    action_range = (-1.0, 1.0)\n")
-    with pytest.raises(ValueError, match=r"gives none to the controls \[0\]: set their ctrlrange"):
-        lw.make(file, model=spec)
+def test_functions_in_the_class_take_precedence_over_the_module(tmp_path: Path) -> None:
+    text = tiny_task.with_function(MEANT["evaluate"].replace("evaluate", "distance"))
+    source = source_of(tmp_path, f"{text}    evaluate = distance\n")
+    assert source.functions["evaluate"] is vars(source.task)["evaluate"]
 
 
-def test_two_files_may_hold_tasks_of_one_name(tmp_path: Path) -> None:
-    (tmp_path / "a").mkdir()
-    (tmp_path / "b").mkdir()
-    first = made(tmp_path / "a", f"{HEAD}\n@lw.register{CLASS}")
-    second = made(tmp_path / "b", f"{HEAD}\n@lw.register{CLASS}    frame_skip = 2\n")
-    assert (first.task.frame_skip, second.task.frame_skip) == (1, 2)
+def test_a_subclass_inherits_functions_and_structs(tmp_path: Path) -> None:
+    file = tiny_task.write(tmp_path, f"{tiny_task.with_function(MEANT['reward'])}\nclass Other(Tiny):\n    pass\n")
+    first, second = (TaskSource(find_task(f"{file}:{name}"), name) for name in ("Tiny", "Other"))
+    assert first.functions == second.functions
+    assert (first.world, first.params) == (second.world, second.params)
 
 
-def test_tasks_in_one_notebook_keep_their_own_functions(tmp_path: Path) -> None:
-    """Each cell defines the same names anew; a task keeps those of its own cell."""
-    one = f"{HEAD}\n@wp.func\ndef evaluate(s: World, p: Params) -> float:\n    return 1.0\n{CLASS}"
-    two = HEAD.replace("s.qpos[0]", "2.0") + CLASS.replace("Shape", "Other")
-    module = types.ModuleType("notebook_of_a_test")
-    sys.modules[module.__name__] = module
-    for i, cell in enumerate((one, two)):
-        file = tmp_path / f"cell{i}.py"  # Warp reads the source from where it was compiled
-        file.write_text(cell)
-        exec(compile(cell, str(file), "exec"), vars(module))
-    shape, other = lw.make(module.Shape), lw.make(module.Other)
-    for env in (shape, other):
-        env.step()
-    assert shape.eval.item() == 1.0
-    assert torch.equal(shape.obs, shape.field("qpos")[:, :1])
-    assert other.obs.item() == 2.0
-    assert torch.equal(other.eval, other.reward)  # the evaluation of the first cell is none of its business
-    del sys.modules[module.__name__]
-
-
-@pytest.mark.parametrize("name", ["hopper.xml", "foo.bar", "./t", ""])
-def test_what_is_no_task_is_said_so(name: str) -> None:
-    with pytest.raises(ValueError, match="there is no task"):
-        lw.make(name)
-
-
-def test_other_librarys_words_are_understood() -> None:
-    with pytest.raises(ValueError, match="no parameter 'num_envs': did you mean nworld"):
-        lw.make("hopper", num_envs=4)
-
-
-def test_an_observation_has_one_size_in_all_worlds() -> None:
-    flags = [True, False]
-    with pytest.raises(ValueError, match=r"obs of the task 'hopper' differs between worlds in \['position'\]"):
-        lw.make("hopper", nworld=2, exclude_current_positions_from_observation=flags)
-    env = lw.make("hopper", nworld=2)
-    with pytest.raises(ValueError, match="would change the observation's parts"):
-        env.set_params(exclude_current_positions_from_observation=flags)
-    env.step()  # goes on with the parameters that it had
-    assert env.get_obs().shape == (2, 11)
-
-
-def test_buffers_are_written_into() -> None:
-    env = lw.make("hopper", nworld=2)
-    with pytest.raises(AttributeError, match=r"env.action is a buffer of fixed address: write into it"):
-        env.action = torch.zeros(2, 3)
-    env.step(torch.zeros(2, 3, requires_grad=True) + 1.0)
-    assert not env.action.requires_grad
-
-
-def test_a_file_in_the_current_folder_takes_no_tasks_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only a model that is asked for comes from the current folder."""
-    spec = lw.gymnasium_model("hopper.xml")
-    spec.geom("torso_geom").density = 5000
-    (tmp_path / "hopper.xml").write_text(spec.to_xml())
-    own = lw.make("hopper").model.body_mass
-    monkeypatch.chdir(tmp_path)
-    assert (lw.make("hopper").model.body_mass == own).all()
-    assert lw.make("hopper", model="hopper.xml").model.body_mass[1] > 2 * own[1]
+def test_every_function_of_the_table_is_in_the_help_of_task() -> None:
+    assert all(function.signature in str(Task.__doc__) for function in FUNCTIONS.values())
+    assert lw.Task is Task

@@ -1,19 +1,136 @@
-"""Where a task's model comes from, and which messages say that it is not there."""
+"""Where a task's model comes from, and what is changed in it so that both engines run the same physics."""
 
 import importlib.util
+from pathlib import Path
 
+import mujoco
 import pytest
+import tiny_task
 
 import lyceum_warp as lw
+from lyceum_warp.binding.bound_task import task_spec
+from lyceum_warp.binding.models import compile_model, load_spec
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.options import PhysicsOptions
+
+BALL = (
+    '<mujoco model="ball"><option {option}/><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
+)
+PHYSICS = PhysicsOptions()
 
 
-def test_gymnasium_robotics_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def ball(option: str = "") -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_string(BALL.format(option=option))
+
+
+# sources
+
+
+def test_a_spec_is_copied() -> None:
+    spec = ball()
+    copy = load_spec(spec)
+    copy.bodies[1].name = "moved"
+    assert spec.bodies[1].name == ""
+
+
+def test_a_compiled_model_is_refused() -> None:
+    with pytest.raises(ValueError, match="must be a file or an MjSpec, not a compiled MjModel: give its MjSpec"):
+        load_spec(ball().compile())
+
+
+def test_a_name_alone_is_one_of_gymnasiums_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert load_spec("hopper.xml").modelname == "hopper"
+    assert lw.gymnasium_model("hopper.xml").modelname == "hopper"
+
+
+def test_a_relative_path_belongs_to_the_tasks_file_not_to_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "robot.xml").write_text(lw.gymnasium_model("hopper.xml").to_xml())
+    file = tiny_task.write(tmp_path, tiny_task.changed(("hopper.xml", "models/robot.xml")))
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    assert task_spec(find_task(file)).modelname == "hopper"
+
+
+def test_the_current_folder_is_searched_only_for_the_option_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = lw.gymnasium_model("hopper.xml")
+    spec.geom("torso_geom").density = 5000
+    (tmp_path / "hopper.xml").write_text(spec.to_xml())
+    own = lw.make("hopper").model.body_mass
+    monkeypatch.chdir(tmp_path)
+    assert (lw.make("hopper").model.body_mass == own).all()
+    assert lw.make("hopper", model="hopper.xml").model.body_mass[1] > 2 * own[1]
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        ("hoper.xml", "no model file 'hoper.xml' in .*; it has hopper.xml"),
+        ("/nowhere/hopper.xml", "there is no model file '/nowhere/hopper.xml'"),
+        ("robott.xml", r"no model file .*robott.xml \(did you mean robot.xml\?\), and of Gymnasium's models: "),
+    ],
+)
+def test_a_model_file_that_is_missing_is_named(model: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "robot.xml").write_text("<mujoco/>")
+    file = tiny_task.write(tmp_path, tiny_task.changed(("hopper.xml", model)))
+    with pytest.raises(FileNotFoundError, match=message):
+        lw.make(file)
+
+
+def test_a_file_that_mujoco_cannot_read_is_named(tmp_path: Path) -> None:
+    (tmp_path / "robot.xml").write_text("<mujoco><robot/></mujoco>")
+    with pytest.raises(ValueError, match=r"MuJoCo can't read the model .*robot.xml: "):
+        load_spec(tmp_path / "robot.xml")
+
+
+def test_a_missing_gymnasium_robotics_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if "robotics" in name else find(name, *a))
     with pytest.raises(FileNotFoundError, match=r"gymnasium_robotics, .*: pip install 'lyceum-warp\[hand\]'"):
         lw.make("adroit_pen", engine="mujoco")
 
 
-def test_a_model_that_gymnasium_robotics_lacks() -> None:
+def test_a_model_that_gymnasium_robotics_lacks_is_refused_with_similar_names() -> None:
     with pytest.raises(FileNotFoundError, match=r"no model file 'adroit_hand/adroit_pan.xml'.* adroit_hand/adroit_pen"):
         lw.gymnasium_robotics_model("adroit_hand/adroit_pan.xml")
+
+
+# changes before compiling
+
+
+def test_the_pgs_solver_becomes_newton() -> None:
+    assert compile_model(ball('solver="PGS"'), (), PHYSICS).opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+    assert compile_model(ball('solver="CG"'), (), PHYSICS).opt.solver == mujoco.mjtSolver.mjSOL_CG
+
+
+def test_physics_options_replace_the_models_own() -> None:
+    physics = PhysicsOptions(cone="elliptic", integrator="implicitfast", solver={"iterations": 7, "ls_iterations": 9})
+    option = compile_model(ball('cone="pyramidal" integrator="RK4"'), (), physics).opt
+    assert option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    assert (option.iterations, option.ls_iterations) == (7, 9)
+
+
+def test_a_field_that_needs_a_sensor_gets_one() -> None:
+    model = compile_model(ball(), ["qpos", "cfrc_ext", "subtree_linvel"], PHYSICS)
+    kinds = [mujoco.mjtSensor.mjSENS_FRAMELINACC, mujoco.mjtSensor.mjSENS_SUBTREELINVEL]
+    assert sorted(model.sensor_type) == sorted(map(int, kinds))
+    assert not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR
+
+
+def test_sensors_are_turned_off_where_no_field_needs_them() -> None:
+    model = compile_model(ball(), ["qpos"], PHYSICS)
+    assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR
+
+
+def test_a_model_that_mujoco_refuses_is_named() -> None:
+    spec = ball()
+    spec.worldbody.add_body().add_joint()
+    with pytest.raises(ValueError, match="MuJoCo refuses the model 'ball': "):
+        compile_model(spec, (), PHYSICS)

@@ -1,0 +1,160 @@
+"""A task bound to its model: its class, the types of its fields, and the size of its observation are checked."""
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import pytest
+import tiny_task
+import torch
+from conftest import TaskFile
+
+import lyceum_warp as lw
+from lyceum_warp.binding.bound_task import BoundTask, task_spec
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.options import PhysicsOptions
+
+DATA = Path(__file__).parents[1] / "data"
+
+
+def bound(file: Path, **options: Any) -> BoundTask:
+    return BoundTask(find_task(file), **options)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("obs = 10", "obs of the task 'tiny' is 10: add the parts of its observation"),
+        ("memory = 1", "the task 'tiny' needs both, memory = ... in the class and memory in World"),
+        ("lagged = ('qvel',)", "the task 'tiny' wants 'qvel' lagged but does not list it in World"),
+        ("frame_skip = 0", "frame_skip of the task 'tiny' must be a whole number from 1 to .*, not 0"),
+        ("horizon = -1", "horizon of the task 'tiny' must be a whole number from 0 to .*, not -1"),
+        ("action_range = 1.0", r"must be two finite numbers, lowest first, as \(-1.0, 1.0\), not 1.0"),
+        ("action_range = (1.0, -1.0)", r"action_range of the task 'tiny' must be .* not \(1.0, -1.0\)"),
+        ("action_range = (0.0, float('inf'))", r"must be two finite numbers, lowest first"),
+    ],
+)
+def test_a_line_of_the_class_that_does_not_fit_is_refused(line: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        bound(tiny_task.write(tmp_path, f"{tiny_task.TINY}    {line}\n"))
+
+
+INCOMPLETE = {
+    "no obs": ("    obs = {", "    parts = {", "the task 'tiny' has no obs: add the parts of its observation"),
+    "no model": ("    model = ", "    file = ", "the task 'tiny' has no model: add a model, as model = \"robot.xml\""),
+    "no memory": (
+        "qpos: Row[float]",
+        "qpos: Row[float]\n    memory: Row[float]",
+        "needs both, memory = ... in the class",
+    ),
+    "no such field": ("qpos: Row[float]", "qpoz: Row[float]", "no field 'qpoz': did you mean qpos"),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "message"), INCOMPLETE.values(), ids=INCOMPLETE)
+def test_an_incomplete_class_says_what_is_missing(old: str, new: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        bound(tiny_task.write(tmp_path, tiny_task.changed((old, new))))
+
+
+DECLARED_OTHERWISE = {
+    "element": ("qpos: Row[wp.vec3]", r"World.qpos of the task 'tiny' must be declared as Row\[float\]"),
+    "vector": ("qpos: Row[float]\n    xpos: Row[float]", r"World.xpos .* must be declared as Row\[wp.vec3\]"),
+    "scalar": ("qpos: Row[float]\n    time: Row[float]", "World.time of the task 'tiny' must be declared as float"),
+}
+
+
+@pytest.mark.parametrize(("fields", "message"), DECLARED_OTHERWISE.values(), ids=DECLARED_OTHERWISE)
+def test_a_field_of_another_type_is_refused_with_the_type_to_write(fields: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        lw.make(tiny_task.write(tmp_path, tiny_task.changed(("qpos: Row[float]", fields))))
+
+
+OBSERVATIONS = {
+    "too long": ("obs[0] = s.qpos[0]\n    obs[2] = 1.0", "writes 3 numbers, but obs declares 1"),
+    "unwritten": ("pass", r"leaves the places \[0\] of obs unwritten"),
+    "not-a-number": ("obs[0] = wp.sqrt(s.qpos[0] - 100.0)", r"writes not-a-number into the places \[0\] of obs"),
+}
+
+
+@pytest.mark.parametrize("case", OBSERVATIONS)
+def test_an_observation_that_does_not_fit_obs_is_refused(case: str, task_file: TaskFile) -> None:
+    observe, message = OBSERVATIONS[case]
+    file = task_file(
+        f"observes_{case.replace(' ', '_').replace('-', '_')}.py", tiny_task.changed(("obs[0] = s.qpos[0]", observe))
+    )
+    with pytest.raises(ValueError, match=f"observe of the task 'tiny' {message}"):
+        lw.make(file)
+
+
+REWARD = "def reward(s0: World, action: Row[float], s1: World, p: Params)"
+NOT_COMPILED = {
+    "unknown field": (f"{REWARD} -> float:\n    return s1.qvel[0]", "can't compile the functions of the task .*qvel"),
+    "whole number": (
+        f"{REWARD}:\n    return 1",
+        r"reward of the task 'tiny' returns int32: it must be written as reward\(s0: World, .* -> float",
+    ),
+    "tuple": (f"{REWARD}:\n    r = (1.0, 2.0)\n    return r", ": a function returns one number, not a tuple"),
+    "declared tuple": (
+        f"{REWARD} -> float:\n    r = (1.0, 2.0)\n    return r", ": a function returns one number, not a tuple"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("function", "message"), NOT_COMPILED.values(), ids=NOT_COMPILED)
+def test_a_function_that_warp_cannot_compile_is_explained_in_one_line(
+    function: str, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        lw.make(tiny_task.write(tmp_path, tiny_task.with_function(function)))
+    assert "\n" not in str(caught.value)
+
+
+def test_actions_are_scaled_only_to_controls_with_ranges(tmp_path: Path) -> None:
+    file = tiny_task.write(tmp_path, f"{tiny_task.TINY}    action_range = (-1.0, 1.0)\n")
+    spec = mujoco.MjSpec.from_file(str(DATA / "unlimited.xml"))
+    with pytest.raises(ValueError, match=r"gives none to the controls \[0\]: set their ctrlrange"):
+        lw.make(file, model=spec)
+
+
+def test_a_model_without_actuators_is_refused(tmp_path: Path) -> None:
+    spec = lw.gymnasium_model("hopper.xml")
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    with pytest.raises(ValueError, match="the model of the task 'tiny' has no actuators"):
+        bound(tiny_task.write(tmp_path, tiny_task.TINY), model=spec)
+
+
+def test_a_step_lasts_frame_skip_substeps(tmp_path: Path) -> None:
+    file = tiny_task.write(tmp_path, f"{tiny_task.TINY}    frame_skip = 3\n")
+    for physics, skip in ((None, 3), (PhysicsOptions(frame_skip=5), 5)):
+        task = bound(file, physics=physics)
+        assert task.frame_skip == skip
+        assert task.params["dt"] == task.timestep == skip * task.model.opt.timestep
+
+
+def test_the_engine_keeps_the_tasks_fields_then_the_further_ones_time_and_ctrl(tmp_path: Path) -> None:
+    task = bound(tiny_task.write(tmp_path, tiny_task.TINY), fields=["xpos", "qpos"])
+    assert [field.name for field in task.fields] == ["qpos", "xpos", "time", "ctrl"]
+
+
+def test_task_spec_gives_the_tasks_own_model_unless_another_one_is_given(tmp_path: Path) -> None:
+    task = find_task(tiny_task.write(tmp_path, tiny_task.TINY))
+    assert task_spec(task).modelname == "hopper"
+    assert task_spec(task, "swimmer.xml").modelname == "swimmer"
+
+
+def test_an_observation_has_one_size_in_all_worlds() -> None:
+    flags = [True, False]
+    with pytest.raises(ValueError, match=r"obs of the task 'hopper' differs between worlds in \['position'\]"):
+        lw.make("hopper", nworld=2, exclude_current_positions_from_observation=flags)
+
+
+def test_parameters_that_would_change_the_observation_are_refused_and_not_kept() -> None:
+    env = lw.make("hopper", nworld=2)
+    for value in (False, [True, False]):
+        with pytest.raises(ValueError, match="would change the observation's parts: make a new environment"):
+            env.set_params(exclude_current_positions_from_observation=value)
+    assert env.task.params["exclude_current_positions_from_observation"] is True
+    env.step(torch.zeros(2, 3))
+    assert env.get_obs().shape == (2, 11)

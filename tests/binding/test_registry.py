@@ -1,0 +1,153 @@
+"""Tasks by name, by file and as classes: how they are found, registered and read again."""
+
+import importlib.util
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import tiny_task
+
+import lyceum_warp as lw
+from lyceum_warp.binding import registry
+from lyceum_warp.binding.registry import find_task, register, task_name, task_names
+
+REGISTERED = tiny_task.changed(("class Tiny", "@lw.register\nclass Tiny"))
+
+Load = Callable[[str, str], ModuleType]
+
+
+@pytest.fixture
+def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
+    """``load("name", source)``: import a file as a module of that name; what it registers goes with the test."""
+    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
+
+    def imported(name: str, source: str) -> ModuleType:
+        spec = importlib.util.spec_from_file_location(name, tiny_task.write(tmp_path, source, f"{name}.py"))
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, name, module)
+        spec.loader.exec_module(module)
+        return module
+
+    return imported
+
+
+# names
+
+
+@pytest.mark.parametrize(
+    ("class_name", "name"), [("HalfCheetah", "half_cheetah"), ("Walker2d", "walker2d"), ("PointMass", "point_mass")]
+)
+def test_a_tasks_name_is_its_class_in_snake_case(class_name: str, name: str) -> None:
+    assert task_name(type(class_name, (), {})) == name
+
+
+def test_every_task_of_the_package_is_found_by_its_name() -> None:
+    for name in task_names():
+        assert task_name(find_task(name)) == name
+
+
+@pytest.mark.parametrize("name", ["hopper.xml", "foo.bar", "./t", ""])
+def test_a_name_that_is_no_task_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="there is no task"):
+        find_task(name)
+
+
+def test_a_misspelt_name_is_refused_with_similar_ones() -> None:
+    with pytest.raises(ValueError, match=r"no task 'hoper': did you mean hopper\? .*path/to/file.py"):
+        find_task("hoper")
+
+
+@pytest.mark.parametrize("task", [3, None, lw.Env])
+def test_something_else_than_a_task_is_refused(task: object) -> None:
+    with pytest.raises(ValueError, match=r"a task is a name, a file or a subclass of lw\.Task, not "):
+        find_task(task)  # type: ignore[arg-type]
+
+
+# classes and registration
+
+
+def test_a_class_is_its_own_task() -> None:
+    hopper = find_task("hopper")
+    assert find_task(hopper) is hopper
+
+
+def test_a_registered_class_is_found_by_name(load: Load) -> None:
+    module = load("registered_here", REGISTERED.replace("Tiny", "RegisteredHere"))
+    assert "registered_here" in task_names()
+    assert find_task("registered_here") is module.RegisteredHere
+
+
+def test_a_class_without_task_is_not_registered() -> None:
+    with pytest.raises(ValueError, match=r"takes a subclass of lw\.Task, not Tiny: write class Tiny\(lw\.Task\)"):
+        register(type("Tiny", (), {}))  # type: ignore[arg-type]
+
+
+def test_a_name_of_another_file_or_of_the_package_is_taken(load: Load) -> None:
+    load("first_taker", "import lyceum_warp as lw\n@lw.register\nclass TakenHere(lw.Task):\n    pass\n")
+    with pytest.raises(ValueError, match=r"'taken_here' is taken by first_taker.TakenHere: rename yours"):
+        load("second_taker", "import lyceum_warp as lw\n@lw.register\nclass TakenHere(lw.Task):\n    pass\n")
+    with pytest.raises(ValueError, match=r"'walker2d' is taken by lyceum_warp.tasks.walker2d.*: rename yours"):
+        load("third_taker", "import lyceum_warp as lw\n@lw.register\nclass Walker2d(lw.Task):\n    pass\n")
+    assert find_task("walker2d").__module__ == "lyceum_warp.tasks.walker2d"
+
+
+# files
+
+
+def test_a_file_is_found_by_text_and_by_path(tmp_path: Path) -> None:
+    file = tiny_task.write(tmp_path, tiny_task.TINY)
+    assert find_task(file) is find_task(str(file)) is find_task(f"{file}:Tiny")
+
+
+def test_a_missing_file_is_named() -> None:
+    with pytest.raises(FileNotFoundError, match=r"there is no task file 'nowhere/task\.py'"):
+        find_task("nowhere/task.py")
+
+
+def test_one_of_several_tasks_of_a_file_must_be_named(tmp_path: Path) -> None:
+    file = tiny_task.write(tmp_path, f"{tiny_task.TINY}\nclass Other(Tiny):\n    pass\n")
+    with pytest.raises(ValueError, match=r"has 2 tasks \(Tiny, Other\): name one, as in .*tiny.py:Name"):
+        find_task(file)
+    with pytest.raises(ValueError, match=r"tiny.py has no task 'Arm'; it has Tiny, Other"):
+        find_task(f"{file}:Arm")
+    assert find_task(f"{file}:Other").__name__ == "Other"
+
+
+def test_a_file_without_a_task_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"has 0 tasks"):
+        find_task(tiny_task.write(tmp_path, "import lyceum_warp\n"))
+
+
+def test_two_files_may_register_tasks_of_one_name(tmp_path: Path) -> None:
+    files = []
+    for folder, skip in (("a", 1), ("b", 2)):
+        (tmp_path / folder).mkdir()
+        files.append(tiny_task.write(tmp_path / folder, f"{REGISTERED}    frame_skip = {skip}\n"))
+    assert [find_task(file).frame_skip for file in files] == [1, 2]
+    assert find_task(files[0]) is not find_task(files[1])
+
+
+def test_a_file_that_changed_is_read_again(tmp_path: Path) -> None:
+    file = tiny_task.write(tmp_path, tiny_task.TINY)
+    first = find_task(file)
+    assert find_task(file) is first
+    tiny_task.write(tmp_path, f"{tiny_task.TINY}    frame_skip = 2\n")
+    assert (find_task(file).frame_skip, first.frame_skip) == (2, 1)
+
+
+def test_a_file_that_stops_working_keeps_its_earlier_module(tmp_path: Path) -> None:
+    file = tiny_task.write(tmp_path, tiny_task.TINY)
+    first = find_task(file)
+    tiny_task.write(tmp_path, f"{tiny_task.TINY}    1 / 0\n")
+    with pytest.raises(ValueError, match=r"task file .*tiny\.py, line \d+: ZeroDivisionError: division by zero"):
+        find_task(file)
+    assert vars(sys.modules[first.__module__])["Tiny"] is first
+
+
+def test_a_missing_import_names_the_file_and_the_line(tmp_path: Path) -> None:
+    file = tiny_task.write(tmp_path, "import lyceum_warp\nimport nowhere_to_be_found.sub\n")
+    with pytest.raises(ImportError, match=r"tiny\.py, line 2: No module named 'nowhere_to_be_found': install what it"):
+        find_task(file)
