@@ -52,7 +52,6 @@ def task_file(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFact
 
     def write(name: str, source: str) -> Path:
         file: Path = folder / name
-        file.parent.mkdir(parents=True, exist_ok=True)
         if not file.exists() or file.read_text() != source:
             file.write_text(source)
         return file

@@ -35,7 +35,9 @@ def test_model_has_dm_controls_masses_joints_and_motor(shared_env: SharedEnv, dm
 
 
 @pytest.mark.parametrize("hold", [1, 25])
-def test_same_controls_lead_to_the_same_trajectory(shared_env: SharedEnv, dm_cartpole: mujoco.MjModel, hold: int) -> None:
+def test_same_controls_lead_to_the_same_trajectory(
+    shared_env: SharedEnv, dm_cartpole: mujoco.MjModel, hold: int
+) -> None:
     """Controls that are held for 25 steps drive the cart against both ends of the rail."""
     ours, theirs = shared_env("cartpole_swingup").model, dm_cartpole
     rng = np.random.default_rng(hold)
@@ -53,5 +55,3 @@ def test_same_controls_lead_to_the_same_trajectory(shared_env: SharedEnv, dm_car
         cart.append(a.qpos[0])
     if hold > 1:
         assert min(cart) < -1.7 and max(cart) > 1.7
-
-

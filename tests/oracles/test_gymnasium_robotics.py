@@ -277,5 +277,3 @@ def test_their_reset_draws_two_angles_in_the_order_of_the_axes() -> None:
     env.reset(seed=3)
     angles = np.random.default_rng(3).uniform(-1, 1, 2)
     np.testing.assert_allclose(env.model.body("target").quat, euler2quat([*angles, 0.0]), atol=1e-12)
-
-

@@ -1,15 +1,21 @@
-"""What is wrong in a task's file is said in one line; once it is mended, the file is read again."""
+"""Mistakes in a task's file: each is one line that says what is wrong and how to fix it; then the file is read again.
+
+tests/binding has the same messages module by module. Here are those that newcomers met.
+"""
 
 from pathlib import Path
 
 import pytest
+import tiny_task
 import torch
+from conftest import TaskFile
 
 import lyceum_warp as lw
 
-TINY = """
+REWARD = "def reward(s0: World, action: Row[float], s1: World, p: Params)"
+WRITE_REWARD = r"reward\(s0: World, action: Row\[float\], s1: World, p: Params\) -> float"
+OTHER_FILE = f"""
 import warp as wp
-import lyceum_warp as lw
 from lyceum_warp import Row
 
 @wp.struct
@@ -19,67 +25,130 @@ class World:
 @wp.struct
 class Params:
     dt: float
+    scale: float = 1.0
 
 @wp.func
-def observe(s: World, p: Params, obs: Row[float]):
-    obs[0] = s.qpos[0]
-
-class Tiny(lw.Task):
-    model = "hopper.xml"
-    obs = {"x": 1}
+{REWARD} -> float:
+    return p.scale
 """
+OWN_WORLD = "@wp.struct\nclass World:\n    qpos: Row[float]\n"
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("qpos: Row[float]", "qpos: Row[float]\n    qpoz: Row[float]", "no field 'qpoz': did you mean qpos"),
-        ("qpos: Row[float]", "qpos: Row[wp.vec3]", r"World.qpos of the task 'tiny' has to be declared as Row\[float"),
-        ("qpos: Row[float]", "qpos: Row[float]\n    xpos: Row[float]", r"World.xpos .* declared as Row\[wp.vec3"),
-        ("qpos: Row[float]", "qpos: Row[float]\n    time: Row[float]", "World.time .* declared as float"),
-        ("def observe", "def look", r"'tiny' has no observe\(s, p, obs\)"),
-        ("    obs = {", "    parts = {", "'tiny' has no obs: add"),
-        ("    model = ", "    file = ", "'tiny' has no model: add"),
-        ('"hopper.xml"', '"hoper.xml"', "no model file 'hoper.xml' in .*; it has hopper.xml"),
-        ('"hopper.xml"', '"/nowhere/hopper.xml"', "no model file '/nowhere/hopper.xml'"),
-        ("@wp.func\n", "", "observe of the task 'tiny' has to be a @wp.func"),
-        ("    obs = {", "    memory = 1\n    obs = {", "memory in World"),
-        ("    obs = {", "    lagged = ('qvel',)\n    obs = {", "wants 'qvel' lagged but does not list it in World"),
-        ("    obs = {", "    frame_skip = 0\n    obs = {", "frame_skip has to be a whole number from 1 to .*, not 0"),
-        ("    dt: float", "    dt: float\n    name: str", r"task file .*tiny\.py, line \d+: AttributeError: .*'str'"),
-        ("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0", r"task file .*tiny\.py, line \d+: SyntaxError: "),
-        ("obs: Row[float]):", "obs: 'Row[float]'):", "observe .* has annotations that are text, not types"),
-        ("class Tiny", "@wp.func\ndef evaluate(s: World, p: Params) -> float:\n    wp.abs(s.qpos[0])\n\nclass Tiny",
-         r"evaluate of the task 'tiny' has no return: it is written as evaluate\(s: World"),
-        ("    dt: float", "    dt: float\n    foot: float = lw.geom('foot_geom')", "foot .* has to be declared as int"),
-    ],
-)  # fmt: skip
-def test_a_broken_task_says_what_to_mend(old: str, new: str, message: str, tmp_path: Path) -> None:
-    file = tmp_path / "tiny.py"
-    assert old in TINY
-    file.write_text(TINY.replace(old, new, 1))
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
-        lw.make(str(file))
+def line(text: str) -> tuple[str, str]:
+    """A line more in the class."""
+    return '    obs = {"x": 1}', f'    obs = {{"x": 1}}\n    {text}'
 
 
-def test_a_model_file_beside_the_task_is_looked_for_there(tmp_path: Path) -> None:
-    (tmp_path / "tiny.py").write_text(TINY.replace("hopper.xml", "robott.xml"))
-    (tmp_path / "robot.xml").write_text("<mujoco/>")
-    with pytest.raises(
-        FileNotFoundError, match=r"no model file .*robott.xml \(did you mean robot.xml\?\), and of Gymn"
-    ):
-        lw.make(str(tmp_path / "tiny.py"))
+def function(text: str) -> tuple[str, str]:
+    """A Warp function more before the class."""
+    return "class Tiny", f"@wp.func\n{text}\n\nclass Tiny"
 
 
-def test_a_file_that_changed_is_read_again(tmp_path: Path) -> None:
-    file = tmp_path / "tiny.py"
-    file.write_text(TINY)
-    old = lw.make(file)
-    file.write_text(TINY.replace("obs[0] = s.qpos[0]", "obs[0] = 2.0 * s.qpos[0"))
-    with pytest.raises(ValueError, match="SyntaxError"):
+MISTAKES: dict[str, tuple[tuple[str, str], str]] = {
+    # the file
+    "missing import": (
+        ("import warp as wp", "import warp as wp\nimport not_installed.sub"),
+        r"task file .*tiny\.py, line 3: No module named 'not_installed': install what it imports, or remove the import",
+    ),
+    "syntax": (
+        ("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0"),
+        r"task file .*tiny\.py, line \d+: SyntaxError: '\[' was never closed",
+    ),
+    "a class without lw.Task": (
+        ("class Tiny(lw.Task)", "@lw.register\nclass Tiny"),
+        r"line \d+: @lw\.register takes a subclass of lw\.Task, not Tiny: write class Tiny\(lw\.Task\)",
+    ),
+    # structs
+    "World without wp.struct": (
+        ("@wp.struct\nclass World", "class World"),
+        r"the argument s of observe has the type World, which must be decorated with @wp\.struct",
+    ),
+    "Params without wp.struct": (
+        ("@wp.struct\nclass Params", "class Params"),
+        r"the argument p of observe has the type Params, which must be decorated with @wp\.struct",
+    ),
+    "text in Params": (
+        ("    dt: float", "    dt: float\n    name: str"),
+        r"line \d+: a @wp\.struct has a field of the type str: it can hold float, int, bool, vectors and matrices",
+    ),
+    "text with a default in Params": (
+        ("    dt: float", "    dt: float\n    name: str = 'x'"),
+        r"line \d+: a @wp\.struct has a field of the type str: it can hold float, int, bool, vectors and matrices",
+    ),
+    "a parameter named like an option": (
+        ("    dt: float", "    dt: float\n    horizon: int = 3"),
+        r"the parameter 'horizon' of the task 'tiny' has the name of an option of make\(\), .*: rename it in Params",
+    ),
+    "an index declared as float": (
+        ("    dt: float", "    dt: float\n    foot: float = lw.geom('foot_geom')"),
+        "the parameter foot of 'tiny' must be declared as int: it is an index",
+    ),
+    "an unknown field": (("qpos: Row[float]", "qpoz: Row[float]"), "there is no field 'qpoz': did you mean qpos"),
+    "a field of another type": (
+        ("qpos: Row[float]", "qpos: Row[wp.vec3]"),
+        r"World\.qpos of the task 'tiny' must be declared as Row\[float\]",
+    ),
+    # functions
+    "observe without wp.func": (("@wp.func\n", ""), r"observe of the task 'tiny' must be a @wp\.func, not <function"),
+    "a reward that returns a tuple": (
+        function(f"{REWARD}:\n    return 1.0, 2.0"),
+        "reward of the task 'tiny' returns a tuple, and must return a single float",
+    ),
+    "a reward that returns a named tuple": (
+        function(f"{REWARD} -> float:\n    both = (1.0, 2.0)\n    return both"),
+        "can't compile the functions of the task 'tiny': .*: a function returns one number, not a tuple",
+    ),
+    "a reward that returns a whole number": (
+        function(f"{REWARD}:\n    return 1"),
+        f"reward of the task 'tiny' returns int32: it must be written as {WRITE_REWARD}",
+    ),
+    "a reward without return": (
+        function(f"{REWARD} -> float:\n    wp.abs(action[0])"),
+        f"reward of the task 'tiny' has no return: it is written as {WRITE_REWARD}",
+    ),
+    "another order of arguments": (
+        function("def reward(s0: World, s1: World, action: Row[float], p: Params) -> float:\n    return 1.0"),
+        f"reward of the task 'tiny' must be written as {WRITE_REWARD}",
+    ),
+    "a misspelt function": (
+        function("def sucess(s: World, p: Params) -> bool:\n    return True"),
+        "the task 'tiny' has a function 'sucess': did you mean success?",
+    ),
+    "a function of another file": (
+        (OWN_WORLD, "from other_rewards import World, reward\n"),
+        r"reward of the task 'tiny' takes the Params of .*other_rewards\.py, but the task has the Params of .*tiny\.py"
+        ": import both structs from one module, or write reward for the task's own",
+    ),
+    # the class
+    "no obs": (("    obs = {", "    parts = {"), "the task 'tiny' has no obs: add the parts of its observation"),
+    "a misspelt attribute": (line("frameskip = 5"), "the task 'tiny' has 'frameskip' in its class: did you mean frame"),
+    "action_range as one number": (
+        line("action_range = 1.0"),
+        r"action_range of the task 'tiny' must be two finite numbers, lowest first, as \(-1\.0, 1\.0\), not 1\.0",
+    ),
+    "a misspelt model": (('"hopper.xml"', '"hoper.xml"'), "there is no model file .*; it has hopper.xml"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "message"), MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_in_a_task_file_is_one_line_that_names_it(
+    change: tuple[str, str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tiny_task.write(tmp_path, OTHER_FILE, "other_rewards.py")
+    monkeypatch.syspath_prepend(tmp_path)
+    file = tiny_task.write(tmp_path, tiny_task.changed(change))
+    with pytest.raises((ValueError, ImportError, FileNotFoundError), match=message) as caught:
         lw.make(file)
-    file.write_text(TINY.replace("obs[0] = s.qpos[0]", "obs[0] = 2.0 * s.qpos[0] + 1.0"))
-    new = lw.make(file)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_fixed_is_read_again_and_old_environments_keep_their_task(task_file: TaskFile) -> None:
+    name, line = "fixed_later.py", "obs[0] = s.qpos[0]"
+    old = lw.make(task_file(name, tiny_task.TINY))
+    broken = task_file(name, tiny_task.changed((line, "obs[0] = 2.0 * s.qpos[0")))
+    with pytest.raises(ValueError, match="SyntaxError"):
+        lw.make(broken)
+    new = lw.make(task_file(name, tiny_task.changed((line, "obs[0] = 2.0 * s.qpos[0] + 1.0"))))
     for env in (old, old.replicate(), new):
         env.reset()
         env.step()
@@ -87,16 +156,17 @@ def test_a_file_that_changed_is_read_again(tmp_path: Path) -> None:
         assert torch.equal(env.obs, 2.0 * x + 1.0 if env is new else x)
 
 
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        ("obs[0] = s.qpos[0]\n    obs[2] = 1.0", "writes 3 numbers, but obs declares 1"),
-        ("pass", r"leaves the places \[0\] of obs unwritten"),
-        ("obs[0] = wp.sqrt(s.qpos[0] - 100.0)", r"makes the places \[0\] of obs not a number \(NaN\)"),
-    ],
-)
-def test_an_observation_of_another_size_is_refused(tmp_path: Path, change: str, message: str) -> None:
-    file = tmp_path / "tiny.py"
-    file.write_text(TINY.replace("obs[0] = s.qpos[0]", change))
-    with pytest.raises(ValueError, match=message):
-        lw.make(str(file))
+def test_a_misspelt_keyword_is_refused_with_the_word_that_was_meant() -> None:
+    for word, meant in (("num_envs", "nworld"), ("ctrl_cost_wieght", "ctrl_cost_weight"), ("horzion", "horizon")):
+        with pytest.raises(ValueError, match=f"the task 'hopper' has no parameter '{word}': did you mean {meant}"):
+            lw.make("hopper", **{word: 4})
+
+
+def test_a_buffer_that_is_replaced_is_refused_with_the_way_to_write_into_it() -> None:
+    env = lw.make("hopper", nworld=2)
+    with pytest.raises(
+        AttributeError, match=r"env\.action is a buffer of fixed address: write into it, as env\.action"
+    ):
+        env.action = torch.zeros(2, 3)
+    env.step(torch.zeros(2, 3, requires_grad=True) + 1.0)
+    assert not env.action.requires_grad

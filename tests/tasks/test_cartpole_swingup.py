@@ -97,5 +97,3 @@ def test_random_resets_add_normal_noise_to_the_hanging_pole(scale: float | None)
     qpos, qvel = positions(env)
     np.testing.assert_allclose(qpos, np.tile([0.0, np.pi], (2000, 1)), atol=1e-6)
     assert not qvel.any()
-
-
