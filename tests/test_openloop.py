@@ -1,6 +1,5 @@
-"""Open-loop roll-outs: what they tell is what stepping an environment tells, to the bit, on both engines."""
+"""Open-loop roll-outs give the numbers of stepping an environment, to the bit, on both engines."""
 
-from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp import Done, Row
@@ -16,12 +16,11 @@ from lyceum_warp.engines.c import mujoco_engine as c
 from lyceum_warp.engines.c.native_rollout import NativeRollout
 from lyceum_warp.openloop import OpenLoop
 
-SharedEnv = Callable[..., lw.Env]
 ENGINES = ["mujoco", "warp"]
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
 
 
-# tasks of the tests' own: an arm of two joints above a floor
+# tasks of these tests: an arm of two joints above a floor
 
 ARM = """
 <mujoco>
@@ -127,7 +126,7 @@ def reward_of_sensors(s0: SensingArm, action: Row[float], s1: SensingArm, p: Arm
 
 
 class Forgetful(lw.Task):
-    """Actions are controls: the task of which the C engine rolls out a horizon in one call."""
+    """Actions are controls, so the C engine rolls out a horizon in one native call."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
     frame_skip = 3
@@ -139,7 +138,7 @@ class Forgetful(lw.Task):
 
 
 class Keepsake(lw.Task):
-    """What it remembers from its reset stays as it is."""
+    """Its memory is written at a reset and stays as it is."""
 
     model, frame_skip, obs, memory = Forgetful.model, 3, Forgetful.obs, 2
     World = Arm
@@ -154,7 +153,7 @@ class Servo(Forgetful):
 
 
 class Sensing(lw.Task):
-    """Its sensor data are of two ages: the velocity is the state's, the acceleration the last substep's."""
+    """It reads sensors of two stages: the velocity belongs to the state, the acceleration to the last substep."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
     frame_skip = 2
@@ -184,7 +183,7 @@ def random_actions(env: lw.Env, steps: int, seed: int) -> torch.Tensor:
 
 
 def some_state(env: lw.Env, seed: int, steps: int = 7) -> torch.Tensor:
-    """A state some random steps into an episode, whose end is not yet said."""
+    """A state some random steps into an episode, with its done_reason cleared."""
     env.rand_reset(seed)
     for action in random_actions(env, steps, seed):
         env.step(action)
@@ -201,14 +200,14 @@ def run(loop: OpenLoop, state: torch.Tensor, actions: torch.Tensor) -> dict[str,
 
 
 def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None:
-    """Several roll-outs, the later ones from recordings, from other states and under other actions each time."""
+    """Compare several roll-outs, from other states and under other actions each time; the later ones replay graphs."""
     for seed in range(rounds):
         state, actions = some_state(env, seed), random_actions(env, loop.horizon, 10 + seed)
         low, high = env.action_space.low, env.action_space.high
         assert ((actions.numpy() < low) | (actions.numpy() > high)).any()
         found = run(loop, state, actions)
         assert not found["fault"].any() and torch.equal(loop.actions, actions)
-        ended = found["terminated"].cumsum(0) > 0  # an environment goes on telling of an end
+        ended = found["terminated"].cumsum(0) > 0  # without automatic resets an environment's end stays set
         env.set_state(state.expand(env.nworld, -1).contiguous())
         for t, action in enumerate(actions):
             env.step(action)
@@ -216,7 +215,7 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
             assert torch.equal(found["reward"][t], env.reward), f"reward of step {t}, round {seed}"
             assert torch.equal(ended[t], env.terminated), f"terminated of step {t}, round {seed}"
         assert torch.equal(found["final_obs"], env.final_obs), f"final_obs, round {seed}"
-        assert len(env.final_obs.unique(dim=0)) == env.nworld, "all worlds are the same: nothing was tested"
+        assert len(env.final_obs.unique(dim=0)) == env.nworld, "all worlds are the same, so nothing was tested"
 
 
 # the tasks of the package
@@ -224,9 +223,9 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", PACKAGE)
-def test_tells_what_stepping_tells(task: str, engine: str) -> None:
+def test_a_roll_out_gives_the_numbers_of_stepping(task: str, engine: str) -> None:
     steps = 3 if task in ("humanoid", "adroit_pen") else 5
-    # on the CPU every substep of the Warp engine is hundreds of launches, which are alike
+    # on the CPU every substep of the Warp engine is hundreds of launches, so two of them must do
     options = {"frame_skip": min(2, find_task(task).frame_skip)} if engine == "warp" else {}
     env = lw.make(task, engine=engine, nworld=4, autoreset=False, **options)
     check_against_stepping(rollouts(task, steps, engine=engine, **options), env)
@@ -234,7 +233,7 @@ def test_tells_what_stepping_tells(task: str, engine: str) -> None:
 
 @pytest.fixture
 def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Grows by one with every roll-out of a whole horizon in one native call."""
+    """Holds one entry for every roll-out of a whole horizon in one native call."""
     calls, original = [], NativeRollout.run
 
     def counting(self: NativeRollout, *args: Any) -> None:
@@ -246,14 +245,13 @@ def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize("task", [*PACKAGE, Forgetful])
-def test_one_native_call_or_many_steps(
+def test_one_native_call_gives_the_numbers_of_many_steps(
     task: str | type[lw.Task], monkeypatch: pytest.MonkeyPatch, native_calls: list[int]
 ) -> None:
-    """A plan on the C engine is the same whether or not its horizon is rolled out in one call."""
     loop = rollouts(task, 4, engine="mujoco")
     state, actions = some_state(loop.env, 3), random_actions(loop.env, 4, 5)
     fast = run(loop, state, actions)
-    assert len(native_calls) == 1, "the fast path was not taken"
+    assert len(native_calls) == 1, "the horizon was not one native call"
     monkeypatch.setattr(c, "is_exact", lambda model, fields: False)
     loop.env.engine._rollouts.clear()
     slow = run(loop, state, actions)
@@ -262,7 +260,7 @@ def test_one_native_call_or_many_steps(
         assert torch.equal(value, slow[name]), name
 
 
-# what a task may do
+# everything that a task may do
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -280,18 +278,18 @@ def test_one_native_call_or_many_steps(
     ],
     ids="memory worlds one_substep rk4 keepsake control control_worlds sensors".split(),
 )
-def test_whatever_a_task_does(
+def test_every_kind_of_task_gives_the_numbers_of_stepping(
     task: type[lw.Task], native: bool, options: dict[str, Any], engine: str, native_calls: list[int]
 ) -> None:
-    """Memory with draws, parameters of each world, RK4 behind derived fields, controls of the task's own, sensors."""
+    """Memory with draws, parameters that differ between worlds, RK4 with derived fields, own controls, sensors."""
     loop = rollouts(task, 6, engine=engine, **options)
     check_against_stepping(loop, lw.make(task, engine=engine, nworld=4, autoreset=False, **options))
     assert len(native_calls) == (3 if native and engine == "mujoco" else 0)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_parameters_that_change_between_roll_outs(engine: str) -> None:
-    """Also those that were one number and become one a world, after a recording was made."""
+def test_parameters_may_change_between_roll_outs(engine: str) -> None:
+    """Also from one number to one a world, after graphs were captured."""
     loop, env = rollouts(Forgetful, 3, engine=engine), lw.make(Forgetful, engine=engine, nworld=4, autoreset=False)
     check_against_stepping(loop, env)
     for params in ({"cost": 5.0}, {"gain": np.array([1.0, 2.0, 3.0, 4.0]), "bound": -1.0}):
@@ -301,8 +299,8 @@ def test_parameters_that_change_between_roll_outs(engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_an_end_is_told_step_by_step(engine: str) -> None:
-    """Whoever goes on after an end sees whether each state by itself is one: the arm swings out and back in."""
+def test_terminated_is_judged_for_each_state_alone(engine: str) -> None:
+    """The arm swings out and back in; only the states outside count as ends."""
     loop = rollouts(Forgetful, 40, engine=engine, nworld=2, bound=0.05)
     loop.env.reset()
     actions = torch.zeros(40, 2, 2)
@@ -315,8 +313,8 @@ def test_an_end_is_told_step_by_step(engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_roll_outs_leave_no_trace(engine: str) -> None:
-    """The same state and actions earn the same, whatever was rolled out before; the tensors stay where they are."""
+def test_the_same_state_and_actions_give_the_same_numbers_again(engine: str) -> None:
+    """Whatever was rolled out between; the tensors stay the same objects."""
     loop = rollouts(Forgetful, 4, engine=engine)
     state, other = some_state(loop.env, 1), some_state(loop.env, 2)
     actions = random_actions(loop.env, 4, 0)
@@ -339,8 +337,8 @@ BAD = 1
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Forgetful, Servo])
 @pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_an_action_that_is_not_finite(task: type[lw.Task], engine: str, number: float) -> None:
-    """Its world is flagged and gets zeros for that step; nothing else changes, and the flag is gone next time."""
+def test_an_action_that_is_not_finite_is_a_fault_of_its_world(task: type[lw.Task], engine: str, number: float) -> None:
+    """The action counts as zero; other worlds keep their numbers, and the next roll-out has no fault."""
     loop = rollouts(task, 5, engine=engine)
     state, actions = some_state(loop.env, 0), random_actions(loop.env, 5, 0)
     zeroed, wrong = actions.clone(), actions.clone()
@@ -419,11 +417,11 @@ class PushedRunaway(Runaway):
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("how", ["native", "rk4", "control"])
 @pytest.mark.parametrize("size, step", [(1e9, 1), (1e9, 5), (1e13, 1)])  # MuJoCo leaves out controls beyond 1e10
-def test_a_sample_that_diverges(size: float, how: str, step: int, engine: str) -> None:
-    """It is flagged, the others don't notice, and the next roll-outs know nothing of it.
+def test_a_world_that_diverges_has_a_fault_and_changes_no_other(size: float, how: str, step: int, engine: str) -> None:
+    """The next roll-outs have no fault either.
 
-    On the C engine such a world stops, and goes on telling the finite numbers that it had: nothing but the flag
-    tells that they mean nothing.
+    On the C engine such a world stops and keeps its last finite numbers, so only the fault shows that they are
+    meaningless.
     """
     task = PushedRunaway if how == "control" else Runaway
     model = mujoco.MjSpec.from_string(RUNAWAY.format('integrator="RK4"' if how == "rk4" else ""))
@@ -449,8 +447,8 @@ def test_a_sample_that_diverges(size: float, how: str, step: int, engine: str) -
 
 
 @pytest.mark.parametrize("task", [Runaway, PushedRunaway])
-def test_trouble_that_is_over_before_the_end_is_told(task: type[lw.Task]) -> None:
-    """A ball that is driven into the floor, for which there is no room, and is in the air again at the end."""
+def test_a_fault_in_the_middle_is_reported_at_the_end(task: type[lw.Task]) -> None:
+    """A ball is driven into the floor, which needs more constraints than there is room for, and flies up again."""
     loop = rollouts(task, 20, engine="warp", nworld=3, nconmax=8, njmax=2)
     loop.env.reset()
     state = loop.env.get_state()[0].clone()
@@ -458,23 +456,22 @@ def test_trouble_that_is_over_before_the_end_is_told(task: type[lw.Task]) -> Non
     actions[:12, BAD], actions[12:, BAD] = -4e-3, 8e-2
     for _ in range(3):
         found = run(loop, state, actions)
-        assert found["final_obs"][BAD, 1] > 0.2, "it lies on the floor at the end: nothing was tested"
+        assert found["final_obs"][BAD, 1] > 0.2, "it lies on the floor at the end, so nothing was tested"
         assert found["fault"].tolist() == [0, int(Done.CONSTRAINT_OVERFLOW), 0]
     assert not run(loop, state, torch.full_like(actions, 9.81e-4))["fault"].any()
 
 
-def test_what_makes_no_sense_is_refused(shared_env: SharedEnv) -> None:
+def test_worlds_that_reset_and_bad_horizons_are_refused(shared_env: SharedEnv) -> None:
     with pytest.raises(ValueError, match=r"worlds that do not reset: make\(..., autoreset=False\)"):
         OpenLoop(shared_env("point_mass"), 5)
     env = shared_env("point_mass", autoreset=False)
     for horizon in (0, -1, 2.5, "a"):
-        with pytest.raises(ValueError, match="horizon has to be a whole number from 1"):
+        with pytest.raises(ValueError, match="horizon must be a whole number from 1"):
             OpenLoop(env, horizon)  # type: ignore[arg-type]
 
 
-def test_a_field_that_comes_later_is_refused() -> None:
-    loop = lw.OpenLoop(lw.make("point_mass", nworld=2, autoreset=False), 3)
-    loop.run()
-    loop.env.field("qacc")  # of the acceleration stage: it becomes part of the state
-    with pytest.raises(ValueError, match="asked for later"):
-        loop.run()
+def test_a_roll_out_is_a_list_of_phases() -> None:
+    """One entry for the whole horizon of a task whose actions are controls, else three for each step."""
+    names = [[phase.name for phase in rollouts(task, 2, engine="mujoco").phases] for task in (Forgetful, Servo)]
+    assert names[0] == ["start", "physics", "judge"]
+    assert names[1] == ["start", "reset", "restore", *["act", "physics", "judge"] * 2, "end"]

@@ -1,4 +1,4 @@
-"""A user's own task in the user's own file: all that a task may use, on both engines, with the package as it is."""
+"""A user's task in a file of its own, with everything that a task may use, on both engines."""
 
 import importlib.util
 import sys
@@ -205,22 +205,25 @@ def random_steps(env: lw.Env, n: int, seed: int = 0) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_keeps_the_rules(module: ModuleType, engine: str) -> None:
+def test_the_task_keeps_the_rules(module: ModuleType, engine: str) -> None:
     check_task("follow_target", engine=engine, steps=100, frame_skip=2, gain=np.array([0.5, 1.0, 1.5, 2.0]))
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_keeps_the_rules_under_rk4_with_scaled_actions(module: ModuleType, path: Path, engine: str) -> None:
+def test_scaled_actions_under_rk4_keep_the_rules(module: ModuleType, path: Path, engine: str) -> None:
     spec = mujoco.MjSpec.from_string(module.XML)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     check_task(f"{path}:ScaledActions", engine=engine, steps=100, model=spec, nworld=3)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_current_fields_are_those_of_mj_forward(module: ModuleType, engine: str) -> None:
-    """After a step, an automatic reset, set_state and rand_reset; the accelerometer is one substep behind."""
-    env = lw.make("follow_target", engine=engine, nworld=3, horizon=5)
-    late = env.field("xipos")
+def test_fields_equal_mj_forward_of_the_state(module: ModuleType, engine: str) -> None:
+    """After a step, an automatic reset, set_state and rand_reset, also for a field that the task does not read.
+
+    The accelerometer is of the last substep; it belongs to the state only after a reset.
+    """
+    env = lw.make("follow_target", engine=engine, nworld=3, horizon=5, fields=["xipos"])
+    centers = env.field("xipos")
     parts = env.state_space.parts
 
     def compare(when: str, accelerations: bool = False) -> None:
@@ -233,7 +236,7 @@ def test_current_fields_are_those_of_mj_forward(module: ModuleType, engine: str)
             for name in ("xpos", "xmat", "site_xpos", "cvel"):
                 found, wanted = env.field(name)[w].numpy(), getattr(data, name)
                 np.testing.assert_allclose(found.reshape(wanted.shape), wanted, atol=2e-5, err_msg=f"{name} {when}")
-            np.testing.assert_allclose(late[w].numpy(), data.xipos, atol=2e-5, err_msg=f"xipos {when}")
+            np.testing.assert_allclose(centers[w].numpy(), data.xipos, atol=2e-5, err_msg=f"xipos {when}")
             first = 0 if accelerations else 3
             np.testing.assert_allclose(
                 env.field("sensordata")[w, first:].numpy(), data.sensordata[first:], atol=2e-4, rtol=1e-4, err_msg=when
@@ -254,7 +257,7 @@ def test_current_fields_are_those_of_mj_forward(module: ModuleType, engine: str)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_acceleration_sensors_are_those_of_the_last_substep(module: ModuleType, engine: str) -> None:
+def test_acceleration_sensors_belong_to_the_last_substep(module: ModuleType, engine: str) -> None:
     env = lw.make("follow_target", engine=engine, nworld=2, frame_skip=1)
     random_steps(env, 3)
     parts, before = env.state_space.parts, env.get_state().numpy()
@@ -270,8 +273,8 @@ def test_acceleration_sensors_are_those_of_the_last_substep(module: ModuleType, 
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_named_elements(module: ModuleType, engine: str) -> None:
-    env = lw.make("follow_target", engine=engine, nworld=2)
+def test_named_elements_are_views_of_their_fields(module: ModuleType, engine: str) -> None:
+    env = lw.make("follow_target", engine=engine, nworld=2, fields=["geom_xpos"])
     random_steps(env, 3)
     for name, element, where in [
         ("qpos", "elbow", np.s_[:, 1:2]), ("qvel", "shoulder", np.s_[:, 0:1]), ("site_xpos", "tip", np.s_[:, 0]),
@@ -280,23 +283,19 @@ def test_named_elements(module: ModuleType, engine: str) -> None:
     ]:  # fmt: skip
         view = env.field(name, element)
         torch.testing.assert_close(view, env.field(name)[where], rtol=0, atol=0)
-        assert view.data_ptr() == env.field(name)[where].data_ptr(), f"{name} is no view"
+        assert view.data_ptr() == env.field(name)[where].data_ptr(), f"{name} is not a view"
     for element, place in (("tip", 0), ("lower", 3), ("target", 0), ("elbow", 1), ("velocity", 6)):
         assert env.task.params[element] == place
     with pytest.raises(ValueError, match="no site 'hand' for the field 'site_xpos'; it has: tip"):
         env.field("site_xpos", "hand")
-    with pytest.raises(ValueError, match="no field 'site_xpoz': did you mean site_xpos"):
-        env.field("site_xpoz")
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_field_asked_for_later_joins_the_state(module: ModuleType, engine: str) -> None:
-    env = lw.make("follow_target", engine=engine, nworld=2)
-    size = env.state_space.size
-    random_steps(env, 4)
+def test_a_further_field_of_the_acceleration_stage_joins_the_state(module: ModuleType, engine: str) -> None:
+    plain, env = (lw.make("follow_target", engine=engine, nworld=2, fields=fields) for fields in ((), ["qacc"]))
+    assert env.state_space.size == plain.state_space.size + 2
     acceleration = env.field("qacc")
-    assert env.state_space.size == size + 2
-    random_steps(env, 2)
+    random_steps(env, 6)
     state, kept = env.get_state(), acceleration.clone()
     assert kept.abs().min() > 0
     random_steps(env, 2, 1)
@@ -308,7 +307,7 @@ def test_a_field_asked_for_later_joins_the_state(module: ModuleType, engine: str
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_controls(module: ModuleType, path: Path, engine: str) -> None:
+def test_controls_come_from_the_task_or_are_scaled_to_their_ranges(module: ModuleType, path: Path, engine: str) -> None:
     env = lw.make("follow_target", engine=engine, nworld=2, gain=[1.0, 10.0])
     env.reset()
     env.step(torch.full((2, 2), 0.5))
@@ -323,7 +322,7 @@ def test_controls(module: ModuleType, path: Path, engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_memory(module: ModuleType, engine: str) -> None:
+def test_memory_advances_with_draws_and_is_cleared_by_a_reset(module: ModuleType, engine: str) -> None:
     env = lw.make("follow_target", engine=engine, nworld=2, horizon=3, seed=4)
     first = []
     for i in range(2):
@@ -342,7 +341,7 @@ def test_memory(module: ModuleType, engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_set_params_in_place(module: ModuleType, engine: str) -> None:
+def test_set_params_takes_effect_with_the_next_step(module: ModuleType, engine: str) -> None:
     env, other = (lw.make("follow_target", engine=engine, nworld=2, seed=1, cost=cost) for cost in (0.0, 2.0))
     action = torch.full((2, 2), 0.5)
     for _ in range(3):
@@ -366,19 +365,13 @@ def test_set_params_in_place(module: ModuleType, engine: str) -> None:
     env.reset()
     np.testing.assert_allclose(env.field("mocap_pos")[:, 0], [[0.4, 0, 0.4]] * 2, atol=1e-6)
     assert env.success.all()
-    with pytest.raises(ValueError, match=r"parameter 'costs': did you mean cost"):
-        env.set_params(costs=1.0)
-    with pytest.raises(ValueError, match="offset of 'follow_target' has shape"):
-        env.set_params(offset=1.0)
-    with pytest.raises(ValueError, match="limit=2.5 of 'follow_target' has to be a whole number"):
-        env.set_params(limit=2.5)
-    hopper = lw.make("hopper", engine=engine)
-    with pytest.raises(ValueError, match="would change the observation's parts"):
-        hopper.set_params(exclude_current_positions_from_observation=False)
-    assert hopper.task.params["exclude_current_positions_from_observation"]
+    for wrong in ({"costs": 1.0}, {"offset": 1.0}, {"limit": 2.5}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            env.set_params(**wrong)
+    assert env.task.params["limit"] == 3
 
 
-def test_terminated(module: ModuleType) -> None:
+def test_a_state_beyond_the_limit_is_terminated(module: ModuleType) -> None:
     env = lw.make("follow_target", nworld=2, limit=1)
     state = env.get_state()
     state[0, env.state_space.parts["qpos"].start] = 1.2
@@ -388,7 +381,7 @@ def test_terminated(module: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_model_frame_skip_and_cone(module: ModuleType, path: Path, engine: str, tmp_path: Path) -> None:
+def test_another_model_frame_skip_and_cone_take_effect(module: ModuleType, path: Path, engine: str, tmp_path: Path) -> None:
     xml = tmp_path / "light.xml"
     xml.write_text(module.XML.replace('size=".03"', 'size=".02"'))
     env = lw.make("follow_target", engine=engine, model=xml, frame_skip=3, cone="elliptic")
@@ -397,43 +390,12 @@ def test_model_frame_skip_and_cone(module: ModuleType, path: Path, engine: str, 
     assert env.timestep == pytest.approx(0.015) == env.task.params["dt"]
     env.step()
     assert env.time.item() == pytest.approx(0.015)
-    torch.testing.assert_close(env.get_obs(env.get_state()), env.obs, rtol=0, atol=0)  # the scratch worlds, too
+    torch.testing.assert_close(env.get_obs(env.get_state()), env.obs, rtol=0, atol=0)  # also in scratch worlds
 
 
-def test_found_by_name_by_path_and_as_a_class(module: ModuleType, path: Path) -> None:
+def test_the_task_is_found_by_name_by_path_and_as_a_class(module: ModuleType, path: Path) -> None:
     assert "follow_target" in lw.task_names()
     assert lw.make("follow_target").task.task.__name__ == "FollowTarget"
     assert lw.make(module.ScaledActions).task.name == "scaled_actions"
     # the file is imported already, and registers its task again
     assert lw.make(f"{path}:FollowTarget").task.name == "follow_target"
-    with pytest.raises(ValueError, match=r"2 tasks \(FollowTarget, ScaledActions\): name one"):
-        lw.make(str(path))
-    with pytest.raises(ValueError, match="no task 'Arm'; it has FollowTarget, ScaledActions"):
-        lw.make(f"{path}:Arm")
-    with pytest.raises(ValueError, match="no task 'follow_targt': did you mean follow_target"):
-        lw.make("follow_targt")
-
-
-def test_names_that_are_taken(module: ModuleType, tmp_path: Path) -> None:
-    clash = tmp_path / "other.py"
-    clash.write_text("import lyceum_warp as lw\n@lw.register\nclass FollowTarget(lw.Task):\n    pass\n")
-    with pytest.raises(ValueError, match=r"'follow_target' is taken by .*FollowTarget: rename yours"):
-        load(clash, "user_other")
-    clash.write_text("import lyceum_warp as lw\n@lw.register\nclass Walker2d(lw.Task):\n    pass\n")
-    with pytest.raises(ValueError, match=r"'walker2d' is taken by lyceum_warp.tasks.walker2d.*: rename yours"):
-        load(clash, "user_other")
-    assert lw.make("walker2d").task.task.__module__ == "lyceum_warp.tasks.walker2d"
-
-
-def test_an_index_in_the_parameters_is_one_of_the_model(module: ModuleType) -> None:
-    for tip in (0, "tip", lw.site("tip")):
-        assert lw.make("follow_target", tip=tip).task.params["tip"] == 0
-    for tip in (1, -1, [0, 1]):
-        with pytest.raises(ValueError, match="'follow_target' is an index of 'site_xpos', of which the model has 1: "):
-            lw.make("follow_target", tip=tip, nworld=2)
-    with pytest.raises(ValueError, match="no site 'top' for the field 'site_xpos'; it has: tip"):
-        lw.make("follow_target", tip="top")
-    with pytest.raises(ValueError, match="tip .* can't be an element of 'xpos': it is one of 'site_xpos'"):
-        lw.make("follow_target", tip=lw.body("lower"))
-    with pytest.raises(ValueError, match="gain .* can't be an element of 'xpos': it is a number"):
-        lw.make("follow_target", gain=lw.body("lower"))
