@@ -1,17 +1,18 @@
 """The C engine and the Warp engine give the same numbers for every task of the package.
 
-Both run the task's own functions; what differs is the physics below them, float64 there and float32 here. With
-pyramidal friction cones MuJoCo Warp lays the tangents of a capsule on a plane differently, a known difference
-that has nothing to do with this package: elliptic cones, which do not depend on the tangents, are compared.
+Both run the task's own functions on different physics: the C engine in float64, the Warp engine in float32. With
+pyramidal friction cones MuJoCo Warp chooses other tangents for a capsule on a plane, a known difference that this
+package has no part in. Elliptic cones, which do not depend on the tangents, are compared instead.
 """
 
 import dataclasses
 import pkgutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 import torch
+from conftest import SharedEnv
 
 import lyceum_warp as lw
 import lyceum_warp.tasks
@@ -27,7 +28,7 @@ FORCE_PARTS = {"humanoid": ("contact_force",)}
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """How far the engines may be apart after one substep: largest coordinate of a world, over worlds."""
+    """Largest difference between the engines after one substep: of a world's coordinates, then over worlds."""
 
     qpos_median: float
     qpos_p95: float
@@ -35,10 +36,10 @@ class Bounds:
     qvel_p95: float
 
 
-# Each number is three to four times what was measured with mujoco and mujoco_warp 4.0.0 on the CPU, over 320 states
-# along random rollouts, rounded to two digits. A float32 position of about 1 is good for 6e-8.
+# Each bound is three to four times the difference measured with mujoco and mujoco_warp 4.0.0 on the CPU, over 320
+# states along random rollouts. A float32 position of about 1 is exact to 6e-8.
 ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median, 95 %
-    # the 5 % are pens that lie on the palm's boxes
+    # the worst 5 % are pens that lie on the palm's boxes
     "adroit_pen": Bounds(1.5e-7, 4e-6, 5e-6, 2e-3),  # 4.1e-8, 1.2e-6; 1.4e-6, 5.8e-4
     "cartpole_swingup": Bounds(2e-7, 4e-7, 4e-8, 1e-7),  # 6.2e-8, 1.1e-7; 1.2e-8, 2.9e-8
     "half_cheetah": Bounds(1e-7, 1e-6, 1e-5, 1e-4),  # 3.2e-8, 2.9e-7; 3.0e-6, 2.9e-5
@@ -53,13 +54,13 @@ ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median
 
 @dataclasses.dataclass
 class Engines:
-    """One task on both engines, one substep a step, and states to put them into."""
+    """One task on both engines, with one substep in a step, and states for both."""
 
     task: str
     c: lw.Env
     warp: lw.Env
     states: list[torch.Tensor]
-    """Along a random rollout of the task as it is, (NWORLD, size) each; every number is one of float32."""
+    """States along a random rollout of the unchanged task, (NWORLD, size) each; every number is one of float32."""
 
     def action(self, rng: np.random.Generator) -> torch.Tensor:
         """Random actions for every world, some beyond the control range."""
@@ -90,12 +91,12 @@ def rollout_states(env: lw.Env) -> list[torch.Tensor]:
 
 @pytest.fixture(scope="module", params=DEVICES)
 def device(request: pytest.FixtureRequest) -> str:
-    """Where the Warp engine runs; the C engine always runs on the CPU."""
+    """The Warp engine's device; the C engine always runs on the CPU."""
     return str(request.param)
 
 
 @pytest.fixture(scope="module", params=TASKS)
-def engines(request: pytest.FixtureRequest, device: str, shared_env: Callable[..., lw.Env]) -> Iterator[Engines]:
+def engines(request: pytest.FixtureRequest, device: str, shared_env: SharedEnv) -> Iterator[Engines]:
     task = request.param
     options = {"nworld": NWORLD, "cone": "elliptic", "frame_skip": 1, "autoreset": False, "horizon": 0}
     states = rollout_states(shared_env(task, engine="mujoco", nworld=NWORLD))
@@ -132,33 +133,32 @@ def check_same(ours: Outcome, other: Outcome, force_parts: dict[str, slice] | No
 
 
 def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) -> Outcome:
-    """What the task's functions make of given field values, wherever an engine would have taken them from."""
-    for batch, values in ((env._before, before), (env._after, after)):
+    """The results of the task's functions for given field values, without any physics."""
+    for batch, values in ((env.worlds.before, before), (env.worlds.after, after)):
         for name, value in values.items():
             torch_view(getattr(batch, name)).copy_(value)
-    torch_view(env._safe_action).copy_(action)
-    env.done_reason.zero_()  # without automatic resets, what has ended stays so
-    env._judge(env._everyone, env._no_fault, env._no_fault, transition=True)
+    env.worlds.judge_transition(action)
     result = outcome(env)
     env.rand_reset(0)
     return result
 
 
-def test_same_state_layout(engines: Engines) -> None:
-    """A state of one engine is a state of the other: its parts lie in the same places."""
+def test_both_engines_have_the_same_spaces(engines: Engines) -> None:
+    """So that a state of one engine is a state of the other."""
     assert engines.c.state_space == engines.warp.state_space
     assert engines.c.obs_space == engines.warp.obs_space
     assert engines.c.timestep == engines.warp.timestep
 
 
-def test_same_fields(engines: Engines) -> None:
-    """The same field values, likely or not, are judged alike."""
+def test_the_same_field_values_are_judged_alike(engines: Engines) -> None:
+    """Values near those of real states; no physics could lead to most of them."""
     rng = torch.Generator().manual_seed(0)
     numpy_rng = np.random.default_rng(1)
     fallen = 0
     for state in engines.states[:4]:
         engines.c.set_state(state)
-        fields: Outcome = {name: torch_view(getattr(engines.c._after, name)).clone() for name in engines.c.task.fields}
+        after = engines.c.worlds.after
+        fields: Outcome = {name: torch_view(getattr(after, name)).clone() for name in engines.c.task.types}
 
         def near(values: Outcome) -> Outcome:
             return {k: v * (1.0 + 0.1 * noise(v)) + 0.1 * noise(v) for k, v in values.items()}
@@ -166,16 +166,16 @@ def test_same_fields(engines: Engines) -> None:
         def noise(like: torch.Tensor) -> torch.Tensor:
             return torch.randn(like.shape, generator=rng)
 
-        before, after, action = near(fields), near(fields), engines.action(numpy_rng)
-        results = [judge(env, before, action, after) for env in (engines.c, engines.warp)]
+        values = near(fields), engines.action(numpy_rng), near(fields)
+        results = [judge(env, *values) for env in (engines.c, engines.warp)]
         assert results[0]["obs"].abs().max() > 0.1
         check_same(*results)
         fallen += int(results[0]["terminated"].sum())
     assert 0 < fallen < 4 * NWORLD or engines.c.task.functions["terminated"] is None
 
 
-def test_same_states(engines: Engines) -> None:
-    """Whole states of one engine, its contact forces included, are judged alike by both, through the interface."""
+def test_the_same_states_are_judged_alike(engines: Engines) -> None:
+    """States with all their fields, contact forces included, through the public interface."""
     rng = np.random.default_rng(2)
     for before, after in zip(engines.states[:-1:3], engines.states[1::3], strict=True):
         action = engines.action(rng)
@@ -194,26 +194,27 @@ def test_same_states(engines: Engines) -> None:
         check_same(*results)
 
 
-def test_same_injected_states(engines: Engines) -> None:
-    """From the same positions and velocities, each engine computes the same observation for itself."""
+def test_the_same_positions_and_velocities_are_observed_alike(engines: Engines) -> None:
+    """Each engine computes all other fields from them."""
     parts = {name: engines.c.obs_space.parts[name] for name in FORCE_PARTS.get(engines.task, ())}
     largest = 0.0
     for state in engines.states:
         results = []
         for env in (engines.c, engines.warp):
             env.set_state(state.to(env.action.device))
-            # a state brings fields with it that are as the last substep left them; here each engine makes its own
-            env.engine.refresh(env._everyone)
-            env._judge_state()
+            # a state holds the fields that the last substep left; here each engine computes its own
+            for phase in env.worlds.reset_phases(randomly=False):
+                if phase.name != "restart":
+                    phase.run()
             results.append(outcome(env))
         check_same(*results, parts)
         largest = max([largest, *(results[0]["obs"][:, part].abs().max().item() for part in parts.values())])
-    assert largest > 1.0 or not parts, "no state has a contact: there is nothing to compare"
+    assert largest > 1.0 or not parts, "no state has a contact, so nothing was compared"
 
 
-def test_one_step(engines: Engines) -> None:
-    """One substep from the same states under the same actions leaves the engines about a float32 rounding apart."""
-    assert engines.task in ONE_STEP, f"measure {engines.task} with pytest -rP and write its bounds into ONE_STEP"
+def test_one_substep_leaves_the_engines_a_rounding_apart(engines: Engines) -> None:
+    """From the same states under the same actions, within the bounds of ONE_STEP."""
+    assert engines.task in ONE_STEP, f"add bounds of {engines.task} to ONE_STEP; pytest -rP shows the differences"
     rng = np.random.default_rng(3)
     errors: dict[str, list[torch.Tensor]] = {"qpos": [], "qvel": []}
     for state in engines.states:

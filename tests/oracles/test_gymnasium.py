@@ -1,7 +1,7 @@
 """The five Gymnasium tasks against Gymnasium's own environments, on the C engine.
 
-Both run the same C code in float64, so from the same state, warm start included, they stay together for good;
-what is left is the rounding of observations and rewards to float32.
+Both run the same C code in float64. From the same state, warm start included, their numbers differ only by the
+rounding of observations and rewards to float32.
 """
 
 import dataclasses
@@ -27,10 +27,10 @@ import lyceum_warp as lw
 
 
 class SensorStageHumanoid(HumanoidEnv):
-    """Gymnasium's Humanoid with the solver that both engines have, and contact forces as a sensor sees them.
+    """Gymnasium's Humanoid with the solver that both engines have, and the contact forces of the last substep.
 
-    Gymnasium computes ``cfrc_ext`` once more after the last substep. Here a sensor asks for it in the model,
-    as in lyceum_warp, and what the last substep's sensor stage left is what counts.
+    Gymnasium computes ``cfrc_ext`` once more after the last substep. Here a sensor of the model asks for it, as in
+    lyceum_warp, and the values of the last substep's sensor stage are used.
     """
 
     def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -70,7 +70,7 @@ def make_ours(task: str, **options: Any) -> lw.Env:
 
 
 def make_theirs(task: str, **options: Any) -> Any:
-    """Gymnasium's environment, bare of wrappers; for the humanoid, the oracle above."""
+    """Gymnasium's environment without wrappers; for the humanoid, the class above."""
     if task == "humanoid":
         return SensorStageHumanoid(**options)
     return gymnasium.make(GYMNASIUM_IDS[task], **options).unwrapped
@@ -105,7 +105,7 @@ class Step:
 
 
 class Pair:
-    """One of our worlds and Gymnasium's, put into the same states and stepped with the same actions."""
+    """One world and Gymnasium's environment, put into the same states and stepped with the same actions."""
 
     def __init__(self, ours: lw.Env, theirs: Any, seed: int = 0) -> None:
         assert ours.nworld == 1
@@ -127,9 +127,9 @@ class Pair:
         state = self.ours.get_state()
         parts = self.ours.state_space.split(state[0])
         for name in parts.keys() - {"step", "key", "episode", "done_reason"}:
-            # fields that are kept as the last substep left them are the ones of the forward pass above
+            # fields that a state holds as the last substep left them come from the forward pass above
             parts[name].copy_(torch.from_numpy(np.ravel(getattr(data, name))))
-        parts["done_reason"].zero_()  # nothing has ended yet in the common state
+        parts["done_reason"].zero_()  # the common state has not ended
         self.ours.set_state(state)
 
     def action(self) -> np.ndarray:
@@ -172,12 +172,9 @@ def check(steps: list[Step]) -> None:
     assert max(step.reward_error for step in steps) <= 1e-4
 
 
-# a thousand steps
-
-
 @pytest.mark.parametrize("task", TASKS)
-def test_thousand_steps(task: str) -> None:
-    """The same numbers as Gymnasium for 1,000 steps of random actions, some beyond the control range."""
+def test_a_thousand_steps_have_gymnasiums_numbers(task: str) -> None:
+    """Random actions, some beyond the control range."""
     pair = Pair(make_ours(task), make_theirs(task))
     assert pair.ours.timestep == pytest.approx(pair.theirs.dt, rel=1e-12)
     assert pair.ours.obs.shape == (1, *pair.theirs.observation_space.shape)
@@ -186,16 +183,16 @@ def test_thousand_steps(task: str) -> None:
     steps = pair.run(1000)
     obs_error, reward_error = max(step.obs_error for step in steps), max(step.reward_error for step in steps)
     falls = sum(step.gym_terminated for step in steps)
-    print(f"{task}: obs within {obs_error:.1e}, reward within {reward_error:.1e}, {falls} falls")  # seen with -rP
+    print(f"{task}: obs within {obs_error:.1e}, reward within {reward_error:.1e}, {falls} falls")  # pytest -rP shows it
     check(steps)
-    # the evaluation metric is the position of the torso
+    # the evaluation metric is the torso's position
     x = np.array([step.info["x_position"] for step in steps])
     assert relative_error(np.array([step.eval for step in steps]), x) <= 1e-5
     assert falls >= 10 if task in ("hopper", "walker2d", "humanoid") else falls == 0
 
 
-def test_humanoid_as_gymnasium_ships_it() -> None:
-    """Against the unchanged Humanoid-v5, its solver apart, only the contact forces and their cost differ."""
+def test_unchanged_humanoid_differs_only_in_contact_forces() -> None:
+    """Humanoid-v5 with another solver: all but the contact forces and their cost agree."""
     theirs: Any = gymnasium.make("Humanoid-v5").unwrapped
     theirs.model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
     pair = Pair(make_ours("humanoid"), theirs)
@@ -207,7 +204,7 @@ def test_humanoid_as_gymnasium_ships_it() -> None:
         cost = np.clip(5e-7 * np.sum(np.square(step.obs[forces])), -np.inf, 10.0)
         others, gym_others = step.reward + cost, step.gym_reward - step.info["reward_contact"]
         assert abs(others - gym_others) <= 1e-4 * max(1.0, abs(gym_others))
-    # should the two one day agree here, too, the note in tasks/humanoid.py can go
+    # once these agree, the note in tasks/humanoid.py can go
     assert max(relative_error(step.obs[forces], step.gym_obs[forces]) for step in steps) > 1e-3
 
 
@@ -224,8 +221,8 @@ WIDE = {"healthy_z_range": (-1e3, 1e3), "healthy_angle_range": (-1e3, 1e3)}
         ("humanoid", 0.5, {}),
     ],
 )
-def test_health_of_any_state(task: str, spread: float, options: dict[str, Any]) -> None:
-    """A state anywhere around the bounds, in every coordinate, is terminal exactly where Gymnasium's is."""
+def test_a_state_is_terminal_where_gymnasium_says_so(task: str, spread: float, options: dict[str, Any]) -> None:
+    """States on both sides of the bounds, in every coordinate."""
     ours, theirs = make_ours(task, nworld=500, **options), make_theirs(task, **options)
     rng = np.random.default_rng(0)
     state = ours.get_state()
@@ -246,8 +243,8 @@ def test_health_of_any_state(task: str, spread: float, options: dict[str, Any]) 
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_first_observation(task: str) -> None:
-    """After a reset, fixed or random, the observation is Gymnasium's of the same state."""
+def test_the_first_observation_is_gymnasiums_of_the_same_state(task: str) -> None:
+    """After a random reset and after the fixed one."""
     ours, theirs = make_ours(task, nworld=16), make_theirs(task)
     for start in (ours.rand_reset, ours.reset):
         start()
@@ -272,7 +269,7 @@ def normal_cdf(x: np.ndarray) -> np.ndarray:
 def check_samples(samples: np.ndarray, scale: float, *, normal: bool) -> None:
     """Check that (n, k) samples are k independent coordinates of U(-scale, scale), or of N(0, scale**2).
 
-    The thresholds let fewer than one right sample in 10,000 fail; seeds are fixed, so it is always the same.
+    Fewer than one correct sample in 10,000 fails these thresholds; the seeds are fixed.
     """
     n, k = samples.shape
     scaled = samples / scale
@@ -281,10 +278,10 @@ def check_samples(samples: np.ndarray, scale: float, *, normal: bool) -> None:
         assert (scaled.max(axis=0) > 1.0 - 20.0 / n).all() and (scaled.min(axis=0) < 20.0 / n - 1.0).all()
     deviation = 1.0 if normal else 1.0 / math.sqrt(3.0)
     assert np.abs(scaled.mean(axis=0)).max() < 5.0 * deviation / math.sqrt(n)
-    # the relative error of a standard deviation comes from the fourth moment: 3 for normal, 9/5 for uniform
+    # the error of a standard deviation follows from the fourth moment: 3 for normal, 9/5 for uniform samples
     spread = math.sqrt(((3.0 if normal else 1.8) - 1.0) / (4.0 * n))
     assert np.abs(scaled.std(axis=0) / deviation - 1.0).max() < 5.0 * spread
-    # Kolmogorov and Smirnov's distance from the whole distribution
+    # the Kolmogorov-Smirnov distance
     cdf = normal_cdf if normal else uniform_cdf
     for coordinate in np.sort(scaled, axis=0).T:
         expected = cdf(coordinate)
@@ -300,11 +297,8 @@ DEFAULT_NOISE = {"hopper": 5e-3, "walker2d": 5e-3, "half_cheetah": 0.1, "swimmer
 @pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("times", [1.0, 0.2, 3.0])
 @pytest.mark.parametrize("task", TASKS)
-def test_reset_noise(task: str, times: float) -> None:
-    """Random resets follow Gymnasium's formula, for its own noise scale and for two others.
-
-    The same statistics of Gymnasium's own resets show that the formula, and the default, are Gymnasium's.
-    """
+def test_random_resets_follow_gymnasiums_formula(task: str, times: float) -> None:
+    """For Gymnasium's noise scale and for two others. Gymnasium's own resets pass the same checks."""
     scale = DEFAULT_NOISE[task] * times
     option = {} if times == 1.0 else {"reset_noise_scale": scale}
     theirs = make_theirs(task, **option)
@@ -365,7 +359,7 @@ CASES = [(task, name, value) for task in TASKS for name, values in PARAMETERS[ta
 
 
 def oracle_numbers(task: str, **options: Any) -> tuple[tuple[int, ...], list[tuple[float, float, bool]]]:
-    """What Gymnasium alone gives in 150 steps: its observation's shape, and numbers of each step."""
+    """Gymnasium's observation shape, and numbers of each of 150 steps."""
     theirs = make_theirs(task, **options)
     theirs.reset(seed=0)
     rng, numbers = np.random.default_rng(0), []
@@ -383,14 +377,14 @@ def default_numbers() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("task", "name", "value"), CASES)
-def test_parameter(task: str, name: str, value: Any, default_numbers: dict[str, Any]) -> None:
-    """Each keyword parameter does what Gymnasium's does, to the numbers and to the observation's size.
+def test_a_parameter_has_the_effect_of_gymnasiums(task: str, name: str, value: Any, default_numbers: dict[str, Any]) -> None:
+    """On the numbers and on the observation's size.
 
-    With automatic resets, because some of the ranges leave out the initial state: a world that is put into a
-    finished state and not reset stays finished, where Gymnasium judges a state only when a step leads there.
+    Worlds reset automatically, because some of the ranges exclude the initial state: without resets a world that is
+    put into a finished state stays finished, while Gymnasium judges a state only after a step.
     """
     shape, numbers = oracle_numbers(task, **{name: value})
-    assert (shape, numbers) != default_numbers[task], f"{name}={value} changes nothing here: choose another value"
+    assert (shape, numbers) != default_numbers[task], f"{name}={value} changes no number: choose another value"
     pair = Pair(make_ours(task, autoreset=True, **{name: value}), make_theirs(task, **{name: value}))
     assert pair.ours.obs.shape == (1, *shape)
     if isinstance(value, bool) and name != "terminate_when_unhealthy":
@@ -416,10 +410,10 @@ def _weaken_motors(root: ET.Element) -> None:
 
 @pytest.mark.parametrize("change", [_halve_timestep, _weaken_motors])
 @pytest.mark.parametrize("task", TASKS)
-def test_other_model(
+def test_a_changed_model_file_has_the_effect_of_gymnasiums(
     task: str, change: Callable[[ET.Element], None], tmp_path: Path, default_numbers: dict[str, Any]
 ) -> None:
-    """A changed copy of the model file is taken as ``model``, as Gymnasium takes it as ``xml_file``."""
+    """The option ``model`` takes a changed copy of the file, as Gymnasium's ``xml_file`` does."""
     tree = ET.parse(make_theirs(task).fullpath)
     change(tree.getroot())
     file = tmp_path / "changed.xml"
@@ -431,8 +425,7 @@ def test_other_model(
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_every_parameter_is_tried(task: str) -> None:
-    """No keyword parameter of Gymnasium's environment is left out, here or in the task."""
+def test_every_parameter_of_gymnasium_is_compared(task: str) -> None:
     code = ORACLES[task].__init__.__code__
     names = set(code.co_varnames[1 : code.co_argcount])
     theirs = names - {"xml_file", "default_camera_config"}
