@@ -1,4 +1,4 @@
-"""Shapes, parts and bounds of what an environment takes and gives."""
+"""Shapes, parts and bounds of observations, actions and states."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -12,18 +12,18 @@ from lyceum_warp.fields import STATE_FIELDS, Field
 
 @dataclasses.dataclass(frozen=True)
 class Space:
-    """One world's vector: its parts by name, its type, and its bounds where there are any.
+    """The vector of one world: its parts by name, its type, and its bounds where there are any.
 
-    A scalar has no axis. The arrays of an environment have one more axis in front, the worlds.
+    A scalar has no axis. The arrays of an environment have one more axis in front, for the worlds.
     """
 
     parts: Mapping[str, slice] = dataclasses.field(default_factory=dict)
-    """Where each named part lies, in order."""
+    """The place of each named part, in order."""
     dtype: torch.dtype = torch.float32
     low: np.ndarray | None = None
-    """Lower bounds, of ``shape``, or None."""
+    """Lower bounds, of the shape ``shape``; None without bounds."""
     high: np.ndarray | None = None
-    """Upper bounds, of ``shape``, or None."""
+    """Upper bounds, of the shape ``shape``; None without bounds."""
 
     @classmethod
     def of(cls, sizes: Mapping[str, int], **rest: object) -> "Space":
@@ -50,11 +50,11 @@ class Space:
 
 
 COUNTERS = ("step", "key", "episode", "done_reason")
-"""Parts of a state that count: steps since the reset, the world's random streams, its episodes, why it ended."""
+"""Counters in a state: steps since the reset, key of the random streams, number of the episode, bits of ``Done``."""
 
 
 def action_space(model: mujoco.MjModel, action_range: tuple[float, float] | None) -> Space:
-    """Actions: one number for each control, by the actuators' names, within their control ranges or one's own."""
+    """Actions: one number for each control, by the actuators' names, within ``action_range`` or the control ranges."""
     names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) or f"actuator_{i}" for i in range(model.nu)]
     bounds = control_ranges(model) if action_range is None else np.tile(action_range, (model.nu, 1))
     low, high = np.ascontiguousarray(bounds.T, dtype=np.float32)
@@ -62,7 +62,11 @@ def action_space(model: mujoco.MjModel, action_range: tuple[float, float] | None
 
 
 def control_map(model: mujoco.MjModel, action_range: tuple[float, float] | None) -> tuple[np.ndarray, np.ndarray]:
-    """The controls' ranges, (nu, 2), and the scale and offset that map actions to controls, (nu, 2)."""
+    """The controls' ranges, (nu, 2), and the scale and offset that map actions to controls, (nu, 2).
+
+    Raises:
+        ValueError: There is an ``action_range``, but a control without a range.
+    """
     ranges = control_ranges(model)
     if action_range is None:
         return ranges, np.tile((1.0, 0.0), (model.nu, 1))
@@ -83,7 +87,7 @@ def control_ranges(model: mujoco.MjModel) -> np.ndarray:
 
 
 def state_space(model: mujoco.MjModel, snapshots: Iterable[Field], memory: int) -> Space:
-    """States: the integration state in MuJoCo's order, fields saved with it, counters, and task memory."""
+    """States: the integration state in MuJoCo's order, the fields saved with it, counters, and task memory."""
     sizes = {}
     names = {component.value: name for name, component in STATE_FIELDS.items()}
     components = mujoco.mjtState.mjSTATE_INTEGRATION.value

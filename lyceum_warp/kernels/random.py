@@ -1,7 +1,7 @@
-"""Counted random streams: what is drawn depends on (seed, world, episode, step), never on who drew before.
+"""Counted random streams: a draw depends on (seed, world, episode, step) alone, in any order of worlds.
 
-The four numbers are hashed one inside the other. A sum of them would give seed 0, episode 1 and seed 1,
-episode 0 the same stream.
+The four numbers are hashed one inside the other. A sum of them would give seed 0, episode 1 the same stream as seed 1,
+episode 0.
 """
 
 import warp as wp
@@ -15,7 +15,7 @@ def world_key(seed: int, world: int) -> wp.uint32:
 
 @wp.func
 def stream(key: wp.uint32, episode: int, step: int) -> wp.uint32:
-    """Start of the stream of one step of one episode; step 0 is the reset."""
+    """Start of the stream of one step in one episode; step 0 is the reset."""
     return wp.rand_init(int(wp.rand_init(int(key), episode)), step)
 
 
@@ -23,8 +23,8 @@ def stream(key: wp.uint32, episode: int, step: int) -> wp.uint32:
 def uniform(rng: wp.array[wp.uint32], low: float, high: float) -> float:
     """Draw from U(low, high) and advance the stream.
 
-    The stream is a row of one element because a number passed by value would not advance in the caller, and
-    two draws would be the same.
+    The stream is a row of one element: a number passed by value would not advance in the caller, so that two draws
+    would be equal.
     """
     state = rng[0]
     value = wp.randf(state, low, high)
@@ -49,7 +49,7 @@ def seed_worlds(
     key_out: wp.array[wp.uint32],
     episode_out: wp.array[int],
 ):
-    """Give the masked worlds the streams of a seed, from their first episode on; world 0 has the number ``first``."""
+    """Start the masked worlds' streams from a seed, at their first episode; world 0 has the number ``first``."""
     w = wp.tid()
     if mask_in[w]:
         key_out[w] = world_key(seed_in[0], first + int(w))

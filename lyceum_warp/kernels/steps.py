@@ -16,7 +16,7 @@ ACTION = wp.constant(int(Done.ACTION))
 
 @wp.struct
 class Outcome:
-    """The outcome of a step in each world; every array is (nworld,) but for the observations."""
+    """The outcome of a step in each world; every array is (nworld,), observations are (nworld, nobs)."""
 
     reward: wp.array[float]
     eval: wp.array[float]
@@ -45,7 +45,7 @@ OUTCOMES = {
 
 @wp.kernel(enable_backward=False)
 def count_faults(fault_in: wp.array[int], count_out: wp.array[int]):
-    """Count each kind of fault, by the place of its bit in Done."""
+    """Count each kind of fault, at the place of its bit in Done."""
     w = wp.tid()
     fault = fault_in[w]
     if fault != 0:
@@ -69,10 +69,9 @@ def make_kernels(
         Batch: Struct of the task's fields for all worlds.
         view: Function from (batch, world) to the struct that the task's functions take.
         Params: Struct of the task's parameters; an array of them holds one entry, or one a world.
-        functions: The task's functions by name, with defaults for those that it lacks.
-        written: Names of the functions that the task itself has. Without ``control`` actions are mapped to controls
-            by a scale and an offset; without ``evaluate`` the evaluation is the reward; without ``advance`` no memory
-            is written.
+        functions: The task's functions by name, with defaults for those that it does not have.
+        written: Names of the functions that the task has. Without ``control`` a scale and an offset map actions to
+            controls; without ``evaluate`` the evaluation is the reward; without ``advance`` memory stays as it is.
         module: Name of the Warp module that the kernels are compiled into, one for each task.
     """
     observe, control, reward = functions["observe"], functions["control"], functions["reward"]
@@ -92,7 +91,7 @@ def make_kernels(
         fault_out: wp.array[int],
         ctrl_out: wp.array2d[float],
     ):
-        """Map actions to controls, within their ranges; an action that is not finite counts as zero."""
+        """Map actions to controls, clipped to their ranges; an action that is not finite counts as zero."""
         w = wp.tid()
         fault = int(0)
         for i in range(action_in.shape[1]):
@@ -121,7 +120,7 @@ def make_kernels(
         episode_in: wp.array[int],
         rng_inout: wp.array2d[wp.uint32],
     ):
-        """Let the task write its memory."""
+        """Advance the task's memory by one step."""
         w = wp.tid()
         rng_inout[w, 0] = stream(key_in[w], episode_in[w], step_in[w])
         p = params[w % params.shape[0]]
@@ -145,8 +144,8 @@ def make_kernels(
     ):
         """Reward, evaluation, termination and observation of a transition, or of a state alone.
 
-        A faulted transition has reward 0, the evaluation of the state before it, and the last good
-        observation; it counts as terminated, so that no learner bootstraps from it.
+        A transition with a fault has reward 0, the evaluation of the state before it, and the last good observation.
+        It counts as terminated, so that no learner bootstraps from it.
         """
         w = wp.tid()
         if not mask_in[w]:
@@ -169,7 +168,7 @@ def make_kernels(
                 out.eval[w] = evaluate(s1, p)
             elif transition:
                 last = evaluate(s0, p)
-                if not faults.is_absurd(last):  # else the state before was itself unfit: keep what was known
+                if not faults.is_absurd(last):  # else keep the evaluation of an earlier state
                     out.eval[w] = last
         else:
             out.eval[w] = gain
@@ -192,7 +191,7 @@ def make_kernels(
         for i in range(out.obs.shape[1]):
             out.obs[w, i] = out.final_obs[w, i]
         if transition:
-            # a world that may step on after its end still can't step on after a fault
+            # without automatic resets a world steps on after its end, but not after a fault
             restart_out[w] = wp.where(keep_reason, fault != 0, reason != 0)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -206,7 +205,7 @@ def make_kernels(
         step_out: wp.array[int],
         episode_inout: wp.array[int],
     ):
-        """Begin an episode in worlds that the engine has put into the model's initial state."""
+        """Begin an episode in masked worlds, which the engine has put into the model's initial state."""
         w = wp.tid()
         if not mask_in[w]:
             return
@@ -258,7 +257,7 @@ def make_kernels(
         memory_inout: wp.array2d[float],
         rng_inout: wp.array2d[wp.uint32],
     ):
-        """Let the task write its memory along a roll-out: one thread a world walks through its steps."""
+        """Advance the task's memory along a roll-out; one thread goes through all steps of a world."""
         w = wp.tid()
         n = step_in.shape[0]
         p = params[w % params.shape[0]]

@@ -1,7 +1,7 @@
-"""The rules that hold for every task on every engine, as checks: run them on your own with ``check_task``.
+"""The rules of an environment, as checks for any task on any engine; ``check_task`` runs them.
 
-Each check is one rule. It takes the environments under test, fails with an AssertionError that names the task,
-the engine, the rule and the values, and leaves the environments usable for the next.
+Each check is one rule. It takes the environments under test, raises an AssertionError that names the task, the
+engine, the rule and the values, and leaves the environments usable for the next check.
 """
 
 import dataclasses
@@ -10,12 +10,13 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.engines import EngineFactory
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import episode_rules as episodes
-from lyceum_warp.testing import fault_rules as trouble
+from lyceum_warp.testing import fault_rules as faults
 from lyceum_warp.testing import state_rules as state
 from lyceum_warp.testing.context import OUTCOMES, Context
 
@@ -40,25 +41,30 @@ CHECKS: tuple[Callable[[Context], None], ...] = (
     state.check_saved_stream,
     episodes.check_truncation,
     episodes.check_no_autoreset,
-    episodes.check_recording,
+    episodes.check_graphs,
     episodes.check_memory,
-    trouble.check_bad_state,
-    trouble.check_bad_action,
-    trouble.check_bad_warmstart,
+    faults.check_bad_state,
+    faults.check_bad_action,
+    faults.check_bad_warmstart,
 )
 """All checks, in the order in which ``check_task`` runs them."""
 
 
+@document_attributes
 @dataclasses.dataclass
 class Report:
-    """What ``check_task`` has checked."""
+    """The rules that a task kept on an engine."""
 
     task: str
+    """The task's name."""
     engine: str
+    """The engine's name."""
     device: str
+    """The device that the worlds stepped on."""
     nworld: int
+    """Number of worlds."""
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    """How long each check took, by its name."""
+    """Duration of each check, by the name of its rule."""
 
     def __str__(self) -> str:
         head = f"{self.task} on the {self.engine} engine ({self.device}, {self.nworld} worlds) keeps the rules:"
@@ -80,26 +86,27 @@ def check_task(
 
     Args:
         task: Name of a task, a file with one, or its class.
-        engine: As for ``make``; also an engine of your own.
+        engine: As for ``make``, or a class of your own (see ``engines.base``).
         device: As for ``make``.
         nworld: Number of worlds, at least 2.
         steps: Steps of the long checks (determinism, memory).
-        seed: Of the worlds and of the random actions.
-        checks: Which rules to check, out of ``CHECKS``.
-        options: Other options of ``make`` and parameters of the task. On a CUDA device ``deterministic`` is True
-            unless it is given: the rules compare to the bit.
+        seed: Seed of the worlds and of the random actions.
+        checks: The rules to check, out of ``CHECKS``.
+        options: Other options of ``make`` and parameters of the task. On a CUDA device ``deterministic`` is True by
+            default, because the rules compare to the bit.
 
     Returns:
-        What was checked; print it.
+        A report of the checks, to print.
 
     Raises:
-        AssertionError: Rules are broken; the message names all of them.
+        AssertionError: Rules are broken; the message lists them.
+        ValueError: There are fewer than 2 worlds, or an option does not fit.
 
     Example:
         >>> print(check_task("hopper", engine="mujoco"))
     """
     if nworld < 2:
-        raise ValueError(f"the checks compare worlds with one another: nworld has to be at least 2, not {nworld}")
+        raise ValueError(f"the checks compare worlds with one another: nworld must be at least 2, not {nworld}")
 
     if str(device or "").startswith("cuda"):
         options = {"deterministic": True} | options

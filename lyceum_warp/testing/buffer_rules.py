@@ -1,4 +1,4 @@
-"""Rules about what the buffers are."""
+"""Rules about spaces, buffers and their getters."""
 
 import torch
 
@@ -8,7 +8,7 @@ from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 
 
 def check_spaces(ctx: Context) -> None:
-    """Every space agrees with its buffer in shape and type, its parts cover it, and bounds are ordered."""
+    """Every space has the shape and type of its buffer, its parts cover it, and lower bounds are below upper ones."""
     env = ctx.a
     pairs = {
         "obs": (env.obs_space, env.obs), "action": (env.action_space, env.action),
@@ -25,7 +25,10 @@ def check_spaces(ctx: Context) -> None:
         ctx.that(starts == ends[:-1], f"the parts of the {name} space leave gaps: {dict(space.parts)}")
         if space.low is not None and space.high is not None:
             ctx.that(space.low.shape == space.high.shape == space.shape, f"bounds of {name} have another shape")
-            ctx.that(bool((space.low <= space.high).all()), f"bounds of {name} cross: {space.low}, {space.high}")
+            ctx.that(
+                bool((space.low <= space.high).all()),
+                f"bounds of {name} are reversed: {space.low}, {space.high}",
+            )
     for name in ("terminated", "truncated", "success", "done"):
         ctx.that(getattr(env, name).dtype == torch.bool, f"{name} is {getattr(env, name).dtype}")
     for name in (*OUTCOMES, "action", "time"):
@@ -36,7 +39,7 @@ def check_spaces(ctx: Context) -> None:
 
 
 def check_addresses(ctx: Context) -> None:
-    """Every buffer stays the same object at the same address, over steps, resets and setting states."""
+    """Every buffer stays the same object at the same address, through steps, resets and restored states."""
     env = ctx.a
     ctx.restart()
     names = (*OUTCOMES, "action", "time")
@@ -49,7 +52,7 @@ def check_addresses(ctx: Context) -> None:
     env.rand_reset()
     env.set_state(state)
     for name in names:
-        ctx.that(id(getattr(env, name)) == before[name][0], f"env.{name} has become another object")
+        ctx.that(id(getattr(env, name)) == before[name][0], f"env.{name} is another object than before")
         ctx.that(getattr(env, name).data_ptr() == before[name][1], f"env.{name} has moved")
     for name, pointer in fields.items():
         ctx.that(env.engine.arrays[name].ptr == pointer, f"the field {name} has moved")
@@ -70,7 +73,7 @@ def check_getters(ctx: Context) -> None:
         ctx.equal(out, value, f"get_{name}(out=)")
         if name != "state":
             ctx.equal(value, getattr(env, name), f"get_{name}()")
-            ctx.that(value.data_ptr() != getattr(env, name).data_ptr(), f"get_{name}() is no copy")
+            ctx.that(value.data_ptr() != getattr(env, name).data_ptr(), f"get_{name}() is not a copy")
     state = env.get_state()
     for name in ("obs", "eval", "terminated"):
         getter = getattr(env, f"get_{name}")
@@ -82,7 +85,7 @@ def check_getters(ctx: Context) -> None:
 
 
 def check_time(ctx: Context) -> None:
-    """``env.time`` is 0 after a reset, grows by ``env.timestep`` a step, and asking for it changes nothing."""
+    """``env.time`` is 0 after a reset, grows by ``env.timestep`` with each step, and reading it changes nothing."""
     env = ctx.a
     with ctx.changed(env, autoreset=False, horizon=0):
         for reset in (env.reset, env.rand_reset):
@@ -97,4 +100,4 @@ def check_time(ctx: Context) -> None:
                 )
                 again = env.time.clone()
                 env.get_state()
-                ctx.equal(env.time, again, "time, asked for twice")
+                ctx.equal(env.time, again, "time, read twice")

@@ -1,4 +1,4 @@
-"""What the checks work on."""
+"""The environments under test, and the comparisons that the checks share."""
 
 import contextlib
 import dataclasses
@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from lyceum_warp.arrays import torch_view
+from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import steps
 
@@ -19,21 +20,27 @@ SHORT = 8
 """Steps of a check that needs only a few."""
 
 
+@document_attributes
 @dataclasses.dataclass
 class Context:
-    """What a check works on: two environments made alike, and the choices they were made with."""
+    """Two environments made with the same options, those options, and comparisons with messages."""
 
     a: Env
+    """The environment that most checks use."""
     b: Env
+    """One for comparison."""
     make: Callable[..., Env]
-    """Makes another environment with the same options, but for those that are given."""
+    """Makes another environment with the same options, except for the given ones."""
     steps: int
-    """Steps of the checks that look at a long run."""
+    """Steps of the long checks."""
     seed: int
+    """Seed of the worlds and of the random actions."""
     task: str
+    """The task's name."""
     engine: str
+    """The engine's name."""
     rule: str = ""
-    """The rule that is being checked."""
+    """Name of the rule that is being checked."""
 
     def fail(self, problem: str) -> None:
         """Raise the AssertionError for a problem."""
@@ -72,23 +79,23 @@ class Context:
         return (low + draws * (high - low)).to(env.action)
 
     def run(self, env: Env, actions: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Step through actions and collect what every step gave, (steps, nworld, ...)."""
-        record: dict[str, list[torch.Tensor]] = {name: [] for name in ("state", *OUTCOMES)}
+        """Step through actions; returns the state and the outcome of every step, (steps, nworld, ...)."""
+        kept: dict[str, list[torch.Tensor]] = {name: [] for name in ("state", *OUTCOMES)}
         for action in actions:
             env.step(action)
-            record["state"].append(env.get_state())
+            kept["state"].append(env.get_state())
             for name in OUTCOMES:
-                record[name].append(getattr(env, name).clone())
-        return {name: torch.stack(values) for name, values in record.items()}
+                kept[name].append(getattr(env, name).clone())
+        return {name: torch.stack(values) for name, values in kept.items()}
 
     def same_runs(self, found: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], what: str) -> None:
-        """Fail unless two runs are the same to the bit."""
+        """Fail unless two runs have the same numbers to the bit."""
         for name in wanted:
             self.equal(found[name], wanted[name], f"{name} {what} (step, world, ...)")
 
     @contextlib.contextmanager
     def changed(self, *envs: Env, **choices: Any) -> Iterator[None]:
-        """For a while, give environments another ``horizon``, ``autoreset`` or ``graphs``."""
+        """Within a ``with`` block, give environments another ``horizon``, ``autoreset`` or ``graphs``."""
         kept = [
             {"horizon": env.horizon, "autoreset": env.autoreset, "graphs": env.worlds.programs.graphs.enabled}
             for env in envs
@@ -102,12 +109,12 @@ class Context:
                 env.worlds.configure(**values)
 
     def buffers(self, env: Env) -> dict[str, torch.Tensor]:
-        """Copies of everything that an environment shows."""
+        """Copies of an environment's buffers, fields and state."""
         shown = {name: getattr(env, name).clone() for name in (*OUTCOMES, "action", "time")}
         fields = {f"field {name}": torch_view(array).clone() for name, array in env.engine.arrays.items()}
         return shown | fields | {"state": env.get_state()}
 
     def finite(self, env: Env, when: str) -> None:
-        """Fail unless the state and everything computed from it are finite."""
+        """Fail unless the state and every outcome are finite."""
         for name, values in {"state": env.get_state(), **{k: getattr(env, k) for k in OUTCOMES}}.items():
             self.that(torch.isfinite(values).all(), f"{name} is not finite {when}: {values}")

@@ -1,4 +1,4 @@
-"""Rules about the end of an episode, and about how steps run."""
+"""Rules about the end of an episode, graphs, and memory that steps use."""
 
 import gc
 import tracemalloc
@@ -10,7 +10,7 @@ from lyceum_warp.done import FAULTS, Done
 from lyceum_warp.env import Env
 from lyceum_warp.testing.context import Context
 
-_PYTHON_BYTES = 2_048  # interned numbers, caches of the interpreter; a float that each of 100 steps kept were 3,200
+_PYTHON_BYTES = 2_048  # the interpreter's own caches; a leak of one float a step would be 3,200 after 100 steps
 
 
 def _check_flags(ctx: Context, env: Env) -> None:
@@ -23,7 +23,7 @@ def _check_flags(ctx: Context, env: Env) -> None:
 def check_truncation(ctx: Context) -> None:
     """At the horizon an episode is truncated; ``final_obs`` is its last observation, ``obs`` the first of the next.
 
-    A truncated episode is not terminated on that account, and worlds that go on have both observations the same.
+    Truncation does not set ``terminated``, and in worlds that go on both observations are equal.
     """
     a, b, horizon = ctx.a, ctx.b, 4
     with ctx.changed(a, horizon=horizon, autoreset=True), ctx.changed(b, horizon=horizon, autoreset=False):
@@ -36,7 +36,7 @@ def check_truncation(ctx: Context) -> None:
             steps += 1
             _check_flags(ctx, a)
             ctx.equal(a.truncated, steps >= horizon, f"truncated after {steps.tolist()} steps of an episode")
-            # until its first end, a world without automatic resets has the same life
+            # until its first end, a world has the same numbers without automatic resets
             ctx.equal(a.final_obs[alive], b.obs[alive], "final_obs against obs without automatic resets")
             ctx.equal(a.reward[alive], b.reward[alive], "reward against the one without automatic resets")
             ctx.equal(a.terminated[alive], b.terminated[alive], "terminated with and without automatic resets")
@@ -67,26 +67,26 @@ def check_no_autoreset(ctx: Context) -> None:
         mask = torch.zeros_like(env.done)
         mask[0] = True
         env.rand_reset(mask=mask)
-        ctx.that(not env.truncated[0] and env.truncated[1:].all(), "a masked reset did not clear just its world's end")
+        ctx.that(not env.truncated[0] and env.truncated[1:].all(), "a masked reset cleared other ends")
 
 
-def check_recording(ctx: Context) -> None:
-    """A recorded step gives the same as an unrecorded one, to the bit, resets included."""
+def check_graphs(ctx: Context) -> None:
+    """Steps and resets with graphs have the numbers of those without, to the bit."""
     a, b, n = ctx.a, ctx.b, 20
     with ctx.changed(a, horizon=6, graphs=True), ctx.changed(b, horizon=6, graphs=False):
         ctx.restart()
         actions = ctx.actions(n)
-        ctx.same_runs(ctx.run(b, actions), ctx.run(a, actions), "unrecorded")
+        ctx.same_runs(ctx.run(b, actions), ctx.run(a, actions), "without graphs")
         for _ in range(3):
             a.rand_reset(ctx.seed)
             b.rand_reset(ctx.seed)
-            ctx.equal(b.get_state(), a.get_state(), "the state after an unrecorded rand_reset")
+            ctx.equal(b.get_state(), a.get_state(), "the state after rand_reset without graphs")
 
 
 def _memory(device: wp.Device) -> dict[str, int]:
     gc.collect()
     found = {"Python bytes": tracemalloc.get_traced_memory()[0]}
-    # by type: isinstance would wake lazily loaded modules
+    # not isinstance: it would load modules that are loaded lazily
     found["arrays"] = sum(issubclass(type(thing), (wp.array, torch.Tensor)) for thing in gc.get_objects())
     if device.is_cuda:
         found["Warp bytes"] = wp.get_mempool_used_mem_current(device)
@@ -95,7 +95,7 @@ def _memory(device: wp.Device) -> dict[str, int]:
 
 
 def check_memory(ctx: Context) -> None:
-    """Steps, resets, getting and setting states allocate nothing that stays."""
+    """Steps, resets, ``get_state`` and ``set_state`` allocate no lasting memory."""
     env = ctx.a
     ctx.restart()
     actions, state = ctx.actions(32), env.get_state()

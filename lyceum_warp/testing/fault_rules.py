@@ -1,4 +1,4 @@
-"""Rules about worlds in trouble."""
+"""Rules about faults."""
 
 from collections.abc import Callable
 
@@ -11,7 +11,7 @@ from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 
 
 def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, what: str) -> None:
-    """Spoil one world of env a and compare with env b, which is left alone."""
+    """Cause a fault in one world of env a, and compare with env b, which has none."""
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     ctx.restart()
     others = torch.arange(a.nworld, device=a.action.device) != bad
@@ -43,11 +43,11 @@ def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, 
         a.step(action)
         b.step(action)
         ctx.finite(a, f"{i + 1} steps after {what}")
-        ctx.that(not int(a.done_reason[bad]) & int(FAULTS), f"{what}: the world is in trouble again")
+        ctx.that(not int(a.done_reason[bad]) & int(FAULTS), f"{what}: the world has another fault")
 
 
 def check_bad_state(ctx: Context) -> None:
-    """A state that is not a number, infinite or absurd ends the episode of its world and touches no other."""
+    """A state that is not-a-number or beyond 1e10 ends the episode of its world and changes no other."""
     for part, value in (("qpos", np.nan), ("qvel", np.nan), ("qvel", np.inf), ("qpos", 1e11), ("qvel", -1e11)):
 
         def spoil(env: Env, world: int, part: str = part, value: float = value) -> None:
@@ -59,7 +59,7 @@ def check_bad_state(ctx: Context) -> None:
 
 
 def check_bad_action(ctx: Context) -> None:
-    """An action that is not finite counts as zero and ends the episode of its world; it touches no other."""
+    """An action that is not finite counts as zero, ends the episode of its world and changes no other."""
     for value in (np.nan, np.inf, -np.inf):
 
         def spoil(env: Env, world: int, value: float = value) -> None:
@@ -69,7 +69,7 @@ def check_bad_action(ctx: Context) -> None:
 
 
 def check_bad_warmstart(ctx: Context) -> None:
-    """A warm start that is not a number neither spoils other worlds nor outlives the reset of its own."""
+    """A warm start of not-a-number changes no other world and is gone after the reset of its own."""
     a, b, bad = ctx.a, ctx.b, 0
     if "qacc_warmstart" not in a.state_space.parts:
         return
@@ -81,8 +81,8 @@ def check_bad_warmstart(ctx: Context) -> None:
         a.step(action)
         b.step(action)
         if i == 0 and (a.done_reason[bad] & int(FAULTS)) == 0:
-            # nothing touches anything in this state, so that the solver has not looked at it
-            ctx.that(torch.isfinite(a.obs[bad]).all(), "the observation is not finite, and no fault was seen")
-        ctx.that(i == 0 or not int(a.done_reason[bad]) & int(FAULTS), f"the world is in trouble again at step {i}")
+            # this state has no contacts, so the solver did not read its warm start
+            ctx.that(torch.isfinite(a.obs[bad]).all(), "the observation is not finite, but there is no fault")
+        ctx.that(i == 0 or not int(a.done_reason[bad]) & int(FAULTS), f"the world has another fault at step {i}")
         ctx.equal(a.get_state()[bad + 1 :], b.get_state()[bad + 1 :], f"the state of other worlds at step {i}")
-    ctx.finite(a, "after a warm start that was not a number")
+    ctx.finite(a, "after a warm start of not-a-number")

@@ -10,7 +10,7 @@ from lyceum_warp.testing.context import SHORT, Context
 
 
 def check_round_trip(ctx: Context) -> None:
-    """Getting a state, setting it and getting it again gives the same numbers."""
+    """A state that is set and read again has the same numbers."""
     env = ctx.a
     ctx.restart()
     ctx.run(env, ctx.actions(5))
@@ -23,7 +23,7 @@ def check_round_trip(ctx: Context) -> None:
 
 
 def check_restoring(ctx: Context) -> None:
-    """Steps after setting a state equal those that followed it before, in the same worlds or in others."""
+    """Steps after ``set_state`` equal those that followed the state before, also in another environment."""
     a, b = ctx.a, ctx.b
     ctx.restart()
     ctx.run(a, ctx.actions(7))
@@ -37,7 +37,7 @@ def check_restoring(ctx: Context) -> None:
 
 
 def check_masked_restoring(ctx: Context) -> None:
-    """Setting the states of some worlds only leaves the others as they are, to the bit."""
+    """``set_state`` with a mask leaves the other worlds unchanged, to the bit."""
     a, b = ctx.a, ctx.b
     ctx.restart()
     mask = torch.arange(a.nworld, device=a.action.device) % 2 == 0
@@ -57,7 +57,7 @@ def check_masked_restoring(ctx: Context) -> None:
 
 
 def check_masked_getting(ctx: Context) -> None:
-    """``get_state`` with a mask writes the masked worlds' rows, exactly, and leaves the others."""
+    """``get_state`` with a mask writes the masked worlds' rows of ``out`` and no others."""
     env = ctx.a
     ctx.restart()
     ctx.run(env, ctx.actions(SHORT))
@@ -69,7 +69,7 @@ def check_masked_getting(ctx: Context) -> None:
 
 
 def check_set_state_shows(ctx: Context) -> None:
-    """After ``set_state`` every getter tells of the state that was set."""
+    """After ``set_state`` every getter reflects the state that was set."""
     a, b = ctx.a, ctx.b
     has_evaluate = a.task.functions["evaluate"] is not None
     with ctx.changed(a, b, autoreset=False, horizon=0):
@@ -86,13 +86,13 @@ def check_set_state_shows(ctx: Context) -> None:
             if has_evaluate:
                 ctx.equal(b.eval, a.eval, "eval after set_state")
             ctx.that((b.reward == 0).all(), f"the reward after set_state is {b.reward.tolist()}")
-            for name in ("terminated", "done", "done_reason"):  # an end stays set once it has come
+            for name in ("terminated", "done", "done_reason"):  # an end stays set
                 ctx.equal(getattr(b, name), getattr(a, name), f"{name} after set_state")
             ctx.equal(a.get_terminated(state), a.terminated, "get_terminated")
 
 
 def check_purity(ctx: Context) -> None:
-    """Functions of old arguments give what the live step gave, whenever they are asked, and change nothing."""
+    """Getters with old states and actions return the numbers of the live step at any time, and change nothing."""
     env = ctx.a
     has_evaluate = env.task.functions["evaluate"] is not None
     with ctx.changed(env, autoreset=False, horizon=0):
@@ -115,12 +115,12 @@ def check_purity(ctx: Context) -> None:
                 ended = env.get_terminated(state) | (ended if i else torch.zeros_like(ended))
                 ctx.equal(ended[fine], live["terminated"][i][fine], f"get_terminated up to step {i}")
                 for name, values in ctx.buffers(env).items():
-                    ctx.equal(values, before[name], f"{name} of the live worlds after asking about old ones")
+                    ctx.equal(values, before[name], f"{name} of the live worlds after a getter with old states")
             ctx.run(env, ctx.actions(20, 1))
 
 
 def check_determinism(ctx: Context) -> None:
-    """Two environments made alike and given the same actions stay the same to the bit, through all resets."""
+    """Two environments with the same options and actions have the same numbers, to the bit, through all resets."""
     ctx.restart()
     for i, action in enumerate(ctx.actions(ctx.steps)):
         ctx.a.step(action)
@@ -138,13 +138,12 @@ def _physics(env: Env, state: torch.Tensor) -> torch.Tensor:
 
 
 def check_reset(ctx: Context) -> None:
-    """``reset`` leads to one and the same state whatever happened before, with zero actions."""
+    """``reset`` leads to the same state whatever happened before, with zero actions."""
     env = ctx.a
     env.reset()
     state, obs = _physics(env, env.get_state()), env.obs.clone()
-    ctx.equal(obs, obs[:1].expand_as(obs).contiguous(), "the worlds' observations after reset") if not any(
-        isinstance(value, np.ndarray) for value in env.task.params.values()
-    ) else None
+    if not any(isinstance(value, np.ndarray) for value in env.task.params.values()):
+        ctx.equal(obs, obs[:1].expand_as(obs).contiguous(), "the worlds' observations after reset")
     for action in ctx.actions(100):
         env.step(action)
     env.reset()
@@ -157,7 +156,7 @@ def check_reset(ctx: Context) -> None:
 
 
 def check_masked_reset(ctx: Context) -> None:
-    """Resetting some worlds only leaves the others as they are, to the bit."""
+    """Resets with a mask leave the other worlds unchanged, to the bit."""
     env = ctx.a
     mask = torch.arange(env.nworld, device=env.action.device) % 2 == 1
     for reset in (env.reset, env.rand_reset):
@@ -166,12 +165,15 @@ def check_masked_reset(ctx: Context) -> None:
         before = ctx.buffers(env)
         reset(mask=mask)
         for name, values in ctx.buffers(env).items():
-            ctx.equal(values[~mask], before[name][~mask], f"{name} of the worlds left out of {reset.__name__}")
-        ctx.that((env.time[mask] == 0).all() and (env.action[mask] == 0).all(), f"{reset.__name__} left out a world")
+            ctx.equal(values[~mask], before[name][~mask], f"{name} of the worlds outside the mask of {reset.__name__}")
+        ctx.that(
+            (env.time[mask] == 0).all() and (env.action[mask] == 0).all(),
+            f"{reset.__name__} skipped a world",
+        )
 
 
 def check_rand_reset(ctx: Context) -> None:
-    """``rand_reset(seed)`` can be repeated; draws, worlds and seeds differ; actions are zero."""
+    """``rand_reset(seed)`` repeats its draws; further draws, worlds and seeds differ; actions are zero."""
     a, b = ctx.a, ctx.b
     ctx.run(a, ctx.actions(5))
     ctx.restart()
@@ -192,11 +194,11 @@ def check_rand_reset(ctx: Context) -> None:
         if a.nworld > 1:
             ctx.that((first[1:] != first[:1]).any(dim=1).all(), "worlds of one draw are the same")
     a.rand_reset(ctx.seed)
-    ctx.equal(a.get_state(), state, "the state after the seed was given again")
+    ctx.equal(a.get_state(), state, "the state after rand_reset with the first seed again")
 
 
 def check_world_count(ctx: Context) -> None:
-    """A seed gives world i the same initial state however many worlds there are."""
+    """A seed gives a world the same initial state for any number of worlds."""
     n = ctx.a.nworld
     doubled = {k: np.concatenate([v, v]) for k, v in ctx.a.task.params.items() if isinstance(v, np.ndarray)}
     more = ctx.make(nworld=2 * n, seed=ctx.seed, **doubled)
@@ -206,7 +208,7 @@ def check_world_count(ctx: Context) -> None:
 
 
 def check_saved_stream(ctx: Context) -> None:
-    """A saved state goes on with its own random stream: later automatic resets lead to the same states."""
+    """A saved state continues its own random stream: later automatic resets lead to the same states."""
     a, b = ctx.a, ctx.b
     with ctx.changed(a, b, horizon=3):
         ctx.restart()

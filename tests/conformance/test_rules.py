@@ -1,0 +1,125 @@
+"""Every rule can be broken: an environment is changed in one place, and the check of the rule must fail."""
+
+import itertools
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+import lyceum_warp as lw
+import lyceum_warp.env
+from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
+from lyceum_warp.graphs.sequence import Calls, Graphs, Phase
+from lyceum_warp.testing import CHECKS, Report, check_task
+from lyceum_warp.worlds import Worlds
+
+Function = Callable[..., Any]
+
+
+def then(extra: Callable[[Any], object]) -> Callable[[Function], Function]:
+    """Wraps a method so that every call does something more at its end."""
+
+    def wrap(method: Function) -> Function:
+        def longer(self: Any, *args: Any, **kwargs: Any) -> Any:
+            result = method(self, *args, **kwargs)
+            extra(self)
+            return result
+
+        return longer
+
+    return wrap
+
+
+def nothing(method: Function) -> Function:
+    return lambda *args, **kwargs: None
+
+
+counter = itertools.count(1)
+leak: list[bytes] = []
+
+
+def skip_some_replays(method: Function) -> Function:
+    def sequence(self: Graphs, phases: Iterable[Phase]) -> Calls:
+        calls = method(self, phases)
+        if not self.enabled:
+            return calls
+        return tuple(lambda call=call: call() if next(counter) % 10 else None for call in calls)
+
+    return sequence
+
+
+def without_action_faults(method: Function) -> Function:
+    return lambda self, mask, fault, action_fault, **how: method(self, mask, fault, self._no_fault, **how)
+
+
+def keep_warm_start(engine: MujocoEngine) -> None:
+    warm = mujoco.mjtState.mjSTATE_WARMSTART.value
+    start = mujoco.mj_stateSize(engine.model, mujoco.mjtState.mjSTATE_INTEGRATION.value & (warm - 1))
+    engine._initial.numpy()[start : start + engine.model.nv] = np.nan
+
+
+BREAKS: list[tuple[str, Any, str, Callable[[Function], Function]]] = [
+    ("spaces", Worlds, "_allocate", then(lambda worlds: setattr(worlds, "obs_space", worlds.action_space))),
+    ("addresses", lw.Env, "step", then(lambda env: env.__dict__.update(obs=env.obs.clone()))),
+    ("getters", lyceum_warp.env, "_given", lambda function: lambda values, out: values),
+    ("time", lw.Env, "__init__", then(lambda env: setattr(env, "timestep", 1.5 * env.timestep))),
+    ("round_trip", Worlds, "_restore_counters", nothing),
+    ("restoring", MujocoEngine, "_set_integration", nothing),
+    ("masked_restoring", lw.Env, "set_state", lambda method: lambda self, state, mask=None: method(self, state)),
+    ("masked_getting", lw.Env, "get_state", lambda method: lambda self, out=None, mask=None: method(self, out)),
+    ("set_state_shows", Worlds, "_judge_state", nothing),
+    ("purity", lw.Env, "_scratch_at", lambda method: lambda self, state: self.set_state(state) or self),
+    ("determinism", lw.Env, "step", then(lambda env: env.reward.add_(1e-6 * next(counter)))),
+    ("reset", lw.Env, "reset", then(lambda env: env.action.fill_(0.1))),
+    ("masked_reset", lw.Env, "reset", lambda method: lambda self, mask=None: method(self)),
+    ("rand_reset", lw.Env, "rand_reset", lambda method: lambda self, seed=None, mask=None: method(self, None, mask)),
+    ("world_count", lw.Env, "rand_reset", then(lambda env: env.obs.add_(env.nworld))),
+    ("saved_stream", Worlds, "_restore_counters", nothing),
+    ("truncation", lw.Env, "step", then(lambda env: env.final_obs.copy_(env.obs))),
+    ("truncation", lw.Env, "step", then(lambda env: env.terminated.copy_(env.done))),
+    ("no_autoreset", lw.Env, "step", then(lambda env: env.done.zero_())),
+    ("graphs", Graphs, "sequence", skip_some_replays),
+    ("memory", lw.Env, "step", then(lambda env: leak.append(float(env.nworld)))),  # 32 bytes
+    ("memory", lw.Env, "get_state", then(lambda env: env.__dict__.setdefault("kept", []).append(env.obs.clone()))),
+    ("bad_state", MujocoEngine, "find_faults", nothing),
+    ("bad_action", Worlds, "_judge", without_action_faults),
+    ("bad_warmstart", MujocoEngine, "_open", then(keep_warm_start)),
+]
+"""A rule, and the function whose change breaks it."""
+
+
+@pytest.mark.parametrize(("rule", "owner", "name", "wrap"), BREAKS, ids=[f"{b[0]}-{b[2]}" for b in BREAKS])
+def test_a_broken_rule_is_reported(
+    rule: str, owner: Any, name: str, wrap: Callable[[Function], Function], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (check,) = (check for check in CHECKS if check.__name__ == f"check_{rule}")
+    monkeypatch.setattr(owner, name, wrap(getattr(owner, name)))
+    with pytest.raises(AssertionError, match=f"hopper on the mujoco engine breaks the rule '{rule}': "):
+        check_task("hopper", engine="mujoco", steps=100, checks=[check])
+
+
+def test_every_rule_is_broken_once() -> None:
+    rules = {f"check_{rule}" for rule, *_ in BREAKS}
+    assert rules == {check.__name__ for check in CHECKS}
+
+
+def test_all_broken_rules_are_reported_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    checks = [check for check in CHECKS if check.__name__ in ("check_reset", "check_time", "check_masked_reset")]
+    monkeypatch.setattr(lw.Env, "reset", then(lambda env: env.action.fill_(0.1))(lw.Env.reset))
+    with pytest.raises(AssertionError) as caught:
+        check_task("hopper", engine="mujoco", checks=checks)
+    assert [line.split("'")[1] for line in str(caught.value).splitlines()] == ["reset", "masked_reset"]
+
+
+def test_a_single_world_is_refused() -> None:
+    with pytest.raises(ValueError, match="compare worlds with one another: nworld must be at least 2, not 1"):
+        check_task("hopper", nworld=1)
+
+
+def test_a_report_names_the_task_the_engine_and_every_rule() -> None:
+    report = check_task("hopper", engine="mujoco", nworld=3, checks=CHECKS[:2])
+    assert isinstance(report, Report)
+    assert list(report.seconds) == ["spaces", "addresses"]
+    assert str(report).startswith("hopper on the mujoco engine (cpu, 3 worlds) keeps the rules:\n  spaces ")
