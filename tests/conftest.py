@@ -1,4 +1,4 @@
-"""What all tests share: environments, which are slow to make, and the GPU, which is often not there."""
+"""Fixtures of all tests: shared environments, files with tasks, and skips on machines without a GPU."""
 
 import gc
 from collections.abc import Callable, Iterator
@@ -11,7 +11,7 @@ import warp as wp
 
 import lyceum_warp as lw
 
-# the tests' batches are too small to share out, and on a busy machine torch's threads wait for each other
+# the tests' batches are too small to divide, and on a busy machine torch's threads wait for each other
 torch.set_num_threads(1)
 
 SharedEnv = Callable[..., lw.Env]
@@ -20,16 +20,15 @@ TaskFile = Callable[[str, str], Path]
 
 @pytest.fixture(scope="module")
 def shared_env() -> Iterator[SharedEnv]:
-    """``shared_env("hopper", engine="warp", nworld=4, ...)``: ``lw.make``, made once a file for the same arguments.
+    """``shared_env("hopper", engine="warp", nworld=4, ...)``: ``lw.make``, called once a file for the same arguments.
 
-    Every call starts the worlds afresh with ``rand_reset(0)``, so tests may leave them anywhere. A test that
-    asks for another field, changes a parameter or an attribute makes an environment of its own, and so does one
-    that wants many worlds for itself alone: they go with the test.
+    Every call resets the worlds with ``rand_reset(0)``, so a test may leave them in any state. A test that changes
+    parameters or attributes, or that needs many worlds, makes an environment of its own, which is freed with it.
     """
     made: dict[tuple[Any, ...], lw.Env] = {}
 
     def get(task: str | type[lw.Task], *, engine: str = "mujoco", nworld: int = 1, **options: Any) -> lw.Env:
-        # the repr of a value tells lists, arrays and classes apart, and all of them can be looked up by it
+        # the repr of a value can be looked up, also where the value is a list or an array
         key = (task, engine, nworld, *sorted((name, repr(value)) for name, value in options.items()))
         if key not in made:
             made[key] = lw.make(task, engine=engine, nworld=nworld, **options)
@@ -43,9 +42,9 @@ def shared_env() -> Iterator[SharedEnv]:
 
 @pytest.fixture(scope="session")
 def task_file(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> TaskFile:
-    """``task_file("mine.py", source)``: a file with a task, in the same place in every run of the tests.
+    """``task_file("mine.py", source)``: a file with a task, at the same path in every run of the tests.
 
-    The kernels of a task are known by its file's path: from the second run on they are in Warp's cache.
+    Warp finds compiled kernels by the task's path, so from the second run on it takes them from its cache.
     """
     cache = getattr(pytestconfig, "cache", None)
     folder = cache.mkdir("tasks") if cache else tmp_path_factory.mktemp("tasks")
@@ -60,9 +59,9 @@ def task_file(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFact
 
 
 def settle() -> None:
-    """Take all that lives on from the garbage collector: imports and kernels are a million objects to look through.
+    """Exempt all live objects from garbage collection: imports and kernels are a million objects to look through.
 
-    What is made later is collected, and counted, as ever. Nothing that is to go may be alive.
+    Later objects are collected and counted as usual. Call it only while no object is alive that a test must free.
     """
     gc.collect()
     gc.freeze()
@@ -70,20 +69,20 @@ def settle() -> None:
 
 @pytest.fixture
 def freed() -> Iterator[None]:
-    """An environment refers to itself: one of many worlds, which is large, is collected at once after its test."""
+    """Collect garbage after the test: an environment refers to itself, and one of many worlds is large."""
     yield
     gc.collect()
 
 
 @pytest.fixture(scope="module", autouse=True)
 def settled() -> None:
-    """Between two files nothing lives but what stays."""
+    """Between two files only lasting objects are alive."""
     settle()
 
 
 @pytest.fixture
 def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
-    """Every environment that the test makes, in turn."""
+    """Every environment that the test makes, in order."""
     made: list[lw.Env] = []
     init = lw.Env.__init__
 
@@ -96,7 +95,7 @@ def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what is marked ``gpu`` on machines without one."""
+    """Skip tests marked ``gpu`` on machines without a GPU."""
     if wp.is_cuda_available():
         return
     skip = pytest.mark.skip(reason="needs a CUDA device")

@@ -1,0 +1,121 @@
+"""The simulator's fields: their types, the stages that compute them, and their named elements."""
+
+import mujoco
+import numpy as np
+import pytest
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp.fields import DERIVED_FIELDS, STATE_FIELDS, Stage, describe, elements, vec10
+
+XML = """
+<mujoco>
+  <worldbody>
+    <body name="target" mocap="true"><geom size=".1" contype="0" conaffinity="0"/></body>
+    <body name="base"><freejoint name="root"/><geom name="hull" size=".1"/><site name="tip"/>
+      <body name="arm" pos=".5 0 0"><joint name="elbow"/><geom size=".1"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor name="turn" joint="elbow"/></actuator>
+  <sensor><framepos name="place" objtype="site" objname="tip"/><accelerometer name="shock" site="tip"/></sensor>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(XML)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "dtype"),
+    [
+        ("time", (), wp.float32),
+        ("qpos", (8,), wp.float32),
+        ("site_xpos", (1,), wp.vec3),
+        ("xquat", (4,), wp.quat),
+        ("xmat", (4,), wp.mat33),
+        ("cvel", (4,), wp.spatial_vector),
+        ("cinert", (4,), vec10),
+    ],
+)
+def test_a_field_has_mujocos_shape_with_vectors_as_elements(
+    name: str, shape: tuple[int, ...], dtype: type, model: mujoco.MjModel
+) -> None:
+    field = describe(model, name)
+    assert (field.shape, field.dtype) == (shape, dtype)
+    assert field.size == np.size(getattr(mujoco.MjData(model), name))
+
+
+@pytest.mark.parametrize(
+    ("name", "lagged", "refresh", "reset", "snapshot"),
+    [
+        ("qpos", False, Stage.NONE, Stage.NONE, False),
+        ("xpos", False, Stage.POSITION, Stage.POSITION, False),
+        ("cvel", False, Stage.VELOCITY, Stage.VELOCITY, False),
+        ("xpos", True, Stage.NONE, Stage.POSITION, True),
+        ("qacc", False, Stage.NONE, Stage.ACCELERATION, True),  # of the last substep, so it is saved with the state
+        ("sensordata", False, Stage.POSITION, Stage.ACCELERATION, True),  # its accelerometer is of the last substep
+    ],
+)
+def test_a_field_names_the_stage_that_makes_it_current(
+    name: str, lagged: bool, refresh: Stage, reset: Stage, snapshot: bool, model: mujoco.MjModel
+) -> None:
+    field = describe(model, name, lagged=lagged)
+    assert (field.refresh, field.reset, field.snapshot) == (refresh, reset, snapshot)
+
+
+def test_every_field_is_one_of_mujocos(model: mujoco.MjModel) -> None:
+    for name in (*STATE_FIELDS, *DERIVED_FIELDS):
+        assert hasattr(mujoco.MjData(model), name)
+
+
+def test_an_unknown_field_is_refused_with_similar_ones(model: mujoco.MjModel) -> None:
+    with pytest.raises(ValueError, match="there is no field 'site_xpoz': did you mean site_xpos"):
+        describe(model, "site_xpoz")
+    with pytest.raises(ValueError, match="there is no field 'site_xpoz': did you mean site_xpos"):
+        lw.make("hopper", fields=["site_xpoz"])
+
+
+@pytest.mark.parametrize("name", ["subtree_linvel"])
+def test_a_field_that_only_a_sensor_computes_is_refused_without_one(name: str, model: mujoco.MjModel) -> None:
+    with pytest.raises(ValueError, match=f"MuJoCo computes the field {name!r} only for a sensor, .*fields="):
+        describe(model, name)
+
+
+@pytest.mark.parametrize(
+    ("name", "element", "where"),
+    [
+        ("qpos", "root", slice(0, 7)),
+        ("qpos", "elbow", slice(7, 8)),
+        ("qvel", "root", slice(0, 6)),
+        ("qacc", "elbow", slice(6, 7)),
+        ("qfrc_applied", "elbow", slice(6, 7)),
+        ("xpos", "arm", slice(3, 4)),
+        ("geom_xpos", "hull", slice(1, 2)),
+        ("site_xmat", "tip", slice(0, 1)),
+        ("xanchor", "elbow", slice(1, 2)),
+        ("ctrl", "turn", slice(0, 1)),
+        ("sensordata", "shock", slice(3, 6)),
+        ("mocap_pos", "target", slice(0, 1)),
+    ],
+)
+def test_a_named_element_has_its_place_in_the_field(
+    name: str, element: str, where: slice, model: mujoco.MjModel
+) -> None:
+    assert elements(model, name, element) == where
+
+
+@pytest.mark.parametrize(
+    ("name", "element", "message"),
+    [
+        ("site_xpos", "hand", "the model has no site 'hand' for the field 'site_xpos'; it has: tip"),
+        ("qpos", "knee", "the model has no joint 'knee' for the field 'qpos'; it has: elbow, root"),
+        ("cam_xpos", "eye", "the model has no camera 'eye' for the field 'cam_xpos'; it has: none"),
+        ("mocap_pos", "arm", "the body 'arm' is .* mocap body, so it has no 'mocap_pos'"),
+        ("time", "noon", "the field 'time' has no named elements"),
+    ],
+)
+def test_an_element_that_is_not_there_is_refused(name: str, element: str, message: str, model: mujoco.MjModel) -> None:
+    with pytest.raises(ValueError, match=message):
+        elements(model, name, element)

@@ -1,0 +1,97 @@
+"""Shapes, parts and bounds of observations, actions and states."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from lyceum_warp.fields import describe
+from lyceum_warp.spaces import COUNTERS, Space, action_space, control_map, control_ranges, state_space
+
+XML = """
+<mujoco>
+  <size nuserdata="2"/>
+  <worldbody>
+    <body mocap="true"><geom size=".1"/></body>
+    <body><joint name="a"/><joint name="b" axis="1 0 0"/><geom size=".1"/></body>
+  </worldbody>
+  <actuator>
+    <motor name="push" joint="a" ctrlrange="-2 4" ctrllimited="true"/>
+    <motor joint="b" {}/>
+  </actuator>
+</mujoco>
+"""
+LIMITED = 'ctrlrange="0 1" ctrllimited="true"'
+
+
+def model(second: str = LIMITED) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(XML.format(second))
+
+
+def test_parts_lie_one_after_another() -> None:
+    space = Space.of({"position": 2, "velocity": 3})
+    assert space.parts == {"position": slice(0, 2), "velocity": slice(2, 5)}
+    assert (space.size, space.shape) == (5, (5,))
+
+
+def test_a_space_without_parts_is_a_scalar() -> None:
+    assert (Space().size, Space().shape) == (1, ())
+
+
+def test_split_gives_views_of_the_parts() -> None:
+    values = torch.arange(10.0).view(2, 5)
+    parts = Space.of({"position": 2, "velocity": 3}).split(values)
+    assert [list(part.shape) for part in parts.values()] == [[2, 2], [2, 3]]
+    parts["velocity"].zero_()
+    assert values.tolist() == [[0.0, 1.0, 0.0, 0.0, 0.0], [5.0, 6.0, 0.0, 0.0, 0.0]]
+
+
+def test_actions_have_the_actuators_names_and_ranges() -> None:
+    space = action_space(model(), None)
+    assert list(space.parts) == ["push", "actuator_1"]
+    assert space.low is not None and space.high is not None
+    assert (space.low.tolist(), space.high.tolist()) == ([-2.0, 0.0], [4.0, 1.0])
+    assert space.low.dtype == np.float32
+
+
+def test_actions_without_a_range_are_unbounded() -> None:
+    space = action_space(model(""), None)
+    assert space.low is not None and space.high is not None
+    assert (space.low[1], space.high[1]) == (-np.inf, np.inf)
+
+
+def test_an_action_range_replaces_the_control_ranges() -> None:
+    space = action_space(model(), (-1.0, 1.0))
+    assert space.low is not None and space.high is not None
+    assert (space.low.tolist(), space.high.tolist()) == ([-1.0, -1.0], [1.0, 1.0])
+
+
+def test_control_map_keeps_actions_without_an_action_range() -> None:
+    ranges, scale = control_map(model(""), None)
+    np.testing.assert_array_equal(ranges, control_ranges(model("")))
+    np.testing.assert_array_equal(scale, [[1.0, 0.0], [1.0, 0.0]])
+
+
+def test_control_map_takes_the_ends_of_an_action_range_to_those_of_the_controls() -> None:
+    ranges, scale = control_map(model(), (-1.0, 3.0))
+    for action, bound in ((-1.0, ranges[:, 0]), (3.0, ranges[:, 1])):
+        np.testing.assert_allclose(scale[:, 0] * action + scale[:, 1], bound)
+
+
+def test_an_action_range_needs_a_range_of_every_control() -> None:
+    with pytest.raises(ValueError, match=r"gives none to the controls \[1\]: set their ctrlrange, or leave action_ra"):
+        control_map(model(""), (-1.0, 1.0))
+
+
+def test_a_state_holds_the_integration_state_snapshots_counters_and_memory() -> None:
+    compiled = model()
+    space = state_space(compiled, [describe(compiled, "qacc")], memory=4)
+    assert space.dtype == torch.float64
+    sizes = {name: part.stop - part.start for name, part in space.parts.items()}
+    assert {name: sizes[name] for name in ("time", "qpos", "qvel", "ctrl", "mocap_pos", "userdata", "qacc")} == {
+        "time": 1, "qpos": 2, "qvel": 2, "ctrl": 2, "mocap_pos": 3, "userdata": 2, "qacc": 2
+    }  # fmt: skip
+    assert list(space.parts)[-6:] == ["qacc", *COUNTERS, "memory"]
+    integration = mujoco.mj_stateSize(compiled, mujoco.mjtState.mjSTATE_INTEGRATION.value)
+    assert space.parts["qacc"].start == integration
+    assert space.size == integration + 2 + len(COUNTERS) + 4
