@@ -6,6 +6,7 @@ if _wp.config.log_level == _wp.LOG_INFO:  # Warp's default, at which it greets a
     _wp.config.log_level = _wp.LOG_WARNING
 
 from lyceum_warp.algos.mppi import MPPI
+from lyceum_warp.algos.mppi_config import MPPIConfig
 from lyceum_warp.algos.npg import NPG, Iteration, NPGConfig
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.rollout_buffer import Episodes, Rollout, evaluate
@@ -21,7 +22,7 @@ from lyceum_warp.fields import vec10
 from lyceum_warp.kernels.random import normal, uniform
 from lyceum_warp.openloop import OpenLoop
 from lyceum_warp.runs import load, load_value
-from lyceum_warp.task import Row, Task, body, dof, geom, mocap, qpos, sensor, site
+from lyceum_warp.task import Planning, Row, Task, body, dof, geom, mocap, qpos, sensor, site
 
 __version__ = "0.1.0"
 
@@ -35,8 +36,10 @@ __all__ = [
     "Episodes",
     "GaussianPolicy",
     "Iteration",
+    "MPPIConfig",
     "NPGConfig",
     "OpenLoop",
+    "Planning",
     "Rollout",
     "Row",
     "Task",

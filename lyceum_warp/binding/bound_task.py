@@ -73,6 +73,32 @@ def task_spec(task: type[Task], model: models.ModelSource | None = None) -> mujo
     return models.load_spec(task.model() if callable(task.model) else task.model, task)
 
 
+def _written(task: type[Task], name: str) -> Any:
+    """What the user calls by a name: in the class, in its module, or in those of the classes it extends."""
+    owners: Any = task.__mro__[: task.__mro__.index(Task)]
+    for owner in owners:
+        found = vars(owner).get(name, owner.scope.get(name, vars(sys.modules[owner.__module__]).get(name)))
+        if found is not None:
+            return found.__func__ if isinstance(found, staticmethod) else found
+    return None
+
+
+def _struct(task: type[Task], name: str) -> Any:
+    struct = _written(task, name)
+    if not hasattr(struct, "vars"):
+        raise ValueError(f"the task {task_name(task)!r} needs a @wp.struct named {name} in its module")
+    return struct
+
+
+def parameter_names(task: type[Task]) -> tuple[str, ...]:
+    """Names of a task's parameters: the fields of its ``Params`` without ``dt``.
+
+    Raises:
+        ValueError: The task has no ``Params``.
+    """
+    return tuple(name for name in _struct(task, "Params").vars if name != "dt")
+
+
 class BoundTask:
     """A task with its parameters, its compiled model and its kernels.
 
@@ -105,8 +131,8 @@ class BoundTask:
         self.task = task
         self.name = task_name(task)
         self.module: ModuleType = sys.modules[task.__module__]
-        self.world_struct = self._struct("World")
-        self.params_struct = self._struct("Params")
+        self.world_struct = _struct(task, "World")
+        self.params_struct = _struct(task, "Params")
         self.functions = {name: self._function(name) for name in FUNCTIONS}
         if self.functions["observe"] is None:
             raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), the one function it needs")
@@ -151,23 +177,8 @@ class BoundTask:
             raise ValueError(f"obs of the task {self.name!r} differs between worlds in {per_world}: give one value")
         return {name: int(size) for name, size in layout.items() if size}
 
-    def _written(self, name: str) -> Any:
-        """What the user calls by a name: in the class, in its module, or in those of the classes it extends."""
-        owners: Any = self.task.__mro__[: self.task.__mro__.index(Task)]
-        for owner in owners:
-            found = vars(owner).get(name, owner.scope.get(name, vars(sys.modules[owner.__module__]).get(name)))
-            if found is not None:
-                return found.__func__ if isinstance(found, staticmethod) else found
-        return None
-
-    def _struct(self, name: str) -> Any:
-        struct = self._written(name)
-        if not hasattr(struct, "vars"):
-            raise ValueError(f"the task {self.name!r} needs a @wp.struct named {name} in its module")
-        return struct
-
     def _function(self, name: str) -> wp.Function | None:
-        function = self._written(name)
+        function = _written(self.task, name)
         if function is None:
             return None
         signature, kinds, result = _SIGNATURES[name]
