@@ -46,10 +46,10 @@ Value: TypeAlias = ValueFunction | wp.Function | Callable[[torch.Tensor], torch.
 class MPPI:
     """A controller that plans anew at every step: ``action = plan(state)``.
 
-    The planner simulates in worlds of its own, one for each sample. The plant, which it controls, may be an
-    environment, with ``plan(env.get_state()[0])``, or a robot, with ``plan(plan.state_of(qpos=..., qvel=..., time=...))``.
-    Its model, time step and parameters may differ from the planner's. Randomness is counted: a plan depends on the
-    seed, on the number of plans before it, and on the plan to start from.
+    The planner simulates in worlds of its own, one for each sample. It controls a plant: an environment, with
+    ``plan(env.get_state()[0])``, or a robot, with ``plan(plan.state_of(qpos=..., qvel=..., time=...))``. The plant's
+    model, time step and parameters may differ from the planner's. Randomness is counted: a plan depends on the seed,
+    on the number of plans before it, and on the plan to start from.
 
     A task's ``planning`` (see ``lw.Planning``) gives settings of the planner, and options and parameters of its
     worlds. Arguments replace what the task gives.
@@ -156,43 +156,6 @@ class MPPI:
         self.returns, self.weights = torch_view(self._return), torch_view(self._weight)
         self._terminal_view, self._shift_view = torch_view(self._terminal), torch_view(self._shift)
 
-    def reset(self, seed: int | None = None) -> None:
-        """Forget the plan, and start the noise again.
-
-        Args:
-            seed: Another seed.
-
-        Raises:
-            ValueError: The seed is not a whole number from 0.
-        """
-        if seed is not None:
-            self._seed.fill_(whole_number("seed", seed, low=0))
-        self._count.zero_()
-        self.actions.copy_(torch_view(self._fill).expand_as(self.actions))
-
-    def state_of(self, **parts: Any) -> torch.Tensor:
-        """A state from its parts, as a robot knows them; the rest is as the task's fixed reset leaves it.
-
-        The rest includes fields that a task reads as the last substep left them: they matter only for the transition
-        in which a plan's first step began. A ``time`` sets the step counter, too, unless ``step`` is given.
-
-        Args:
-            parts: Values for parts of ``env.state_space``: qpos, qvel, time, mocap_pos, ...
-
-        Returns:
-            (state_space.size,) float64.
-
-        Raises:
-            ValueError: A part is unknown, or its value has another size or is not a number.
-        """
-        return state_from_parts(self.env, self._initial, parts)
-
-    @property
-    def summary(self) -> dict[str, float]:
-        """Best and mean return, effective number and failures of the last improvement's samples."""
-        best, mean, effective, failed = self._summary.numpy().tolist()
-        return {"best_return": best, "mean_return": mean, "effective_samples": effective, "failed_samples": failed}
-
     @torch.no_grad()
     def __call__(self, state: torch.Tensor, obs: torch.Tensor | None = None, *, shift: int = 1) -> torch.Tensor:
         """Improve the plan from a state.
@@ -277,6 +240,43 @@ class MPPI:
                 f"value must return {self.samples} numbers for {tuple(obs.shape)} observations, not {described(values)}"
             )
         return values.view(self.samples)
+
+    def reset(self, seed: int | None = None) -> None:
+        """Forget the plan, and start the noise again.
+
+        Args:
+            seed: Another seed.
+
+        Raises:
+            ValueError: The seed is not a whole number from 0.
+        """
+        if seed is not None:
+            self._seed.fill_(whole_number("seed", seed, low=0))
+        self._count.zero_()
+        self.actions.copy_(torch_view(self._fill).expand_as(self.actions))
+
+    def state_of(self, **parts: Any) -> torch.Tensor:
+        """A state from its parts, as a robot knows them; the rest is as the task's fixed reset leaves it.
+
+        The rest includes fields that a task reads as the last substep left them: they matter only for the transition
+        in which a plan's first step began. A ``time`` sets the step counter, too, unless ``step`` is given.
+
+        Args:
+            parts: Values for parts of ``env.state_space``: qpos, qvel, time, mocap_pos, ...
+
+        Returns:
+            (state_space.size,) float64.
+
+        Raises:
+            ValueError: A part is unknown, or its value has another size or is not a number.
+        """
+        return state_from_parts(self.env, self._initial, parts)
+
+    @property
+    def summary(self) -> dict[str, float]:
+        """Best and mean return, effective number and failures of the last improvement's samples."""
+        best, mean, effective, failed = self._summary.numpy().tolist()
+        return {"best_return": best, "mean_return": mean, "effective_samples": effective, "failed_samples": failed}
 
 
 _SAMPLES_A_CORE = 40

@@ -208,10 +208,8 @@ def _check_options(options: Mapping[str, Any]) -> None:
 
 def _hint(word: str, known: Sequence[str]) -> str:
     """What may have been meant by a parameter that the task does not have."""
-    if word in SETTINGS or word in OPTIONS:  # only in params: among the words it would be one
-        return (
-            f"it is {'a setting of MPPI' if word in SETTINGS else 'an option of its worlds'}, so leave it out of params"
-        )
+    if word in SETTINGS or word in OPTIONS:  # only in params, because among the words it is that
+        return f"it is {'a setting of MPPI' if word in SETTINGS else 'an option of its worlds'}: give it outside params"
     others = [setting for setting in SETTINGS if setting not in OPTIONS]
     return suggestion(word, [*others, *known]) or f"it has {', '.join(known) or 'none'}"
 
