@@ -47,7 +47,7 @@ class MPPIConfig:
     """Weights (b0, b1, b2) that smooth the noise n over time: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) from the third
     step on. (1, 0, 0) is white noise."""
     discount: float | None = None
-    """Discount of rewards and of the terminal value for each step; by default 1, or that of the value function."""
+    """Discount of rewards and of the terminal value for each step. None is that of the value function, or else 1."""
     iterations: int = 1
     """Improvements of the plan in each call."""
     fill: str | Numbers = "zero"

@@ -50,7 +50,7 @@ def evaluate_run(options: Eval) -> int:
     config = run.config
     nworld = min(options.nworld, options.episodes)
     engine, device = options.engine or config["engine"], options.device or config["device"]
-    where = {"engine": engine, "device": device} | Physics.of(config).options() | config["params"]
+    where = {"engine": engine, "device": device} | Physics.of(config).options().given() | config["params"]
     if engine == "auto" and options.device is None:
         where |= ON_CPU_CORES
     env = Env(config["task"], nworld=nworld, **where)

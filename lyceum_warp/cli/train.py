@@ -16,8 +16,9 @@ from lyceum_warp.algos.distributed import Team, join
 from lyceum_warp.algos.npg import NPG, NPGConfig, enough_samples
 from lyceum_warp.algos.rollout_buffer import Episodes, evaluate, moved
 from lyceum_warp.binding.registry import find_task, task_name, task_names
-from lyceum_warp.cli.arguments import Interrupted, Physics, Words, parameter, portable, postponed, spelled
+from lyceum_warp.cli.arguments import Physics, Words, parameter, portable, spelled
 from lyceum_warp.cli.display import Display, curve_table, filmed, make_console, plotted
+from lyceum_warp.cli.interrupts import Interrupted, postponed
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.compile_ahead import workers
 from lyceum_warp.runs import Run
@@ -105,7 +106,7 @@ def _config(options: Train, team: Team) -> dict[str, Any]:
         "algorithm": "npg",
         "task": portable(options.task),
         "params": dict(parameter(text) for text in options.param),
-        "physics": options.physics.options(),
+        "physics": options.physics.options().given(),
         "engine": options.engine,
         "device": options.device,
         "nworld": nworld,
@@ -186,7 +187,7 @@ def _settings(options: Train) -> dict[str, Any]:
     settings = {f.name: getattr(options, f.name) for f in dataclasses.fields(options) if f.name not in free}
     settings["task"] = portable(options.task or "")
     settings["param"] = dict(parameter(text) for text in options.param)
-    return settings | options.physics.options() | dataclasses.asdict(options.npg)
+    return settings | dataclasses.asdict(options.physics.options()) | dataclasses.asdict(options.npg)
 
 
 def _hyperparameters(config: dict[str, Any]) -> NPGConfig:
@@ -198,7 +199,7 @@ def _algorithm(config: dict[str, Any], team: Team) -> NPG:
     if config["threads"] < 1:
         raise ValueError(f"threads has to be at least 1, not {config['threads']}")
     torch.set_num_threads(config["threads"])
-    options = Physics.of(config).options() | config["params"]
+    options = Physics.of(config).options().given() | config["params"]
     if team.neighbours > 1 and _engine(config) == "mujoco":
         options["nthread"] = max(1, workers() // team.neighbours)
     nworld = team.share(config["nworld"])

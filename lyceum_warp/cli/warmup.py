@@ -47,7 +47,7 @@ class Warmup:
 
 def warm_up(options: Warmup) -> int:
     """The command."""
-    more = options.physics.given() | dict(parameter(text) for text in options.param)
+    more = options.physics.options().given() | dict(parameter(text) for text in options.param)
     start, before = time.perf_counter(), cached()
     env = Env(options.task, nworld=options.nworld, engine=options.engine, device=options.device, **more)
     for _ in range(3):  # unrecorded, recorded, replayed
