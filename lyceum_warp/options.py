@@ -6,6 +6,7 @@ misspelt words all read these two classes. A new option is a new field here, and
 
 import dataclasses
 import difflib
+import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -156,10 +157,16 @@ class EnvOptions:
         object.__setattr__(self, "fields", tuple(self.fields))
 
     @classmethod
-    def split(cls, words: Mapping[str, Any]) -> tuple["EnvOptions", dict[str, Any]]:
-        """Sort the keyword arguments of a flat call into options and everything else, the task's parameters."""
+    def split(cls, words: Mapping[str, Any], base: "EnvOptions | None" = None) -> tuple["EnvOptions", dict[str, Any]]:
+        """Sort the keyword arguments of a flat call into options and everything else, the task's parameters.
+
+        Args:
+            words: The keyword arguments.
+            base: The options that they change; by default the defaults.
+        """
         rest = {name: value for name, value in words.items() if name not in OPTIONS}
-        return cls().changed({name: value for name, value in words.items() if name in OPTIONS}), rest
+        options = {name: value for name, value in words.items() if name in OPTIONS}
+        return (base or cls()).changed(options), rest
 
     def changed(self, words: Mapping[str, Any]) -> "EnvOptions":
         """The same options with some changed, those of the physics included, all by name."""
@@ -200,3 +207,18 @@ def suggestion(word: str, others: Iterable[str] = ()) -> str:
     """
     close = [_OTHER_WORDS[word]] if word in _OTHER_WORDS else difflib.get_close_matches(word, [*others, *OPTIONS], 3)
     return f"did you mean {' or '.join(close)}?" if close else ""
+
+
+def signature_of_options(function: Callable[..., Any]) -> inspect.Signature:
+    """The signature of a flat call, with every option in place of its ``**options``."""
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    options = [
+        inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type)
+        for kind in (EnvOptions, PhysicsOptions)
+        for field in dataclasses.fields(kind)
+        if field.name != "physics"
+    ]
+    rest = inspect.Parameter("params", inspect.Parameter.VAR_KEYWORD, annotation=Any)
+    signature = inspect.signature(function)
+    positional = [p for p in signature.parameters.values() if p.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD]
+    return signature.replace(parameters=[*positional, *options, rest])

@@ -14,6 +14,7 @@ smoothing. A temperature here is a true one: the 5 of Summers et al. for their a
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -31,9 +32,10 @@ from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.engines import ON_CPU_CORES, find_device
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.compile_ahead import workers
+from lyceum_warp.graphs.sequence import Calls, Phase
 from lyceum_warp.kernels import planning
 from lyceum_warp.openloop import OpenLoop
-from lyceum_warp.options import EnvOptions
+from lyceum_warp.options import ModelSource
 from lyceum_warp.task import Task
 from lyceum_warp.validate import described, whole_number
 
@@ -108,9 +110,13 @@ class MPPI:
         self.temperature, self.discount = self.config.temperature, self.config.discount
         self.termination = self.config.termination
 
-        given = _placed(task, options, self.samples).given()
-        self.settings = plain(given | own_params | vars(self.config))
-        self.env = Env(task, nworld=self.samples, autoreset=False, horizon=0, **given, **own_params)
+        noslip = partial(_has_noslip, task, options.model, options.physics.solver)
+        place = _place_samples(
+            options.engine, options.device, nthread=options.nthread, samples=self.samples, has_noslip=noslip
+        )
+        options = options.changed(place)
+        self.settings = plain(options.given() | own_params | vars(self.config))
+        self.env = Env(task, options, nworld=self.samples, autoreset=False, horizon=0, **own_params)
         self.env.reset()
         self.timestep = self.env.timestep
         self._initial = self.env.get_state()[0]
@@ -125,6 +131,8 @@ class MPPI:
             except RuntimeError as error:  # its weights lie elsewhere, or it takes other observations
                 observations = described(self._loop.final_obs)
                 raise ValueError(f"value cannot take observations {observations}: {error}") from error
+        first, others = self._program(first=True), self._program(first=False)
+        self._calls = first + others * (self.iterations - 1)
         self.reset(seed)
         self._made = True
 
@@ -174,27 +182,18 @@ class MPPI:
         """
         self._loop.state.copy_(checked_state(self.env, state, self._loop.state))
         self._shift_view.fill_(whole_number("shift", shift, low=0))
-        if self._value_in_torch:  # torch computes between two graphs
-            for i in range(self.iterations):
-                self._loop.record_all(self._sample, i == 0)
-                self._terminal_view.copy_(self._torch_values())
-                self._loop.record(self._update)
-        else:
-            self._loop.record_all(self._improve)
+        for call in self._calls:
+            call()
         return self.actions[0].clone()
 
-    def _improve(self) -> None:
-        for i in range(self.iterations):
-            self._sample(i == 0)
-            self._loop.record(self._update)
-
-    def _sample(self, first: bool) -> None:
-        self._loop.record(self._perturb, first)
-        self._loop.run()
-
-    def _update(self) -> None:
-        self._weigh()
-        self._average()
+    def _program(self, *, first: bool) -> Calls:
+        """The calls of one improvement, of which ``first`` moves the plan forward in time."""
+        graphs = self.env.worlds.programs.graphs
+        sample = [Phase("perturb", partial(self._perturb, first)), *self._loop.phases]
+        update = [Phase("weigh", self._weigh), Phase("average", self._average)]
+        if self._value_in_torch:  # torch computes between two graphs
+            return (*graphs.sequence(sample), self._evaluate, *graphs.sequence(update))
+        return graphs.sequence([*sample, *update])
 
     def _perturb(self, first: bool) -> None:
         """The plan to start from, and the samples around it."""
@@ -226,6 +225,9 @@ class MPPI:
         plan = [self._weight, self._samples, self._nominal, self._summary, self._plan]
         device = self.env.device
         wp.launch_tiled(planning.average, dim=[self._plan.size], inputs=plan, block_dim=_BLOCK, device=device)
+
+    def _evaluate(self) -> None:
+        self._terminal_view.copy_(self._torch_values())
 
     def _torch_values(self) -> torch.Tensor:
         """Values of the states where the samples end, (samples,)."""
@@ -279,31 +281,32 @@ class MPPI:
         return {"best_return": best, "mean_return": mean, "effective_samples": effective, "failed_samples": failed}
 
 
-_SAMPLES_A_CORE = 40
+_SAMPLES_PER_CORE = 40
 """With fewer samples for each core of the CPU, its C engine plans faster than an H100. Measured with 16 cores, where
-the two are equal at 27 a core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah (bench/README.md)."""
+the two meet at 27 samples a core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah (bench/README.md)."""
 
 _MOST_CORES = 16
 """More were not measured, and the planner's work besides physics runs on one."""
 
 _NOSLIP = 6
-"""Factor for models with the noslip solver, by which a substep takes longer on a GPU."""
+"""Factor on the samples for models with the noslip solver, which makes a substep on a GPU that much slower."""
 
 
-def _placed(task: type[Task], options: EnvOptions, samples: int) -> EnvOptions:
-    """Options that say where to roll out: engine="auto" on a GPU chooses by the number of samples and the solver."""
-    if options.engine != "auto" or not find_device(options.device).is_cuda:
-        return options
-    enough = _SAMPLES_A_CORE * min(_MOST_CORES, options.nthread or workers())
-    if samples >= enough and (samples >= _NOSLIP * enough or not _has_noslip(task, options)):
-        return options.changed({"engine": "warp", "nthread": None})
-    return options.changed(ON_CPU_CORES)
+def _place_samples(
+    engine: Any, device: str | None, *, nthread: int | None, samples: int, has_noslip: Callable[[], bool]
+) -> dict[str, Any]:
+    """The options to change for the planner's worlds: engine="auto" on a GPU chooses by the number of samples."""
+    if engine != "auto" or not find_device(device).is_cuda:
+        return {}
+    enough = _SAMPLES_PER_CORE * min(_MOST_CORES, nthread or workers())
+    if samples >= enough and (samples >= _NOSLIP * enough or not has_noslip()):
+        return {"engine": "warp", "nthread": None}
+    return dict(ON_CPU_CORES)
 
 
-def _has_noslip(task: type[Task], options: EnvOptions) -> bool:
-    solver = options.physics.solver or {}
-    if "noslip_iterations" in solver:
-        return bool(solver["noslip_iterations"])
-    if options.model is None and not hasattr(task, "model"):
+def _has_noslip(task: type[Task], model: ModelSource | None, solver: Mapping[str, int] | None) -> bool:
+    if solver is not None and "noslip_iterations" in solver:
+        return solver["noslip_iterations"] > 0
+    if model is None and not hasattr(task, "model"):
         return False  # the environment reports what is missing
-    return task_spec(task, options.model).option.noslip_iterations > 0
+    return task_spec(task, model).option.noslip_iterations > 0

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import torch
 
-from lyceum_warp.binding.bound_task import parameter_names
+from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.registry import task_name
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.options import OPTIONS, EnvOptions, suggestion
@@ -149,7 +149,7 @@ def planner_arguments(
         raise ValueError(f"config must be a lw.MPPIConfig, as lw.MPPIConfig(horizon=16), not {described(config)}")
     if params is not None and not isinstance(params, Mapping):
         raise ValueError(f"params must be a dict of parameters of the task, not {described(params)}")
-    name, planning, known = task_name(task), _planning(task), parameter_names(task)
+    name, planning, known = task_name(task), _planning(task), _parameter_names(task)
     for word in words:
         if word in SETTINGS and word in known:
             raise ValueError(
@@ -214,6 +214,10 @@ def _hint(word: str, known: Sequence[str]) -> str:
     return suggestion(word, [*others, *known]) or f"it has {', '.join(known) or 'none'}"
 
 
+def _parameter_names(task: type[Task]) -> list[str]:
+    return [name for name in TaskSource(task, task_name(task)).params.vars if name != "dt"]
+
+
 def _planning(task: type[Task]) -> Planning:
     """A task's ``planning``, all of whose names are known."""
     planning, name = task.planning, task_name(task)
@@ -222,7 +226,7 @@ def _planning(task: type[Task]) -> Planning:
             f"planning of the task {name!r} must be lw.Planning(settings={{...}}, options={{...}}, params={{...}}), "
             f"not {described(planning)}"
         )
-    known = {"settings": SETTINGS, "options": OPTIONS, "params": parameter_names(task)}
+    known = {"settings": SETTINGS, "options": OPTIONS, "params": _parameter_names(task)}
     for part, names in known.items():
         for word in getattr(planning, part):
             if word in names:

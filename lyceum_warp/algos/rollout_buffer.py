@@ -69,7 +69,7 @@ class Rollout:
         self.running_return = torch_view(self._return)
         self.faults = torch_view(self._fault)
         """Faults of each world within the record, (nworld,) int32."""
-        self._recorder = Recorder(env.device, env.record)
+        self._recorder = Recorder(env.device, env.options.graphs)
         self._inputs = [wp.from_torch(env.obs), wp.from_torch(env.action), wp.from_torch(env.episode_step)]
         outputs = [
             env.final_obs, env.reward, env.eval, env.terminated, env.done, env.success, env.done_reason,
