@@ -119,7 +119,7 @@ def task_config(task: type[Task], value: object = None) -> MPPIConfig:
     try:
         config = MPPIConfig(**planning.settings)
     except ValueError as error:
-        raise ValueError(f"planning of the task {task_name(task)!r}: {error}") from error
+        raise ValueError(f"planning.settings of the task {task_name(task)!r}: {error}") from error
     return config if getattr(value, "discount", None) is None else dataclasses.replace(config, discount=None)
 
 
@@ -235,12 +235,12 @@ def _planning(task: type[Task]) -> Planning:
             close = difflib.get_close_matches(word, names, 3)
             hint = f"it belongs to {other}" if other else f"did you mean {' or '.join(close)}?" if close else ""
             hint = hint or f"there are {', '.join(names) or 'none'}"
-            raise ValueError(f"{part} in planning of the task {name!r} has an unknown name {word!r}: {hint}")
+            raise ValueError(f"{word!r} in planning.{part} of the task {name!r} is unknown: {hint}")
     try:
         _check_options(planning.options)
         EnvOptions().changed(planning.options)
     except ValueError as error:
-        raise ValueError(f"options in planning of the task {name!r}: {error}") from error
+        raise ValueError(f"planning.options of the task {name!r}: {error}") from error
     return planning
 
 

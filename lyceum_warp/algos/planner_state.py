@@ -26,9 +26,7 @@ def state_from_parts(env: Env, initial: torch.Tensor, parts: Mapping[str, Any]) 
     Raises:
         ValueError: A part is unknown, or its value has another size or is not a number.
     """
-    space, state, parts = env.state_space, initial.clone(), dict(parts)
-    if "time" in parts and "step" not in parts:
-        parts["step"] = np.round(np.asarray(parts["time"], dtype=np.float64) / env.timestep)
+    space, state = env.state_space, initial.clone()
     for name, value in parts.items():
         if name not in space.parts:
             raise ValueError(f"a state of {env.task.name!r} has no part {name!r}: it has {list(space.parts)}")
@@ -40,6 +38,8 @@ def state_from_parts(env: Env, initial: torch.Tensor, parts: Mapping[str, Any]) 
         if values.shape != target.shape:
             raise ValueError(f"the part {name!r} of a state has {len(target)} numbers, not {len(values)}")
         target.copy_(values)
+    if "time" in parts and "step" not in parts:
+        state[space.parts["step"]] = torch.round(state[space.parts["time"]] / env.timestep)
     return state
 
 

@@ -23,7 +23,7 @@ def plant(task: str) -> lw.Env:
 
 
 @pytest.mark.parametrize("task, horizon", [("reach", 16), ("half_cheetah", 8), ("cartpole_swingup", 20)])
-def test_plans_are_those_of_the_cpu(task: str, horizon: int) -> None:
+def test_plans_agree_with_those_of_the_cpu(task: str, horizon: int) -> None:
     env = plant(task)
     # a high temperature: a low one would let rounding choose between samples
     gpu, cpu = (
@@ -40,20 +40,22 @@ def test_plans_are_those_of_the_cpu(task: str, horizon: int) -> None:
         env.step(other[None])
 
 
-def test_a_replay_equals_the_unrecorded_plan() -> None:
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_a_replayed_plan_equals_one_without_graphs(iterations: int) -> None:
     env = plant("reach")
-    recorded, plain = (
-        lw.MPPI("reach", device=CUDA, engine="warp", deterministic=True, record=record) for record in (True, False)
+    replayed, direct = (
+        lw.MPPI("reach", device=CUDA, engine="warp", deterministic=True, graphs=graphs, iterations=iterations)
+        for graphs in (True, False)
     )
     for _ in range(4):
         state = env.get_state()[0]
-        assert torch.equal(recorded(state), plain(state))
-        assert torch.equal(recorded.returns, plain.returns)
-        env.step(recorded.actions[:1].cpu())
+        assert torch.equal(replayed(state), direct(state))
+        assert torch.equal(replayed.returns, direct.returns)
+        env.step(replayed.actions[:1].cpu())
 
 
 @pytest.mark.parametrize("kind", ["none", "warp", "torch"])
-def test_plans_do_not_wait(kind: str) -> None:
+def test_plans_allocate_nothing_and_do_not_wait_for_the_device(kind: str) -> None:
     value = {"none": None, "warp": first_squared, "torch": lambda obs: 3.0 * obs[:, 0] ** 2}[kind]
     plan = lw.MPPI("reach", device=CUDA, engine="warp", samples=256, value=value)
     state = plan.state_of(mocap_pos=[0.1, 0.1, 0.2])
@@ -66,7 +68,7 @@ def test_plans_do_not_wait(kind: str) -> None:
     assert (torch.cuda.memory_allocated(), wp.get_mempool_used_mem_current(CUDA)) == memory
 
 
-def test_values_agree() -> None:
+def test_values_in_torch_and_in_warp_agree() -> None:
     warp, tensor = (
         lw.MPPI("reach", device=CUDA, engine="warp", samples=64, value=value, temperature=10.0, deterministic=True)
         for value in (first_squared, lambda obs: 3.0 * obs[:, 0] ** 2)
@@ -83,7 +85,7 @@ def test_a_planner_on_the_gpu_controls_a_plant_on_the_cpu() -> None:
 
 
 @pytest.mark.parametrize("samples", [8, 2048])
-def test_a_value_function_goes_where_the_plans_are(samples: int) -> None:
+def test_a_value_function_moves_to_the_device_of_the_plans(samples: int) -> None:
     env = lw.make("hopper")
     for device in ("cpu", CUDA):
         value = lw.ValueFunction(env.obs_space.size, (8,), scale=1.0).to(device)
@@ -92,7 +94,7 @@ def test_a_value_function_goes_where_the_plans_are(samples: int) -> None:
         assert torch.isfinite(plan(plan.state_of())).all()
 
 
-def test_few_samples_are_rolled_out_by_the_cpu() -> None:
+def test_few_samples_are_rolled_out_on_the_cpu() -> None:
     assert lw.MPPI("reach", device=CUDA, samples=8).env.engine.name == "mujoco"
     assert lw.MPPI("reach", device=CUDA, samples=8, nthread=1, nconmax=16).env.device.is_cpu
     assert lw.MPPI("reach", device=CUDA, samples=64, nthread=1).env.engine.name == "warp"
