@@ -71,7 +71,7 @@ class SamplingPlanner:
 
 
 class SimulatedClock:
-    """A clock that moves only when a test moves it, or when somebody waits for a later moment."""
+    """A clock that moves only when a test moves it, or when the loop waits for a later moment."""
 
     def __init__(self) -> None:
         self.time = 100.0

@@ -14,15 +14,15 @@ from lyceum_warp.validate import described, positive_number
 
 
 class CheckedController:
-    """Calls a controller, checks what it returns, and converts between its steps and the world's.
+    """Calls a controller, checks its actions, and converts the plant's steps to the controller's.
 
     Args:
         controller: The controller.
-        env: The controlled world.
+        env: The plant.
 
     Raises:
-        ValueError: The controller cannot be called with a state and an observation, plans in the controlled
-            environment itself, or has a time step that is not positive.
+        ValueError: The controller cannot be called with a state and an observation, plans in the plant itself, or has
+            a time step that is not positive.
     """
 
     def __init__(self, controller: Controller, env: Env) -> None:
@@ -42,14 +42,14 @@ class CheckedController:
         """Make a plan for a state.
 
         Args:
-            state: State of the world, (state_size,) float64.
+            state: State of the plant, (state_size,) float64.
             obs: Its observation, (nobs,).
             shift: Steps of the controller since the state of its last plan.
-            step: Step of the world, for error messages.
+            step: Step of the plant, for error messages.
 
         Returns:
-            The plan, (horizon, nu) float32, a copy on the CPU. The action of a controller without a plan is one of
-            horizon 1.
+            The plan, (horizon, nu) float32, a copy on the CPU. A controller without a plan returns one action, which
+            is a plan of horizon 1.
 
         Raises:
             ValueError: The plan has another shape, or is not finite.
@@ -74,11 +74,11 @@ class CheckedController:
         return failed, 0.0 if failed == getattr(self._controller, "samples", None) else effective
 
     def steps(self, plant_steps: int) -> int:
-        """Convert steps of the world to steps of the controller, rounded."""
+        """Convert steps of the plant to steps of the controller, rounded."""
         return math.floor(plant_steps * self._ratio + 0.5 + 1e-9)
 
     def index(self, plant_steps: int, horizon: int) -> int:
-        """Index in a plan of the action to apply so many steps of the world after the plan's state."""
+        """Index in a plan of the action to apply so many steps of the plant after the plan's state."""
         return min(self.steps(plant_steps), horizon - 1)
 
     def description(self) -> dict[str, Any]:

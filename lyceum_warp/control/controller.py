@@ -9,7 +9,7 @@ from lyceum_warp.env import Env
 
 
 class Controller(Protocol):
-    """A function of one world's state and observation that returns an action.
+    """A function that returns an action for the state and the observation of one world, the plant.
 
     A plain function is a controller, and so is ``lw.MPPI``. A policy becomes one as
     ``lambda state, obs: policy(obs)``. A controller may also have members of ``PlanningController``. Each of them is
@@ -20,7 +20,7 @@ class Controller(Protocol):
         """Choose an action.
 
         Args:
-            state: State of the world as in ``env.get_state()[0]``, (state_size,) float64, on the world's device.
+            state: State of the plant as in ``env.get_state()[0]``, (state_size,) float64, on the plant's device.
             obs: Observation of that state, (nobs,) float32, on the same device.
 
         Returns:
@@ -33,7 +33,8 @@ class Controller(Protocol):
 class PlanningController(Controller, Protocol):
     """A controller that makes a plan, a sequence of actions, at every call. ``lw.MPPI`` is one.
 
-    These are all members that the loops use beyond the call.
+    These are all members that the loops use beyond the call. A controller implements those that it needs, and does not
+    derive from this class.
     """
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /, *, shift: int = 1) -> torch.Tensor:
@@ -42,8 +43,9 @@ class PlanningController(Controller, Protocol):
         Args:
             state: See ``Controller``.
             obs: See ``Controller``.
-            shift: Number of ``timestep`` since the state of the last plan: 0 for the first plan of an episode, or 1 if
-                the run continues an episode. The loops pass it to controllers that have an argument of this name.
+            shift: Steps of length ``timestep`` since the state of the last plan: 0 for the first plan after a reset, 1
+                for the first plan of a run with ``reset=False``. The loops pass it to controllers that have an argument
+                of this name.
 
         Returns:
             The first action of the plan, (nu,). The loops read ``actions`` instead, if it is there.
@@ -51,17 +53,17 @@ class PlanningController(Controller, Protocol):
         ...
 
     def reset(self, seed: int | None, /) -> object:
-        """Prepare for a new episode. Called before the first plan, with the seed of the run."""
+        """Prepare for a new episode. Called with the seed of the run before its first plan, and not with ``reset=False``."""
         ...
 
     @property
     def actions(self) -> torch.Tensor:
-        """The last plan, (horizon, nu), finite. The first row is the action of the state that was given."""
+        """The last plan, (horizon, nu), finite. The first row is the action for the given state."""
         ...
 
     @property
     def timestep(self) -> float:
-        """Simulated seconds between two actions of the plan. Without it, the time step of the controlled world."""
+        """Simulated seconds between two actions of the plan. By default the plant's time step."""
         ...
 
     @property
@@ -81,5 +83,5 @@ class PlanningController(Controller, Protocol):
 
     @property
     def env(self) -> Env:
-        """Environment that simulates the plans. It must not be the controlled one, because planning changes it."""
+        """Environment that simulates the plans. It must not be the plant, because planning changes its state."""
         ...

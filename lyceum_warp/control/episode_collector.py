@@ -70,7 +70,7 @@ def step_limit(env: Env, steps: int | None) -> int:
 
 
 def begin_episode(env: Env, controller: CheckedController, seed: int | None, *, reset: bool) -> None:
-    """Reset the world and the controller, unless the run continues from their states.
+    """Reset the plant and the controller, unless the run continues from their states.
 
     Raises:
         ValueError: A seed is given without a reset, or the episode is already over.
@@ -87,10 +87,10 @@ def begin_episode(env: Env, controller: CheckedController, seed: int | None, *, 
 class EpisodeCollector:
     """Collects the states, actions, outcomes and plans of an episode, and makes a ``Trajectory`` of them.
 
-    For each step, a loop calls ``before_step``, steps the world and calls ``after_step``.
+    For each step, a loop calls ``before_step``, steps the plant and calls ``after_step``.
 
     Args:
-        env: The controlled world, in its initial state.
+        env: The plant, in its initial state.
         controller: Its controller.
         mode: "sync" or "async"; see ``Trajectory.mode``.
         period: Seconds of the wall clock between two steps.
@@ -158,8 +158,8 @@ class EpisodeCollector:
         if on_step is not None:
             assert self._applied is not None
             plan_time, plans = self._applied.seconds, self._applied.index + 1
-            steps, outcome, age = len(self._outcomes), self._outcomes[-1], self._ages[-1]
-            on_step(ControlProgress(steps, self.elapsed(), *outcome, plan_time, age, plans))
+            step, outcome, age = len(self._outcomes), self._outcomes[-1], self._ages[-1]
+            on_step(ControlProgress(step, self.elapsed(), *outcome, plan_time, age, plans))
 
     def abort(self, on_abort: OnAbort | None, wall_seconds: float) -> None:
         """Call ``on_abort`` with the steps so far, if there are any."""
