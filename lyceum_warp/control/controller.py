@@ -53,7 +53,7 @@ class PlanningController(Controller, Protocol):
         ...
 
     def reset(self, seed: int | None, /) -> object:
-        """Prepare for a new episode. Called with the seed of the run before its first plan, and not with ``reset=False``."""
+        """Prepare for a new episode. The loops call it with the seed of the run, unless ``reset=False``."""
         ...
 
     @property
