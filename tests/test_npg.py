@@ -419,12 +419,12 @@ def test_gpu_resumes() -> None:
 
 def test_what_is_no_environment_or_no_configuration_is_refused() -> None:
     env = lw.make("point_mass", nworld=2)
-    with pytest.raises(ValueError, match=r"env of NPG has to be of type Env, as lw.make\(...\) .*, not str 'hopper'"):
+    with pytest.raises(ValueError, match=r"env of NPG must be of type Env, as lw.make\(...\) .*, not str 'hopper'"):
         lw.NPG("hopper")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"config of NPG has to be of type NPGConfig .* not dict"):
+    with pytest.raises(ValueError, match=r"config of NPG must be of type NPGConfig .* not dict"):
         lw.NPG(env, config={"samples": 3})  # type: ignore[arg-type]
     for hidden in (8, (8, 0), "wide"):
-        with pytest.raises(ValueError, match=r"hidden layers are given by their widths, as in \(64, 64\), not as "):
+        with pytest.raises(ValueError, match=r"hidden must be the widths of the hidden layers, as in \(64, 64\), not "):
             lw.NPG(env, config=lw.NPGConfig(hidden=hidden))  # type: ignore[arg-type]
 
 

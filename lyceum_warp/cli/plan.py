@@ -16,7 +16,8 @@ from lyceum_warp.cli.arguments import Physics, Words, optional_flags, parameter,
 from lyceum_warp.cli.display import PlanDisplay, filmed_states, make_console, plotted_control, report_table
 from lyceum_warp.cli.interrupts import Interrupted
 from lyceum_warp.control.control_report import control_report
-from lyceum_warp.control.loop import control, control_async
+from lyceum_warp.control.loop import control
+from lyceum_warp.control.real_time import control_async
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.options import OPTIONS
