@@ -28,7 +28,7 @@ class Rail:
 class RailParams:
     dt: float
     limit: float = 0.5
-    wrong: float = wp.inf  # divided by itself
+    wrong: float = wp.inf  # inf / inf is not a number
 
 
 @wp.func

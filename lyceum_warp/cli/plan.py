@@ -204,8 +204,8 @@ def _left(run: Run, whole: int, aborted: list[Trajectory], path: Path | None) ->
     if not whole:
         where = f"it is in {path}" if path else f"{run.folder} holds no episode"
         return f"in the first episode, {steps}; {where}"
-    told = f"after {whole} episode{'s' * (whole != 1)}; in {run.folder}"
-    return f"{told}; the interrupted episode is in {path.name}, {steps}" if path else told
+    summary = f"after {whole} episode{'s' * (whole != 1)}; in {run.folder}"
+    return f"{summary}; the interrupted episode is in {path.name}, {steps}" if path else summary
 
 
 def _file(run: Run, episode: int) -> Path:

@@ -1,4 +1,4 @@
-"""MPPI against a plain version of it, in use, and what it controls.
+"""MPPI against a plain version of it, in use, and in control of tasks.
 
 The planner's own arithmetic is float32; the plain version's is float64, and so the two drift apart by roundings.
 """
@@ -35,7 +35,7 @@ def reached(seed: int) -> tuple[lw.Env, torch.Tensor]:
 
 
 def falling_hopper(plant: lw.Env) -> torch.Tensor:
-    """A hopper that leans and turns: it falls within a few steps, when exactly depends on what it does."""
+    """A hopper that leans and turns: it falls within a few steps, when exactly depends on its actions."""
     plant.reset()
     state, parts = plant.get_state(), plant.state_space.parts
     state[:, parts["qpos"].start + 2], state[:, parts["qvel"].start + 2] = 0.15, 3.0
@@ -404,7 +404,7 @@ def test_the_planner_may_have_another_model_or_time_step() -> None:
     assert not torch.allclose(plain.returns, long.returns, atol=0.01)
 
 
-# what it controls
+# in control
 
 
 def drive(task: str, steps: int, seed: int, **settings: Any) -> tuple[lw.Env, np.ndarray, np.ndarray]:
