@@ -21,7 +21,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig, plain, planner_arguments
+from lyceum_warp.algos.mppi_arguments import plain, planner_arguments
+from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig
 from lyceum_warp.algos.planner_state import checked_state, state_from_parts
 from lyceum_warp.algos.rollout_buffer import moved
 from lyceum_warp.algos.value import ValueFunction
@@ -65,9 +66,9 @@ class MPPI:
             parameters in ``planning`` do not apply, because values are of the rewards of the task itself.
         seed: Seed of the noise.
         params: Parameters of the task, for names that are also settings.
-        words: Single settings, by the names of ``lw.MPPIConfig``; options of the planner's worlds, as for ``lw.make``;
-            and parameters of the task. With a CUDA device and engine="auto", the C engine on the CPU rolls out few
-            samples, because it is faster there; plans and actions then lie on the CPU.
+        words: Single settings, by the names of ``lw.MPPIConfig`` (None leaves one as it is); options of the planner's
+            worlds, as for ``lw.make``; and parameters of the task. With a CUDA device and engine="auto", the C engine
+            on the CPU rolls out few samples, because it is faster there; plans and actions then lie on the CPU.
 
     Raises:
         ValueError: An argument is unknown, ambiguous or not valid.

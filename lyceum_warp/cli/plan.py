@@ -10,7 +10,8 @@ import torch
 import tyro
 
 from lyceum_warp.algos.mppi import MPPI
-from lyceum_warp.algos.mppi_config import MPPIConfig, task_config
+from lyceum_warp.algos.mppi_arguments import task_config
+from lyceum_warp.algos.mppi_config import MPPIConfig
 from lyceum_warp.binding.registry import find_task, task_name
 from lyceum_warp.cli.arguments import Physics, Words, optional_flags, parameter, portable
 from lyceum_warp.cli.display import PlanDisplay, filmed_states, make_console, plotted_control, report_table
