@@ -13,12 +13,13 @@ from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.models import ModelSource
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.done import FAULTS
-from lyceum_warp.engines import ON_CPU_CORES, EngineFactory, find_device, open_engine
-from lyceum_warp.engines.memory import bytes_of
-from lyceum_warp.fields import elements
+from lyceum_warp.engines.base import EngineFactory
+from lyceum_warp.engines.placement import bytes_per_world, few_worlds, find_device, open_engine
+from lyceum_warp.fields import Field, describe, elements
 from lyceum_warp.graphs.compile_ahead import compile_ahead
 from lyceum_warp.graphs.recorder import Recorder
 from lyceum_warp.kernels import random, steps
+from lyceum_warp.spaces import state_space
 from lyceum_warp.task import Task
 from lyceum_warp.validate import check_tensor, whole_number
 from lyceum_warp.worlds import PHASES, Worlds
@@ -143,10 +144,11 @@ class Env(Worlds):
         self.timestep: float = self.task.timestep  # seconds in a step
         # what both engines were made of: changes here reach neither, an MjSpec that was changed is given as model=
         self.model: mujoco.MjModel = self.task.model
-        self.engine = open_engine(
-            engine, self.model, self.nworld, self.device, nthread=nthread, nconmax=nconmax, njmax=njmax,
-            deterministic=deterministic, unroll=unroll,
-        )  # fmt: skip
+        kept = self._fields_to_keep()
+        more = dict(nthread=nthread, nconmax=nconmax, njmax=njmax, deterministic=deterministic, unroll=unroll)
+        beside = self._own_bytes(kept)
+        self.engine = open_engine(engine, self.model, self.nworld, self.device, kept, beside=beside, **more)
+        self._bytes_per_world = bytes_per_world(engine, self.model, self.device, kept, **more) + beside
         self.record = record
         if nvtx and not torch.backends.cuda.is_built():
             raise ValueError("nvtx=True marks phases through torch, whose build here is without CUDA: leave it out")
@@ -156,10 +158,10 @@ class Env(Worlds):
         with wp.ScopedDevice(self.device):
             self._allocate()
         try:
-            if self.engine.recordable:
+            if self.engine.capturable:
                 compile_ahead(self._rehearsal, self.device, self.task.name)
                 if record:
-                    self.engine.prepare()
+                    self.engine.prepare_capture()
             self.rand_reset(seed)
         except Exception as error:
             raise self.task.explained(error) from None
@@ -348,9 +350,7 @@ class Env(Worlds):
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
         """A live view of one of the engine's fields, by MuJoCo's name.
 
-        On the C engine it is a copy that every step renews: read it, and write through ``set_state``. Asking for a
-        field that the task does not read costs new recordings, and one of the acceleration stage becomes part of
-        the state from then on: states that were taken before no longer fit.
+        On the C engine it is a copy that every step renews: read it, and write through ``set_state``.
 
         Args:
             name: Attribute of MjData, for instance "qpos" or "site_xpos".
@@ -358,17 +358,16 @@ class Env(Worlds):
                 site, geom or camera elsewhere.
 
         Raises:
-            ValueError: There is no such field or element, or it takes a sensor and the environment was made without
-                it: see ``fields``.
+            ValueError: There is no such field or element, or the environment was made without it: see ``fields``.
         """
         if name not in self._views:
-            known = name in self.engine.fields
-            self._views[name] = torch_view(self.engine.field(name))
-            if not known:
-                if self.engine.fields[name].snapshot:
-                    self._allocate_state()
-                    self._scratch = None
-                self._record.forget()
+            if name not in self.engine.arrays:
+                describe(self.model, name)
+                raise ValueError(
+                    f"this environment does not keep the field {name!r}: list it in the task's World, or give make() "
+                    f"fields=[{name!r}]"
+                )
+            self._views[name] = torch_view(self.engine.arrays[name])
         view = self._views[name]
         if element is None:
             return view
@@ -406,12 +405,8 @@ class Env(Worlds):
 
     @property
     def bytes_per_world(self) -> float:
-        """Memory that a world takes, in bytes: of every array behind this environment, its share.
-
-        The model, which all worlds share, is not counted, nor are arrays that MuJoCo Warp makes within a recording or
-        what an MjData's arena holds. Scratch worlds, which judge given states, count once they exist.
-        """
-        return (bytes_of(self) - self.engine.shared_bytes + self.engine.hidden_bytes) / self.nworld
+        """An estimate of the memory that a world takes, in bytes, without scratch worlds, which judge given states."""
+        return self._bytes_per_world
 
     @property
     def fault_counts(self) -> dict[str, int]:
@@ -434,9 +429,7 @@ class Env(Worlds):
         On a GPU a step of a few worlds takes nearly as long as one of thousands. Where the choice was left to
         engine="auto", they step on CPU cores through the C engine, in double precision.
         """
-        if self.device.is_cpu or self._options["engine"] != "auto":
-            return self.replicate(nworld=nworld, **changes)
-        return self.replicate(nworld=nworld, **(ON_CPU_CORES | changes))
+        return self.replicate(nworld=nworld, **(few_worlds(self._options["engine"], self.device) | changes))
 
     def _params_for(self, nworld: int) -> dict[str, Any]:
         params = {}
@@ -447,12 +440,22 @@ class Env(Worlds):
 
     # helpers
 
+    def _fields_to_keep(self) -> list[Field]:
+        task = self.task
+        names = dict.fromkeys([*(name for name in task.fields if name != "memory"), *task.further, "time"])
+        return [describe(self.model, name, lagged=name in task.task.lagged) for name in names]
+
+    def _own_bytes(self, kept: list[Field]) -> int:
+        """An estimate of what this environment itself allocates for each world, in bytes."""
+        snapshots = [field for field in kept if field.snapshot]
+        state = state_space(self.model, snapshots, self.task.task.memory)
+        fields = sum(field.size for field in kept)
+        return 8 * fields + 8 * state.size + 8 * sum(self.task.obs_layout.values()) + 200
+
     def _scratch_at(self, given: torch.Tensor) -> "Env":
         """Worlds of the same task for judging given states; made when first needed."""
         if self._scratch is None:
             self._scratch = self.replicate()
-            for name in self.engine.fields:
-                self._scratch.field(name)
         self._scratch.set_state(given)
         return self._scratch
 

@@ -8,7 +8,7 @@ import warp as wp
 from lyceum_warp.arrays import launch_rows, torch_view
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.done import FAULTS
-from lyceum_warp.engines import Engine
+from lyceum_warp.engines.base import Engine
 from lyceum_warp.fields import Stage
 from lyceum_warp.graphs.recorder import Recorder
 from lyceum_warp.kernels import random, state, steps
@@ -47,15 +47,12 @@ class Worlds:
         self._after, self._before = kernels.Batch(), kernels.Batch()
         self._pairs: list[tuple[wp.array, wp.array]] = []
         for name in self.task.fields:
-            live = self._memory if name == "memory" else self.engine.field(name, lagged=name in task.lagged)
+            live = self._memory if name == "memory" else self.engine.arrays[name]
             self.task.check_field(name, live)
             copy = wp.zeros_like(live)
             setattr(self._after, name, live)
             setattr(self._before, name, copy)
             self._pairs.append((copy, live))
-
-        for name in self.task.further:
-            self.engine.field(name)
 
         self.action_space = action_space(self.engine.model, task.action_range)
         self.obs_space = Space.of(self.task.obs_layout)
@@ -91,7 +88,7 @@ class Worlds:
 
     def _run(self, function: Callable[..., None], *args: Hashable) -> None:
         """Call a function that calls the engine: as one recording where the engine can be recorded."""
-        if self.engine.recordable:
+        if self.engine.capturable:
             self._whole(function, *args)
         else:
             function(*args)
@@ -105,7 +102,7 @@ class Worlds:
 
     def _physics(self, function: Callable[..., None], *args: Hashable) -> None:
         """Call a function of the engine, as a recording where the engine can be recorded."""
-        if self.engine.recordable:
+        if self.engine.capturable:
             self._record(function, *args)
         else:
             with self._record.range(function):
