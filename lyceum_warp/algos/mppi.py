@@ -26,9 +26,8 @@ from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.arrays import torch_view
 from lyceum_warp.binding.bound_task import task_spec
 from lyceum_warp.binding.registry import find_task
-from lyceum_warp.engines import ON_CPU_CORES, find_device
+from lyceum_warp.engines.placement import place_samples
 from lyceum_warp.env import Env
-from lyceum_warp.graphs.compile_ahead import workers
 from lyceum_warp.kernels import planning
 from lyceum_warp.openloop import OpenLoop
 from lyceum_warp.options import OPTIONS
@@ -331,26 +330,12 @@ class MPPI:
         return state
 
 
-_SAMPLES_A_CORE = 40
-"""Below so many samples for each core of the CPU, its C engine plans faster than an H100. Measured with 16 cores, where
-the two meet at 27 a core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah (bench/README.md)."""
-
-_MOST_CORES = 16
-"""More were not measured, and what a plan does besides physics runs on one."""
-
-_NOSLIP = 6
-"""Times as many where the planner's model has the noslip solver: so much longer a substep then takes on a GPU."""
-
-
 def _placed(task: str | type[Task], options: Mapping[str, Any], samples: int) -> dict[str, Any]:
     """Where to roll out: engine="auto" on a GPU chooses by the number of samples and by the solver."""
-    placed = dict(options)
-    if placed.get("engine", "auto") != "auto" or not find_device(placed.get("device")).is_cuda:
-        return placed
-    enough = _SAMPLES_A_CORE * min(_MOST_CORES, placed.get("nthread") or workers())
-    if samples >= enough and (samples >= _NOSLIP * enough or not _has_noslip(task, placed)):
-        return placed | {"engine": "warp", "nthread": None}
-    return placed | ON_CPU_CORES
+    return dict(options) | place_samples(
+        options.get("engine", "auto"), options.get("device"), nthread=options.get("nthread"), samples=samples,
+        has_noslip=lambda: _has_noslip(task, options),
+    )  # fmt: skip
 
 
 def _has_noslip(task: str | type[Task], options: Mapping[str, Any]) -> bool:

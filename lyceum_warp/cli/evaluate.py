@@ -11,7 +11,7 @@ from rich.table import Table
 from lyceum_warp.algos.rollout_buffer import Episodes, evaluate
 from lyceum_warp.cli.arguments import Physics
 from lyceum_warp.cli.display import filmed, make_console
-from lyceum_warp.engines import ON_CPU_CORES
+from lyceum_warp.engines.placement import few_worlds
 from lyceum_warp.env import Env
 from lyceum_warp.runs import Run, load
 from lyceum_warp.viz.video import check_video
@@ -51,8 +51,8 @@ def evaluate_run(options: Eval) -> int:
     nworld = min(options.nworld, options.episodes)
     engine, device = options.engine or config["engine"], options.device or config["device"]
     where = {"engine": engine, "device": device} | Physics.of(config).options() | config["params"]
-    if engine == "auto" and options.device is None:
-        where |= ON_CPU_CORES
+    if options.device is None:
+        where |= few_worlds(engine, device)
     env = Env(config["task"], nworld=nworld, **where)
     policy = load(run, device=env.obs.device)
     sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)

@@ -18,8 +18,9 @@ from lyceum_warp.algos.rollout_buffer import Episodes, evaluate, moved
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.cli.arguments import Interrupted, Physics, Words, parameter, portable, postponed, spelled
 from lyceum_warp.cli.display import Display, curve_table, filmed, make_console, plotted
+from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.env import Env
-from lyceum_warp.graphs.compile_ahead import workers
+from lyceum_warp.machine import cpu_cores
 from lyceum_warp.runs import Run
 from lyceum_warp.versions import versions
 
@@ -200,7 +201,7 @@ def _algorithm(config: dict[str, Any], team: Team) -> NPG:
     torch.set_num_threads(config["threads"])
     options = Physics.of(config).options() | config["params"]
     if team.neighbours > 1 and _engine(config) == "mujoco":
-        options["nthread"] = max(1, workers() // team.neighbours)
+        options["nthread"] = max(1, cpu_cores() // team.neighbours)
     nworld = team.share(config["nworld"])
     env = Env(
         config["task"], nworld=nworld, first_world=team.rank * nworld, engine=config["engine"],
@@ -210,8 +211,7 @@ def _algorithm(config: dict[str, Any], team: Team) -> NPG:
 
 
 def _engine(config: dict[str, Any]) -> str:
-    automatic = "warp" if config["device"].startswith("cuda") else "mujoco"
-    return automatic if config["engine"] == "auto" else config["engine"]
+    return engine_name(config["engine"], config["device"])
 
 
 def _learn(run: Run | None, npg: NPG, options: Train) -> int:

@@ -10,7 +10,7 @@ from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.npg import NPG, NPGConfig
 from lyceum_warp.cli.arguments import Physics, Words, parameter
 from lyceum_warp.cli.display import make_console
-from lyceum_warp.engines.memory import free_memory
+from lyceum_warp.engines.memory import most_worlds
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.compile_ahead import cached
 
@@ -65,12 +65,9 @@ def warm_up(options: Warmup) -> int:
     console = make_console()
     built = f"compiled {len(new)} modules of kernels ({megabytes:.1f} MB)" if new else "every kernel was there"
     console.print(f"{env.task.name} on {env.device.alias}: {built}, {seconds:.1f} s in all", soft_wrap=True)
-    text = f"memory: {env.bytes_per_world / 1e3:.1f} kB a world of {env.nworld}"
-    free = free_memory(env.device)
-    if env.engine.name == "warp" and free is not None:
-        footprint = env.engine.footprint()  # type: ignore[attr-defined]
-        most = footprint.largest(free)
-        place = f"the {free / 1e9:.1f} GB that are free" if most != footprint.most else "Warp's --deterministic buffers"
-        text += f"; at most some {most:,d} worlds fit into {place}"
+    text = f"memory: about {env.bytes_per_world / 1e3:.1f} kB a world"
+    most = most_worlds(env.bytes_per_world, env.device)
+    if most is not None:
+        text += f"; at most some {most:,d} worlds fit into the free memory"
     console.print(text, soft_wrap=True)
     return 0
