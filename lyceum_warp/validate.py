@@ -1,8 +1,24 @@
 """Checks of what a user gives that more than one room needs."""
 
+import math
 from typing import Any
 
+import numpy as np
 import torch
+
+
+def finite_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
+    """A finite number within bounds, as a float.
+
+    Raises:
+        ValueError: The value is not a finite number, or is out of bounds.
+    """
+    if isinstance(value, (int, float, np.number)) and not isinstance(value, bool):
+        number = float(value)
+        if math.isfinite(number) and low <= number <= high:
+            return number
+    bounds = f" from {low:g} to {high:g}" if high < math.inf else f" of at least {low:g}" if low > -math.inf else ""
+    raise ValueError(f"{name} must be a finite number{bounds}, not {value!r}")
 
 
 def whole_number(name: str, value: Any, *, low: int, high: int = 2**31 - 1) -> int:
@@ -32,16 +48,16 @@ def check_kind(name: str, value: Any, kind: Any, example: str) -> None:
         raise ValueError(f"{name} has to be of type {wanted}, {example}, not {described(value)}")
 
 
-def layer_sizes(hidden: Any) -> list[int]:
+def layer_sizes(hidden: Any, name: str = "hidden") -> list[int]:
     """Widths of hidden layers.
 
     Raises:
-        ValueError: They are none.
+        ValueError: The value is not a sequence of positive whole numbers.
     """
     try:
         return [whole_number("a width", width, low=1) for width in hidden]
     except (TypeError, ValueError) as error:
-        raise ValueError(f"hidden layers are given by their widths, as in (64, 64), not as {hidden!r}") from error
+        raise ValueError(f"{name} must be the widths of hidden layers, as in (64, 64), not {hidden!r}") from error
 
 
 def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:

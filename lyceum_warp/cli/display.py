@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from lyceum_warp.algos.npg import Iteration
+from lyceum_warp.algos.evaluation import moved
 from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.algos.rollout_buffer import moved
+from lyceum_warp.algos.statistics import Iteration
 from lyceum_warp.control.control_report import ControlReport
 from lyceum_warp.control.loop import ControlProgress
 from lyceum_warp.control.trajectory import Trajectory

@@ -8,7 +8,7 @@ import rich.box
 import tyro
 from rich.table import Table
 
-from lyceum_warp.algos.rollout_buffer import Episodes, evaluate
+from lyceum_warp.algos.evaluation import Episodes, evaluate
 from lyceum_warp.cli.arguments import Physics
 from lyceum_warp.cli.display import filmed, make_console
 from lyceum_warp.engines import ON_CPU_CORES

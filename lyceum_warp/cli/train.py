@@ -13,8 +13,9 @@ import tyro
 from rich.console import Console
 
 from lyceum_warp.algos.distributed import Team, join
-from lyceum_warp.algos.npg import NPG, NPGConfig, enough_samples
-from lyceum_warp.algos.rollout_buffer import Episodes, evaluate, moved
+from lyceum_warp.algos.evaluation import Episodes, evaluate, moved
+from lyceum_warp.algos.npg import NPG
+from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.cli.arguments import Interrupted, Physics, Words, parameter, portable, postponed, spelled
 from lyceum_warp.cli.display import Display, curve_table, filmed, make_console, plotted
