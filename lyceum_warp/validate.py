@@ -1,24 +1,10 @@
 """Checks of what a user gives that more than one room needs."""
 
 import math
+import numbers
 from typing import Any
 
-import numpy as np
 import torch
-
-
-def finite_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
-    """A finite number within bounds, as a float.
-
-    Raises:
-        ValueError: The value is not a finite number, or is out of bounds.
-    """
-    if isinstance(value, (int, float, np.number)) and not isinstance(value, bool):
-        number = float(value)
-        if math.isfinite(number) and low <= number <= high:
-            return number
-    bounds = f" from {low:g} to {high:g}" if high < math.inf else f" of at least {low:g}" if low > -math.inf else ""
-    raise ValueError(f"{name} must be a finite number{bounds}, not {value!r}")
 
 
 def whole_number(name: str, value: Any, *, low: int, high: int = 2**31 - 1) -> int:
@@ -57,7 +43,7 @@ def layer_sizes(hidden: Any, name: str = "hidden") -> list[int]:
     try:
         return [whole_number("a width", width, low=1) for width in hidden]
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be the widths of hidden layers, as in (64, 64), not {hidden!r}") from error
+        raise ValueError(f"{name} must be the widths of the hidden layers, as in (64, 64), not {hidden!r}") from error
 
 
 def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:
@@ -79,3 +65,17 @@ def described(value: Any) -> str:
     if hasattr(value, "shape"):
         return f"a {type(value).__name__} of shape {tuple(value.shape)}"
     return f"{type(value).__name__} {value!r}"
+
+
+def finite_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
+    """Convert a finite number of any type to a float, and check its bounds.
+
+    Raises:
+        ValueError: The value is not a finite number from low to high.
+    """
+    if isinstance(value, numbers.Real) and not isinstance(value, bool):
+        number = float(value)
+        if math.isfinite(number) and low <= number <= high:
+            return number
+    bounds = f" from {low:g} to {high:g}" if high < math.inf else f" of at least {low:g}" if low > -math.inf else ""
+    raise ValueError(f"{name} must be a finite number{bounds}, not {value!r}")
