@@ -140,7 +140,7 @@ def saved_options(folder: Path) -> Train:
     """The options that a run was started with.
 
     Raises:
-        FileNotFoundError: There is no run in the folder.
+        FileNotFoundError: The folder holds no run.
         ValueError: The run's configuration is not one of NPG.
     """
     config = Run.open(folder).config
