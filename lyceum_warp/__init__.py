@@ -16,7 +16,10 @@ from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.binding.models import gymnasium_model, gymnasium_robotics_model
 from lyceum_warp.binding.registry import register, task_names
 from lyceum_warp.control.control_report import ControlReport, control_report
-from lyceum_warp.control.loop import ControlProgress, control, control_async
+from lyceum_warp.control.controller import Controller, PlanningController
+from lyceum_warp.control.episode_collector import ControlProgress
+from lyceum_warp.control.loop import control
+from lyceum_warp.control.real_time import control_async
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.done import Done
 from lyceum_warp.env import Env, make
@@ -33,6 +36,7 @@ __all__ = [
     "NPG",
     "ControlProgress",
     "ControlReport",
+    "Controller",
     "Done",
     "Env",
     "Episodes",
@@ -40,6 +44,7 @@ __all__ = [
     "Iteration",
     "NPGConfig",
     "OpenLoop",
+    "PlanningController",
     "Rollout",
     "Row",
     "Task",

@@ -5,6 +5,7 @@ does not, so ``document_attributes`` appends these strings to the docstring of t
 """
 
 import ast
+import enum
 import inspect
 import itertools
 import textwrap
@@ -40,6 +41,9 @@ def listed(docs: dict[str, str]) -> str:
 
 def document_attributes(cls: Class) -> Class:
     """Class decorator: append the attributes' docstrings to the class's own, where ``help`` shows them."""
-    if docs := attribute_docs(cls):
+    docs = attribute_docs(cls)
+    if issubclass(cls, enum.Enum):
+        docs = {f"{member.name} ({member.value})": docs[member.name] for member in cls if member.name in docs}
+    if docs:
         cls.__doc__ = f"{inspect.cleandoc(cls.__doc__ or '')}\n\nAttributes:\n{listed(docs)}\n"
     return cls

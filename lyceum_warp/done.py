@@ -5,12 +5,15 @@ Both engines report the same bits for the same fault, so that a task, a log and 
 
 import enum
 
+from lyceum_warp.docstrings import document_attributes
 
+
+@document_attributes
 class Done(enum.IntFlag):
     """Why an episode ended; ``env.done_reason`` holds these bits for each world."""
 
     TERMINATED = 1
-    """The task said so."""
+    """The task's ``terminated`` returned True."""
     TRUNCATED = 2
     """The time limit was reached."""
     NAN = 4

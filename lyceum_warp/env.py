@@ -1,6 +1,8 @@
-"""Env: one task in many worlds."""
+"""Env: one task in many worlds, the public face of the package."""
 
-from collections.abc import Collection, Mapping
+import inspect
+import os
+import weakref
 from typing import Any
 
 import mujoco
@@ -10,71 +12,72 @@ import warp as wp
 
 from lyceum_warp.arrays import torch_view
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.binding.models import ModelSource
 from lyceum_warp.binding.registry import find_task
+from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.done import FAULTS
-from lyceum_warp.engines import ON_CPU_CORES, EngineFactory, find_device, open_engine
-from lyceum_warp.engines.memory import bytes_of
+from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines.placement import few_worlds, find_device, open_engine
 from lyceum_warp.fields import elements
 from lyceum_warp.graphs.compile_ahead import compile_ahead
-from lyceum_warp.graphs.recorder import Recorder
-from lyceum_warp.kernels import random, steps
+from lyceum_warp.kernels import steps
+from lyceum_warp.options import OPTION_DOCS, EnvOptions, signature_of_options
+from lyceum_warp.spaces import Space
 from lyceum_warp.task import Task
 from lyceum_warp.validate import check_tensor, whole_number
-from lyceum_warp.worlds import PHASES, Worlds
+from lyceum_warp.worlds import Worlds
+
+_BUFFERS = (*steps.OUTCOMES, "action")
 
 
-def make(task: str | type[Task], **options: Any) -> "Env":
-    """Make an environment: ``make("hopper", nworld=64, ctrl_cost_weight=1e-2)``; see ``Env`` for the options."""
+def _document_options(function: Any) -> Any:
+    """Decorator: put the options into the docstring and the signature, where ``help`` shows them."""
+    function.__doc__ = inspect.cleandoc(function.__doc__).replace("    {options}", OPTION_DOCS)
+    return function
+
+
+@_document_options
+def make(task: str | type[Task], **options: Any) -> "Env":  # noqa: D417
+    """Make an environment, as in ``make("hopper", nworld=64, ctrl_cost_weight=1e-2)``.
+
+    Args:
+        task: Name of a task, a file with one (path/to/file.py, or path/to/file.py:Class), or its class.
+        {options}
+        params: Every other keyword is a parameter of the task, a field of its ``Params``; a scalar may also be given
+            as one value a world, (nworld,).
+
+    Raises:
+        ValueError: An argument is unknown or does not fit; the message names it and how to fix it.
+        FileNotFoundError: A model file or a task file is missing.
+    """
     return Env(task, **options)
 
 
-class Env(Worlds):
+@_document_options
+@document_attributes
+class Env:
     """One task in many worlds, with every array allocated once and shared with torch.
 
-    Write ``action``, call ``step``, read ``obs``, ``reward``, ``eval``, ``terminated``, ``truncated``,
-    ``success``, ``done``, ``done_reason`` and ``final_obs``: the tensors stay the same objects at the same
-    addresses and change in place. A world whose episode ends begins a new, random one within the same step;
-    ``obs`` is then the first observation of the new episode, ``final_obs`` the last one of the old.
+    Write ``action``, call ``step``, read the other buffers: they stay the same tensors at the same addresses and change
+    in place. A world whose episode ends begins a new, random one within the same step; ``obs`` is then the first
+    observation of the new episode, ``final_obs`` the last one of the old.
 
-    On a GPU, torch's work on these tensors belongs on torch's default stream, which waits for Warp's and is
-    waited for; work on other streams has to be synchronised by whoever puts it there.
+    A world with a fault (see ``Done``) restarts, is counted in ``fault_counts``, and leaves the numbers of all other
+    worlds unchanged to the bit. The transition has reward 0 and the last good observation as ``final_obs``. Under the
+    Warp engine the worlds share a pool of contacts: when it overflows, every world that it touched has a fault.
+
+    On a GPU, torch's work on these tensors belongs on torch's default stream, which is synchronised with Warp's. Work
+    on other streams must be synchronised by the caller.
 
     Args:
-        task: Name of a task, a file with one, or its class.
-        nworld: Number of worlds.
-        device: "cpu" or a CUDA device.
-        engine: "mujoco" (C, on CPU cores), "warp", or "auto": Warp on CUDA and C on the CPU.
-        seed: Seed of the worlds' random streams.
-        first_world: Number of the first world among those of all processes, where several share a batch: its
-            worlds have the random streams of these numbers.
-        autoreset: False lets finished worlds keep stepping with their ``done`` set until they are reset. Only
-            worlds with a fault still begin again at once.
-        horizon: Steps after which an episode is truncated, 0 for never; the task's own by default.
-        record: False runs every launch unrecorded, for debugging; the numbers are the same to the bit.
-        model: Another model than the task's: a file or an MjSpec.
-        frame_skip: Another number of substeps in a step.
-        cone: Another friction cone: "pyramidal" or "elliptic".
-        integrator: Another integrator: "euler", "rk4", "implicit" or "implicitfast".
-        solver: Other limits of the constraint solver, any of {"iterations": 4, "ls_iterations": 10,
-            "noslip_iterations": 0}.
-        nthread: Threads of the C engine; all cores by default.
-        nconmax: Contacts that the Warp engine has room for in each world, on average; probed by default.
-        njmax: Constraints that the Warp engine has room for in each world; probed by default.
-        deterministic: True makes two runs on a CUDA device equal to the bit, for a price: 5 to 18 times the time and
-            5 to 7 times the memory on hopper, half_cheetah and humanoid. On the CPU two runs are equal anyway.
-        unroll: True has the Warp engine go through all iterations of the solver, instead of a loop that ends with the
-            last world's. The numbers stay the same. With a ``solver`` of at most 20 iterations only; with some four it
-            gained 3 to 5 % on half_cheetah and humanoid, and lost 1 to 2 % on hopper. The C engine takes no notice.
-        fields: Fields that the task does not read, but ``field`` will be asked for: they are there from the start.
-            Needed for those that MuJoCo computes only for a sensor: "sensordata" itself, "cacc", "cfrc_ext" and others.
-        nvtx: True marks the phases of a step for NVIDIA's profilers (act, physics, judge, restart, refresh, look), and
-            records each by itself.
-        params: The task's parameters; a scalar may also be given as one value a world.
+        task: Name of a task, a file with one (path/to/file.py, or path/to/file.py:Class), or its class.
+        options: Options in one piece; those given by name replace single ones.
+        {options}
+        params: Every other keyword is a parameter of the task, a field of its ``Params``; a scalar may also be given
+            as one value a world, (nworld,).
 
     Raises:
-        ValueError: Something given does not fit; the message names it and the mend.
-        FileNotFoundError: A model or task file is missing.
+        ValueError: An argument is unknown or does not fit; the message names it and how to fix it.
+        FileNotFoundError: A model file or a task file is missing.
     """
 
     obs: torch.Tensor
@@ -96,99 +99,105 @@ class Env(Worlds):
     done_reason: torch.Tensor
     """Bits of ``Done``, (nworld,), int32."""
     action: torch.Tensor
-    """Actions of the next step, (nworld, nu), float32."""
+    """Actions of the next step, (nworld, nu), float32. One that is not finite is a fault and is applied as zero."""
+    episode_step: torch.Tensor
+    """Steps since the reset, (nworld,), int32."""
+    time: torch.Tensor
+    """Simulated seconds since the reset, (nworld,), float32."""
+    nworld: int
+    """Number of worlds."""
+    timestep: float
+    """Simulated seconds in a step, all its substeps together."""
+    device: wp.Device
+    """The Warp device; ``obs.device`` is torch's name of it."""
+    model: mujoco.MjModel
+    """The compiled model that both engines were made of. Changes here reach neither: give an edited MjSpec as
+    ``model=`` instead."""
+    options: EnvOptions
+    """The options that the environment was made with."""
+    task: BoundTask
+    """The task with its model, parameters (``task.params``) and kernels."""
+    engine: Engine
+    """The physics; ``engine.name`` is mujoco or warp."""
+    worlds: Worlds
+    """The arrays and the phases behind this environment; not needed to use it."""
+    obs_space: Space
+    """Parts of an observation and their places."""
+    action_space: Space
+    """Names, places and bounds of an action's numbers."""
+    state_space: Space
+    """Parts of a state and their places."""
+    reward_space: Space
+    """A scalar."""
+    eval_space: Space
+    """A scalar."""
 
-    def __init__(
-        self,
-        task: str | type[Task],
-        *,
-        nworld: int = 1,
-        device: str | None = None,
-        engine: str | EngineFactory = "auto",
-        seed: int = 0,
-        first_world: int = 0,
-        autoreset: bool = True,
-        horizon: int | None = None,
-        record: bool = True,
-        model: ModelSource | None = None,
-        frame_skip: int | None = None,
-        cone: str | None = None,
-        integrator: str | None = None,
-        solver: Mapping[str, int] | None = None,
-        nthread: int | None = None,
-        nconmax: int | None = None,
-        njmax: int | None = None,
-        deterministic: bool = False,
-        unroll: bool = False,
-        fields: Collection[str] = (),
-        nvtx: bool = False,
-        **params: Any,
-    ) -> None:
-        self._options: dict[str, Any] = dict(
-            device=device, engine=engine, record=record, model=model, frame_skip=frame_skip, cone=cone,
-            integrator=integrator, solver=solver, nthread=nthread, nconmax=nconmax, njmax=njmax,
-            deterministic=deterministic, unroll=unroll, fields=fields, nvtx=nvtx,
-        )  # fmt: skip
-        self.nworld = whole_number("nworld", nworld, low=1)
-        self._first_world = whole_number("first_world", first_world, low=0)
-        self.device = find_device(device)
+    def __init__(self, task: str | type[Task], options: EnvOptions | None = None, **words: Any) -> None:
+        known, params = EnvOptions.split(words, options)
+        self.options = options = known
+        self.nworld = options.nworld
+        self.device = find_device(options.device)
         self.task = BoundTask(
-            find_task(task), self.nworld, model=model, frame_skip=frame_skip, cone=cone, integrator=integrator,
-            solver=solver, fields=fields, **params,
+            find_task(task), options.nworld, model=options.model, fields=options.fields, physics=options.physics,
+            params=params,
         )  # fmt: skip
-        self._horizon = self.task.task.horizon if horizon is None else whole_number("horizon", horizon, low=0)
-        self._autoreset = autoreset
-        self._given_params = dict(params)
-        whole_number("seed", seed, low=0)  # before anything large is made
-        self.timestep: float = self.task.timestep  # seconds in a step
-        # what both engines were made of: changes here reach neither, an MjSpec that was changed is given as model=
-        self.model: mujoco.MjModel = self.task.model
-        self.engine = open_engine(
-            engine, self.model, self.nworld, self.device, nthread=nthread, nconmax=nconmax, njmax=njmax,
-            deterministic=deterministic, unroll=unroll,
-        )  # fmt: skip
-        self.record = record
-        if nvtx and not torch.backends.cuda.is_built():
+        self.timestep, self.model = self.task.timestep, self.task.model
+        if options.nvtx and not torch.backends.cuda.is_built():
             raise ValueError("nvtx=True marks phases through torch, whose build here is without CUDA: leave it out")
-        self._record = Recorder(self.device, record, PHASES if nvtx else None)
+        self.engine = open_engine(options, self.model, self.device, self.task.fields)
+        self._given_params = params
         self._scratch: Env | None = None
-        self._views: dict[str, torch.Tensor] = {}
-        with wp.ScopedDevice(self.device):
-            self._allocate()
         try:
-            if self.engine.recordable:
-                compile_ahead(self._rehearsal, self.device, self.task.name)
-                if record:
-                    self.engine.prepare()
-            self.rand_reset(seed)
+            self.worlds = worlds = Worlds(self.task, self.engine, options)
+            for name, buffer in worlds.buffers.items():
+                setattr(self, name, buffer)
+            self.obs_space, self.action_space = worlds.obs_space, worlds.action_space
+            self.state_space = worlds.state_space
+            self.reward_space = self.eval_space = Space()
+            self._fields = {name: torch_view(array) for name, array in self.engine.arrays.items()}
+            self.time, self.episode_step = self._fields["time"], torch_view(worlds.steps)
+            if self.engine.capturable:
+                compile_ahead(worlds.rehearsal, self.device, self.task.name)
+                if options.graphs:
+                    self.engine.prepare_capture()
+            self.rand_reset(options.seed)
+            self.task.check_observation(worlds.after, worlds.params)
         except Exception as error:
             raise self.task.explained(error) from None
-        self.task.check_observation(self._after, self._params)
+        _live.add(self)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in self.__dict__ and name in (*steps.OUTCOMES, "action"):
+        if name in self.__dict__ and name in _BUFFERS:
             raise AttributeError(f"env.{name} is a buffer of fixed address: write into it, as env.{name}.copy_(...)")
         super().__setattr__(name, value)
+
+    def __reduce__(self) -> Any:
+        raise TypeError(
+            "an environment cannot be pickled or copied: make it again from its arguments (env.replicate() does), and "
+            "send env.get_state() to another process"
+        )
 
     @property
     def horizon(self) -> int:
         """Steps after which an episode is truncated; 0 for never."""
-        return self._horizon
+        return self.worlds.horizon
 
     @property
     def first_world(self) -> int:
-        """Number of the first world among those of all processes; 0 where there is but one."""
-        return self._first_world
+        """Number of the first world among those of all processes; 0 where there is only one process."""
+        return self.options.first_world
 
     @property
     def autoreset(self) -> bool:
         """Whether finished worlds begin a new episode within the same step."""
-        return self._autoreset
+        return self.worlds.autoreset
 
     # the step
 
     def step(self, action: torch.Tensor | None = None) -> None:
         """Advance every world by one step under ``action``, and begin new episodes where one ended.
+
+        ``Worlds.step_phases`` lists what happens, in order.
 
         Args:
             action: Copied into ``env.action`` first, if given; (nworld, nu).
@@ -199,7 +208,8 @@ class Env(Worlds):
         if action is not None:
             check_tensor(action, "action", self.action)
             self.action.copy_(action.detach())
-        self._run(self._whole_step)
+        for call in self.worlds.step:
+            call()
 
     # resets
 
@@ -209,22 +219,26 @@ class Env(Worlds):
         Args:
             mask: Which worlds, (nworld,) bool; all by default.
         """
-        self._set_mask(mask)
-        self._begin_episodes(randomly=False)
+        worlds = self.worlds
+        worlds.set_mask(mask)
+        self.action.masked_fill_(worlds.mask_view[:, None], 0.0)
+        for call in worlds.programs.reset:
+            call()
 
     def rand_reset(self, seed: int | None = None, mask: torch.Tensor | None = None) -> None:
         """Put worlds into random initial states, with zero actions.
 
         Args:
-            seed: Starts the worlds' random streams anew; by default each world goes on with its own.
+            seed: Starts the worlds' random streams anew; by default each world continues its own.
             mask: Which worlds, (nworld,) bool; all by default.
         """
-        self._set_mask(mask)
+        worlds = self.worlds
+        worlds.set_mask(mask)
         if seed is not None:
-            self._seed.fill_(whole_number("seed", seed, low=0))
-            args = [self._mask, self._seed, self._first_world, self._key, self._episode]
-            wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
-        self._begin_episodes(randomly=True)
+            worlds.seed_streams(whole_number("seed", seed, low=0))
+        self.action.masked_fill_(worlds.mask_view[:, None], 0.0)
+        for call in worlds.programs.rand_reset:
+            call()
 
     # the state
 
@@ -232,23 +246,25 @@ class Env(Worlds):
         """Everything that the future depends on, (nworld, state_space.size), float64.
 
         The engine's integration state, fields that are as the last substep left them, the step counter, the
-        random stream and the task's memory; ``state_space.parts`` says where each lies.
+        random stream and the task's memory; ``state_space.parts`` gives the place of each.
 
         Args:
             out: Where to write the states.
             mask: Which worlds' rows of ``out`` to write, (nworld,) bool; all by default.
         """
-        self._record(self._pack)
+        worlds = self.worlds
+        for call in worlds.programs.read_state:
+            call()
         if mask is None or out is None:
-            return self._given(self._state_view, out)
-        check_tensor(out, "out", self._state_view)
-        self._set_mask(mask)
-        return torch.where(self._mask_view[:, None], self._state_view, out, out=out)
+            return _given(worlds.state_view, out)
+        check_tensor(out, "out", worlds.state_view)
+        worlds.set_mask(mask)
+        return torch.where(worlds.mask_view[:, None], worlds.state_view, out, out=out)
 
     def set_state(self, state: torch.Tensor, mask: torch.Tensor | None = None, *, check: bool = True) -> None:
         """Put worlds into states from ``get_state``, exactly; every getter reflects them afterwards.
 
-        The reward becomes 0: no action has led there.
+        The reward becomes 0, because no action led there.
 
         Args:
             state: (nworld, state_space.size), float64.
@@ -258,30 +274,32 @@ class Env(Worlds):
         Raises:
             ValueError: The state has another shape or type, or is not finite.
         """
-        check_tensor(state, "state", self._state_view)
-        self._set_mask(mask)
-        if check and (bad := ~torch.isfinite(state) & self._mask_view[:, None]).any():
+        worlds = self.worlds
+        check_tensor(state, "state", worlds.state_view)
+        worlds.set_mask(mask)
+        if check and (bad := ~torch.isfinite(state) & worlds.mask_view[:, None]).any():
             world, column = bad.nonzero()[0].tolist()
             part = next(name for name, part in self.state_space.parts.items() if part.start <= column < part.stop)
             raise ValueError(
-                f"the state of world {world} has {state[world, column].item()} in its {part!r}: it has to be finite"
+                f"the state of world {world} has {state[world, column].item()} in its {part!r}: it must be finite"
             )
-        self._state_view.copy_(state)
-        self._run(self._unpack)
+        worlds.state_view.copy_(state)
+        for call in worlds.programs.restore_state:
+            call()
 
     # getters and setters of the paper's interface
 
     def get_obs(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
         """Observations of the current states, or of given ones, (nworld, nobs)."""
-        return self._given(self.obs if state is None else self._scratch_at(state).obs, out)
+        return _given(self.obs if state is None else self._scratch_at(state).obs, out)
 
     def get_eval(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
         """The evaluation metric after the last step, or of given states, (nworld,)."""
-        return self._given(self.eval if state is None else self._scratch_at(state).eval, out)
+        return _given(self.eval if state is None else self._scratch_at(state).eval, out)
 
     def get_terminated(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
         """Whether the last step, or given states, end the episode, (nworld,) bool."""
-        return self._given(self.terminated if state is None else self._scratch_at(state).terminated, out)
+        return _given(self.terminated if state is None else self._scratch_at(state).terminated, out)
 
     def get_reward(
         self,
@@ -292,7 +310,7 @@ class Env(Worlds):
     ) -> torch.Tensor:
         """Rewards of the last step, or of given transitions, (nworld,).
 
-        Given transitions are judged in scratch worlds; the live ones are untouched.
+        Given transitions are judged in scratch worlds; the live ones stay untouched.
 
         Args:
             before: States before, (nworld, state_space.size).
@@ -304,26 +322,24 @@ class Env(Worlds):
             ValueError: Only a part of a transition is given, or it has the wrong shape or type.
         """
         if before is None and action is None and after is None:
-            return self._given(self.reward, out)
+            return _given(self.reward, out)
         if before is None or action is None or after is None:
             raise ValueError("a reward belongs to a transition: give before, action and after, or none of them")
         check_tensor(action, "action", self.action)
         if not torch.isfinite(action).all():
             raise ValueError("an action is not finite: such a transition is a fault, and has no reward")
         scratch = self._scratch_at(before)
-        for copy, live in scratch._pairs:
-            wp.copy(copy, live)
+        scratch.worlds.keep_before()
         scratch.set_state(after)
-        torch_view(scratch._safe_action).copy_(action)
-        scratch._judge(scratch._everyone, scratch._no_fault, scratch._no_fault, transition=True)
-        return self._given(scratch.reward, out)
+        scratch.worlds.judge_transition(action)
+        return _given(scratch.reward, out)
 
     def get_action(self, out: torch.Tensor | None = None) -> torch.Tensor:
         """The actions of the next step, (nworld, nu)."""
-        return self._given(self.action, out)
+        return _given(self.action, out)
 
     def set_action(self, action: torch.Tensor) -> None:
-        """Set the actions of the next step, with every check; ``env.action.copy_`` is the way without.
+        """Set the actions of the next step, with every check; ``env.action.copy_`` does it without.
 
         Raises:
             ValueError: The action has another shape or type, or is not finite.
@@ -332,25 +348,15 @@ class Env(Worlds):
         if not torch.isfinite(action).all():
             world, i = (~torch.isfinite(action)).nonzero()[0].tolist()
             name = list(self.action_space.parts)[i]
-            raise ValueError(f"the action {name!r} of world {world} is {action[world, i].item()}: it has to be finite")
+            raise ValueError(f"the action {name!r} of world {world} is {action[world, i].item()}: it must be finite")
         self.action.copy_(action.detach())
-
-    @property
-    def episode_step(self) -> torch.Tensor:
-        """Steps since the reset, (nworld,), int32."""
-        return self._step_view
-
-    @property
-    def time(self) -> torch.Tensor:
-        """Simulated seconds since the reset, (nworld,), float32."""
-        return self.field("time")
 
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
         """A live view of one of the engine's fields, by MuJoCo's name.
 
-        On the C engine it is a copy that every step renews: read it, and write through ``set_state``. Asking for a
-        field that the task does not read costs new recordings, and one of the acceleration stage becomes part of
-        the state from then on: states that were taken before no longer fit.
+        An environment keeps the fields that its task reads, ``time`` and ``ctrl``; name further ones when making it,
+        as in ``make("hopper", fields=["site_xpos"])``. On the C engine the view is a copy that every step renews: read
+        it, and write through ``set_state``.
 
         Args:
             name: Attribute of MjData, for instance "qpos" or "site_xpos".
@@ -358,23 +364,22 @@ class Env(Worlds):
                 site, geom or camera elsewhere.
 
         Raises:
-            ValueError: There is no such field or element, or it takes a sensor and the environment was made without
-                it: see ``fields``.
+            ValueError: The environment does not keep this field, or the model has no such element.
         """
-        if name not in self._views:
-            known = name in self.engine.fields
-            self._views[name] = torch_view(self.engine.field(name))
-            if not known:
-                if self.engine.fields[name].snapshot:
-                    self._allocate_state()
-                    self._scratch = None
-                self._record.forget()
-        view = self._views[name]
+        if name not in self._fields:
+            kept = ", ".join(sorted(self._fields))
+            raise ValueError(
+                f"this environment of {self.task.name!r} does not keep the field {name!r}: make it with "
+                f"fields=[{name!r}] (it keeps {kept})"
+            )
+        view = self._fields[name]
         if element is None:
             return view
         where = elements(self.model, name, element)
         one_object = view.ndim > 2 and not name.startswith("cdof")
         return view[:, where.start] if one_object else view[:, where]
+
+    # parameters and other environments of the same task
 
     def set_params(self, **params: Any) -> None:
         """Change parameters of the task from the next step on, in place.
@@ -382,61 +387,35 @@ class Env(Worlds):
         Raises:
             ValueError: There is no such parameter, or the observation would change its size.
         """
-        previous = self.task.params
-        self.task.params = previous | self.task.checked_params(params)
-        try:
-            same = self.task.layout() == self.task.obs_layout
-        except ValueError:  # one value a world, where the layout wants a single one
-            same = False
-        if not same:
-            self.task.params = previous
-            raise ValueError(f"{', '.join(params)} would change the observation's parts: make a new environment")
-        self._given_params |= params
-        changed = self.task.params_array(self.device)
-        if changed.shape == self._params.shape:
-            wp.copy(self._params, changed)
-        else:
-            self._params = changed
-            self._record.forget()
+        self.task.change_params(params)
+        self._given_params = self._given_params | params
+        self.worlds.update_params()
         self._scratch = None
 
     def follow(self, other: "Env") -> None:
         """Take over the parameters of another environment of the same task, as ``replicate`` does."""
         self.set_params(**other._params_for(self.nworld))
 
-    @property
-    def bytes_per_world(self) -> float:
-        """Memory that a world takes, in bytes: of every array behind this environment, its share.
-
-        The model, which all worlds share, is not counted, nor are arrays that MuJoCo Warp makes within a recording or
-        what an MjData's arena holds. Scratch worlds, which judge given states, count once they exist.
-        """
-        return (bytes_of(self) - self.engine.shared_bytes + self.engine.hidden_bytes) / self.nworld
-
-    @property
-    def fault_counts(self) -> dict[str, int]:
-        """How often each kind of fault has happened since construction; waits for the device."""
-        counts = self._fault_count.numpy()
-        return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
-
     def replicate(self, *, nworld: int | None = None, **changes: Any) -> "Env":
-        """Another environment of the same task with the same options and parameters, but for the given changes.
+        """Another environment of the same task with the same options and parameters, except for the given changes.
 
-        Where a parameter has one value a world and the number of worlds differs, the values go round.
+        Where a parameter has one value a world and the number of worlds differs, its values are repeated.
         """
         nworld = self.nworld if nworld is None else nworld
-        options = self._options | {"horizon": self.horizon, "autoreset": self.autoreset}
-        return Env(self.task.task, nworld=nworld, **(options | self._params_for(nworld) | changes))
+        known, params = EnvOptions.split(changes, self._own_options())
+        return Env(self.task.task, known.changed({"nworld": nworld}), **(self._params_for(nworld) | params))
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
         """``replicate`` for a few worlds, such as an evaluation's.
 
-        On a GPU a step of a few worlds takes nearly as long as one of thousands. Where the choice was left to
-        engine="auto", they step on CPU cores through the C engine, in double precision.
+        On a GPU a step of a few worlds takes nearly as long as one of thousands. Where engine="auto" leaves the
+        choice, they step on CPU cores through the C engine, in double precision.
         """
-        if self.device.is_cpu or self._options["engine"] != "auto":
-            return self.replicate(nworld=nworld, **changes)
-        return self.replicate(nworld=nworld, **(ON_CPU_CORES | changes))
+        return self.replicate(nworld=nworld, **(few_worlds(self.options.engine, self.device) | changes))
+
+    def _own_options(self) -> EnvOptions:
+        current = {"horizon": self.horizon, "autoreset": self.autoreset, "seed": 0, "first_world": 0}
+        return self.options.changed(current)
 
     def _params_for(self, nworld: int) -> dict[str, Any]:
         params = {}
@@ -445,19 +424,59 @@ class Env(Worlds):
             params[name] = value[np.arange(nworld) % self.nworld] if isinstance(value, np.ndarray) else given
         return params
 
-    # helpers
-
     def _scratch_at(self, given: torch.Tensor) -> "Env":
-        """Worlds of the same task for judging given states; made when first needed."""
+        """Worlds of the same task in given states; made when first needed."""
         if self._scratch is None:
             self._scratch = self.replicate()
-            for name in self.engine.fields:
-                self._scratch.field(name)
         self._scratch.set_state(given)
         return self._scratch
 
-    def _given(self, values: torch.Tensor, out: torch.Tensor | None) -> torch.Tensor:
-        if out is None:
-            return values.clone()
-        check_tensor(out, "out", values)
-        return out.copy_(values)
+    # diagnostics
+
+    @property
+    def bytes_per_world(self) -> float:
+        """Memory that one world takes, in bytes: an estimate, without the model, which all worlds share."""
+        return self.engine.bytes_per_world + self.worlds.bytes_per_world
+
+    @property
+    def fault_counts(self) -> dict[str, int]:
+        """How often each kind of fault has happened since construction; waits for the device."""
+        counts = self.worlds.fault_count.numpy()
+        return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
+
+
+make.__signature__ = signature_of_options(make)  # type: ignore[attr-defined]
+
+
+def _given(values: torch.Tensor, out: torch.Tensor | None) -> torch.Tensor:
+    if out is None:
+        return values.clone()
+    check_tensor(out, "out", values)
+    return out.copy_(values)
+
+
+# A forked child has none of the threads that the engines run on, and would wait for them without end.
+
+_live: "weakref.WeakSet[Env]" = weakref.WeakSet()
+_lost: list[object] = []
+
+
+class _LostWorlds:
+    """Stands in for the worlds of an environment in a forked child."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise RuntimeError(
+            "this environment was made before the process was forked, and its engine's threads stayed in the parent: "
+            "make it in the child, or start children with multiprocessing.get_context('spawn')"
+        )
+
+
+def _after_fork() -> None:
+    for env in _live:
+        _lost.append(env.worlds)  # never destroyed here: its engine would wait for its threads
+        _lost.append(env.engine)
+        env.worlds = _LostWorlds()  # type: ignore[assignment]
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)

@@ -1,31 +1,34 @@
 """Open-loop roll-outs: a horizon of given actions in every world, judged by the task."""
 
-from collections.abc import Callable, Hashable
+from functools import partial
 
 import torch
 import warp as wp
 
 from lyceum_warp.arrays import launch_rows, torch_view
+from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
+from lyceum_warp.graphs.sequence import Phase
 from lyceum_warp.kernels import planning, state
 from lyceum_warp.spaces import COUNTERS
 from lyceum_warp.validate import whole_number
 
 
+@document_attributes
 class OpenLoop:
-    """Rolls out the worlds of an environment from one state under given actions, and keeps what they earn.
+    """Rolls out the worlds of an environment from one state under given actions, and keeps their rewards.
 
     Write ``state`` and ``actions``, call ``run``, read the rest; every tensor stays the same object. Episodes do not
-    end along the way: what a task's termination means is for the caller to say. The engine takes the whole horizon at
-    once: on the C engine a single native call where its records are exact and the task maps no actions itself, on
-    the Warp engine launches that become one recording.
+    end on the way: the caller decides what a task's termination means. The engine takes the whole horizon at once: on
+    the C engine as a single native call where its results are exact and the task maps no actions itself, on the Warp
+    engine as launches that become one graph.
 
     Args:
-        env: Worlds to roll out in; they are the roll-outs' own from then on.
+        env: Worlds to roll out in; they belong to the roll-outs from then on.
         horizon: Steps.
 
     Raises:
-        ValueError: The environment resets its worlds by itself.
+        ValueError: The environment resets its worlds automatically.
     """
 
     state: torch.Tensor
@@ -39,12 +42,14 @@ class OpenLoop:
     final_obs: torch.Tensor
     """Observations after the last step, (nworld, nobs)."""
     fault: torch.Tensor
-    """Bits of ``Done`` for what went wrong in a world, (nworld,) int32: what it earned then means nothing."""
+    """Bits of ``Done`` for the faults of a world, (nworld,) int32: with any, its rewards mean nothing."""
+    phases: tuple[Phase, ...]
+    """What ``run`` does, in order, for a caller that puts more into the same graph."""
 
     def __init__(self, env: Env, horizon: int) -> None:
         if env.autoreset:
             raise ValueError("open-loop roll-outs need worlds that do not reset: make(..., autoreset=False)")
-        self.env = env
+        self.env, self.worlds = env, env.worlds
         self.horizon = whole_number("horizon", horizon, low=1)
         n, nu, task = env.nworld, env.action_space.size, env.task
         rows = self.horizon * n
@@ -56,107 +61,102 @@ class OpenLoop:
             self._terminated = wp.zeros(rows, dtype=bool)
             self._fault = wp.zeros(n, dtype=int)
             self._obs = wp.zeros((n, env.obs_space.size), dtype=float)
-            self._records: dict[str, wp.array] = {}
+            # each field for all steps: the states before a step, after it, and the last ones are views of one buffer
+            self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
-            for name in task.fields:
-                live = getattr(env._after, name)
-                record: wp.array = wp.zeros((rows + n, *live.shape[1:]), dtype=live.dtype)
-                self._records[name] = record.reshape((self.horizon + 1, *live.shape))
+            for name in task.types:
+                live = getattr(self.worlds.after, name)
+                buffer: wp.array = wp.zeros((rows + n, *live.shape[1:]), dtype=live.dtype)
+                self._fields[name] = buffer.reshape((self.horizon + 1, *live.shape))
                 for batch, start in ((self._before, 0), (self._after, n), (self._last, rows)):
-                    setattr(batch, name, record[start : min(start + rows, rows + n)])
-        self._memory = self._records.pop("memory", None)
+                    setattr(batch, name, buffer[start : min(start + rows, rows + n)])
+        self._memory = self._fields.pop("memory", None)
         self.state, self.actions = torch_view(self._state), torch_view(self._actions)
         self.reward = torch_view(self._reward).view(self.horizon, n)
         self.terminated = torch_view(self._terminated).view(self.horizon, n)
         self.fault, self.final_obs = torch_view(self._fault), torch_view(self._obs)
-
-    def record(self, function: Callable[..., None], *args: Hashable) -> None:
-        """Call a function made of launches, recorded once for the same arguments and replayed."""
-        self.env._record(function, *args)
-
-    def record_all(self, function: Callable[..., None], *args: Hashable) -> None:
-        """Call a function made of launches, ``record`` and ``run``: one recording where the engine can be recorded."""
-        self.env._run(function, *args)
+        self.phases = self._whole_horizon() if task.functions["control"] is None else self._step_by_step()
+        self._calls = self.worlds.programs.graphs.sequence(self.phases)
 
     def run(self) -> None:
-        """Roll out.
+        """Roll out."""
+        for call in self._calls:
+            call()
 
-        Raises:
-            ValueError: A field was asked for that became part of the state, so that ``state`` no longer fits.
-        """
-        env = self.env
-        if env.state_space.size != self.state.numel():
-            raise ValueError(
-                f"a field of {env.task.name!r} that was asked for later has made its states longer: ask for it before"
-            )
-        self.record(self._begin)
-        if env.task.functions["control"] is None:
-            env.engine.rollout(env._state, self._controls, env.task.frame_skip, self._records)
-            self.record(self._judge)
-        else:
-            self._step_by_step()
+    def _whole_horizon(self) -> tuple[Phase, ...]:
+        physics = partial(
+            self.env.engine.rollout, self.worlds.state, self._controls, self.env.task.frame_skip, self._fields
+        )
+        return (
+            Phase("start", self._start),
+            Phase("physics", physics, engine=True),
+            Phase("judge", self._judge_rows),
+        )
 
-    def _begin(self) -> None:
-        """The start in every world, and the controls of all steps."""
-        env = self.env
-        wp.launch(planning.broadcast, env._state.shape, [self._state, env._state], device=env.device)
-        rest = env._state[:, env.engine.state_size :]
-        counters = [env._everyone, rest, env._step, env._key, env._episode, env._out.done_reason]
-        wp.launch(state.unpack_counters, env.nworld, counters, device=env.device)
+    def _step_by_step(self) -> tuple[Phase, ...]:
+        """For a task that maps actions to controls itself: it must see the state that each step starts from."""
+        engine, worlds = self.env.engine, self.worlds
+        phases = [
+            Phase("start", self._start),
+            Phase("reset", partial(engine.reset, worlds.everyone)),
+            Phase("restore", partial(engine.set_state, worlds.state, worlds.everyone), engine=True),
+        ]
+        for t in range(self.horizon):
+            phases += [
+                Phase("act", partial(self._act, t)),
+                Phase("physics", partial(engine.step, self.env.task.frame_skip), engine=True),
+                Phase("judge", partial(self._judge_step, t)),
+            ]
+        return (*phases, Phase("end", partial(self._end, worlds.after)))
+
+    def _start(self) -> None:
+        """Put every world at the start, and map the actions of all steps to controls."""
+        worlds, device = self.worlds, self.env.device
+        wp.launch(planning.broadcast, worlds.state.shape, [self._state, worlds.state], device=device)
+        rest = worlds.state[:, self.env.engine.state_size :]
+        worlds.restore_counters(worlds.everyone, rest)
         if self._memory is not None:
-            launch_rows(state.narrow, env._everyone, rest[:, len(COUNTERS) :], env._memory)
-            wp.copy(self._memory[0], env._memory)
+            launch_rows(state.narrow, worlds.everyone, rest[:, len(COUNTERS) :], worlds.memory)
+            wp.copy(self._memory[0], worlds.memory)
         self._fault.zero_()
-        args = [self._actions, env._ranges, env._scale, self._fault, self._controls]
-        wp.launch(planning.controls, self._actions.shape[:2], args, device=env.device)
+        args = [self._actions, worlds.ranges, worlds.scale, self._fault, self._controls]
+        wp.launch(planning.controls, self._actions.shape[:2], args, device=device)
 
-    def _judge(self) -> None:
-        """What the recorded transitions earn."""
-        env, kernels = self.env, self.env.task.kernels
+    def _judge_rows(self) -> None:
+        """Judge the transitions of the whole horizon."""
+        worlds, kernels, device = self.worlds, self.env.task.kernels, self.env.device
         actions = self._actions.reshape((-1, self._actions.shape[2]))
-        transition = [self._before, self._after, env._params, actions]
-        if self._memory is not None and kernels.recall is None:  # it stays as it was at the reset
+        transition = [self._before, self._after, worlds.params, actions]
+        if self._memory is not None and kernels.advance_rows is None:  # it stays as it was at the reset
             for t in range(self.horizon):
                 wp.copy(self._memory[t + 1], self._memory[0])
         elif self._memory is not None:
-            counters = [env._step, env._key, env._episode]
+            counters = [worlds.steps, worlds.key, worlds.episode]
             memory = self._memory.reshape((-1, self._memory.shape[2]))
-            wp.launch(kernels.recall, env.nworld, [*transition, *counters, memory, env._rng], device=env.device)
-        wp.launch(kernels.gains, len(actions), [*transition, self._reward, self._terminated], device=env.device)
+            args = [*transition, *counters, memory, worlds.rng]
+            wp.launch(kernels.advance_rows, self.env.nworld, args, device=device)
+        wp.launch(kernels.judge_rows, len(actions), [*transition, self._reward, self._terminated], device=device)
         self._end(self._last)
 
-    def _end(self, batch: object) -> None:
-        env = self.env
-        env.engine.find_faults(env._everyone)
-        wp.launch(planning.merge_faults, env.nworld, [env.engine.fault, self._fault], device=env.device)
-        args = [env._everyone, batch, env._params, self._obs]
-        wp.launch(env.task.kernels.look, env.nworld, args, device=env.device)
-
-    # where the task maps actions to controls itself, it has to see the state that each step starts from
-
-    def _step_by_step(self) -> None:
-        env = self.env
-        env.engine.reset(env._everyone)
-        env.engine.set_state(env._state, env._everyone)
-        for t in range(self.horizon):
-            env._record(self._act, t)
-            env.engine.step(env.task.frame_skip)
-            env._record(self._judge_step, t)
-        self.record(self._end_of_steps)
-
     def _act(self, t: int) -> None:
-        wp.copy(self.env._action, self._actions[t])
-        self.env._begin()
+        wp.copy(self.worlds.action, self._actions[t])
+        self.worlds.act()
 
     def _judge_step(self, t: int) -> None:
-        env, n = self.env, self.env.nworld
-        kernels = env.task.kernels
-        transition = [env._before, env._after, env._params, self._actions[t]]
-        if kernels.remember is not None:
-            counters = [env._step, env._key, env._episode]
-            wp.launch(kernels.remember, n, [*transition, *counters, env._rng], device=env.device)
-        earned = [self._reward[t * n : (t + 1) * n], self._terminated[t * n : (t + 1) * n]]
-        wp.launch(kernels.gains, n, [*transition, *earned], device=env.device)
+        worlds, n, device = self.worlds, self.env.nworld, self.env.device
+        kernels = self.env.task.kernels
+        transition = [worlds.before, worlds.after, worlds.params, self._actions[t]]
+        if kernels.advance_memory is not None:
+            args = [*transition, worlds.steps, worlds.key, worlds.episode, worlds.rng]
+            wp.launch(kernels.advance_memory, n, args, device=device)
+        rows = slice(t * n, (t + 1) * n)
+        args = [*transition, self._reward[rows], self._terminated[rows]]
+        wp.launch(kernels.judge_rows, n, args, device=device)
 
-    def _end_of_steps(self) -> None:
-        self._end(self.env._after)
+    def _end(self, batch: object) -> None:
+        """Collect the worlds' faults, and observe where they ended."""
+        worlds, n, device = self.worlds, self.env.nworld, self.env.device
+        self.env.engine.find_faults(worlds.everyone)
+        wp.launch(planning.merge_faults, n, [self.env.engine.fault, self._fault], device=device)
+        args = [worlds.everyone, batch, worlds.params, self._obs]
+        wp.launch(self.env.task.kernels.observe_worlds, n, args, device=device)

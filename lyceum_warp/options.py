@@ -6,6 +6,7 @@ misspelt words all read these two classes. A new option is a new field here, and
 
 import dataclasses
 import difflib
+import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -27,6 +28,11 @@ INTEGRATORS = {
 }
 SOLVER_LIMITS = {"iterations": 1, "ls_iterations": 1, "noslip_iterations": 0}
 """The limits of the constraint solver that ``solver`` accepts, with the smallest value of each."""
+
+
+def _for_engine(default: Any) -> Any:
+    """A field of an option that the engine's constructor takes."""
+    return dataclasses.field(default=default, metadata={"engine": True})
 
 
 def _given(options: Any) -> dict[str, Any]:
@@ -77,14 +83,14 @@ class PhysicsOptions:
     solver: Mapping[str, int] | None = None
     """Limits of the constraint solver: any of iterations, ls_iterations (of its line search) and noslip_iterations
     (0 turns the noslip solver off)."""
-    nconmax: int | None = None
+    nconmax: int | None = _for_engine(None)
     """Contacts that the Warp engine has room for in each world, on average; by default twice the peak of a probe."""
-    njmax: int | None = None
+    njmax: int | None = _for_engine(None)
     """Constraints that the Warp engine has room for in each world; by default twice the peak of a probe."""
-    deterministic: bool = False
+    deterministic: bool = _for_engine(False)
     """Make two runs on a CUDA device equal to the bit. Costs 5 to 18 times the time and 5 to 7 times the memory on
     hopper, half_cheetah and humanoid. Runs on the CPU are always equal to the bit."""
-    unroll: bool = False
+    unroll: bool = _for_engine(False)
     """Unroll the solver's iterations in the Warp engine instead of a loop that ends with the last world's. The numbers
     stay the same. Needs a solver limit of at most 20 iterations; with 4 it gained 3 to 5 % on half_cheetah and
     humanoid and lost 1 to 2 % on hopper. The C engine ignores it."""
@@ -120,7 +126,7 @@ class EnvOptions:
     engine: str | Callable[..., Any] = "auto"
     """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU. Also a callable
     with the signature of ``lyceum_warp.engines.base.Engine``, for an engine of your own."""
-    nthread: int | None = None
+    nthread: int | None = _for_engine(None)
     """Threads of the C engine; by default all cores."""
     seed: int = 0
     """Seed of the worlds' random streams."""
@@ -156,10 +162,16 @@ class EnvOptions:
         object.__setattr__(self, "fields", tuple(self.fields))
 
     @classmethod
-    def split(cls, words: Mapping[str, Any]) -> tuple["EnvOptions", dict[str, Any]]:
-        """Sort the keyword arguments of a flat call into options and everything else, the task's parameters."""
+    def split(cls, words: Mapping[str, Any], base: "EnvOptions | None" = None) -> tuple["EnvOptions", dict[str, Any]]:
+        """Sort the keyword arguments of a flat call into options and everything else, the task's parameters.
+
+        Args:
+            words: The keyword arguments.
+            base: The options that they change; by default the defaults.
+        """
         rest = {name: value for name, value in words.items() if name not in OPTIONS}
-        return cls().changed({name: value for name, value in words.items() if name in OPTIONS}), rest
+        options = {name: value for name, value in words.items() if name in OPTIONS}
+        return (base or cls()).changed(options), rest
 
     def changed(self, words: Mapping[str, Any]) -> "EnvOptions":
         """The same options with some changed, those of the physics included, all by name."""
@@ -168,6 +180,11 @@ class EnvOptions:
         if physics:
             others["physics"] = dataclasses.replace(others.get("physics", self.physics), **physics)
         return dataclasses.replace(self, **others)
+
+    def for_engine(self) -> dict[str, Any]:
+        """The options that the engine's constructor takes, by name."""
+        both = [(options, field) for options in (self, self.physics) for field in dataclasses.fields(options)]
+        return {field.name: getattr(options, field.name) for options, field in both if field.metadata.get("engine")}
 
     def given(self) -> dict[str, Any]:
         """The options that differ from their defaults, those of the physics included, by name."""
@@ -200,3 +217,18 @@ def suggestion(word: str, others: Iterable[str] = ()) -> str:
     """
     close = [_OTHER_WORDS[word]] if word in _OTHER_WORDS else difflib.get_close_matches(word, [*others, *OPTIONS], 3)
     return f"did you mean {' or '.join(close)}?" if close else ""
+
+
+def signature_of_options(function: Callable[..., Any]) -> inspect.Signature:
+    """The signature of a flat call, with every option in place of its ``**options``."""
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    options = [
+        inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type)
+        for kind in (EnvOptions, PhysicsOptions)
+        for field in dataclasses.fields(kind)
+        if field.name != "physics"
+    ]
+    rest = inspect.Parameter("params", inspect.Parameter.VAR_KEYWORD, annotation=Any)
+    signature = inspect.signature(function)
+    positional = [p for p in signature.parameters.values() if p.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD]
+    return signature.replace(parameters=[*positional, *options, rest])

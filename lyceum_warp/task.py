@@ -1,10 +1,15 @@
-"""Task: what a user writes."""
+"""Task: what a user writes, and the one table of its functions."""
 
+import dataclasses
+import inspect
 import sys
+import textwrap
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import warp as wp
+
+from lyceum_warp.docstrings import document_attributes
 
 if TYPE_CHECKING:
     T = TypeVar("T")
@@ -21,18 +26,69 @@ else:
     Row = wp.array
 
 
-FUNCTIONS = (
-    "observe",
-    "control",
-    "reward",
-    "evaluate",
-    "terminated",
-    "success",
-    "initialize",
-    "randomize",
-    "advance",
-)
-"""The functions of a task."""
+@dataclasses.dataclass(frozen=True)
+class TaskFunction:
+    """One of a task's functions: how it is written and what happens without it."""
+
+    name: str
+    arguments: str
+    """The arguments as they are written in a task's file."""
+    result: type | None
+    """What it returns: float, bool, or None for a function that writes into its arguments."""
+    about: str
+    """What it is for, and its default, for the documentation."""
+    default: str | None = None
+    """The body of the function that stands in for it; None where it is required."""
+
+    @property
+    def signature(self) -> str:
+        """The line that defines it, without ``def``."""
+        return f"{self.name}({self.arguments})" + (f" -> {self.result.__name__}" if self.result else "")
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The annotations of its arguments, in order."""
+        return tuple(argument.partition(": ")[2] for argument in self.arguments.split(", "))
+
+
+_TRANSITION = "s0: World, action: Row[float], s1: World, p: Params"
+
+FUNCTIONS = {
+    function.name: function
+    for function in (
+        TaskFunction("observe", "s: World, p: Params, obs: Row[float]", None,
+                     "Writes the observation. The only function that is required."),
+        TaskFunction("control", "s: World, action: Row[float], p: Params, ctrl: Row[float]", None,
+                     "Turns an action into controls. Default: copies it, or scales it (see ``action_range``).", "pass"),
+        TaskFunction("reward", _TRANSITION, float,
+                     "Reward of one transition. ``s1.memory`` is already that of ``advance``. Default: 0.",
+                     "return 0.0"),
+        TaskFunction("evaluate", "s: World, p: Params", float,
+                     "The evaluation metric, separate from the reward. Default: the reward.", "return 0.0"),
+        TaskFunction("terminated", "s: World, p: Params", bool,
+                     "Whether the state ends the episode. Default: False.", "return False"),
+        TaskFunction("success", "s: World, p: Params", bool,
+                     "Whether the task's goal is met. Default: False.", "return False"),
+        TaskFunction("initialize", "s: World, p: Params", None,
+                     "Changes the fixed initial state, the model's own. Default: keeps it.", "pass"),
+        TaskFunction("randomize", "s: World, p: Params, rng: Row[wp.uint32]", None,
+                     "Turns the fixed initial state into a random one. Default: keeps it.", "pass"),
+        TaskFunction("advance", f"{_TRANSITION}, rng: Row[wp.uint32]", None,
+                     "Writes task memory, ``s1.memory``, after each step and before ``reward``. Default: keeps it.",
+                     "pass"),
+    )
+}  # fmt: skip
+"""The functions of a task, by name. Checks, kernels, error messages and ``help(lw.Task)`` are made from this table."""
+
+
+def _document_functions(cls: type["Task"]) -> type["Task"]:
+    """Class decorator: put the table of functions into the docstring."""
+    rows = []
+    for function in FUNCTIONS.values():
+        rows += [f"    {function.signature}", *textwrap.wrap(function.about, 108, initial_indent=" " * 8,
+                                                              subsequent_indent=" " * 8)]  # fmt: skip
+    cls.__doc__ = inspect.cleandoc(cls.__doc__ or "").replace("{functions}", "\n".join(rows))
+    return cls
 
 
 class Element(int):
@@ -83,53 +139,54 @@ def mocap(body: str) -> int:
     return Element("mocap_pos", body)
 
 
+@_document_functions
+@document_attributes
 class Task:
     """A model, the fields that are read, and a few functions of one world.
 
-    A subclass names its model and the parts of its observation. Its module holds two Warp structs, ``World``
-    (the fields that the functions read, by MuJoCo's names) and ``Params`` (the keyword arguments of ``make``,
-    with defaults), and the functions, each a ``wp.func``. Either may also be an attribute of the class.
+    A subclass names its model and the parts of its observation. Its module holds two Warp structs, ``World`` (the
+    fields that the functions read, by MuJoCo's names) and ``Params`` (the keyword arguments of ``make``, with
+    defaults; ``dt``, the seconds in a step, is filled in), and the functions, each a ``wp.func``. Each of these may
+    also be an attribute of the class.
 
-    =============================================== =====================================================
-    ``observe(s, p, obs)``                          fills the observation; the only one that is required
-    ``reward(s0, action, s1, p) -> float``          of one transition; default 0
-    ``evaluate(s, p) -> float``                     the evaluation metric; default: the reward
-    ``terminated(s, p) -> bool``                    default False
-    ``success(s, p) -> bool``                       default False
-    ``control(s, action, p, ctrl)``                 action to controls; default: copy (see ``action_range``)
-    ``initialize(s, p)``                            changes the fixed initial state, the model's own
-    ``randomize(s, p, rng)``                        turns the fixed initial state into a random one
-    ``advance(s0, action, s1, p, rng)``             the only writer of task memory, ``s1.memory``
-    =============================================== =====================================================
+    Functions:
+    {functions}
 
-    Controls are clipped to the model's ranges; costs see the action as given. ``rng`` is drawn from with
-    ``uniform`` and ``normal``. ``initialize`` and ``randomize`` may write qpos, qvel, act, mocap_pos,
-    mocap_quat, userdata and memory where ``World`` lists them; positions and the like (``xpos``, ``site_xpos``,
-    ``sensordata``) are computed only after them, so that these two must not read any.
+    ``s``, ``s0`` and ``s1`` are one world's fields: now, before the step, and after it. Positions, velocities and
+    their like belong to that state; quantities of the acceleration stage (forces, accelerations) are those of the
+    last substep. Controls are clipped to the model's ranges; costs see the action as given. ``rng`` is the world's
+    random stream: pass it to ``lw.uniform`` and ``lw.normal``.
+
+    ``initialize`` and ``randomize`` may write qpos, qvel, act, mocap_pos, mocap_quat, userdata and memory where
+    ``World`` lists them. They must not read positions and their like (``xpos``, ``site_xpos``, ``sensordata``), which
+    are computed afterwards.
+
+    Quaternions in fields are in MuJoCo's order w, x, y, z; Warp's own quaternion functions expect x, y, z, w.
     """
 
     model: ClassVar[Any]
-    """A file (relative to the task's own file, or one that gymnasium ships), an MjSpec, or a static method
-    without arguments that makes one."""
+    """The model: a file (relative to the task's own file, or one that gymnasium ships), an MjSpec, or a static method
+    without arguments that returns one."""
     frame_skip: ClassVar[int] = 1
-    """Physics substeps in a step."""
+    """Substeps in a step."""
     obs: ClassVar[Any]
-    """The observation's parts and their sizes, in order; or a static method of the Params that gives them."""
+    """The observation's parts and their sizes, in order, as ``{"position": 5, "velocity": 6}``; or a static method of
+    the Params that returns them."""
     horizon: ClassVar[int] = 1000
     """Steps after which an episode is truncated; 0 for never."""
     lagged: ClassVar[tuple[str, ...]] = ()
-    """Fields wanted as ``mj_step`` leaves them, one substep behind the state, as in some Gymnasium tasks."""
+    """Fields to read as ``mj_step`` leaves them, one substep behind the state, as some Gymnasium tasks do."""
     memory: ClassVar[int] = 0
-    """Floats that the task remembers, in the field ``memory``."""
+    """Number of floats in the field ``memory``, which the task writes in ``advance`` and which belongs to the state."""
     action_range: ClassVar[tuple[float, float] | None] = None
-    """The range of an action that the default ``control`` maps to the model's control ranges; None: actions
-    are controls."""
+    """The range of an action that the default ``control`` scales to the model's control ranges; None: actions are
+    controls."""
     planning: ClassVar[Mapping[str, Any]] = {}
     """What suits this task of MPPI's arguments (horizon, samples, temperature, noise, ...), and options or
     parameters for the planner's worlds alone."""
 
+    # World, Params and functions of the class's module when the class was made
     scope: ClassVar[dict[str, Any]] = {}
-    """What the class's module held by the names above when the class was made."""
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)

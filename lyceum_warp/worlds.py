@@ -1,6 +1,10 @@
-"""The arrays of an environment, and the order in which a step's launches follow one another."""
+"""Worlds: the arrays of an environment, and the phases of a step, a reset, and a state that is read or restored.
 
-from collections.abc import Callable, Hashable
+The order of a step is the list in ``Worlds.step_phases``, and stands nowhere else.
+"""
+
+import dataclasses
+from functools import partial
 
 import torch
 import warp as wp
@@ -8,231 +12,269 @@ import warp as wp
 from lyceum_warp.arrays import launch_rows, torch_view
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.done import FAULTS
-from lyceum_warp.engines import Engine
+from lyceum_warp.engines.base import Engine
 from lyceum_warp.fields import Stage
-from lyceum_warp.graphs.recorder import Recorder
+from lyceum_warp.graphs.sequence import Calls, Graphs, Phase
 from lyceum_warp.kernels import random, state, steps
+from lyceum_warp.options import EnvOptions
 from lyceum_warp.spaces import COUNTERS, Space, action_space, control_map, state_space
 from lyceum_warp.validate import check_tensor
 
-PHASES = {
-    "_begin": "act", "step": "physics", "_judge_step": "judge", "_restart": "restart", "refresh": "refresh",
-    "_look": "look", "_judge_state": "judge",
-}  # fmt: skip
-"""What a profiler calls the functions that a step is made of."""
+
+@dataclasses.dataclass(frozen=True)
+class Programs:
+    """The phases of an environment as calls, for one horizon, one way to reset, and one choice about graphs."""
+
+    graphs: Graphs
+    step: Calls
+    reset: Calls
+    rand_reset: Calls
+    read_state: Calls
+    restore_state: Calls
 
 
 class Worlds:
-    """What ``Env`` is made of: its arrays, and functions made of launches and calls of the engine.
+    """Many worlds of one task on one engine: arrays of fixed address, and the phases that work on them.
 
-    A function whose launches stay the same is recorded and replayed. On an engine that can be recorded that is
-    the whole step; on others the launches between two of the engine's calls.
+    Every method that a phase names launches the same kernels on the same arrays each time.
+
+    Args:
+        task: The task, bound to its model and parameters.
+        engine: Its physics, which keeps the task's fields.
+        options: Options of the environment.
     """
 
-    nworld: int
-    device: wp.Device
-    task: BoundTask
-    engine: Engine
-    action: torch.Tensor
-    _horizon: int
-    _autoreset: bool
-    _record: Recorder
+    def __init__(self, task: BoundTask, engine: Engine, options: EnvOptions) -> None:
+        self.task, self.engine, self.device, self.nworld = task, engine, engine.device, engine.nworld
+        self.first_world = options.first_world
+        with wp.ScopedDevice(self.device):
+            self._allocate()
+        self._nvtx = options.nvtx
+        self._programs: dict[tuple[int, bool, bool], Programs] = {}
+        horizon = task.task.horizon if options.horizon is None else options.horizon
+        self.configure(horizon=horizon, autoreset=options.autoreset, graphs=options.graphs)
 
     def _allocate(self) -> None:
-        """Make every array; nothing is made after this."""
-        n, nu, task, kernels = self.nworld, self.engine.model.nu, self.task.task, self.task.kernels
-        self._memory, self._no_memory = wp.zeros((n, task.memory), dtype=float), wp.zeros((n, task.memory), dtype=float)
-        self._params = self.task.params_array(self.device)
-        # the fields of the state that a step leads to, live, and copies of those that it came from
-        self._after, self._before = kernels.Batch(), kernels.Batch()
-        self._pairs: list[tuple[wp.array, wp.array]] = []
-        for name in self.task.fields:
-            live = self._memory if name == "memory" else self.engine.field(name, lagged=name in task.lagged)
+        """Make every array; a step, a reset or a restored state makes no other."""
+        n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
+        # the fields of the state that a step leads to, live, and copies of those of the state before
+        self.memory = wp.zeros((n, task.memory), dtype=float)
+        self.after, self.before = kernels.Batch(), kernels.Batch()
+        self.pairs: list[tuple[wp.array, wp.array]] = []
+        for name in self.task.types:
+            live = self.memory if name == "memory" else self.engine.arrays[name]
             self.task.check_field(name, live)
             copy = wp.zeros_like(live)
-            setattr(self._after, name, live)
-            setattr(self._before, name, copy)
-            self._pairs.append((copy, live))
+            setattr(self.after, name, live)
+            setattr(self.before, name, copy)
+            self.pairs.append((copy, live))
+        self._no_memory = wp.zeros((n, task.memory), dtype=float)
+        self.params = self.task.parameters.array(self.device)
 
-        for name in self.task.further:
-            self.engine.field(name)
-
-        self.action_space = action_space(self.engine.model, task.action_range)
+        self.action_space = action_space(model, task.action_range)
         self.obs_space = Space.of(self.task.obs_layout)
-        self.reward_space = self.eval_space = Space()
+        self.state_space = state_space(model, self.engine.snapshots, task.memory)
 
-        self._out = steps.Outcome()
+        self.outcome = steps.Outcome()
+        self.buffers: dict[str, torch.Tensor] = {}
         for name, dtype in steps.OUTCOMES.items():
             shape = (n, self.obs_space.size) if name in ("obs", "final_obs") else n
             array: wp.array = wp.zeros(shape, dtype=dtype)
-            setattr(self._out, name, array)
-            setattr(self, name, torch_view(array))
-        self._action, self._safe_action = wp.zeros((n, nu), dtype=float), wp.zeros((n, nu), dtype=float)
-        self.action = torch_view(self._action)
-        ranges, scale = control_map(self.engine.model, task.action_range)
-        self._ranges: wp.array = wp.array(ranges, dtype=float)
-        self._scale: wp.array = wp.array(scale, dtype=float)
+            setattr(self.outcome, name, array)
+            self.buffers[name] = torch_view(array)
+        nu = self.action_space.size
+        self.action, self.safe_action = wp.zeros((n, nu), dtype=float), wp.zeros((n, nu), dtype=float)
+        self.buffers["action"] = torch_view(self.action)
+        ranges, scale = control_map(model, task.action_range)
+        self.ranges: wp.array = wp.array(ranges, dtype=float)
+        self.scale: wp.array = wp.array(scale, dtype=float)
 
-        self._step, self._episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
-        self._key, self._rng = wp.zeros(n, dtype=wp.uint32), wp.zeros((n, 1), dtype=wp.uint32)
+        self.steps, self.episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
+        self.key, self.rng = wp.zeros(n, dtype=wp.uint32), wp.zeros((n, 1), dtype=wp.uint32)
         self._seed = wp.zeros(1, dtype=int)
         self._action_fault, self._no_fault = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
-        self._fault_count = wp.zeros(int(FAULTS).bit_length(), dtype=int)
-        self._everyone, self._mask = wp.full(n, True, dtype=bool), wp.zeros(n, dtype=bool)
-        self._restarting = wp.zeros(n, dtype=bool)
-        self._mask_view, self._step_view = torch_view(self._mask), torch_view(self._step)
-        self._allocate_state()
+        self.fault_count = wp.zeros(int(FAULTS).bit_length(), dtype=int)
+        self.everyone, self.mask = wp.full(n, True, dtype=bool), wp.zeros(n, dtype=bool)
+        self.restarting = wp.zeros(n, dtype=bool)
+        self.state = wp.zeros((n, self.state_space.size), dtype=wp.float64)
+        self.mask_view, self.state_view = torch_view(self.mask), torch_view(self.state)
 
-    def _allocate_state(self) -> None:
-        """Make the state vector, for the fields that the engine keeps in it now."""
-        self.state_space = state_space(self.engine.model, self.engine.snapshots, self.task.task.memory)
-        self._state = wp.zeros((self.nworld, self.state_space.size), dtype=wp.float64, device=self.device)
-        self._state_view = torch_view(self._state)
+    def configure(self, *, horizon: int, autoreset: bool, graphs: bool) -> None:
+        """Choose the horizon, whether episodes restart automatically, and whether launches become graphs.
 
-    def _run(self, function: Callable[..., None], *args: Hashable) -> None:
-        """Call a function that calls the engine: as one recording where the engine can be recorded."""
-        if self.engine.recordable:
-            self._whole(function, *args)
-        else:
-            function(*args)
+        Graphs hold the first two, so each combination has graphs of its own.
+        """
+        self.horizon, self.autoreset = horizon, autoreset
+        key = (horizon, autoreset, graphs)
+        if key not in self._programs:
+            capture = Graphs(self.device, enabled=graphs, capture_engine=self.engine.capturable, nvtx=self._nvtx)
+            self._programs[key] = Programs(
+                capture,
+                step=capture.sequence(self.step_phases()),
+                reset=capture.sequence(self.reset_phases(randomly=False)),
+                rand_reset=capture.sequence(self.reset_phases(randomly=True)),
+                read_state=capture.sequence(self.read_phases()),
+                restore_state=capture.sequence(self.restore_phases()),
+            )
+        self.programs = self._programs[key]
+        self.step = self.programs.step
 
-    def _whole(self, function: Callable[..., None], *args: Hashable) -> None:
-        """Record a function of several phases as one; for a profiler, who asks for ranges, each phase by itself."""
-        if self._record.ranges is None:
-            self._record(function, *args)
-        else:
-            function(*args)
+    # phases
 
-    def _physics(self, function: Callable[..., None], *args: Hashable) -> None:
-        """Call a function of the engine, as a recording where the engine can be recorded."""
-        if self.engine.recordable:
-            self._record(function, *args)
-        else:
-            with self._record.range(function):
-                function(*args)
+    def step_phases(self) -> list[Phase]:
+        """One step, in order."""
+        phases = [
+            Phase("act", self._act),
+            Phase("physics", partial(self.engine.step, self.task.frame_skip), engine=True),
+            Phase("judge", self._judge_step),
+            Phase("restart", partial(self._restart, self.restarting, randomly=True)),
+            Phase("refresh", partial(self.engine.refresh, self.restarting), engine=True),
+            Phase("observe", self._observe_restarted),
+        ]
+        if self.engine.reset_stage == Stage.NONE:  # no field follows from the state
+            phases = [phase for phase in phases if phase.name != "refresh"]
+        return phases
 
-    def _whole_step(self) -> None:
-        """One step: the task before physics, physics, the task after it, and new episodes."""
-        self._record(self._begin)
-        self._physics(self.engine.step, self.task.frame_skip)
-        if self.engine.reset_stage == Stage.NONE:
-            self._whole(self._finish)
-        else:
-            self._whole(self._judge_and_restart)
-            self._physics(self.engine.refresh, self._restarting)
-            self._record(self._look)
+    def reset_phases(self, *, randomly: bool) -> list[Phase]:
+        """New episodes in the worlds of ``mask``, in order."""
+        return [
+            Phase("restart", partial(self._restart, self.mask, randomly=randomly)),
+            Phase("refresh", partial(self.engine.refresh, self.mask), engine=True),
+            Phase("judge", self._judge_state),
+        ]
 
-    def _begin(self) -> None:
+    def read_phases(self) -> list[Phase]:
+        """Every world's state into ``state``."""
+        return [Phase("read state", self._read_state)]
+
+    def restore_phases(self) -> list[Phase]:
+        """The worlds of ``mask`` into the states of ``state``, in order; every getter reflects them afterwards."""
+        engine_columns = self.state[:, : self.engine.state_size]
+        return [
+            Phase("restore engine", partial(self.engine.set_state, engine_columns, self.mask), engine=True),
+            Phase("restore counters", self._restore_counters),
+            Phase("judge", partial(self._judge_state, keep_reason=True)),
+        ]
+
+    def rehearsal(self) -> None:
+        """Run every phase once, in an order that means nothing, to find the kernels that they launch."""
+        self.seed_streams(0)
+        for phase in (*self.reset_phases(randomly=True), *self.step_phases(), *self.read_phases()):
+            phase.run()
+        for phase in self.restore_phases():
+            phase.run()
+
+    def _act(self) -> None:
         """Keep the state that the step starts from, and turn actions into controls."""
-        kernels = self.task.kernels
-        for copy, live in self._pairs:
+        for copy, live in self.pairs:
             wp.copy(copy, live)
-        wp.launch(kernels.act, self.nworld, [
-            self._after, self._params, self._action, self._ranges, self._scale, self._step, self._safe_action,
+        wp.launch(self.task.kernels.act, self.nworld, [
+            self.after, self.params, self.action, self.ranges, self.scale, self.steps, self.safe_action,
             self._action_fault, self.engine.ctrl,
         ], device=self.device)  # fmt: skip
 
-    def _finish(self) -> None:
-        self._judge_and_restart()
-        self._record(self._look)
-
-    def _judge_and_restart(self) -> None:
-        self._record(self._judge_step)
-        self._record(self._restart, self._restarting, True)
-
     def _judge_step(self) -> None:
-        """Faults, task memory, reward and ends of a step."""
-        kernels = self.task.kernels
-        self.engine.find_faults(self._everyone)
-        if kernels.remember is not None:
-            wp.launch(kernels.remember, self.nworld, [
-                self._before, self._after, self._params, self._safe_action, self._step, self._key, self._episode,
-                self._rng,
+        """Find faults, advance task memory, and judge the transition."""
+        self.engine.find_faults(self.everyone)
+        if (advance := self.task.kernels.advance_memory) is not None:
+            wp.launch(advance, self.nworld, [
+                self.before, self.after, self.params, self.safe_action, self.steps, self.key, self.episode, self.rng,
             ], device=self.device)  # fmt: skip
-        sticky = not self._autoreset
-        self._judge(self._everyone, self.engine.fault, self._action_fault, transition=True, sticky=sticky)
-        wp.launch(steps.count_faults, self.nworld, [self.engine.fault, self._fault_count], device=self.device)
+        keep_reason = not self.autoreset
+        self._judge(self.everyone, self.engine.fault, self._action_fault, transition=True, keep_reason=keep_reason)
+        wp.launch(steps.count_faults, self.nworld, [self.engine.fault, self.fault_count], device=self.device)
 
     def _judge(
-        self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, sticky: bool = False
+        self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, keep_reason: bool = False
     ) -> None:
         """Reward, evaluation, ends and observation of the masked worlds; see ``kernels.steps``."""
         wp.launch(self.task.kernels.judge, self.nworld, [
-            mask, self._before, self._after, self._params, self._safe_action, self._step, self._horizon, transition,
-            sticky, fault, action_fault, self._out, self._restarting,
+            mask, self.before, self.after, self.params, self.safe_action, self.steps, self.horizon, transition,
+            keep_reason, fault, action_fault, self.outcome, self.restarting,
         ], device=self.device)  # fmt: skip
 
-    def _restart(self, mask: wp.array, randomly: bool) -> None:
+    def _restart(self, mask: wp.array, *, randomly: bool) -> None:
         """Put the masked worlds into an initial state of the task."""
         self.engine.reset(mask)
         if self.task.task.memory:
-            launch_rows(state.copy_rows, mask, self._no_memory, self._memory)
+            launch_rows(state.copy_rows, mask, self._no_memory, self.memory)
         wp.launch(self.task.kernels.restart, self.nworld, [
-            mask, randomly, self._after, self._params, self._key, self._rng, self._step, self._episode,
+            mask, randomly, self.after, self.params, self.key, self.rng, self.steps, self.episode,
         ], device=self.device)  # fmt: skip
         self.engine.commit(mask)
 
-    def _look(self) -> None:
-        """Observe the worlds that begin again; the others were observed when they were judged."""
-        args = [self._restarting, self._after, self._params, self._out.obs]
-        wp.launch(self.task.kernels.look, self.nworld, args, device=self.device)
+    def _observe_restarted(self) -> None:
+        """Observe the worlds that restarted; the others were observed when they were judged."""
+        args = [self.restarting, self.after, self.params, self.outcome.obs]
+        wp.launch(self.task.kernels.observe_worlds, self.nworld, args, device=self.device)
 
-    def _rehearsal(self) -> None:
-        """Everything that an environment launches, unrecorded and in a senseless order."""
-        enabled, self._record.enabled = self._record.enabled, False
-        try:
-            wp.launch(random.seed_worlds, 1, [self._mask, self._seed, 0, self._key, self._episode], device=self.device)
-            self._whole_reset(True)
-            self._whole_step()
-            self._pack()
-            self._unpack()
-        finally:
-            self._record.enabled = enabled
+    def _judge_state(self, *, keep_reason: bool = False) -> None:
+        """Observe and judge the states of the masked worlds, without a transition."""
+        # a state that was set unchecked may be a fault: its world shows the last good observation, as after a step
+        self.engine.find_faults(self.mask)
+        keep_reason = keep_reason and not self.autoreset
+        self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)
 
-    def _begin_episodes(self, *, randomly: bool) -> None:
-        self.action.masked_fill_(self._mask_view[:, None], 0.0)
-        self._run(self._whole_reset, randomly)
-
-    def _whole_reset(self, randomly: bool) -> None:
-        """Begin episodes in the masked worlds; every getter tells of them afterwards."""
-        self._record(self._restart, self._mask, randomly)
-        self._physics(self.engine.refresh, self._mask)
-        self._record(self._judge_state)
-
-    def _judge_state(self, sticky: bool = False) -> None:
-        """Observe and judge the masked worlds where they are, without a transition."""
-        # a state that was set unchecked may be unfit: its world shows the last good observation, as after a step
-        self.engine.find_faults(self._mask)
-        self._judge(self._mask, self.engine.fault, self._no_fault, transition=False, sticky=sticky)
-
-    def _set_mask(self, mask: torch.Tensor | None) -> None:
-        if mask is None:
-            self._mask_view.fill_(True)
-        else:
-            check_tensor(mask, "a mask", self._mask_view)
-            self._mask_view.copy_(mask)
-
-    def _pack(self) -> None:
-        """Gather the state vector."""
+    def _read_state(self) -> None:
         size = self.engine.state_size
-        self.engine.get_state(self._state[:, :size])
-        # with automatic resets an end is over with the step that it came in, without it stays
-        ended = self._no_fault if self._autoreset else self._out.done_reason
-        counters = [self._step, self._key, self._episode, ended, self._state[:, size:]]
+        self.engine.get_state(self.state[:, :size])
+        # with automatic resets an end is over with its step, without them it stays
+        ended = self._no_fault if self.autoreset else self.outcome.done_reason
+        counters = [self.steps, self.key, self.episode, ended, self.state[:, size:]]
         wp.launch(state.pack_counters, self.nworld, counters, device=self.device)
         if self.task.task.memory:
-            launch_rows(state.widen, self._everyone, self._memory, self._state[:, size + len(COUNTERS) :])
+            launch_rows(state.widen, self.everyone, self.memory, self._memory_columns)
 
-    def _unpack(self) -> None:
-        """Put the masked worlds into the state vector's states; every getter tells of them afterwards."""
-        size = self.engine.state_size
-        self.engine.set_state(self._state[:, :size], self._mask)
-        self._record(self._unpack_counters)
-        self._record(self._judge_state, not self._autoreset)
-
-    def _unpack_counters(self) -> None:
-        size = self.engine.state_size
-        counters = [self._mask, self._state[:, size:], self._step, self._key, self._episode, self._out.done_reason]
-        wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)
+    def _restore_counters(self) -> None:
+        self.restore_counters(self.mask, self.state[:, self.engine.state_size :])
         if self.task.task.memory:
-            launch_rows(state.narrow, self._mask, self._state[:, size + len(COUNTERS) :], self._memory)
+            launch_rows(state.narrow, self.mask, self._memory_columns, self.memory)
+
+    @property
+    def _memory_columns(self) -> wp.array:
+        return self.state[:, self.engine.state_size + len(COUNTERS) :]
+
+    # what environments, open-loop roll-outs and checks do besides
+
+    def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
+        """Set the masked worlds' counters from columns of states."""
+        counters = [mask, columns, self.steps, self.key, self.episode, self.outcome.done_reason]
+        wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)
+
+    def act(self) -> None:
+        """The first phase of a step alone."""
+        self._act()
+
+    def judge_transition(self, action: torch.Tensor) -> None:
+        """Judge the transition from ``before`` to the current state under some actions, as if without faults."""
+        torch_view(self.safe_action).copy_(action)
+        self._judge(self.everyone, self._no_fault, self._no_fault, transition=True)
+
+    def keep_before(self) -> None:
+        """Keep the current state as the one that a transition starts from."""
+        for copy, live in self.pairs:
+            wp.copy(copy, live)
+
+    def seed_streams(self, seed: int) -> None:
+        """Start the random streams of the masked worlds anew."""
+        self._seed.fill_(seed)
+        args = [self.mask, self._seed, self.first_world, self.key, self.episode]
+        wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
+
+    def set_mask(self, mask: torch.Tensor | None) -> None:
+        """Choose the worlds that the next reset or restored state concerns; None for all."""
+        if mask is None:
+            self.mask_view.fill_(True)
+        else:
+            check_tensor(mask, "a mask", self.mask_view)
+            self.mask_view.copy_(mask)
+
+    def update_params(self) -> None:
+        """Bring the parameters of the task into the array that kernels read."""
+        changed = self.task.parameters.array(self.device)
+        if changed.shape == self.params.shape:
+            wp.copy(self.params, changed)
+            return
+        self.params = changed
+        for programs in self._programs.values():
+            programs.graphs.forget()

@@ -17,7 +17,7 @@ from training_runs import QUIET, TINY, interrupted, refused
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.cli.display import PlanDisplay
-from lyceum_warp.control.loop import ControlProgress
+from lyceum_warp.control.episode_collector import ControlProgress
 from lyceum_warp.control.trajectory import Trajectory
 
 # tests may run in the background, where a shell has its children ignore SIGINT
@@ -64,7 +64,7 @@ def test_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path / "run", "--no-plot") == 0
     lines = capsys.readouterr().out.splitlines()
     video = next(line for line in lines if line.startswith("video:")).split(maxsplit=1)[1]
-    if video.startswith("none: this machine can't draw"):
+    if video.startswith("none: this machine cannot draw"):
         pytest.skip(video)
     assert Path(video).read_bytes()[4:8] == b"ftyp"
 

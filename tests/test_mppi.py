@@ -429,7 +429,7 @@ def test_plans_move_forward(fill: Any) -> None:
         expected = torch.cat([old[min(steps, H) :], last.expand(min(steps, H), 2)])
         assert torch.equal(plan.nominal, expected), f"shift={shift}"
     for shift in (-1, 0.5, "a"):
-        with pytest.raises(ValueError, match="shift has to be a whole number from 0"):
+        with pytest.raises(ValueError, match="shift must be a whole number from 0"):
             plan(plan.state_of(), shift=shift)
 
 

@@ -468,7 +468,7 @@ def test_what_makes_no_sense_is_refused(shared_env: SharedEnv) -> None:
         OpenLoop(shared_env("point_mass"), 5)
     env = shared_env("point_mass", autoreset=False)
     for horizon in (0, -1, 2.5, "a"):
-        with pytest.raises(ValueError, match="horizon has to be a whole number from 1"):
+        with pytest.raises(ValueError, match="horizon must be a whole number from 1"):
             OpenLoop(env, horizon)  # type: ignore[arg-type]
 
 

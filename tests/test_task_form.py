@@ -65,7 +65,7 @@ def test_a_function_that_is_written_wrongly_is_named(tmp_path: Path, written: st
     "line, message",
     [
         ("frameskip = 5", "'frameskip' in its class: did you mean frame_skip"),
-        ("horizon = -1", "horizon of the task 'shape' has to be a whole number"),
+        ("horizon = -1", "horizon of the task 'shape' must be a whole number"),
         ("obs = 10", "obs of the task 'shape' is 10: add the parts of its observation"),
     ],
 )

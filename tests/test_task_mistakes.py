@@ -45,7 +45,7 @@ class Tiny(lw.Task):
         ("@wp.func\n", "", "observe of the task 'tiny' has to be a @wp.func"),
         ("    obs = {", "    memory = 1\n    obs = {", "memory in World"),
         ("    obs = {", "    lagged = ('qvel',)\n    obs = {", "wants 'qvel' lagged but does not list it in World"),
-        ("    obs = {", "    frame_skip = 0\n    obs = {", "frame_skip has to be a whole number from 1 to .*, not 0"),
+        ("    obs = {", "    frame_skip = 0\n    obs = {", "frame_skip must be a whole number from 1 to .*, not 0"),
         ("    dt: float", "    dt: float\n    name: str", r"task file .*tiny\.py, line \d+: AttributeError: .*'str'"),
         ("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0", r"task file .*tiny\.py, line \d+: SyntaxError: "),
         ("obs: Row[float]):", "obs: 'Row[float]'):", "observe .* has annotations that are text, not types"),

@@ -12,7 +12,6 @@ and in trajopt, whose smoothing of the noise it takes over. A temperature here i
 arm is an inverse temperature, and stands for 0.2.
 """
 
-import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -32,6 +31,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.graphs.compile_ahead import workers
 from lyceum_warp.kernels import planning
 from lyceum_warp.openloop import OpenLoop
+from lyceum_warp.options import OPTIONS
 from lyceum_warp.spaces import Space
 from lyceum_warp.task import Task
 from lyceum_warp.validate import described, whole_number
@@ -215,12 +215,12 @@ class MPPI:
         self._loop.state.copy_(self._checked(state))
         self._shift_view.fill_(whole_number("shift", shift, low=0))
         if self.value is None or self._value_kernel is not None:
-            self._loop.record_all(self._improve)
+            self._improve()
         else:  # torch has its turn between two recordings
             for i in range(self.iterations):
-                self._loop.record_all(self._sample, i == 0)
+                self._sample(i == 0)
                 self._terminal_view.copy_(self._torch_values())
-                self._loop.record(self._update)
+                self._update()
         return self.actions[0].clone()
 
     @property
@@ -266,10 +266,10 @@ class MPPI:
     def _improve(self) -> None:
         for i in range(self.iterations):
             self._sample(i == 0)
-            self._loop.record(self._update)
+            self._update()
 
     def _sample(self, first: bool) -> None:
-        self._loop.record(self._perturb, first)
+        self._perturb(first)
         self._loop.run()
 
     def _perturb(self, first: bool) -> None:
@@ -393,7 +393,7 @@ def _array(value: Any) -> np.ndarray:
         return np.array(math.nan)
 
 
-_WORLDS = frozenset(inspect.signature(Env).parameters)
+_WORLDS = frozenset(OPTIONS)
 """Options of environments, as opposed to parameters of tasks."""
 
 

@@ -69,7 +69,7 @@ class Rollout:
         inputs = (env.obs, env.action, env.episode_step)
         outputs = (env.final_obs, env.reward, env.eval, env.terminated, env.done, env.success, env.done_reason)
         self._inputs, self._outputs = [wp.from_torch(t) for t in inputs], [wp.from_torch(t) for t in outputs]
-        graphs = Graphs(env.device, enabled=env.record)
+        graphs = Graphs(env.device, enabled=env.options.graphs)
         self._before_step = graphs.sequence([Phase("store inputs", self._store_inputs)])
         self._after_step = graphs.sequence([Phase("store outputs", self._store_outputs)])
 

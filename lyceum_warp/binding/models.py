@@ -6,19 +6,16 @@ import importlib.util
 import logging
 import sys
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
-from typing import Any, TypeAlias
 
 import mujoco
 
 from lyceum_warp.fields import ON_DEMAND, SENSED
 from lyceum_warp.mujoco_log import quiet
-from lyceum_warp.validate import whole_number
+from lyceum_warp.options import CONES, INTEGRATORS, ModelSource, PhysicsOptions
 
 log = logging.getLogger(__name__)
-
-ModelSource: TypeAlias = str | Path | Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,14 +72,14 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
     Args:
         source: A path, absolute or relative to the current folder, or to the file that defines ``owner``;
             otherwise the name of a model that gymnasium ships; or an MjSpec, which is copied.
-        owner: The task class whose own model it is: the current folder then has no say.
+        owner: The task class whose own model it is: its path is then relative to the task's file alone.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: MuJoCo can't read the file, or the source is a compiled model.
     """
     if isinstance(source, mujoco.MjModel):
-        raise ValueError("a task's model has to be a file or an MjSpec, not a compiled MjModel: give its MjSpec")
+        raise ValueError("a task's model must be a file or an MjSpec, not a compiled MjModel: give its MjSpec")
     if isinstance(source, mujoco.MjSpec):
         return source.copy()
     folder = Path()
@@ -106,25 +103,7 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         raise ValueError(f"MuJoCo can't read the model {path}: {error}") from error
 
 
-_CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
-_INTEGRATORS = {
-    "euler": mujoco.mjtIntegrator.mjINT_EULER,
-    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
-    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
-    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-}
-_SOLVER = {"iterations": 1, "ls_iterations": 1, "noslip_iterations": 0}
-"""What a caller may say about the solver, and the least that makes sense."""
-
-
-def compile_model(
-    spec: mujoco.MjSpec,
-    fields: Collection[str],
-    *,
-    cone: str | None = None,
-    integrator: str | None = None,
-    solver: Mapping[str, int] | None = None,
-) -> mujoco.MjModel:
+def compile_model(spec: mujoco.MjSpec, fields: Collection[str], physics: PhysicsOptions) -> mujoco.MjModel:
     """Compile a model for either engine.
 
     MuJoCo Warp has no PGS solver, so a model that asks for it gets Newton on both engines, which converges to
@@ -134,22 +113,19 @@ def compile_model(
     Args:
         spec: The model; changed in place.
         fields: Names of the fields that will be read.
-        cone: "pyramidal" or "elliptic" friction cones instead of the model's own.
-        integrator: "euler", "rk4", "implicit" or "implicitfast" instead of the model's own.
-        solver: Other limits than the model's own: "iterations" of the solver, "ls_iterations" of its line search,
-            "noslip_iterations" after it (0 for none).
+        physics: Cone, integrator and solver limits that replace the model's own.
 
     Raises:
-        ValueError: MuJoCo refuses the model, or one of the options makes no sense.
+        ValueError: MuJoCo refuses the model.
     """
     if spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
         spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
         log.info("%s asks for the PGS solver, which MuJoCo Warp lacks: both engines use Newton", spec.modelname)
-    if cone is not None:
-        spec.option.cone = _chosen("friction cone", cone, _CONES)
-    if integrator is not None:
-        spec.option.integrator = _chosen("integrator", integrator, _INTEGRATORS)
-    for name, limit in _limits(solver).items():
+    if physics.cone is not None:
+        spec.option.cone = CONES[physics.cone]
+    if physics.integrator is not None:
+        spec.option.integrator = INTEGRATORS[physics.integrator]
+    for name, limit in (physics.solver or {}).items():
         setattr(spec.option, name, limit)
     for sensor in sorted({ON_DEMAND[name] for name in fields if name in ON_DEMAND}, key=int):
         body = spec.bodies[1]
@@ -169,22 +145,3 @@ def compile_model(
     for warning in caught:  # most are about Gymnasium's own XML, where a user can change nothing
         log.info("%s: %s", spec.modelname, warning.message)
     return model
-
-
-def _chosen(what: str, name: Any, known: Mapping[str, Any]) -> Any:
-    if not isinstance(name, str) or name not in known:
-        *others, last = map(repr, known)
-        raise ValueError(f"there is no {what} {name!r}: use {', '.join(others)} or {last}")
-    return known[name]
-
-
-def _limits(solver: Mapping[str, int] | None) -> dict[str, int]:
-    names = ", ".join(map(repr, _SOLVER))
-    if solver is not None and not isinstance(solver, Mapping):
-        raise ValueError(f"solver has to be a dict of limits, as solver={{'iterations': 4}}, not {solver!r}")
-    limits = {}
-    for name, value in (solver or {}).items():
-        if name not in _SOLVER:
-            raise ValueError(f"solver has no limit {name!r}: it takes {names}")
-        limits[name] = whole_number(f"solver's {name}", value, low=_SOLVER[name])
-    return limits

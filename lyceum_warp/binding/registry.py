@@ -16,18 +16,21 @@ from lyceum_warp.task import Task
 _tasks: dict[str, type[Task]] = {}
 
 _loaded: dict[str, tuple[int, int]] = {}
-"""What the files of tasks were when they were run, by the names of their modules: when written, and how long."""
+"""When the files of tasks were written and how long they were when they were last run, by their modules' names."""
 
 
 def register(task: type[Task]) -> type[Task]:
     """Class decorator: make a task known by its name, the class name in snake_case.
 
-    A class of the same file may take the place of the one before: a file is run again in a notebook, or both
-    imported and given as a path.
+    A class may replace an earlier one of the same file: a notebook runs a file again, or a file is both imported and
+    given as a path.
 
     Raises:
-        ValueError: Another task has the name.
+        ValueError: Another task has the name, or the class is not a task.
     """
+    if not (isinstance(task, type) and issubclass(task, Task)):
+        name = getattr(task, "__name__", repr(task))
+        raise ValueError(f"@lw.register takes a subclass of lw.Task, not {name}: write class {name}(lw.Task)")
     name = task_name(task)
     known = _tasks.get(name)
     if known is None and not task.__module__.startswith(_PACKAGE) and name in _package_tasks():
@@ -70,7 +73,7 @@ def task_names() -> list[str]:
 def find_task(task: str | Path | type[Task]) -> type[Task]:
     """The class of a task, by name, by file (``path/to/file.py`` or ``path/to/file.py:Class``), or itself.
 
-    A file that has changed since is run again; environments that are there keep what they were made of.
+    A file that has changed since is run again; existing environments keep the task that they were made of.
 
     Raises:
         ValueError: There is no such task, or its file can't be run.
@@ -95,7 +98,7 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
 
 
 def _run(path: Path, name: str) -> None:
-    """Make a file a module, in the place of what it was before."""
+    """Run a file as a module, which replaces an earlier one of this name."""
     module = ModuleType(name)
     module.__file__ = file = str(path.resolve())
     before = sys.modules.get(name)
@@ -107,12 +110,28 @@ def _run(path: Path, name: str) -> None:
         del sys.modules[name]
         if before is not None:
             sys.modules[name] = before
-        if not isinstance(error, Exception) or isinstance(error, ImportError):
+        if not isinstance(error, Exception):
             raise
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
-        where = str(path) if line is None else f"{path}, line {line}"
-        raise ValueError(f"the task file {where}: {type(error).__name__}: {str(error).strip()}") from error
+        where = f"the task file {path}" if line is None else f"the task file {path}, line {line}"
+        if isinstance(error, ImportError):
+            raise ImportError(f"{where}: {error}: install what it imports, or remove the import") from error
+        raise ValueError(f"{where}: {_explained(error)}") from error
+
+
+def _explained(error: Exception) -> str:
+    """What is wrong with a task file, where Warp's own words do not say how to fix it."""
+    text = str(error).strip()
+    if found := re.search(r"argument '(\w+)' of function (\w+): Unrecognized type '<class '[\w.]*?(\w+)'>'", text):
+        argument, function, kind = found.groups()
+        return f"the argument {argument} of {function} has the type {kind}, which must be decorated with @wp.struct"
+    if found := re.search(r"type object '(\w+)' has no attribute '_type_'", text):
+        return (
+            f"a @wp.struct has a field of the type {found.group(1)}: it can hold float, int, bool, vectors and "
+            "matrices (wp.vec3, ...) and arrays"
+        )
+    return text if type(error) is ValueError else f"{type(error).__name__}: {text}"
 
 
 def _task_of_file(path: Path, attribute: str) -> type[Task]:

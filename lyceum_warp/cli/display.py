@@ -14,7 +14,7 @@ from lyceum_warp.algos.evaluation import moved
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.statistics import Iteration
 from lyceum_warp.control.control_report import ControlReport
-from lyceum_warp.control.loop import ControlProgress
+from lyceum_warp.control.episode_collector import ControlProgress
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs import Run
@@ -125,7 +125,7 @@ def states_video(env: Env, states: torch.Tensor, path: Path) -> str:
     from lyceum_warp.viz import video
 
     try:
-        return str(video.record(env, states, path))
+        return str(video.write_video(env, states, path))
     except (video.NoVideoError, ValueError) as error:
         return f"none: {error}"
 

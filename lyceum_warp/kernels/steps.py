@@ -1,5 +1,6 @@
 """The kernels of one step, around the functions of a task."""
 
+from collections.abc import Collection, Mapping
 from types import SimpleNamespace
 
 import warp as wp
@@ -15,7 +16,7 @@ ACTION = wp.constant(int(Done.ACTION))
 
 @wp.struct
 class Outcome:
-    """What a step tells about each world; every array is (nworld,) but for the observations."""
+    """The outcome of a step in each world; every array is (nworld,) but for the observations."""
 
     reward: wp.array[float]
     eval: wp.array[float]
@@ -57,20 +58,10 @@ def make_kernels(
     Batch,  # noqa: N803
     view,
     Params,  # noqa: N803
+    functions: Mapping[str, wp.Function],
+    written: Collection[str],
     *,
     module: str,
-    observe,
-    control,
-    reward,
-    evaluate,
-    terminated,
-    success,
-    initialize,
-    randomize,
-    advance,
-    has_control: bool,
-    has_evaluate: bool,
-    has_advance: bool,
 ) -> SimpleNamespace:
     """Fuse a task's functions into the kernels of a step.
 
@@ -78,12 +69,16 @@ def make_kernels(
         Batch: Struct of the task's fields for all worlds.
         view: Function from (batch, world) to the struct that the task's functions take.
         Params: Struct of the task's parameters; an array of them holds one entry, or one a world.
+        functions: The task's functions by name, with defaults for those that it lacks.
+        written: Names of the functions that the task itself has. Without ``control`` actions are mapped to controls
+            by a scale and an offset; without ``evaluate`` the evaluation is the reward; without ``advance`` no memory
+            is written.
         module: Name of the Warp module that the kernels are compiled into, one for each task.
-        observe, ..., advance: The task's functions, or defaults for them.
-        has_control: False maps actions to controls by a scale and an offset.
-        has_evaluate: False lets the evaluation be the reward.
-        has_advance: Whether the task has memory to write.
     """
+    observe, control, reward = functions["observe"], functions["control"], functions["reward"]
+    evaluate, terminated, success = functions["evaluate"], functions["terminated"], functions["success"]
+    initialize, randomize, advance = functions["initialize"], functions["randomize"], functions["advance"]
+    has_control, has_evaluate, has_advance = (name in written for name in ("control", "evaluate", "advance"))
 
     @wp.kernel(module=module, enable_backward=False)
     def act(
@@ -116,7 +111,7 @@ def make_kernels(
         step_inout[w] = step_inout[w] + 1
 
     @wp.kernel(module=module, enable_backward=False)
-    def remember(
+    def advance_memory(
         before: Batch,
         after: Batch,
         params: wp.array[Params],
@@ -142,7 +137,7 @@ def make_kernels(
         step_in: wp.array[int],
         horizon: int,
         transition: bool,
-        sticky: bool,
+        keep_reason: bool,
         fault_inout: wp.array[int],
         action_fault_in: wp.array[int],
         out: Outcome,
@@ -151,7 +146,7 @@ def make_kernels(
         """Reward, evaluation, termination and observation of a transition, or of a state alone.
 
         A faulted transition has reward 0, the evaluation of the state before it, and the last good
-        observation; it counts as terminated, so that nobody bootstraps from it.
+        observation; it counts as terminated, so that no learner bootstraps from it.
         """
         w = wp.tid()
         if not mask_in[w]:
@@ -188,7 +183,7 @@ def make_kernels(
             out.success[w] = False
         if horizon > 0 and step_in[w] >= horizon:
             reason = reason | TRUNCATED
-        if sticky:
+        if keep_reason:
             reason = reason | out.done_reason[w]
         out.done_reason[w] = reason
         out.terminated[w] = (reason & ~TRUNCATED) != 0
@@ -197,8 +192,8 @@ def make_kernels(
         for i in range(out.obs.shape[1]):
             out.obs[w, i] = out.final_obs[w, i]
         if transition:
-            # whoever steps on after the end still can't step on after a fault
-            restart_out[w] = wp.where(sticky, fault != 0, reason != 0)
+            # a world that may step on after its end still can't step on after a fault
+            restart_out[w] = wp.where(keep_reason, fault != 0, reason != 0)
 
     @wp.kernel(module=module, enable_backward=False)
     def restart(
@@ -226,17 +221,17 @@ def make_kernels(
             randomize(s, p, rng_inout[w])
 
     @wp.kernel(module=module, enable_backward=False)
-    def look(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], obs_out: wp.array2d[float]):
+    def observe_worlds(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], obs_out: wp.array2d[float]):
         """Observe the masked worlds."""
         w = wp.tid()
         if mask_in[w]:
             observe(view(batch, w), params[w % params.shape[0]], obs_out[w])
 
-    # An open-loop roll-out records its fields for all steps: row t * nworld + w is world w after t steps. The
+    # An open-loop roll-out keeps its fields for all steps: row t * nworld + w is world w after t steps. The
     # transition of that row leads to the one nworld further, so `before` and `after` are the same arrays, shifted.
 
     @wp.kernel(module=module, enable_backward=False)
-    def gains(
+    def judge_rows(
         before: Batch,
         after: Batch,
         params: wp.array[Params],
@@ -244,7 +239,7 @@ def make_kernels(
         reward_out: wp.array[float],
         terminated_out: wp.array[bool],
     ):
-        """Reward and termination of recorded transitions."""
+        """Reward and termination of a roll-out's transitions."""
         row = wp.tid()
         p = params[row % params.shape[0]]
         s1 = view(after, row)
@@ -252,7 +247,7 @@ def make_kernels(
         terminated_out[row] = terminated(s1, p)
 
     @wp.kernel(module=module, enable_backward=False)
-    def recall(
+    def advance_rows(
         before: Batch,
         after: Batch,
         params: wp.array[Params],
@@ -263,7 +258,7 @@ def make_kernels(
         memory_inout: wp.array2d[float],
         rng_inout: wp.array2d[wp.uint32],
     ):
-        """Let the task write its memory along a recorded roll-out: one thread a world walks through its steps."""
+        """Let the task write its memory along a roll-out: one thread a world walks through its steps."""
         w = wp.tid()
         n = step_in.shape[0]
         p = params[w % params.shape[0]]
@@ -277,10 +272,10 @@ def make_kernels(
     return SimpleNamespace(
         Batch=Batch,
         act=act,
-        remember=remember if has_advance else None,
+        advance_memory=advance_memory if has_advance else None,
         judge=judge,
         restart=restart,
-        look=look,
-        gains=gains,
-        recall=recall if has_advance else None,
+        observe_worlds=observe_worlds,
+        judge_rows=judge_rows,
+        advance_rows=advance_rows if has_advance else None,
     )

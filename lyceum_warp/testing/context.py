@@ -18,8 +18,6 @@ OUTCOMES = tuple(steps.OUTCOMES)
 SHORT = 8
 """Steps of a check that needs only a few."""
 
-_SETTINGS = ("horizon", "autoreset", "record")
-
 
 @dataclasses.dataclass
 class Context:
@@ -36,8 +34,6 @@ class Context:
     engine: str
     rule: str = ""
     """The rule that is being checked."""
-    recordings: dict[tuple[object, ...], dict[Any, Any]] = dataclasses.field(default_factory=dict)
-    """Recorded steps, by the environment and the settings that they hold."""
 
     def fail(self, problem: str) -> None:
         """Raise the AssertionError for a problem."""
@@ -91,25 +87,19 @@ class Context:
             self.equal(found[name], wanted[name], f"{name} {what} (step, world, ...)")
 
     @contextlib.contextmanager
-    def changed(self, *envs: Env, **options: Any) -> Iterator[None]:
-        """For a while, give environments another ``horizon``, ``autoreset`` or ``record``.
-
-        A recorded step holds these, so that each setting has its own recordings.
-        """
-        kept = [(env.horizon, env.autoreset, env._record.enabled) for env in envs]
+    def changed(self, *envs: Env, **choices: Any) -> Iterator[None]:
+        """For a while, give environments another ``horizon``, ``autoreset`` or ``graphs``."""
+        kept = [
+            {"horizon": env.horizon, "autoreset": env.autoreset, "graphs": env.worlds.programs.graphs.enabled}
+            for env in envs
+        ]
         try:
             for env, values in zip(envs, kept, strict=True):
-                chosen = [options.get(name, value) for name, value in zip(_SETTINGS, values, strict=True)]
-                self._set(env, *chosen)
+                env.worlds.configure(**(values | choices))
             yield
         finally:
             for env, values in zip(envs, kept, strict=True):
-                self._set(env, *values)
-
-    def _set(self, env: Env, horizon: int, autoreset: bool, record: bool) -> None:
-        self.recordings[id(env), env.horizon, env.autoreset] = env._record._graphs
-        env._horizon, env._autoreset, env._record.enabled = horizon, autoreset, record
-        env._record._graphs = self.recordings.get((id(env), horizon, autoreset), {})
+                env.worlds.configure(**values)
 
     def buffers(self, env: Env) -> dict[str, torch.Tensor]:
         """Copies of everything that an environment shows."""

@@ -73,7 +73,7 @@ def check_no_autoreset(ctx: Context) -> None:
 def check_recording(ctx: Context) -> None:
     """A recorded step gives the same as an unrecorded one, to the bit, resets included."""
     a, b, n = ctx.a, ctx.b, 20
-    with ctx.changed(a, horizon=6, record=True), ctx.changed(b, horizon=6, record=False):
+    with ctx.changed(a, horizon=6, graphs=True), ctx.changed(b, horizon=6, graphs=False):
         ctx.restart()
         actions = ctx.actions(n)
         ctx.same_runs(ctx.run(b, actions), ctx.run(a, actions), "unrecorded")

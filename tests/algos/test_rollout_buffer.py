@@ -12,7 +12,7 @@ def test_collect_stores_what_each_step_read_and_gave() -> None:
     stored = []
     for graphs in (True, False):
         env, plain = (
-            lw.make("point_mass", nworld=3, horizon=4, seed=2, **options) for options in ({"record": graphs}, {})
+            lw.make("point_mass", nworld=3, horizon=4, seed=2, **options) for options in ({"graphs": graphs}, {})
         )
         rollout = lw.Rollout(env, 6)
         generator = torch.Generator().manual_seed(0)

@@ -99,7 +99,7 @@ def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: py
 
 def physics(env: lw.Env) -> tuple[int, int, int, bool]:
     opt = env.model.opt
-    return opt.integrator, opt.iterations, opt.ls_iterations, env._options["deterministic"]
+    return opt.integrator, opt.iterations, opt.ls_iterations, env.options.physics.deterministic
 
 
 def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]) -> None:

@@ -25,7 +25,7 @@ def test_warmup_applies_the_options_of_physics(made_envs: list[lw.Env], capsys: 
     for env in made_envs:
         opt = env.model.opt
         assert (opt.integrator, opt.ls_iterations) == (mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 9)
-        assert env._options["deterministic"]
+        assert env.options.physics.deterministic
     capsys.readouterr()
     assert main([*warmup, "--integrator", "rk5"]) == 2
     assert "there is no integrator 'rk5'" in capsys.readouterr().err

@@ -1,0 +1,78 @@
+"""From a task's functions to kernels: the source that Warp needs around them.
+
+The functions of a task see one world. The generated source is the batch around them: a struct of the same fields with
+one more axis, a view of world w in it, and default functions. It is text, because Warp compiles source.
+"""
+
+import linecache
+import re
+from typing import Any
+
+import warp as wp
+
+from lyceum_warp.binding.functions import TaskSource
+from lyceum_warp.kernels import steps
+from lyceum_warp.task import FUNCTIONS, Row, Task, TaskFunction
+
+_BATCH = """
+@wp.struct
+class Batch:
+{batch}
+
+
+@wp.func
+def view(batch: Batch, w: int) -> World:
+    s = World()
+{rows}
+    return s
+"""
+
+_kernels: dict[Any, Any] = {}
+_module_names: list[str] = []
+
+
+def kernels_of(source: TaskSource) -> Any:
+    """The kernels of a task, made once for the same functions and structs; see ``kernels.steps.make_kernels``."""
+    key = (source.world, source.params, tuple(source.functions.values()))
+    if key not in _kernels:
+        scope = _generated(source)
+        functions = {name: function or scope[f"no_{name}"] for name, function in source.functions.items()}
+        written = [name for name, function in source.functions.items() if function is not None]
+        module = _module_name(source.task)
+        _kernels[key] = steps.make_kernels(
+            scope["Batch"], scope["view"], source.params, functions, written, module=module
+        )
+    return _kernels[key]
+
+
+def _module_name(task: type[Task]) -> str:
+    """The same name in every process, so that Warp finds the module in its cache; with a number if it is taken."""
+    name = f"lyceum_warp.generated.{task.__module__}.{task.__qualname__}"
+    taken = sum(module == name or module.startswith(f"{name}#") for module in _module_names)
+    _module_names.append(f"{name}#{taken}" if taken else name)
+    return re.sub(r"[^\w.]", "_", _module_names[-1])
+
+
+def _generated(source: TaskSource) -> dict[str, Any]:
+    """The scope of the generated source after it has run: Batch, view and the default functions."""
+    scope: dict[str, Any] = {"wp": wp, "Row": Row, "World": source.world, "Params": source.params}
+    batch, rows = [], []
+    for name, variable in source.world.vars.items():
+        kind = variable.type
+        ndim, dtype = (kind.ndim + 1, kind.dtype) if hasattr(kind, "ndim") else (1, kind)
+        scope[f"type_{name}"] = wp.array(dtype=dtype, ndim=ndim)
+        batch.append(f"    {name}: type_{name}")
+        rows.append(f"    s.{name} = batch.{name}[w]")
+    parts = [_BATCH.format(batch="\n".join(batch), rows="\n".join(rows))]
+    parts += [_default(function) for function in FUNCTIONS.values() if function.default is not None]
+    text = "\n".join(parts)
+    task = source.task
+    file = f"<lyceum_warp {task.__module__}.{task.__qualname__}>"
+    linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
+    scope["__name__"] = f"lyceum_warp.generated.{source.name}"
+    exec(compile(text, file, "exec"), scope)
+    return scope
+
+
+def _default(function: TaskFunction) -> str:
+    return f"\n\n@wp.func\ndef no_{function.signature}:\n    {function.default}\n"

@@ -1,0 +1,139 @@
+"""A task's structs and functions: found in its class or module, and checked against the table in ``task.FUNCTIONS``."""
+
+import ast
+import difflib
+import inspect
+import sys
+import textwrap
+from typing import Any
+
+import warp as wp
+
+from lyceum_warp.task import FUNCTIONS, Task
+
+
+class TaskSource:
+    """The structs and the functions that a task consists of.
+
+    Args:
+        task: The task's class.
+        name: The task's name, for messages.
+
+    Raises:
+        ValueError: A struct or ``observe`` is missing, a function is not written as the table says, or a name looks
+            like a misspelt one of the table.
+    """
+
+    def __init__(self, task: type[Task], name: str) -> None:
+        self.task, self.name = task, name
+        self.world: Any = self._struct("World")
+        self.params: Any = self._struct("Params")
+        self.functions: dict[str, wp.Function | None] = {name: self._function(name) for name in FUNCTIONS}
+        if self.functions["observe"] is None:
+            raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), the one function it needs")
+        self._check_names()
+
+    def _written(self, name: str) -> Any:
+        """The value of a name in the class, in its module, or in those of the classes that it extends."""
+        owners: Any = self.task.__mro__[: self.task.__mro__.index(Task)]
+        for owner in owners:
+            found = vars(owner).get(name, owner.scope.get(name, vars(sys.modules[owner.__module__]).get(name)))
+            if found is not None:
+                return found.__func__ if isinstance(found, staticmethod) else found
+        return None
+
+    def _struct(self, name: str) -> Any:
+        struct = self._written(name)
+        if isinstance(struct, type):
+            raise ValueError(f"{name} of the task {self.name!r} must be a Warp struct: decorate it with @wp.struct")
+        if not hasattr(struct, "vars"):
+            raise ValueError(f"the task {self.name!r} needs a @wp.struct named {name} in its module")
+        return struct
+
+    def _function(self, name: str) -> wp.Function | None:
+        function = self._written(name)
+        if function is None:
+            return None
+        wanted = FUNCTIONS[name]
+        if not isinstance(function, wp.Function):
+            raise ValueError(f"{name} of the task {self.name!r} must be a @wp.func, not {function!r}")
+        types = list(function.input_types.values())
+        structs = [kind for kind in types if hasattr(kind, "vars") and hasattr(kind, "cls")]
+        if structs and self.world not in structs and self.params not in structs:
+            return None  # another task's, left over in a notebook
+        annotations = function.func.__annotations__
+        if any(isinstance(annotation, str) for annotation in annotations.values()):
+            raise ValueError(
+                f"{name} of the task {self.name!r} has annotations that are text, not types: leave out "
+                "'from __future__ import annotations', and quotes around types"
+            )
+        returned = annotations.get("return")
+        if wanted.result is not None and not _returns(function):
+            raise ValueError(f"{name} of the task {self.name!r} has no return: it is written as {wanted.signature}")
+        if wanted.result is not None and _returns_tuple(function):
+            raise ValueError(
+                f"{name} of the task {self.name!r} returns a tuple, and must return a single {wanted.result.__name__}"
+            )
+        self._check_structs(name, structs)
+        if tuple(map(self._kind, types)) != wanted.kinds or (returned is not None and returned is not wanted.result):
+            raise ValueError(f"{name} of the task {self.name!r} must be written as {wanted.signature}")
+        return function
+
+    def _check_structs(self, name: str, structs: list[Any]) -> None:
+        """Refuse a function of another file that takes that file's own World or Params."""
+        for kind in structs:
+            for own_name, own in (("World", self.world), ("Params", self.params)):
+                if kind is not own and kind.key.rpartition(".")[2] == own_name:
+                    raise ValueError(
+                        f"{name} of the task {self.name!r} takes the {own_name} of {_origin(kind)}, but the task has "
+                        f"the {own_name} of {_origin(own)}: import both structs from one module, or write {name} for "
+                        "the task's own"
+                    )
+
+    def _kind(self, argument: Any) -> str:
+        """How the table writes the type of an argument."""
+        if argument is self.world:
+            return "World"
+        if argument is self.params:
+            return "Params"
+        element: Any = getattr(argument, "dtype", None) if getattr(argument, "ndim", 0) == 1 else None
+        return {wp.float32: "Row[float]", wp.uint32: "Row[wp.uint32]"}.get(element, "?")
+
+    def _check_names(self) -> None:
+        """Refuse what looks like a misspelt name of the table: it would never be called."""
+        attributes = [name for name in vars(Task) if not name.startswith("_")]
+        for name in vars(self.task):
+            if name.startswith("_") or name in (*attributes, "World", "Params", *FUNCTIONS):
+                continue
+            if close := difflib.get_close_matches(name, (*attributes, *FUNCTIONS), 1, 0.75):
+                raise ValueError(f"the task {self.name!r} has {name!r} in its class: did you mean {close[0]}?")
+        for name, value in vars(sys.modules[self.task.__module__]).items():
+            if isinstance(value, wp.Function) and name not in FUNCTIONS:
+                own = self._kind(next(iter(value.input_types.values()), None)) == "World"
+                close = difflib.get_close_matches(name, [f for f in FUNCTIONS if self.functions[f] is None], 1, 0.85)
+                if own and close:
+                    raise ValueError(f"the task {self.name!r} has a function {name!r}: did you mean {close[0]}?")
+
+
+def _origin(struct: Any) -> str:
+    """The file that a struct comes from; its module where there is no file."""
+    module = struct.cls.__module__
+    return str(getattr(sys.modules.get(module), "__file__", None) or module)
+
+
+def _return_values(function: wp.Function) -> list[ast.expr] | None:
+    """The expressions that a function returns; None where its source is not known."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function.func)))  # type: ignore[arg-type]
+    except (OSError, SyntaxError, TypeError):
+        return None
+    return [node.value for node in ast.walk(tree) if isinstance(node, ast.Return) and node.value is not None]
+
+
+def _returns(function: wp.Function) -> bool:
+    values = _return_values(function)
+    return values is None or bool(values)
+
+
+def _returns_tuple(function: wp.Function) -> bool:
+    return any(isinstance(value, ast.Tuple) for value in _return_values(function) or [])

@@ -1,0 +1,36 @@
+"""``help`` shows what a user needs, attributes included."""
+
+import pydoc
+
+import pytest
+
+import lyceum_warp as lw
+from lyceum_warp.docstrings import attribute_docs
+from lyceum_warp.task import FUNCTIONS, Task
+
+
+def page(thing: object) -> str:
+    return pydoc.plain(pydoc.render_doc(thing))
+
+
+def test_help_of_task_shows_every_function_and_every_attribute() -> None:
+    text = page(lw.Task)
+    for function in FUNCTIONS.values():
+        assert function.signature in text
+    for name in (name for name in Task.__annotations__ if name != "scope"):
+        assert f"{name}: " in text
+    assert "w, x, y, z" in text  # the order of quaternions
+
+
+@pytest.mark.parametrize("kind", [lw.Env, lw.Task, lw.NPGConfig, lw.Iteration, lw.OpenLoop, lw.Trajectory])
+def test_help_shows_every_attribute_docstring(kind: type) -> None:
+    docs, text = attribute_docs(kind), " ".join(page(kind).replace("|", " ").split())
+    assert docs
+    for name, doc in docs.items():
+        assert f"{name}: {' '.join(doc.split())}" in text
+
+
+def test_help_of_done_explains_every_bit() -> None:
+    text = page(lw.Done)
+    for bit in lw.Done:
+        assert f"{bit.name} ({int(bit)}): " in text

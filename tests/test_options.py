@@ -1,0 +1,89 @@
+"""The options of environments and physics: checked when made, split from parameters, suggested when misspelt."""
+
+import dataclasses
+import inspect
+
+import pytest
+
+import lyceum_warp as lw
+from lyceum_warp.options import OPTION_DOCS, OPTIONS, EnvOptions, PhysicsOptions, suggestion
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"nworld": 0}, "nworld must be a whole number from 1 to 2147483647, not 0"),
+        ({"nworld": 2.5}, "nworld must be a whole number .*, not 2.5"),
+        ({"seed": -1}, "seed must be a whole number from 0 .*, not -1"),
+        ({"horizon": -3}, "horizon must be a whole number from 0 .*, not -3"),
+        ({"nthread": "all"}, "nthread must be a whole number .*, not 'all'"),
+        ({"autoreset": "no"}, "autoreset must be True or False, not 'no'"),
+        ({"graphs": 1}, "graphs must be True or False, not 1"),
+        ({"fields": "sensordata"}, r"fields must be names of fields, as in fields=\['sensordata'\], not 'sensordata'"),
+        ({"fields": [3]}, r"fields must be names of fields, .* not \[3\]"),
+        ({"frame_skip": 0}, "frame_skip must be a whole number from 1 .*, not 0"),
+        ({"cone": "round"}, "there is no friction cone 'round': use 'pyramidal' or 'elliptic'"),
+        ({"integrator": "rk5"}, "no integrator 'rk5': use 'euler', 'rk4', 'implicit' or 'implicitfast'"),
+        ({"solver": 4}, r"solver must be a dict of limits, as solver=\{'iterations': 4\}, not 4"),
+        ({"solver": {"itrations": 4}}, "solver has no limit 'itrations': it takes 'iterations', 'ls_iterations'"),
+        ({"solver": {"iterations": 0}}, "solver's iterations must be a whole number from 1 .*, not 0"),
+        ({"deterministic": None}, "deterministic must be True or False, not None"),
+    ],
+)  # fmt: skip
+def test_an_option_out_of_range_is_refused_with_its_value(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        EnvOptions.split(options)
+    with pytest.raises(ValueError, match=message):
+        lw.make("hopper", **options)
+
+
+def test_a_flat_call_is_split_into_options_physics_and_parameters() -> None:
+    options, params = EnvOptions.split({"nworld": 4, "cone": "elliptic", "ctrl_cost_weight": 0.1})
+    assert options == EnvOptions(nworld=4, physics=PhysicsOptions(cone="elliptic"))
+    assert params == {"ctrl_cost_weight": 0.1}
+    assert options.given() == {"nworld": 4, "cone": "elliptic"}
+
+
+def test_changed_keeps_all_other_options() -> None:
+    options = EnvOptions(nworld=4, horizon=7, physics=PhysicsOptions(cone="elliptic", njmax=24))
+    changed = options.changed({"nworld": 2, "njmax": 48})
+    assert changed.given() == {"nworld": 2, "horizon": 7, "cone": "elliptic", "njmax": 48}
+
+
+def test_options_in_one_piece_and_by_name_make_the_same_environment() -> None:
+    options = EnvOptions(nworld=2, horizon=5, physics=PhysicsOptions(integrator="euler"))
+    for env in (lw.Env("hopper", options), lw.Env("hopper", EnvOptions(horizon=5), nworld=2, integrator="euler")):
+        assert env.options == options
+        assert (env.nworld, env.horizon) == (2, 5)
+
+
+def test_a_replica_has_the_options_of_the_original_but_for_the_changes() -> None:
+    env = lw.make("hopper", nworld=2, horizon=5, integrator="euler", solver={"iterations": 4}, seed=3)
+    replica = env.replicate(nworld=3, horizon=6)
+    assert replica.options.given() == {
+        "nworld": 3, "horizon": 6, "integrator": "euler", "solver": {"iterations": 4}
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("nworlds", "did you mean nworld?"),
+        ("num_envs", "did you mean nworld?"),
+        ("record", "did you mean graphs?"),
+        ("ls_iterations", "did you mean solver={'ls_iterations': ...}?"),
+        ("qqq", ""),
+    ],
+)
+def test_suggestion_knows_every_option_and_words_of_other_packages(word: str, expected: str) -> None:
+    assert suggestion(word) == expected
+
+
+def test_every_option_is_in_the_help_and_the_signature_of_make() -> None:
+    names = [field.name for kind in (EnvOptions, PhysicsOptions) for field in dataclasses.fields(kind)]
+    assert list(OPTIONS) == names
+    for name in names:
+        assert f"    {name}: " in OPTION_DOCS
+        assert name == "physics" or name in inspect.signature(lw.make).parameters
+    assert OPTION_DOCS in str(lw.make.__doc__)
+    assert OPTION_DOCS in str(lw.Env.__doc__)
