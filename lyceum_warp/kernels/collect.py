@@ -1,4 +1,4 @@
-"""Kernels that store rollouts: what a step reads and gives goes to the place of an index that lies on the device."""
+"""Kernels that store the inputs and results of steps in a rollout buffer, at an index that is kept on the device."""
 
 import warp as wp
 

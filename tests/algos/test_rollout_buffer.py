@@ -7,7 +7,7 @@ import torch
 import lyceum_warp as lw
 
 
-def test_collect_stores_what_each_step_read_and_gave() -> None:
+def test_collect_stores_inputs_and_results_of_each_step() -> None:
     """The same with graphs, which are captured in the second step, and without."""
     stored = []
     for graphs in (True, False):
