@@ -4,7 +4,7 @@
 the public interface of the environment and of its open-loop roll-outs.
 
 NPG's parts: ``npg_config`` (hyperparameters), ``rollout_buffer`` (samples), ``natural_gradient`` (Fisher information
-and conjugate gradient), ``policy``, ``value`` and ``networks`` (the functions that are learned), ``value_fit`` (regression on
-returns), ``evaluation`` (the mean policy in whole episodes), ``statistics`` (the numbers of an iteration),
-``distributed`` (several processes) and ``timing``.
+and conjugate gradient), ``policy``, ``value`` and ``networks`` (the functions that are learned), ``value_fit``
+(regression on returns), ``evaluation`` (the mean policy in whole episodes), ``statistics`` (the numbers of an
+iteration), ``distributed`` (several processes) and ``timing``.
 """
