@@ -447,7 +447,7 @@ class Env:
         return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
 
 
-make.__signature__ = signature_of_options(make)  # type: ignore[attr-defined]
+make.__signature__ = signature_of_options(make)
 
 
 def _given(values: torch.Tensor, out: torch.Tensor | None) -> torch.Tensor:

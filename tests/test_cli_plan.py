@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from rich.console import Console
-from test_cli import QUIET, TINY, interrupted, refused
+from training_runs import QUIET, TINY, interrupted, refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli

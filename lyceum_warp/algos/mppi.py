@@ -21,7 +21,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.algos.rollout_buffer import moved
+from lyceum_warp.algos.evaluation import moved
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.arrays import torch_view
 from lyceum_warp.binding.bound_task import task_spec

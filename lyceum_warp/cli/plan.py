@@ -12,7 +12,7 @@ import tyro
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.binding.registry import find_task, task_name
 from lyceum_warp.cli.arguments import Interrupted, Physics, Words, parameter, portable
-from lyceum_warp.cli.display import PlanDisplay, filmed_states, make_console, plotted_control, report_table
+from lyceum_warp.cli.display import PlanDisplay, make_console, plotted_control, report_table, states_video
 from lyceum_warp.control.control_report import control_report
 from lyceum_warp.control.loop import control
 from lyceum_warp.control.real_time import control_async
@@ -226,7 +226,7 @@ def _tell(run: Run, plant: Env, trajectories: list[Trajectory], options: Plan) -
     if options.plot:
         paths.append(("plot", plotted_control(trajectories, run.folder / "plan.png")))
     if options.video:
-        paths.append(("video", filmed_states(plant, trajectories[0].states, run.folder / "video.mp4")))
+        paths.append(("video", states_video(plant, trajectories[0].states, run.folder / "video.mp4")))
     for name, path in paths:
         console.print(f"{name + ':':<12}{path}", soft_wrap=True, markup=False)
     return 0
