@@ -1,6 +1,7 @@
 """Checks of values that users pass, shared by several rooms."""
 
 import math
+import numbers
 from typing import Any
 
 import torch
@@ -44,7 +45,7 @@ def check_kind(name: str, value: Any, kind: Any, example: str) -> None:
         raise ValueError(f"{name} must be of type {wanted}, {example}, not {described(value)}")
 
 
-def layer_sizes(hidden: Any) -> list[int]:
+def layer_sizes(hidden: Any, name: str = "hidden") -> list[int]:
     """Check the widths of hidden layers.
 
     Raises:
@@ -53,7 +54,7 @@ def layer_sizes(hidden: Any) -> list[int]:
     try:
         return [whole_number("a width", width, low=1) for width in hidden]
     except (TypeError, ValueError) as error:
-        raise ValueError(f"hidden must be the widths of the hidden layers, as in (64, 64), not {hidden!r}") from error
+        raise ValueError(f"{name} must be the widths of the hidden layers, as in (64, 64), not {hidden!r}") from error
 
 
 def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:
@@ -75,3 +76,17 @@ def described(value: Any) -> str:
     if hasattr(value, "shape"):
         return f"a {type(value).__name__} of shape {tuple(value.shape)}"
     return f"{type(value).__name__} {value!r}"
+
+
+def finite_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
+    """Convert a finite number of any type to a float, and check its bounds.
+
+    Raises:
+        ValueError: The value is not a finite number from low to high.
+    """
+    if not isinstance(value, bool) and isinstance(value, numbers.Real):
+        number = float(value)
+        if math.isfinite(number) and low <= number <= high:
+            return number
+    bounds = f" from {low:g} to {high:g}" if high < math.inf else f" of at least {low:g}" if low > -math.inf else ""
+    raise ValueError(f"{name} must be a finite number{bounds}, not {value!r}")

@@ -21,22 +21,18 @@ import numpy as np
 import torch
 import warp as wp
 
+from lyceum_warp.algos.evaluation import moved
 from lyceum_warp.algos.mppi_arguments import plain, planner_arguments
 from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig
 from lyceum_warp.algos.planner_state import checked_state, state_from_parts
-from lyceum_warp.algos.rollout_buffer import moved
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.arrays import torch_view
-from lyceum_warp.binding.bound_task import task_spec
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.docstrings import document_attributes
-from lyceum_warp.engines import ON_CPU_CORES, find_device
 from lyceum_warp.env import Env
-from lyceum_warp.graphs.compile_ahead import workers
 from lyceum_warp.graphs.sequence import Calls, Phase
 from lyceum_warp.kernels import planning
 from lyceum_warp.openloop import OpenLoop
-from lyceum_warp.options import ModelSource
 from lyceum_warp.task import Task
 from lyceum_warp.validate import described, whole_number
 
@@ -111,11 +107,6 @@ class MPPI:
         self.temperature, self.discount = self.config.temperature, self.config.discount
         self.termination = self.config.termination
 
-        noslip = partial(_has_noslip, task, options.model, options.physics.solver)
-        place = _place_samples(
-            options.engine, options.device, nthread=options.nthread, samples=self.samples, has_noslip=noslip
-        )
-        options = options.changed(place)
         self.settings = plain(options.given() | own_params | vars(self.config))
         self.env = Env(task, options, nworld=self.samples, autoreset=False, horizon=0, **own_params)
         self.env.reset()
@@ -280,34 +271,3 @@ class MPPI:
         """Best and mean return, effective number and failures of the last improvement's samples."""
         best, mean, effective, failed = self._summary.numpy().tolist()
         return {"best_return": best, "mean_return": mean, "effective_samples": effective, "failed_samples": failed}
-
-
-_SAMPLES_PER_CORE = 40
-"""With fewer samples for each core of the CPU, its C engine plans faster than an H100. Measured with 16 cores, where
-the two meet at 27 samples a core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah (bench/README.md)."""
-
-_MOST_CORES = 16
-"""More were not measured, and the planner's work besides physics runs on one."""
-
-_NOSLIP = 6
-"""Factor on the samples for models with the noslip solver, which makes a substep on a GPU that much slower."""
-
-
-def _place_samples(
-    engine: Any, device: str | None, *, nthread: int | None, samples: int, has_noslip: Callable[[], bool]
-) -> dict[str, Any]:
-    """The options to change for the planner's worlds: engine="auto" on a GPU chooses by the number of samples."""
-    if engine != "auto" or not find_device(device).is_cuda:
-        return {}
-    enough = _SAMPLES_PER_CORE * min(_MOST_CORES, nthread or workers())
-    if samples >= enough and (samples >= _NOSLIP * enough or not has_noslip()):
-        return {"engine": "warp", "nthread": None}
-    return dict(ON_CPU_CORES)
-
-
-def _has_noslip(task: type[Task], model: ModelSource | None, solver: Mapping[str, int] | None) -> bool:
-    if solver is not None and "noslip_iterations" in solver:
-        return solver["noslip_iterations"] > 0
-    if model is None and not hasattr(task, "model"):
-        return False  # the environment reports what is missing
-    return task_spec(task, model).option.noslip_iterations > 0

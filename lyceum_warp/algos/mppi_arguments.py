@@ -11,8 +11,10 @@ import numpy as np
 import torch
 
 from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig
+from lyceum_warp.binding.bound_task import task_spec
 from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.registry import task_name
+from lyceum_warp.engines.placement import place_samples
 from lyceum_warp.options import OPTIONS, EnvOptions, suggestion
 from lyceum_warp.task import Planning, Task
 from lyceum_warp.validate import described
@@ -54,7 +56,8 @@ def planner_arguments(
         value: The value function. With one the parameters in ``planning`` do not apply.
 
     Returns:
-        The settings, the options of the planner's worlds, and the parameters of the planner's worlds.
+        The settings, the options of the planner's worlds with the engine and the device that suit the number of
+        samples, and the parameters of the planner's worlds.
 
     Raises:
         ValueError: A word is unknown or ambiguous, or a value is not valid.
@@ -87,7 +90,11 @@ def planner_arguments(
     for word in rest:
         if word not in known:
             raise ValueError(f"the task {name!r} has no parameter {word!r}: {_hint(word, known)}")
-    return config, options, dict(planning.params if value is None else {}) | rest
+    place = place_samples(
+        options.engine, options.device, nthread=options.nthread, samples=config.samples,
+        has_noslip=lambda: _has_noslip(task, options),
+    )  # fmt: skip
+    return config, options.changed(place), dict(planning.params if value is None else {}) | rest
 
 
 def plain(value: Any) -> Any:
@@ -118,6 +125,15 @@ def _check_options(options: Mapping[str, Any]) -> None:
     for name in options:
         if name in _OWN_OPTIONS:
             raise ValueError(f"a planner takes no option {name}: {_OWN_OPTIONS[name]}")
+
+
+def _has_noslip(task: type[Task], options: EnvOptions) -> bool:
+    solver = options.physics.solver or {}
+    if "noslip_iterations" in solver:
+        return solver["noslip_iterations"] > 0
+    if options.model is None and not hasattr(task, "model"):
+        return False  # the environment reports what is missing
+    return task_spec(task, options.model).option.noslip_iterations > 0
 
 
 def _hint(word: str, known: Sequence[str]) -> str:

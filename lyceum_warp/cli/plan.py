@@ -14,7 +14,7 @@ from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.mppi_config import MPPIConfig
 from lyceum_warp.binding.registry import find_task, task_name
 from lyceum_warp.cli.arguments import Physics, Words, optional_flags, parameter, portable
-from lyceum_warp.cli.display import PlanDisplay, filmed_states, make_console, plotted_control, report_table
+from lyceum_warp.cli.display import PlanDisplay, make_console, plotted_control, report_table, states_video
 from lyceum_warp.cli.interrupts import Interrupted
 from lyceum_warp.control.control_report import control_report
 from lyceum_warp.control.loop import control
@@ -227,7 +227,7 @@ def _report(run: Run, plant: Env, done: list[Trajectory], options: Plan) -> int:
     if options.plot:
         paths.append(("plot", plotted_control(done, run.folder / "plan.png")))
     if options.video:
-        paths.append(("video", filmed_states(plant, done[0].states, run.folder / "video.mp4")))
+        paths.append(("video", states_video(plant, done[0].states, run.folder / "video.mp4")))
     for name, path in paths:
         console.print(f"{name + ':':<12}{path}", soft_wrap=True, markup=False)
     return 0

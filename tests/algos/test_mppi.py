@@ -3,7 +3,6 @@
 The planner's own arithmetic is float32; the plain version's is float64, and so the two drift apart by roundings.
 """
 
-import types
 from typing import Any
 
 import mujoco
@@ -16,8 +15,6 @@ from rail_task import Picky, rail
 
 import lyceum_warp as lw
 from lyceum_warp import MPPI, Row
-from lyceum_warp.algos import mppi
-from lyceum_warp.binding.registry import find_task
 from lyceum_warp.tasks.reach import arm
 
 ENGINES = ["mujoco", "warp"]
@@ -447,7 +444,7 @@ def test_hopper_hops_without_falling() -> None:
     assert evals[-1] > 0.3 and rewards.sum() > 165, (evals[-1], rewards.sum())
 
 
-# attributes, worlds, placement
+# attributes and worlds
 
 
 @pytest.mark.parametrize("name", ["horizon", "samples", "temperature", "noise", "smoothing", "discount", "iterations",
@@ -483,41 +480,3 @@ def test_resets_of_the_planners_worlds_do_not_change_plans() -> None:
         assert torch.equal(first, second)
         env.step(first[None])
     assert plans[0].env.episode_step.tolist() == [2, 2, 2, 2]
-
-
-@pytest.mark.parametrize(
-    ("asked", "noslip", "expected"),
-    [
-        (dict(samples=79), False, "cpu"),
-        (dict(samples=80), False, "gpu"),
-        (dict(samples=79, nthread=1), False, "gpu"),
-        (dict(samples=640, nthread=128), False, "gpu"),  # more than 16 cores were not measured
-        (dict(samples=639, nthread=128), False, "cpu"),
-        (dict(samples=160), True, "cpu"),  # the noslip solver is slow on a GPU
-        (dict(samples=479), True, "cpu"),
-        (dict(samples=480), True, "gpu"),
-        (dict(samples=1, engine="warp"), False, "as asked"),
-        (dict(samples=4096, device="cpu"), False, "as asked"),
-        (dict(samples=4096, device=None), False, "as asked"),
-    ],
-)  # fmt: skip
-def test_auto_places_samples_by_their_number(
-    asked: dict[str, Any], noslip: bool, expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(mppi, "find_device", lambda name: types.SimpleNamespace(is_cuda=str(name).startswith("cuda")))
-    asked = {"engine": "auto", "device": "cuda:0", "nthread": 2, "has_noslip": lambda: noslip} | asked
-    changes = {
-        "cpu": {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None},
-        "gpu": {"engine": "warp", "nthread": None},
-        "as asked": {},
-    }
-    assert mppi._place_samples(**asked) == changes[expected]
-
-
-@pytest.mark.parametrize(
-    ("task", "solver", "expected"),
-    [("reach", None, False), ("adroit_pen", None, True), ("adroit_pen", {"iterations": 4}, True),
-     ("adroit_pen", {"noslip_iterations": 0}, False), ("reach", {"noslip_iterations": 3}, True)],
-)  # fmt: skip
-def test_the_noslip_solver_is_found_in_options_or_else_in_the_model(task: str, solver: Any, expected: bool) -> None:
-    assert mppi._has_noslip(find_task(task), None, solver) == expected

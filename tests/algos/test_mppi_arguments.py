@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import types
 from typing import Any
 
 import mujoco
@@ -15,6 +16,7 @@ import lyceum_warp as lw
 from lyceum_warp import MPPI, MPPIConfig, Planning, Row
 from lyceum_warp.algos.mppi_arguments import planner_arguments, task_config
 from lyceum_warp.binding.registry import find_task
+from lyceum_warp.engines import placement
 
 # the planning of a task
 
@@ -206,6 +208,39 @@ def test_the_discount_is_the_given_one_or_else_that_of_the_value_function(
     value = lw.ValueFunction(6)
     value.discount = fitted
     assert arguments(planned(settings={"discount": 0.8}), value=value, **words)[0].discount == expected
+
+
+# where samples are rolled out
+
+
+@pytest.mark.parametrize(
+    ("task", "words", "expected"),
+    [
+        ("reach", dict(samples=79), ("mujoco", "cpu")),
+        ("reach", dict(samples=80), ("warp", "cuda:0")),
+        ("reach", dict(samples=79, nthread=1), ("warp", "cuda:0")),
+        ("reach", dict(samples=639, nthread=128), ("mujoco", "cpu")),
+        ("reach", dict(samples=640, nthread=128), ("warp", "cuda:0")),  # more than 16 cores were not measured
+        ("reach", dict(samples=79, nconmax=16), ("mujoco", "cpu")),
+        ("reach", dict(samples=1, engine="warp"), ("warp", "cuda:0")),
+        ("reach", dict(samples=4096, device="cpu"), ("auto", "cpu")),
+        ("reach", dict(samples=4096, device=None), ("auto", None)),
+        ("reach", dict(samples=100, solver={"noslip_iterations": 3}), ("mujoco", "cpu")),
+        # the hand's noslip solver is slow on a GPU, unless it is turned off
+        ("adroit_pen", dict(samples=160), ("mujoco", "cpu")),
+        ("adroit_pen", dict(samples=479, solver={"iterations": 4}), ("mujoco", "cpu")),
+        ("adroit_pen", dict(samples=480), ("warp", "cuda:0")),
+        ("adroit_pen", dict(samples=160, solver={"noslip_iterations": 0}), ("warp", "cuda:0")),
+    ],
+)  # fmt: skip
+def test_auto_on_a_gpu_places_samples_by_their_number(
+    task: str, words: dict[str, Any], expected: tuple[str, str | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cuda = types.SimpleNamespace(is_cuda=True), types.SimpleNamespace(is_cuda=False)
+    monkeypatch.setattr(placement, "find_device", lambda name: cuda[not str(name).startswith("cuda")])
+    options = arguments(task, **{"device": "cuda:0", "nthread": 2} | words)[1]
+    assert (options.engine, options.device) == expected
+    assert options.physics.nconmax is None, "only the Warp engine takes sizes"
 
 
 # reports

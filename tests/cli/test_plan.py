@@ -15,7 +15,7 @@ import pytest
 import torch
 from conftest import TaskFile
 from rich.console import Console
-from test_cli import QUIET, TINY, interrupted, refused
+from training_runs import QUIET, TINY, interrupted, refused
 
 import lyceum_warp as lw
 from lyceum_warp import Trajectory, cli
