@@ -4,7 +4,7 @@ python bench/episodes.py reach --episodes 100
 python bench/episodes.py adroit_pen --episodes 100 --processes 2 --out pen.csv
 
 Without further options these are the planning tasks of the Lyceum paper, with its settings and its 75 steps. Every
-episode is a row of the table, written when it ends: the same command again goes on where the last one stopped.
+episode is a row of the table, written when it ends: the same command again continues where the last one stopped.
 """
 
 import concurrent.futures
@@ -24,7 +24,7 @@ from rich.console import Console
 
 import lyceum_warp as lw
 from lyceum_warp.cli.arguments import parameter
-from lyceum_warp.control.control_report import wilson
+from lyceum_warp.control.control_statistics import wilson
 from lyceum_warp.versions import versions
 
 
@@ -43,18 +43,18 @@ class Options:
     plan: tuple[str, ...] = ()
     """Other settings of MPPI than the task's own, as NAME=VALUE."""
     solver: tuple[str, ...] = ()
-    """Other limits of the planner's constraint solver, as NAME=VALUE; what is controlled keeps its own."""
+    """Other limits of the planner's constraint solver, as NAME=VALUE; the controlled world keeps its own."""
     param: tuple[str, ...] = ()
     """Parameters of the task, as NAME=VALUE."""
     stop_after: float = math.inf
-    """Seconds after which no further episode is begun."""
+    """Seconds after which no further episode starts."""
     out: Path | None = None
     """Table (CSV) of the episodes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Episode:
-    """What is kept of an episode."""
+    """A row of the table."""
 
     episode: int
     success: bool
@@ -134,7 +134,7 @@ def summarise(console: Console, episodes: list[Episode]) -> None:
 
 
 def same_experiment(options: Options) -> None:
-    """Refuse to go on with a table of other settings; they lie beside it."""
+    """Refuse to continue a table of other settings; its settings are in a file beside it."""
     if options.out is None:
         return
     settings = {name: getattr(options, name) for name in ("task", "steps", "plan", "solver", "param")}

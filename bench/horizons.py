@@ -1,4 +1,4 @@
-"""What a value function does for a short horizon (Lowrey et al. 2019, POLO): MPPI with and without one.
+"""The effect of a value function on short horizons (Lowrey et al. 2019, POLO): MPPI with and without one.
 
     lyceum-warp train hopper --nworld 10 --out runs/hopper
     python bench/horizons.py runs/hopper --horizons 4 8 16 32 64
@@ -52,7 +52,7 @@ class Options:
 
 @dataclasses.dataclass(frozen=True)
 class Episode:
-    """What is kept of an episode."""
+    """A row of the table."""
 
     horizon: int
     value: bool
@@ -72,8 +72,8 @@ def episode(options: Options, horizon: int, with_value: bool, temperature: float
     config = Run.open(options.run).config
     task, params, physics = config["task"], config["params"], config.get("physics", {})
     env = lw.make(task, autoreset=False, horizon=options.steps, nthread=1, **(physics | params))
-    # what the task itself pays, with and without the value function that was fitted to it
-    own = {name: env.task.params[name] for name in env.task.task.planning if name in env.task.params}
+    # the rewards of the task itself, with and without the value function that was fitted to them
+    own = {name: env.task.params[name] for name in env.task.task.planning.params}
     more: dict[str, Any] = {"value": lw.load_value(options.run)} if with_value else {}
     plan = lw.MPPI(
         task, horizon=horizon, samples=options.samples, noise=options.noise, discount=config["npg"]["gamma"], seed=seed,

@@ -140,8 +140,8 @@ def copy_bandwidth(device: wp.Device) -> float:
 
 def measure(task: str, options: Options, bandwidth: float) -> list[Row]:
     where: dict[str, Any] = {"engine": options.engine, "device": options.device}
-    env = lw.make(task, nworld=options.nworld, record=False, **where)
-    plan = lw.MPPI(task, samples=options.nworld, horizon=options.horizon, record=False, **where)
+    env = lw.make(task, nworld=options.nworld, graphs=False, **where)
+    plan = lw.MPPI(task, samples=options.nworld, horizon=options.horizon, graphs=False, **where)
     rows = []
     env.step()
     with caught() as launches:

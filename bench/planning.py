@@ -1,13 +1,12 @@
-"""What a plan costs, beside the bare engine on the same roll-outs and beside MPPI over single Python environments.
+"""The cost of a plan beside the bare engine on the same roll-outs, and beside MPPI over single Python environments.
 
     python bench/planning.py --tasks reach adroit_pen
 
 Planner and bare engine take turns at every step of a controlled episode. The bare engine is one call of
 ``mujoco.batch.Batch.rollout``, or one graph of ``mujoco_warp.step``, from the same state, under the same controls,
-for the same samples, steps and substeps; setting the state and the controls is outside its clock. The baseline does
-what one does without this toolkit, and does it well: an environment as in Gymnasium in each of as many processes as
-there are cores, kept alive, one message for each plan and process, noise and weights in NumPy; it plans from the same
-states afterwards.
+for the same samples, steps and substeps; setting the state and the controls is outside its clock. The baseline is a
+careful planner without this package: an environment as in Gymnasium in each of as many processes as there are cores,
+kept alive, one message for each plan and process, noise and weights in NumPy. It plans from the same states afterwards.
 """
 
 import dataclasses
@@ -56,7 +55,7 @@ class Options:
     nthread: int | None = None
     """Threads of the C engine, and processes of the baseline; all cores by default."""
     option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Other settings of MPPI or options of its environment, as NAME=VALUE."""
+    """Other settings of MPPI or options of its worlds, as NAME=VALUE."""
     solver: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Other limits of the planner's constraint solver, as NAME=VALUE."""
     seconds: float = 60.0
@@ -64,7 +63,7 @@ class Options:
     baseline: bool = True
     """Whether to measure single Python environments, too."""
     out: Path | None = None
-    """JSON file for the record."""
+    """JSON file for the results."""
 
 
 # the baseline: single environments with Gymnasium's step
@@ -119,7 +118,7 @@ BASELINES: dict[str, Callable[[mujoco.MjModel], Any]] = {
 }
 
 
-def work(pipe: Connection, task: str, samples: int, horizon: int, noise_scale: float, smooth: list, seed: int) -> None:
+def work(pipe: Connection, task: str, samples: int, horizon: int, noise_scale: float, smooth: tuple, seed: int) -> None:
     """A process of the baseline: rolls out its share of the samples for every plan that it is sent."""
     env = BASELINES[task](lw.make(task, nthread=1).model)
     random = np.random.default_rng(seed)
@@ -148,12 +147,12 @@ class Baseline:
         self.pipes, self.processes = [], []
         for seed, share in enumerate(shares):
             pipe, other = context.Pipe()
-            settings = (int(share), plan.horizon, plan.settings["noise"], plan.settings["smoothing"], seed)
+            settings = (int(share), plan.horizon, plan.config.noise, plan.config.smoothing, seed)
             process = context.Process(target=work, args=(other, task, *settings), daemon=True)
             process.start()
             self.pipes.append(pipe)
             self.processes.append(process)
-        self(plan.state_of().cpu().numpy())  # wait until all are there
+        self(plan.state_of().cpu().numpy())  # wait until every process is ready
 
     def __call__(self, state: np.ndarray) -> None:
         for pipe in self.pipes:
@@ -183,7 +182,7 @@ class BareC:
         self.size = engine.integration_size
         self.batch = Batch(engine.native_model, plan.samples, engine.nthread)
         self.control = np.zeros((plan.samples, plan.horizon * self.nstep, engine.model.nu))
-        self.records = None
+        self.results = None
 
     def load(self, state: torch.Tensor) -> None:
         """The last plan's state and samples."""
@@ -191,8 +190,8 @@ class BareC:
         self.control[:] = np.repeat(self.plan._loop._controls.numpy().transpose(1, 0, 2), self.nstep, axis=1)
 
     def __call__(self) -> None:
-        self.records = self.batch.rollout(
-            self.control.shape[1], self.control, record=["qpos", "qvel"], out=self.records
+        self.results = self.batch.rollout(
+            self.control.shape[1], self.control, record=["qpos", "qvel"], out=self.results
         )  # fmt: skip
 
 
@@ -278,7 +277,7 @@ def measure(task: str, samples: int, options: Options) -> Row:
     plan(before := plant.get_state())
     while len(times) < warm + 10 or time.perf_counter() - began < options.seconds:
         state = plant.get_state()
-        # whoever comes first wakes the threads: they take turns at that, too
+        # the first of the two wakes the threads, so they take turns at being first
         if first := len(times) % 2 == 0:
             spent = timed(lambda state=state: plan(state))
         bare.load(state if first else before)
@@ -294,7 +293,7 @@ def measure(task: str, samples: int, options: Options) -> Row:
     times = times[warm:]
     spent_ms, bare_ms = (1e3 * statistics.median(t[i] for t in times) for i in (0, 1))
     python_ms = None
-    if options.baseline and task in BASELINES:  # by itself: its processes would take the others' caches
+    if options.baseline and task in BASELINES:  # alone: its processes would compete for the caches
         baseline, began, taken = Baseline(task, plan, processes), time.perf_counter(), []
         for state in itertools.cycle(states):
             start = time.perf_counter()

@@ -37,7 +37,7 @@ class Options:
 
 
 class Slowed:
-    """A planner that takes longer than it has to."""
+    """A planner that waits after each plan until a given time has passed."""
 
     def __init__(self, plan: lw.MPPI, seconds: float) -> None:
         self.plan, self.seconds = plan, seconds
@@ -75,8 +75,8 @@ def main(options: Options) -> None:
         table.add_row(rows[0][0], *(value for _, value in rows))
     Console(width=110).print(table)
     if options.out is not None:
-        record = {name: json.loads(report.to_json()) for name, report in reports.items()}
-        options.out.write_text(json.dumps(record, indent=2) + "\n")
+        contents = {name: json.loads(report.to_json()) for name, report in reports.items()}
+        options.out.write_text(json.dumps(contents, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""What options of the physics gain, and what they lose in accuracy, on states that the model's own options lead to.
+"""Speed and accuracy of options of the physics, on states that the model's own options lead to.
 
     python bench/solver.py --tasks hopper half_cheetah humanoid --nworld 4096 --engine warp --device cuda
 
-Every setting makes the same steps: from each recorded state, episodes that have just begun included, one step with the
-recorded action. A step's error is the largest of a world's velocities, relative to the larger of 1 and the largest
-velocity; its scale is what the model's own options differ by when they make the same steps once more ("own, again":
-on a GPU sums are taken in any order). Settings take turns, so that all see a machine of the same mood.
+Every setting makes the same steps: from each saved state, episodes that have just begun included, one step with the
+saved action. A step's error is the largest of a world's velocities, relative to the larger of 1 and the largest
+velocity; its scale is the difference between two passes with the model's own options ("own, again": on a GPU sums are
+taken in any order). Settings take turns, so that all run under the same load.
 """
 
 import dataclasses
@@ -61,11 +61,11 @@ class Options:
     device: str = "cpu"
     """Device."""
     settings: tuple[str, ...] = tuple(SETTINGS)
-    """What to compare with the model's own options."""
+    """Settings to compare with the model's own options."""
     states: int = 20
     """Steps that each setting makes, five steps of the environment apart."""
     out: Path | None = None
-    """JSON file for the record."""
+    """JSON file for the results."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Row:
     bytes_per_world: float
 
 
-def recorded(task: str, nworld: int, options: Options) -> list[tuple[torch.Tensor, torch.Tensor]]:
+def saved_steps(task: str, nworld: int, options: Options) -> list[tuple[torch.Tensor, torch.Tensor]]:
     """States with the actions that are taken there, under uniformly random ones."""
     env = lw.make(task, nworld=nworld, engine=options.engine, device=options.device)
     generator = torch.Generator(env.obs.device).manual_seed(0)
@@ -102,7 +102,7 @@ def recorded(task: str, nworld: int, options: Options) -> list[tuple[torch.Tenso
 
 
 def measure(task: str, nworld: int, options: Options) -> list[Row]:
-    steps = recorded(task, nworld, options)
+    steps = saved_steps(task, nworld, options)
     envs: dict[str, lw.Env] = {}
     for name in dict.fromkeys(("own", *options.settings)):
         setting = SETTINGS[name]
@@ -115,7 +115,7 @@ def measure(task: str, nworld: int, options: Options) -> list[Row]:
     velocity = envs["own"].state_space.parts["qvel"]
     times: dict[str, list[float]] = {name: [] for name in envs}
     errors: dict[str, list[torch.Tensor]] = {name: [] for name in envs}
-    for state, action in [*steps[:3], *steps]:  # three to warm up, recordings included
+    for state, action in [*steps[:3], *steps]:  # three to warm up, captures included
         wanted = None
         for name, env in envs.items():
             env.set_state(state)

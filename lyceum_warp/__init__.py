@@ -5,15 +5,22 @@ import warp as _wp
 if _wp.config.log_level == _wp.LOG_INFO:  # Warp's default, at which it greets and reports every kernel
     _wp.config.log_level = _wp.LOG_WARNING
 
+from lyceum_warp.algos.evaluation import Episodes, evaluate
 from lyceum_warp.algos.mppi import MPPI
-from lyceum_warp.algos.npg import NPG, Iteration, NPGConfig
+from lyceum_warp.algos.mppi_config import MPPIConfig
+from lyceum_warp.algos.npg import NPG
+from lyceum_warp.algos.npg_config import NPGConfig
 from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.algos.rollout_buffer import Episodes, Rollout, evaluate
+from lyceum_warp.algos.rollout_buffer import Rollout
+from lyceum_warp.algos.statistics import Iteration
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.binding.models import gymnasium_model, gymnasium_robotics_model
 from lyceum_warp.binding.registry import register, task_names
 from lyceum_warp.control.control_report import ControlReport, control_report
-from lyceum_warp.control.loop import ControlProgress, control, control_async
+from lyceum_warp.control.controller import Controller, PlanningController
+from lyceum_warp.control.episode_collector import ControlProgress
+from lyceum_warp.control.loop import control
+from lyceum_warp.control.real_time import control_async
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.done import Done
 from lyceum_warp.env import Env, make
@@ -21,7 +28,7 @@ from lyceum_warp.fields import vec10
 from lyceum_warp.kernels.random import normal, uniform
 from lyceum_warp.openloop import OpenLoop
 from lyceum_warp.runs import load, load_value
-from lyceum_warp.task import Row, Task, body, dof, geom, mocap, qpos, sensor, site
+from lyceum_warp.task import Planning, Row, Task, body, dof, geom, mocap, qpos, sensor, site
 
 __version__ = "0.1.0"
 
@@ -30,13 +37,17 @@ __all__ = [
     "NPG",
     "ControlProgress",
     "ControlReport",
+    "Controller",
     "Done",
     "Env",
     "Episodes",
     "GaussianPolicy",
     "Iteration",
+    "MPPIConfig",
     "NPGConfig",
     "OpenLoop",
+    "Planning",
+    "PlanningController",
     "Rollout",
     "Row",
     "Task",

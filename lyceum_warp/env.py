@@ -16,7 +16,7 @@ from lyceum_warp.binding.registry import find_task
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.engines.placement import few_worlds, find_device, open_engine
+from lyceum_warp.engines.placement import bytes_per_world, few_worlds, find_device, open_engine
 from lyceum_warp.fields import elements
 from lyceum_warp.graphs.compile_ahead import compile_ahead
 from lyceum_warp.kernels import steps
@@ -24,7 +24,7 @@ from lyceum_warp.options import OPTION_DOCS, EnvOptions, signature_of_options
 from lyceum_warp.spaces import Space
 from lyceum_warp.task import Task
 from lyceum_warp.validate import check_tensor, whole_number
-from lyceum_warp.worlds import Worlds
+from lyceum_warp.worlds import Worlds, own_bytes_per_world
 
 _BUFFERS = (*steps.OUTCOMES, "action")
 
@@ -144,7 +144,8 @@ class Env:
         self.timestep, self.model = self.task.timestep, self.task.model
         if options.nvtx and not torch.backends.cuda.is_built():
             raise ValueError("nvtx=True marks phases through torch, whose build here is without CUDA: leave it out")
-        self.engine = open_engine(options, self.model, self.device, self.task.fields)
+        physics = options.engine, self.model, self.nworld, self.device, self.task.fields
+        self.engine = open_engine(*physics, beside=own_bytes_per_world(self.task), **options.for_engine())
         self._given_params = params
         self._scratch: Env | None = None
         try:
@@ -435,8 +436,9 @@ class Env:
 
     @property
     def bytes_per_world(self) -> float:
-        """Memory that one world takes, in bytes: an estimate, without the model, which all worlds share."""
-        return self.engine.bytes_per_world + self.worlds.bytes_per_world
+        """An estimate of the memory that a world takes, in bytes, without the model, which all worlds share."""
+        physics = self.options.engine, self.model, self.device, self.task.fields
+        return bytes_per_world(*physics, **self.options.for_engine()) + own_bytes_per_world(self.task)
 
     @property
     def fault_counts(self) -> dict[str, int]:
@@ -445,7 +447,7 @@ class Env:
         return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
 
 
-make.__signature__ = signature_of_options(make)  # type: ignore[attr-defined]
+make.__signature__ = signature_of_options(make)
 
 
 def _given(values: torch.Tensor, out: torch.Tensor | None) -> torch.Tensor:

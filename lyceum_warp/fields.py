@@ -1,4 +1,4 @@
-"""The simulator's fields: at which stage each is computed, its Warp type, and how it stays current."""
+"""The simulator's fields: the stage that computes each, its Warp type, and how it stays current."""
 
 import dataclasses
 import difflib
@@ -12,7 +12,7 @@ vec10 = wp.types.vector(length=10, dtype=wp.float32)
 
 
 class Stage(enum.IntEnum):
-    """How far a forward pass goes; the values are mjtStage's."""
+    """A stage of a forward pass; the values are those of mjtStage."""
 
     NONE = 0
     POSITION = 1
@@ -51,7 +51,7 @@ DERIVED_FIELDS = (
     | dict.fromkeys(_VELOCITY.split(), Stage.VELOCITY)
     | dict.fromkeys(_ACCELERATION.split(), Stage.ACCELERATION)
 )
-"""Fields that a forward pass computes, with the stage that does."""
+"""Fields that a forward pass computes, with the stage that computes them."""
 
 ON_DEMAND = {
     "cacc": mujoco.mjtSensor.mjSENS_FRAMELINACC,
@@ -60,14 +60,14 @@ ON_DEMAND = {
     "subtree_linvel": mujoco.mjtSensor.mjSENS_SUBTREELINVEL,
     "subtree_angmom": mujoco.mjtSensor.mjSENS_SUBTREEANGMOM,
 }
-"""Fields that MuJoCo leaves at zero unless a sensor of the model needs them, with such a sensor."""
+"""Fields that MuJoCo leaves at zero unless a sensor of the model needs them, with the type of such a sensor."""
 
 SENSED = {"sensordata", *ON_DEMAND}
-"""Fields for which the model's sensors have to be on."""
+"""Fields for which the model's sensors must be enabled."""
 
 _TYPES = {3: wp.vec3, 4: wp.quat, 6: wp.spatial_vector, 9: wp.mat33, 10: vec10}
 
-# the objects along a field's first axis, for access by name
+# the kind of object along a field's first axis, by the prefix of the field's name
 _OBJECTS = {
     "ten": mujoco.mjtObj.mjOBJ_TENDON,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
@@ -93,7 +93,7 @@ _COUNTS = {
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """One field of one model, and the way in which it is wanted."""
+    """One field of one model, and how the engine keeps it."""
 
     name: str
     shape: tuple[int, ...]
@@ -101,13 +101,13 @@ class Field:
     dtype: type
     """Warp type of an element: float, wp.vec3, wp.quat (w, x, y, z as in MuJoCo), ..."""
     refresh: Stage
-    """The stage that has to be computed again for this field to belong to the state."""
+    """The stage that must be computed after a step for this field to belong to the new state."""
     reset: Stage
-    """The stage that has to be computed after a reset."""
+    """The stage that must be computed after a reset."""
     lagged: bool
-    """Wanted as ``mj_step`` leaves it."""
+    """Whether the field stays as ``mj_step`` leaves it, one substep behind the state."""
     snapshot: bool
-    """No function of the integration state: saved and restored with it."""
+    """Whether the field is not a function of the integration state, so that it is saved and restored with it."""
 
     @property
     def size(self) -> int:
@@ -116,20 +116,21 @@ class Field:
 
 
 def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field:
-    """Find out what a field is in a model.
+    """Describe a field of a model.
 
     Args:
         model: The compiled model.
-        name: MuJoCo's name of the field (an attribute of MjData).
-        lagged: Whether it is wanted as ``mj_step`` leaves it, one substep behind the state.
+        name: MuJoCo's name of the field, an attribute of MjData.
+        lagged: Whether to keep the field as ``mj_step`` leaves it, one substep behind the state. Fields of the
+            acceleration stage are always kept so; for a field of the integration state it has no effect.
 
     Raises:
-        ValueError: There is no such field, or it is not the same on both engines.
+        ValueError: There is no such field, or the model has no enabled sensor that makes MuJoCo compute it.
     """
     if name in SENSED and not _sensed(model, name):
         raise ValueError(
-            f"MuJoCo computes the field {name!r} only for a sensor, and the model has none that needs it, or they are "
-            f"off, as nobody needs them: list it in the task's World, or give make() fields=[{name!r}]"
+            f"MuJoCo computes the field {name!r} only for a sensor, and this model has no enabled sensor that needs "
+            f"it: list the field in the task's World, or give make() fields=[{name!r}]"
         )
     if name in STATE_FIELDS:
         refresh = reset = Stage.NONE
@@ -155,8 +156,15 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field
     return Field(name, shape, wp.float32, refresh, reset, lagged, snapshot)
 
 
+def state_columns(model: mujoco.MjModel, name: str) -> slice:
+    """The columns of a state field in the integration state (mjSTATE_INTEGRATION)."""
+    component = STATE_FIELDS[name].value
+    start = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION.value & (component - 1))
+    return slice(start, start + mujoco.mj_stateSize(model, component))
+
+
 def _sensed(model: mujoco.MjModel, name: str) -> bool:
-    """Whether the model's sensors make MuJoCo compute a field."""
+    """Whether a sensor of the model makes MuJoCo compute a field."""
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
         return False
     if name == "sensordata":
@@ -173,8 +181,9 @@ def _sensed(model: mujoco.MjModel, name: str) -> bool:
 def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
     """Where a named element of the model lies in a field, along the axis after the worlds.
 
-    A joint has its coordinates in ``qpos`` and its degrees of freedom in ``qvel`` and its like, a sensor its
-    numbers in ``sensordata``, a mocap body its row in ``mocap_pos``; everything else is one row an object.
+    A joint has its coordinates in ``qpos`` and its degrees of freedom in ``qvel``, ``qacc`` and other fields of that
+    size, a sensor its numbers in ``sensordata``, a mocap body its row in ``mocap_pos``. In every other field each
+    object has one row.
 
     Raises:
         ValueError: The model has no such element.
@@ -203,7 +212,7 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
     if name in ("mocap_pos", "mocap_quat"):
         i = int(model.body_mocapid[find(mujoco.mjtObj.mjOBJ_BODY)])
         if i < 0:
-            raise ValueError(f"the body {element!r} is no mocap body, so it has no {name!r}")
+            raise ValueError(f"the body {element!r} is not a mocap body, so it has no {name!r}")
         return slice(i, i + 1)
     prefix = name.partition("_")[0]
     if name == "ctrl":

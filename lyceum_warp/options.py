@@ -30,6 +30,11 @@ SOLVER_LIMITS = {"iterations": 1, "ls_iterations": 1, "noslip_iterations": 0}
 """The limits of the constraint solver that ``solver`` accepts, with the smallest value of each."""
 
 
+def _for_engine(default: Any) -> Any:
+    """A field of an option that the engine's constructor takes."""
+    return dataclasses.field(default=default, metadata={"engine": True})
+
+
 def _given(options: Any) -> dict[str, Any]:
     values = {field.name: (getattr(options, field.name), field.default) for field in dataclasses.fields(options)}
     return {name: value for name, (value, default) in values.items() if value is not default and value != default}
@@ -78,14 +83,14 @@ class PhysicsOptions:
     solver: Mapping[str, int] | None = None
     """Limits of the constraint solver: any of iterations, ls_iterations (of its line search) and noslip_iterations
     (0 turns the noslip solver off)."""
-    nconmax: int | None = None
+    nconmax: int | None = _for_engine(None)
     """Contacts that the Warp engine has room for in each world, on average; by default twice the peak of a probe."""
-    njmax: int | None = None
+    njmax: int | None = _for_engine(None)
     """Constraints that the Warp engine has room for in each world; by default twice the peak of a probe."""
-    deterministic: bool = False
+    deterministic: bool = _for_engine(False)
     """Make two runs on a CUDA device equal to the bit. Costs 5 to 18 times the time and 5 to 7 times the memory on
     hopper, half_cheetah and humanoid. Runs on the CPU are always equal to the bit."""
-    unroll: bool = False
+    unroll: bool = _for_engine(False)
     """Unroll the solver's iterations in the Warp engine instead of a loop that ends with the last world's. The numbers
     stay the same. Needs a solver limit of at most 20 iterations; with 4 it gained 3 to 5 % on half_cheetah and
     humanoid and lost 1 to 2 % on hopper. The C engine ignores it."""
@@ -121,7 +126,7 @@ class EnvOptions:
     engine: str | Callable[..., Any] = "auto"
     """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU. Also a callable
     with the signature of ``lyceum_warp.engines.base.Engine``, for an engine of your own."""
-    nthread: int | None = None
+    nthread: int | None = _for_engine(None)
     """Threads of the C engine; by default all cores."""
     seed: int = 0
     """Seed of the worlds' random streams."""
@@ -175,6 +180,11 @@ class EnvOptions:
         if physics:
             others["physics"] = dataclasses.replace(others.get("physics", self.physics), **physics)
         return dataclasses.replace(self, **others)
+
+    def for_engine(self) -> dict[str, Any]:
+        """The options that the engine's constructor takes, by name."""
+        both = [(options, field) for options in (self, self.physics) for field in dataclasses.fields(options)]
+        return {field.name: getattr(options, field.name) for options, field in both if field.metadata.get("engine")}
 
     def given(self) -> dict[str, Any]:
         """The options that differ from their defaults, those of the physics included, by name."""

@@ -139,6 +139,30 @@ def mocap(body: str) -> int:
     return Element("mocap_pos", body)
 
 
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Planning:
+    """What suits a task when MPPI plans for it.
+
+    Raises:
+        ValueError: A part is not a dict.
+    """
+
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Settings of the planner, by the names of ``lw.MPPIConfig``."""
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Options of the planner's worlds, by the names that ``lw.make`` knows, as ``{"integrator": "euler"}``."""
+    params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Parameters of the planner's worlds, by the names of the task's ``Params``. They do not apply where MPPI is given
+    a value function, because that was fitted to the rewards of the task itself."""
+
+    def __post_init__(self) -> None:
+        """Check the type of every part."""
+        for field in dataclasses.fields(self):
+            if not isinstance(part := getattr(self, field.name), Mapping):
+                raise ValueError(f"{field.name} of lw.Planning must be a dict, not {part!r}")
+
+
 @_document_functions
 @document_attributes
 class Task:
@@ -181,9 +205,9 @@ class Task:
     action_range: ClassVar[tuple[float, float] | None] = None
     """The range of an action that the default ``control`` scales to the model's control ranges; None: actions are
     controls."""
-    planning: ClassVar[Mapping[str, Any]] = {}
-    """What suits this task of MPPI's arguments (horizon, samples, temperature, noise, ...), and options or
-    parameters for the planner's worlds alone."""
+    planning: ClassVar[Planning] = Planning()
+    """What suits this task when MPPI plans for it: settings of the planner, and options and parameters of its worlds,
+    as ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
 
     # World, Params and functions of the class's module when the class was made
     scope: ClassVar[dict[str, Any]] = {}

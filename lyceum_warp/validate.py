@@ -1,15 +1,17 @@
-"""Checks of what a user gives that more than one room needs."""
+"""Checks of values that users pass, shared by several rooms."""
 
+import math
+import numbers
 from typing import Any
 
 import torch
 
 
 def whole_number(name: str, value: Any, *, low: int, high: int = 2**31 - 1) -> int:
-    """A whole number within bounds, from whatever type of number it comes as.
+    """Convert a number of any type to an int, and check its bounds.
 
     Raises:
-        ValueError: It is none.
+        ValueError: The value is not a whole number from low to high.
     """
     try:
         number = int(value)
@@ -21,45 +23,70 @@ def whole_number(name: str, value: Any, *, low: int, high: int = 2**31 - 1) -> i
     return number
 
 
-def check_kind(name: str, value: Any, kind: Any, example: str) -> None:
-    """Refuse something of another type.
+def positive_number(name: str, value: Any, unit: str) -> float:
+    """Check that a value is a positive, finite number, and convert it to a float.
 
     Raises:
-        ValueError: It is.
+        ValueError: The value is not a positive, finite number.
+    """
+    if not isinstance(value, (int, float)) or not 0 < value < math.inf:
+        raise ValueError(f"{name} must be a positive number of {unit}, not {value!r}")
+    return float(value)
+
+
+def check_kind(name: str, value: Any, kind: Any, example: str) -> None:
+    """Check the type of a value.
+
+    Raises:
+        ValueError: The value is not an instance of ``kind``.
     """
     if not isinstance(value, kind):
         wanted = getattr(kind, "__name__", str(kind).rpartition(".")[2])
-        raise ValueError(f"{name} has to be of type {wanted}, {example}, not {described(value)}")
+        raise ValueError(f"{name} must be of type {wanted}, {example}, not {described(value)}")
 
 
-def layer_sizes(hidden: Any) -> list[int]:
-    """Widths of hidden layers.
+def layer_sizes(hidden: Any, name: str = "hidden") -> list[int]:
+    """Check the widths of hidden layers.
 
     Raises:
-        ValueError: They are none.
+        ValueError: The value is not a sequence of positive whole numbers.
     """
     try:
         return [whole_number("a width", width, low=1) for width in hidden]
     except (TypeError, ValueError) as error:
-        raise ValueError(f"hidden layers are given by their widths, as in (64, 64), not as {hidden!r}") from error
+        raise ValueError(f"{name} must be the widths of the hidden layers, as in (64, 64), not {hidden!r}") from error
 
 
 def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:
-    """Compare something given with the buffer that it is meant for.
+    """Check that a value has the shape, the type and the device of a buffer.
 
     Raises:
-        ValueError: It is no tensor of the same shape and type.
+        ValueError: The value is not a tensor, or differs from the buffer in one of them.
     """
     if not isinstance(value, torch.Tensor) or value.shape != like.shape or value.dtype != like.dtype:
-        raise ValueError(f"{name} has to be {described(like)}, not {described(value)}")
+        raise ValueError(f"{name} must be {described(like)}, not {described(value)}")
     if value.device != like.device:
-        raise ValueError(f"{name} lies on {value.device}, but belongs on {like.device}: move it with .to()")
+        raise ValueError(f"{name} must lie on {like.device}, not on {value.device}: move it with .to()")
 
 
 def described(value: Any) -> str:
-    """A value in a few words, for messages."""
+    """Describe a value in a few words, for error messages."""
     if isinstance(value, torch.Tensor):
         return f"a {str(value.dtype).removeprefix('torch.')} tensor of shape {tuple(value.shape)}"
     if hasattr(value, "shape"):
         return f"a {type(value).__name__} of shape {tuple(value.shape)}"
     return f"{type(value).__name__} {value!r}"
+
+
+def finite_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
+    """Convert a finite number of any type to a float, and check its bounds.
+
+    Raises:
+        ValueError: The value is not a finite number from low to high.
+    """
+    if not isinstance(value, bool) and isinstance(value, numbers.Real):
+        number = float(value)
+        if math.isfinite(number) and low <= number <= high:
+            return number
+    bounds = f" from {low:g} to {high:g}" if high < math.inf else f" of at least {low:g}" if low > -math.inf else ""
+    raise ValueError(f"{name} must be a finite number{bounds}, not {value!r}")

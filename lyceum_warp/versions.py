@@ -1,4 +1,4 @@
-"""What numbers depend on besides the code that makes them."""
+"""The versions and the machine that a run's numbers depend on."""
 
 import functools
 import importlib.metadata
@@ -15,7 +15,11 @@ _PACKAGES = ("lyceum-warp", "mujoco", "mujoco-warp", "warp-lang", "torch", "nump
 
 
 def versions(device: str = "cpu") -> dict[str, Any]:
-    """What a run depends on: packages, Python, the machine, and the commit if this is a checkout of git."""
+    """Versions of the packages and of Python, the machine, and the commit in a git checkout.
+
+    Args:
+        device: Device of the run; a CUDA device adds the names of the GPU and of the CUDA version.
+    """
     found: dict[str, Any] = {}
     for package in _PACKAGES:
         try:
@@ -49,7 +53,7 @@ def _cpu_name() -> str:
 def _commit() -> str | None:
     root = Path(__file__).resolve().parent.parent
     git = shutil.which("git")
-    # an installed package may lie in somebody else's checkout: only our own counts
+    # an installed package may lie inside the checkout of another project, whose commit would be wrong
     if git is None or not (root / ".git").exists():
         return None
     command = [git, "describe", "--always", "--dirty", "--abbrev=40"]

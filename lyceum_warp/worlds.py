@@ -33,6 +33,14 @@ class Programs:
     restore_state: Calls
 
 
+def own_bytes_per_world(task: BoundTask) -> int:
+    """An estimate of the memory that ``Worlds`` takes for each world beside its engine, in bytes."""
+    snapshots = [field for field in task.fields if field.snapshot]
+    state_size = state_space(task.model, snapshots, task.task.memory).size
+    copies = sum(field.size for field in task.fields)
+    return 4 * copies + 8 * state_size + 8 * sum(task.obs_layout.values()) + 200
+
+
 class Worlds:
     """Many worlds of one task on one engine: arrays of fixed address, and the phases that work on them.
 

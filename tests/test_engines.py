@@ -180,7 +180,7 @@ def test_the_integrator_matters_and_both_engines_have_it() -> None:
         ({"integrator": "rk5"}, "no integrator 'rk5': use 'euler', 'rk4', 'implicit' or 'implicitfast'"),
         ({"integrator": 1}, "no integrator 1: use"),
         ({"solver": {"iteration": 3}}, "no limit 'iteration': it takes 'iterations', 'ls_iterations', 'noslip_"),
-        ({"solver": {"iterations": 0}}, "solver's iterations has to be a whole number from 1 to .*, not 0"),
+        ({"solver": {"iterations": 0}}, "solver's iterations must be a whole number from 1 to .*, not 0"),
         ({"solver": 4}, "solver has to be a dict of limits, as .*, not 4"),
         ({"iterations": 4}, r"no parameter 'iterations': did you mean solver=\{'iterations': ...\}"),
         ({"nvtx": True}, "nvtx=True marks phases through torch"),

@@ -215,14 +215,14 @@ def test_a_bad_action_is_applied_as_zero(engine: str) -> None:
         ({"ctrl_cost_weight": [1.0, 2.0]}, r"shape \(2,\); it takes one number, or one a world, \(4,\)"),
         ({"healthy_z_range": 1.0}, r"healthy_z_range of 'hopper' has shape \(\); it takes \(2,\)"),
         ({"terminate_when_unhealthy": 0.5}, "terminate_when_unhealthy=0.5 of 'hopper' has to be a whole number"),
-        ({"nworld": 0}, "nworld has to be a whole number from 1 to .*, not 0"),
+        ({"nworld": 0}, "nworld must be a whole number from 1 to .*, not 0"),
         ({"nworld": 2.5}, "nworld .* not 2.5"),
         ({"nworld": "many"}, "nworld .* not 'many'"),
-        ({"frame_skip": -1}, "frame_skip has to be a whole number from 1 to .*, not -1"),
+        ({"frame_skip": -1}, "frame_skip must be a whole number from 1 to .*, not -1"),
         ({"frame_skip": float("inf")}, "frame_skip .* not inf"),
-        ({"horizon": -5}, "horizon has to be a whole number from 0 to .*, not -5"),
+        ({"horizon": -5}, "horizon must be a whole number from 0 to .*, not -5"),
         ({"horizon": 1.5}, "horizon .* not 1.5"),
-        ({"seed": -1}, "seed has to be a whole number from 0 to 2147483647, not -1"),
+        ({"seed": -1}, "seed must be a whole number from 0 to 2147483647, not -1"),
         ({"seed": 2**31}, "seed .* not 2147483648"),
         ({"seed": "lucky"}, "seed .* not 'lucky'"),
         ({"cone": "round"}, "no friction cone 'round': use 'pyramidal' or 'elliptic'"),
@@ -232,8 +232,8 @@ def test_a_bad_action_is_applied_as_zero(engine: str) -> None:
         ({"engine": None}, "no engine None"),
         ({"engine": "mujoco", "njmax": 64}, r"the mujoco engine takes no njmax; it takes \['nthread'\]"),
         ({"engine": "warp", "nthread": 2}, r"the warp engine takes no nthread; it takes \['nconmax', 'njmax'\]"),
-        ({"engine": "warp", "njmax": -3}, "njmax has to be a whole number from 1 to .*, not -3"),
-        ({"engine": "mujoco", "nthread": -3}, "nthread has to be a whole number from 0 to .*, not -3"),
+        ({"engine": "warp", "njmax": -3}, "njmax must be a whole number from 1 to .*, not -3"),
+        ({"engine": "mujoco", "nthread": -3}, "nthread must be a whole number from 0 to .*, not -3"),
         ({"model": "hoper.xml"}, "no model file 'hoper.xml' in .*; it has hopper.xml"),
         ({"model": "/nowhere/hopper.xml"}, "no model file '/nowhere/hopper.xml'"),
     ],
@@ -296,7 +296,7 @@ def env() -> lw.Env:
 @pytest.mark.parametrize("method", ["step", "set_action"])
 def test_actions_that_do_not_fit(env: lw.Env, method: str) -> None:
     call = getattr(env, method)
-    wanted = r"action has to be a float32 tensor of shape \(4, 3\), not "
+    wanted = r"action must be a float32 tensor of shape \(4, 3\), not "
     with pytest.raises(ValueError, match=wanted + r"a float32 tensor of shape \(3,\)"):
         call(torch.zeros(3))
     with pytest.raises(ValueError, match=wanted + r"a float64 tensor of shape \(4, 3\)"):
@@ -316,7 +316,7 @@ def test_an_action_that_is_not_finite(env: lw.Env) -> None:
 
 def test_states_that_do_not_fit(env: lw.Env) -> None:
     state = env.get_state()
-    wanted = r"state has to be a float64 tensor of shape \(4, \d+\), not a "
+    wanted = r"state must be a float64 tensor of shape \(4, \d+\), not a "
     with pytest.raises(ValueError, match=wanted + r"float64 tensor of shape \(2, \d+\)"):
         env.set_state(state[:2])
     with pytest.raises(ValueError, match=wanted + "float32"):
@@ -340,16 +340,16 @@ def test_masks_and_outputs_that_do_not_fit(env: lw.Env) -> None:
     calls = (env.reset, lambda mask: env.rand_reset(mask=mask), lambda mask: env.set_state(state, mask))
     for mask in (torch.ones(3, dtype=torch.bool), torch.ones(N), np.ones(N, bool), [True] * N):
         for call in calls:
-            with pytest.raises(ValueError, match=r"a mask has to be a bool tensor of shape \(4,\), not "):
+            with pytest.raises(ValueError, match=r"a mask must be a bool tensor of shape \(4,\), not "):
                 call(mask)
     for out in (torch.zeros(N, 10), torch.zeros(N, 11, dtype=torch.float64), np.zeros((N, 11))):
-        with pytest.raises(ValueError, match=r"out has to be a float32 tensor of shape \(4, 11\), not a "):
+        with pytest.raises(ValueError, match=r"out must be a float32 tensor of shape \(4, 11\), not a "):
             env.get_obs(out=out)
     with pytest.raises(ValueError, match="give before, action and after, or none of them"):
         env.get_reward(env.get_state())
-    with pytest.raises(ValueError, match="action has to be"):
+    with pytest.raises(ValueError, match="action must be"):
         env.get_reward(env.get_state(), torch.zeros(3), env.get_state())
-    with pytest.raises(ValueError, match="seed has to be"):
+    with pytest.raises(ValueError, match="seed must be"):
         env.rand_reset(-3)
 
 

@@ -12,7 +12,7 @@ ROOT = Path(lw.__file__).parent
 PATHS = sorted(ROOT.rglob("*.py"))
 
 LEVELS = {
-    "arrays": 0, "docstrings": 0, "done": 0, "mujoco_log": 0, "validate": 0, "versions": 0,
+    "docstrings": -1, "arrays": 0, "done": 0, "files": 0, "machine": 0, "mujoco_log": 0, "validate": 0, "versions": 0,
     "fields": 1, "kernels": 1, "options": 1, "task": 1,
     "graphs": 2, "spaces": 2,
     "binding": 3, "engines": 3,
@@ -36,7 +36,7 @@ MODULES = {module_name(path): path for path in PATHS}
 
 
 def room(module: str) -> str:
-    return (module.split(".") + ["__init__"])[1]
+    return [*module.split("."), "__init__"][1]
 
 
 def imported_modules(path: Path) -> set[str]:

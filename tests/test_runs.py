@@ -1,4 +1,4 @@
-"""A run's folder: what it refuses, what it survives, and what comes back from it."""
+"""The folder of a run: creation, table, checkpoint, and what is refused."""
 
 import csv
 import json
@@ -18,28 +18,25 @@ def run(tmp_path: Path) -> Run:
     return run
 
 
-def test_create_and_open(run: Run) -> None:
-    again = Run.open(run.folder)
-    assert again.config == {"format": FORMAT, "task": "hopper", "seed": 0, "scale": float("inf")}
+def test_open_returns_the_configuration(run: Run) -> None:
+    assert Run.open(run.folder).config == {"format": FORMAT, "task": "hopper", "seed": 0, "scale": float("inf")}
+
+
+def test_create_writes_the_versions(run: Run) -> None:
     versions = json.loads((run.folder / "versions.json").read_text())
     assert versions["torch"] == torch.__version__
-    assert {
-        "lyceum_warp",
-        "mujoco",
-        "mujoco_warp",
-        "warp_lang",
-        "numpy",
-        "python",
-        "platform",
-        "cpu",
-    } <= versions.keys()
-    state = again.read()["state"]
+    packages = {"lyceum_warp", "mujoco", "mujoco_warp", "warp_lang", "numpy"}
+    assert packages | {"python", "platform", "cpu"} <= versions.keys()
+
+
+def test_read_returns_the_saved_state(run: Run) -> None:
+    state = Run.open(run.folder).read()["state"]
     assert state["counter"] == 5
     assert state["tensor"].tolist() == [0, 1, 2]
     assert {path.name for path in run.folder.iterdir()} == {"config.json", "versions.json", "checkpoint.pt"}
 
 
-def test_create_refuses_what_is_there(run: Run, tmp_path: Path) -> None:
+def test_create_refuses_a_folder_with_content(run: Run, tmp_path: Path) -> None:
     before = {path: path.read_bytes() for path in run.folder.iterdir()}
     with pytest.raises(ValueError, match=r"holds a run: continue it with --resume .*, or give another --out"):
         Run.create(run.folder, {})
@@ -56,9 +53,12 @@ def test_create_leaves_no_folder_when_the_configuration_is_bad(tmp_path: Path) -
     assert not (tmp_path / "run").exists()
 
 
-def test_open_refuses(tmp_path: Path) -> None:
+def test_open_of_an_empty_folder_finds_no_run(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"there is no run in .*: it has no config\.json"):
         Run.open(tmp_path)
+
+
+def test_open_refuses_a_foreign_configuration(tmp_path: Path) -> None:
     for text in ("{", "[]", "{}", '"text"'):
         (tmp_path / "config.json").write_text(text)
         with pytest.raises(ValueError, match=r"config\.json is not the configuration of a run"):
@@ -66,14 +66,20 @@ def test_open_refuses(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text('{"format": "one"}')
     with pytest.raises(ValueError, match="was not written by lyceum_warp: its format is 'one'"):
         Run.open(tmp_path)
+
+
+def test_open_refuses_a_run_of_a_newer_release(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(json.dumps({"format": FORMAT + 1}))
     with pytest.raises(ValueError, match=r"newer lyceum_warp \(format 2, this one reads up to 1\): pip install --up"):
         Run.open(tmp_path)
 
 
-def test_metrics(run: Run) -> None:
+def test_rows_before_the_first_iteration_are_missing(run: Run) -> None:
     with pytest.raises(FileNotFoundError, match="the run has no complete iteration"):
         run.rows()
+
+
+def test_rows_come_back_with_every_digit(run: Run) -> None:
     rows = [{"iteration": i, "value": i / 3, "mean": None if i % 2 else 1e-30, "bad": float("nan")} for i in (1, 2, 3)]
     for row in rows:
         run.write(row)
@@ -82,16 +88,16 @@ def test_metrics(run: Run) -> None:
     assert table[0] == ["iteration", "value", "mean", "bad"]
     assert table[1] == ["1", repr(1 / 3), "", "nan"]
     read = run.rows()
-    assert [row["value"] for row in read] == [row["value"] for row in rows]  # every digit
+    assert [row["value"] for row in read] == [row["value"] for row in rows]
     assert [row["mean"] for row in read] == [None, 1e-30, None]
 
 
 def test_cut_drops_rows_without_a_checkpoint(run: Run) -> None:
-    run.cut(2)  # nothing there yet
+    run.cut(2)  # without a table
     for i in (1, 2, 3):
         run.write({"iteration": i, "value": 0.5})
     with run.metrics.open("a") as file:
-        file.write("4,0.")  # a row that the end of the process cut off
+        file.write("4,0.")  # a row that was cut off when the process ended
     whole = run.metrics.read_text()
     run.cut(2)
     assert [row["iteration"] for row in run.rows()] == [1, 2]
@@ -103,16 +109,16 @@ def test_cut_drops_rows_without_a_checkpoint(run: Run) -> None:
     assert [row["iteration"] for row in run.rows()] == [1]
 
 
-def test_metrics_that_are_none(run: Run) -> None:
+def test_a_table_of_another_kind_is_refused(run: Run) -> None:
     run.metrics.write_text("iteration,value\n1,apple\n")
-    with pytest.raises(ValueError, match=r"metrics\.csv is no table of metrics: line 2"):
+    with pytest.raises(ValueError, match=r"metrics\.csv is not a table of metrics: line 2"):
         run.rows()
     run.metrics.write_text("iteration,value\n1,2,3\n")
     with pytest.raises(ValueError, match="line 2"):
         run.rows()
 
 
-def test_load_gives_the_same_policy(run: Run) -> None:
+def test_load_returns_the_same_policy(run: Run) -> None:
     policy = GaussianPolicy(3, 2, (8, 4), normalize=True)
     policy.normalizer.update(3.0 + 2.0 * torch.randn(100, 3))  # type: ignore[operator]
     run.save(1, policy, {})
@@ -138,14 +144,14 @@ def test_a_failed_save_keeps_the_old_checkpoint(run: Run, monkeypatch: pytest.Mo
 
 
 class Foreign:
-    """Something that a checkpoint must never bring to life."""
+    """A class whose instances a checkpoint must not contain."""
 
 
 @pytest.mark.parametrize("kind", ["empty", "truncated", "text", "foreign", "code", "list", "newer", "partial", "shape"])
-def test_broken_and_foreign_checkpoints(run: Run, kind: str) -> None:
+def test_broken_and_foreign_checkpoints_are_refused_in_one_line(run: Run, kind: str) -> None:
     path, whole = run.checkpoint, run.checkpoint.read_bytes()
     content = run.read()
-    mend = "restore the file from a copy, or train again with another --out"
+    fix = "restore the file from a copy, or train again with another --out"
     match kind:
         case "empty":
             path.write_bytes(b"")
@@ -161,26 +167,26 @@ def test_broken_and_foreign_checkpoints(run: Run, kind: str) -> None:
             torch.save([1, 2], path)
         case "newer":
             torch.save(content | {"lyceum_warp": FORMAT + 1}, path)
-            mend = "pip install --upgrade lyceum-warp"
+            fix = "pip install --upgrade lyceum-warp"
         case "partial":
             del content["policy"]
             torch.save(content, path)
         case "shape":
             content["policy"]["shape"]["nobs"] = 4
             torch.save(content, path)
-    with pytest.raises(ValueError, match=mend) as caught:
+    with pytest.raises(ValueError, match=fix) as caught:
         load(run)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_checkpoint(run: Run) -> None:
+def test_a_missing_checkpoint_is_reported(run: Run) -> None:
     run.checkpoint.unlink()
     with pytest.raises(FileNotFoundError, match=r"there is no checkpoint .*checkpoint\.pt: train the run first"):
         load(run)
 
 
-def test_changed_versions_are_told_and_noted(run: Run) -> None:
+def test_changed_versions_are_returned_and_noted(run: Run) -> None:
     now = json.loads((run.folder / "versions.json").read_text())
     assert run.changed(now) == {}
     assert run.changed(now | {"torch": "9.9"}) == {"torch": (torch.__version__, "9.9")}

@@ -9,13 +9,11 @@ import sys
 import types
 from pathlib import Path
 
-import mujoco
 import pytest
 import torch
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp.cli import main
 from lyceum_warp.engines import memory
 from lyceum_warp.engines.memory import Footprint, Scratch, bytes_of, check_fit
 from lyceum_warp.graphs.rehearsal import rehearse
@@ -189,27 +187,3 @@ def test_bytes_are_counted_once() -> None:
     view = wp.to_torch(array)
     assert bytes_of(array, view, view[2:], {"a": [array[3]]}, array.numpy()) == 400
     assert bytes_of([torch.zeros(4), None, "text", 3]) == 16
-
-
-def test_warmup_says_what_it_did(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["warmup", "point_mass", "--engine", "warp", "--nworld", "8"]) == 0
-    out = capsys.readouterr().out
-    assert out.startswith("point_mass on cpu: ")
-    assert "kB a world of 8; at most some " in out
-    assert main(["warmup", "point_mass", "--nworld", "8", "--plan", "--npg"]) == 0
-    assert "kB a world of 8\n" in capsys.readouterr().out
-    assert main(["warmup", "nothing"]) == 2
-
-
-def test_warmup_with_other_physics(made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]) -> None:
-    warmup = ["warmup", "point_mass", "--nworld", "8", "--plan"]
-    options = ["--integrator", "implicitfast", "--solver", "ls_iterations=9", "--deterministic"]
-    assert main([*warmup, *options]) == 0
-    assert len(made_envs) == 2  # the environment's and the planner's
-    for env in made_envs:
-        opt = env.model.opt
-        assert (opt.integrator, opt.ls_iterations) == (mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 9)
-        assert env._options["deterministic"]
-    capsys.readouterr()
-    assert main([*warmup, "--integrator", "rk5"]) == 2
-    assert "there is no integrator 'rk5'" in capsys.readouterr().err

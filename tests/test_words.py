@@ -1,9 +1,6 @@
 """One word for one thing: words and phrases that were settled against, with their replacements."""
 
-import re
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).parent.parent
 

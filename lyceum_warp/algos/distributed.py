@@ -1,8 +1,8 @@
 """Learning in several processes: each steps its share of the worlds, and all make the same update.
 
-Sums over all worlds are sums over a process's own worlds, then over the processes. Random numbers for all worlds
-are drawn in every process from the same stream, and each takes those of its own worlds. So it makes no difference,
-but for the rounding of sums, how many processes there are.
+A sum over all worlds is a sum over each process's own worlds, then over the processes. Every process draws the random
+numbers of all worlds from the same stream and takes those of its own worlds. The number of processes therefore changes
+nothing but the rounding of sums.
 """
 
 import contextlib
@@ -15,9 +15,9 @@ from torch import distributed
 
 
 class Team:
-    """The processes that learn together, and what they do with each other; alone, there is nothing to do.
+    """The processes that learn together, and their communication. A team of one process does not communicate.
 
-    Every method but ``share`` and ``rows`` has to be called by all of them, in the same order.
+    All processes must call every method but ``share`` and ``locate``, in the same order.
 
     Args:
         rank: Number of this process.
@@ -32,20 +32,20 @@ class Team:
 
     @property
     def leads(self) -> bool:
-        """Whether this is the process that writes files and speaks."""
+        """Whether this is the process that writes files and messages."""
         return self.rank == 0
 
     @property
-    def records(self) -> bool:
-        """Whether a CUDA graph can hold what the processes do with each other."""
+    def captures(self) -> bool:
+        """Whether a CUDA graph can hold the communication of the processes."""
         return self.size == 1 or distributed.get_backend() == "nccl"
 
-    def hold(self, graph: torch.cuda.CUDAGraph) -> None:
-        """Take note of a graph that holds what the processes do with each other, for ``release``."""
+    def keep(self, graph: torch.cuda.CUDAGraph) -> None:
+        """Register a graph that holds communication, for ``release``."""
         self._graphs.add(graph)
 
     def release(self) -> None:
-        """End all graphs that ``hold`` was told of: NCCL's end waits for them, for ever."""
+        """Reset all graphs that ``keep`` registered. As long as one exists, NCCL does not shut down."""
         for graph in list(self._graphs):
             graph.reset()
 
@@ -53,21 +53,24 @@ class Team:
         """Number of worlds of each process, of ``nworld`` in all.
 
         Raises:
-            ValueError: They cannot be shared out evenly.
+            ValueError: ``nworld`` is not a multiple of the number of processes.
         """
         if nworld % self.size:
-            raise ValueError(f"{nworld} worlds cannot be shared evenly by {self.size} processes: take a multiple")
+            raise ValueError(
+                f"{self.size} processes cannot share {nworld} worlds evenly: use a multiple of {self.size}"
+            )
         return nworld // self.size
 
-    def rows(self, index: torch.Tensor, nworld: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Where samples of all worlds are among those of this process's worlds.
+    def locate(self, index: torch.Tensor, nworld: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Find samples of all worlds among those of this process's worlds.
 
         Args:
             index: Places in the flattened (steps, all worlds).
             nworld: Number of this process's worlds.
 
         Returns:
-            Places in the flattened (steps, nworld), 0 for samples of other processes, and whether it is an own one.
+            Places in the flattened (steps, nworld), 0 for samples of other processes; and whether each sample is one
+            of this process.
         """
         step, world = index // (nworld * self.size), index % (nworld * self.size) - self.rank * nworld
         own = (world >= 0) & (world < nworld)
@@ -80,43 +83,43 @@ class Team:
         return tensor
 
     def largest(self, number: int) -> int:
-        """The largest of the processes' numbers; several wait for their devices."""
+        """The largest of the processes' numbers. Waits for the device if there are several processes."""
         if self.size == 1:
             return number
         numbers = torch.tensor(number, device=self.device)
         distributed.all_reduce(numbers, distributed.ReduceOp.MAX)
         return int(numbers)
 
-    def gather(self, rows: torch.Tensor) -> torch.Tensor:
-        """The rows of all processes, (size * n, ...) from (n, ...), in every process."""
+    def gather(self, part: torch.Tensor) -> torch.Tensor:
+        """The parts of all processes one after another, (size * n, ...) from (n, ...), in every process."""
         if self.size == 1:
-            return rows
-        everyones = rows.new_empty(self.size * rows.shape[0], *rows.shape[1:])
-        distributed.all_gather(list(everyones.chunk(self.size)), rows.contiguous())
-        return everyones
+            return part
+        whole = part.new_empty(self.size * part.shape[0], *part.shape[1:])
+        distributed.all_gather(list(whole.chunk(self.size)), part.contiguous())
+        return whole
 
     @torch.no_grad()
-    def follow(self, tensors: Iterable[torch.Tensor]) -> None:
-        """Take over the leading process's numbers, in place.
+    def copy_leader(self, tensors: Iterable[torch.Tensor]) -> None:
+        """Overwrite tensors with those of the leading process.
 
-        Parameters that every process updated for itself are the same already where all have the same hardware;
-        where they have not, rounding must not let them drift apart.
+        Where all processes have the same hardware, parameters that each updated for itself are equal already.
+        Elsewhere this keeps rounding from driving them apart.
         """
         if self.size > 1:
             tensors = list(tensors)
-            everything = torch.cat([tensor.reshape(-1) for tensor in tensors])
-            distributed.broadcast(everything, 0)
-            for tensor, part in zip(tensors, everything.split([t.numel() for t in tensors]), strict=True):
+            flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
+            distributed.broadcast(flat, 0)
+            for tensor, part in zip(tensors, flat.split([t.numel() for t in tensors]), strict=True):
                 tensor.copy_(part.view_as(tensor))
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
-        """What all processes have to get through: an error in one ends the others, too, and those quietly.
+        """A block that ends in all processes if it fails in one; only the one that failed reports the error.
 
-        Within it nobody may do anything else together: a process that has failed would not take part.
+        The block itself must not communicate: a process that has failed would not take part.
 
         Raises:
-            SystemExit: There was an error in another process, which has told of it.
+            SystemExit: The block failed in another process.
         """
         if self.size == 1:
             yield
@@ -133,10 +136,10 @@ class Team:
 
 @contextlib.contextmanager
 def join(device: str = "cpu") -> Iterator[Team]:
-    """The team of the processes that ``torchrun`` started, or of this one alone.
+    """The team of the processes that ``torchrun`` started, or a team of this process alone.
 
     Args:
-        device: "cpu", or a CUDA device; each of several processes takes the GPU of its place on its machine.
+        device: "cpu", or a CUDA device. Each of several processes takes the GPU of its number on its machine.
 
     Raises:
         ValueError: There are fewer GPUs than processes on this machine.
@@ -145,15 +148,15 @@ def join(device: str = "cpu") -> Iterator[Team]:
     if size == 1 or "MASTER_ADDR" not in os.environ:
         yield Team(device=device)
         return
-    # the first optimizer loads torch's compiler, and if there is a group by then, that holds it for ever: its threads
-    # would still run while Python ends, which aborts the process now and then
+    # The first optimizer loads torch's compiler. Loaded within a process group, the compiler would keep the group
+    # alive: its threads would still run while Python ends, which now and then aborts the process.
     torch.optim.SGD([torch.zeros(1)])
     place, neighbours = int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     if device.startswith("cuda"):
         if neighbours > torch.cuda.device_count():
             raise ValueError(
-                f"{neighbours} processes on this machine want a GPU each, and it has {torch.cuda.device_count()}: "
-                "start fewer (torchrun --nproc-per-node), or take --device cpu"
+                f"{neighbours} processes on this machine need a GPU each, and it has {torch.cuda.device_count()}: "
+                "start fewer (torchrun --nproc-per-node), or use --device cpu"
             )
         device = f"cuda:{place}"
         torch.cuda.set_device(place)
@@ -166,7 +169,7 @@ def join(device: str = "cpu") -> Iterator[Team]:
         clean = True
     finally:
         team.release()
-        # after an error NCCL may wait in vain for those who are not there any more: the end of the process is the
-        # end of its group. Gloo waits for nobody, but its threads must be gone before Python is.
+        # After an error NCCL may wait for processes that have ended already, so the group is left to the end of the
+        # process. Gloo does not wait, but its threads must end before Python does.
         if clean or distributed.get_backend() == "gloo":
             distributed.destroy_process_group()

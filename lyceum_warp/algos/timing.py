@@ -1,4 +1,4 @@
-"""Where the time goes: seconds of an iteration's phases, and threads that would not earn their keep."""
+"""Seconds of an iteration's phases, and torch's threads on the CPU."""
 
 import contextlib
 import time
@@ -8,9 +8,9 @@ import torch
 
 
 class Clock:
-    """Seconds between calls of ``mark``, the first of which is made by itself.
+    """Measures the seconds between calls of ``mark``; making the clock is the first mark.
 
-    On a GPU a mark is an event among the device's work, so that nobody waits for it before ``seconds``.
+    On a GPU a mark is an event in the device's stream: only ``seconds`` waits for the device.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -39,7 +39,7 @@ class Clock:
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Keep torch to one CPU thread: operations on a step or a mini-batch are too small to share out.
+    """Limit torch to one CPU thread: operations on one step or one mini-batch are too small to divide.
 
     On a busy machine torch's threads would wait for each other much longer than they compute.
     """

@@ -10,6 +10,7 @@ import traceback
 import zlib
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from lyceum_warp.task import Task
 
@@ -28,8 +29,9 @@ def register(task: type[Task]) -> type[Task]:
     Raises:
         ValueError: Another task has the name, or the class is not a task.
     """
-    if not (isinstance(task, type) and issubclass(task, Task)):
-        name = getattr(task, "__name__", repr(task))
+    given: Any = task
+    if not (isinstance(given, type) and issubclass(given, Task)):
+        name = getattr(given, "__name__", repr(given))
         raise ValueError(f"@lw.register takes a subclass of lw.Task, not {name}: write class {name}(lw.Task)")
     name = task_name(task)
     known = _tasks.get(name)

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from lyceum_warp.cli.arguments import Interrupted, signals
 from lyceum_warp.cli.evaluate import Eval, evaluate_run
+from lyceum_warp.cli.interrupts import Interrupted, signals
 from lyceum_warp.cli.list_tasks import Tasks, list_tasks
 from lyceum_warp.cli.plan import Plan, plan
 from lyceum_warp.cli.train import Train, resume, saved_options, train

@@ -1,131 +1,102 @@
-"""What several commands share: values on the command line and in config.json, and how a program is asked to end."""
+"""Arguments that several commands share: flags made from options, and values as NAME=VALUE."""
 
 import ast
-import contextlib
 import dataclasses
-import signal
-from collections.abc import Callable, Iterator, Mapping
+import typing
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
+from lyceum_warp.docstrings import attribute_docs
+from lyceum_warp.options import PhysicsOptions
+
 Words = tyro.conf.UseAppendAction[tuple[str, ...]]
-"""What may be given several times."""
+"""A flag that may be given several times."""
+
+Class = TypeVar("Class")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@typing.dataclass_transform(kw_only_default=True, frozen_default=True)
+def optional_flags(options: type, *, default: str = "") -> Callable[[type[Class]], type[Class]]:
+    """Class decorator: add the fields of a dataclass as flags, each None (or False) unless it is given.
+
+    Help texts are the docstrings of the fields. The class declares those fields itself that a shell writes in another
+    way, and those of more than one type. Values are checked when the dataclass is made of them, not before.
+
+    Args:
+        options: The dataclass.
+        default: How the help text describes the default of a flag.
+    """
+
+    def decorated(cls: type[Class]) -> type[Class]:
+        own = dict(vars(cls).get("__annotations__", {}))
+        hints, docs = typing.get_type_hints(options), attribute_docs(options) | attribute_docs(cls)
+        flags: dict[str, Any] = {}
+        for field in dataclasses.fields(options):
+            if field.name not in vars(cls):
+                setattr(cls, field.name, False if field.default is False else None)
+            flag = own.pop(field.name, None) or _optional(hints[field.name])
+            hint = default if getattr(cls, field.name) is None else None
+            text = " ".join(docs.get(field.name, "").split())
+            flags[field.name] = Annotated[flag, tyro.conf.arg(help=text, help_behavior_hint=hint)]
+        cls.__annotations__ = flags | own
+        return dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+
+    return decorated
+
+
+def _optional(hint: Any) -> Any:
+    """The annotation of a flag that may be left out, for a field of one type, or of one type and None."""
+    if hint is bool:
+        return bool
+    (kind,) = [kind for kind in typing.get_args(hint) if kind is not type(None)] or [hint]
+    return Annotated[kind | None, tyro.conf.arg(metavar=kind.__name__.upper())]
+
+
+@optional_flags(PhysicsOptions)
 class Physics:
-    """How the worlds are simulated."""
+    """How the worlds are simulated. Options that are left out are those of the task or of its model."""
 
-    integrator: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Another integrator than the model's: euler, rk4, implicit or implicitfast."""
     solver: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Another limit of the constraint solver than the model's, as iterations=4, ls_iterations=10 or
     noslip_iterations=0; may be given several times."""
-    deterministic: bool = False
-    """Whether runs on a GPU are equal to the bit, at many times the cost; on the CPU they are anyway."""
-    unroll: bool = False
-    """Whether the Warp engine goes through all iterations of the solver instead of a loop that ends early, which may
-    gain a few percent on a GPU: with --solver iterations=4 or the like."""
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> "Physics":
-        """That of a run; one from before there was a choice has the model's own."""
+        """The flags of a run's config.json; options that it does not name have their defaults."""
         saved = dict(config.get("physics", {}))
-        if "solver" in saved:
-            saved["solver"] = tuple(f"{name}={limit}" for name, limit in saved["solver"].items())
-        return cls(**saved)
+        solver = saved.pop("solver", None) or {}
+        return cls(solver=tuple(f"{name}={limit}" for name, limit in solver.items()), **saved)
 
-    def options(self) -> dict[str, Any]:
-        """As an environment takes it."""
-        return dataclasses.asdict(self) | {"solver": dict(map(parameter, self.solver))}
+    def options(self) -> PhysicsOptions:
+        """The options that the flags stand for.
 
-    def given(self) -> dict[str, Any]:
-        """The same without what was not given: a planner then has what the task suggests."""
-        return {name: value for name, value in self.options().items() if value not in (None, {}, False)}
-
-
-class Interrupted(BaseException):
-    """A signal asks the program to end."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number
-
-
-@contextlib.contextmanager
-def signals() -> Iterator[None]:
-    """Ctrl-C and SIGTERM raise Interrupted, once: a second one does not disturb the goodbye."""
-
-    def interrupt(number: int, frame: Any) -> None:
-        for other in previous:
-            signal.signal(other, signal.SIG_IGN)
-        raise Interrupted(number)
-
-    previous = _handled_by(interrupt)
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def postponed(when: bool = True) -> Iterator[list[int]]:
-    """Within ``signals``: Ctrl-C and SIGTERM are noted in the list, for who raises Interrupted at a better time.
-
-    What is still noted at the end raises it there. Once it is raised, later signals are ignored.
-
-    Args:
-        when: False leaves signals alone.
-
-    Raises:
-        Interrupted: A signal came that nobody asked the list about.
-    """
-    noted: list[int] = []
-    previous = _handled_by(lambda number, frame: noted.append(number)) if when else {}
-    try:
-        yield noted
-    except Interrupted:
-        previous = dict.fromkeys(previous, signal.SIG_IGN)
-        raise
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-    if noted:
-        signal.raise_signal(signal.Signals(noted[0]))
-
-
-def _handled_by(handler: Callable[[int, Any], None]) -> dict[int, Any]:
-    """Handle Ctrl-C and SIGTERM, and return who did before."""
-    previous: dict[int, Any] = {}
-    with contextlib.suppress(ValueError):  # not the main thread: signals are somebody else's
-        for number in (int(signal.SIGINT), int(signal.SIGTERM)):
-            # whoever started us in the background with SIGINT ignored means it
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                previous[number] = signal.signal(number, handler)
-    return previous
+        Raises:
+            ValueError: A value is not valid.
+        """
+        return PhysicsOptions(**vars(self) | {"solver": dict(map(parameter, self.solver))})
 
 
 def portable(task: str) -> str:
-    """A task's file with its whole path, so that the run can be used from another folder."""
+    """A task's file with its whole path, so that a run can be used from another folder; a name stays as it is."""
     path, colon, attribute = task.partition(":")
     return f"{Path(path).resolve()}{colon}{attribute}" if path.endswith(".py") else task
 
 
 def parameter(text: str) -> tuple[str, Any]:
-    """A parameter of a task, or a limit of the solver, as it is given: NAME=VALUE, a vector as NAME=0.7,inf.
+    """Name and value of a parameter of a task, or of a limit of the solver, from NAME=VALUE or NAME=0.7,inf.
 
     Raises:
-        ValueError: It is written otherwise.
+        ValueError: The text is written in another way.
     """
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
-        raise ValueError(f"{text!r} has to be written as NAME=VALUE")
+        raise ValueError(f"{text!r} must be written as NAME=VALUE")
     parts = [_value(part, text) for part in value.strip().strip("[]()").split(",") if part.strip()]
     if not parts:
-        raise ValueError(f"{text!r} has to be written as NAME=VALUE")
+        raise ValueError(f"{text!r} must be written as NAME=VALUE")
     return name.strip(), parts[0] if len(parts) == 1 else parts
 
 
@@ -141,7 +112,7 @@ def _value(part: str, text: str) -> bool | int | float:
     try:
         return float(part)  # inf
     except ValueError:
-        raise ValueError(f"the value in {text!r} is no number, true or false") from None
+        raise ValueError(f"the value in {text!r} must be a number, true or false") from None
 
 
 def spelled(value: Any) -> str:

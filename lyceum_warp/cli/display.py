@@ -1,4 +1,4 @@
-"""What the command line shows: progress, the learning curve's table, the curve and the video."""
+"""Output of the command line: progress, tables, plots and videos."""
 
 import math
 import sys
@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from lyceum_warp.algos.npg import Iteration
+from lyceum_warp.algos.evaluation import moved
 from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.algos.rollout_buffer import moved
+from lyceum_warp.algos.statistics import Iteration
 from lyceum_warp.control.control_report import ControlReport
-from lyceum_warp.control.loop import ControlProgress
+from lyceum_warp.control.episode_collector import ControlProgress
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs import Run
@@ -23,12 +23,18 @@ _TABLE_ROWS = 15
 
 
 def make_console() -> Console:
-    """A wide one where the output goes into a file, so that tables stay whole."""
+    """A console; 120 columns wide where the output is not a terminal, so that tables stay whole."""
     return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=120)
 
 
 class Display:
-    """Progress: a live bar on a terminal, of at most 80 columns, and a line an iteration elsewhere."""
+    """Progress of a training run: a live bar of at most 80 columns on a terminal, a line for each iteration elsewhere.
+
+    Args:
+        console: Where it is shown.
+        done: Complete iterations.
+        total: Iterations in all.
+    """
 
     def __init__(self, console: Console, done: int, total: int) -> None:
         self.console, self.total, self.mean = console, total, math.nan
@@ -46,18 +52,18 @@ class Display:
     def __exit__(self, *exception: object) -> None:
         self.progress.stop()
 
-    def __call__(self, record: Iteration) -> None:
+    def __call__(self, it: Iteration) -> None:
         """Show an iteration."""
-        if record.mean_return is not None:
-            self.mean = record.mean_return
-        shown = self.mean if self.console.is_terminal else math.nan if record.mean_return is None else self.mean
+        if it.mean_return is not None:
+            self.mean = it.mean_return
+        shown = self.mean if self.console.is_terminal else math.nan if it.mean_return is None else self.mean
         mean = "" if math.isnan(shown) else f" (mean policy {shown:.4g})"
-        ended = "-" if math.isnan(record.return_mean) else f"{record.return_mean:.4g}"
-        text = f"return {ended}{mean} {record.samples_per_second / 1000:.3g}k"
+        ended = "-" if math.isnan(it.return_mean) else f"{it.return_mean:.4g}"
+        text = f"return {ended}{mean} {it.samples_per_second / 1000:.3g}k"
         if self.console.is_terminal:
-            self.progress.update(self.bar, completed=record.iteration, text=f"{text}/s")
+            self.progress.update(self.bar, completed=it.iteration, text=f"{text}/s")
         else:
-            line = f"iteration {record.iteration:4d}/{self.total}  {text} samples/s"
+            line = f"iteration {it.iteration:4d}/{self.total}  {text} samples/s"
             self.console.print(line, soft_wrap=True)
             sys.stdout.flush()
 
@@ -84,7 +90,7 @@ def curve_table(rows: list[dict[str, float | None]]) -> Table:
 
 
 def _spread(rows: list[dict[str, float | None]]) -> list[dict[str, float | None]]:
-    """At most 15 rows, the first and the last among them; those with an evaluation if they are enough."""
+    """At most 15 rows, with the first and the last; where at least 5 have an evaluation, only those between them."""
     if sum(row.get("mean_return") is not None for row in rows) >= 5:
         ends = (0, len(rows) - 1)
         rows = [row for i, row in enumerate(rows) if i in ends or row["mean_return"] is not None]
@@ -94,7 +100,7 @@ def _spread(rows: list[dict[str, float | None]]) -> list[dict[str, float | None]
 
 
 def plotted(run: Run) -> str:
-    """Draw a run's learning curve; the picture's path, or why there is none."""
+    """Draw a run's learning curve; returns the picture's path, or the reason why there is none."""
     try:
         from lyceum_warp.viz.learning_curve import learning_curve
 
@@ -103,23 +109,23 @@ def plotted(run: Run) -> str:
         return f"none: {error}"
 
 
-def filmed(env: Env, policy: GaussianPolicy, path: Path, seed: int) -> str:
-    """Film an episode of a policy; the video's path, or why there is none."""
+def policy_video(env: Env, policy: GaussianPolicy, path: Path, seed: int) -> str:
+    """Write a video of an episode under a policy; returns its path, or the reason why there is none."""
     from lyceum_warp.viz import video
 
     one = env.replicate_few(1, autoreset=False)
     try:
-        return filmed_states(one, video.episode(one, moved(policy, one), seed=seed), path)
+        return states_video(one, video.episode(one, moved(policy, one), seed=seed), path)
     except ValueError as error:
         return f"none: {error}"
 
 
-def filmed_states(env: Env, states: torch.Tensor, path: Path) -> str:
-    """Film given states; the video's path, or why there is none."""
+def states_video(env: Env, states: torch.Tensor, path: Path) -> str:
+    """Write a video of given states; returns its path, or the reason why there is none."""
     from lyceum_warp.viz import video
 
     try:
-        return str(video.record(env, states, path))
+        return str(video.write_video(env, states, path))
     except (video.NoVideoError, ValueError) as error:
         return f"none: {error}"
 
@@ -128,10 +134,10 @@ def filmed_states(env: Env, states: torch.Tensor, path: Path) -> str:
 
 
 class PlanDisplay:
-    """Progress of an episode under a planner: a live line on a terminal, and a line an episode everywhere.
+    """Progress of an episode under a planner: a live line on a terminal, and a line at the end of each episode.
 
-    Rates and the real-time factor are of the episode so far. A plant that waits shows how fast it runs; one that keeps
-    its rate, whose own says nothing, how often it is planned for and how old its action is.
+    Rates and the real-time factor are of the episode so far. For a plant that waits for its plans, the live line shows
+    the speed of the plant; for one that keeps its own rate, the rate of the plans and the age of the action.
     """
 
     def __init__(
@@ -164,7 +170,7 @@ class PlanDisplay:
             self.progress.update(self.bar, completed=now.step, text=text)
 
     def done(self, trajectory: Trajectory) -> None:
-        """Say what came of the episode."""
+        """Print the result of the episode."""
         factor = trajectory.steps * trajectory.timestep / trajectory.wall_seconds
         end = "success, " if trajectory.succeeded else "ended early, " if trajectory.terminated else ""
         self.console.print(
@@ -183,7 +189,7 @@ def report_table(report: ControlReport) -> Table:
 
 
 def plotted_control(trajectories: list[Trajectory], path: Path) -> str:
-    """Draw trajectories; the picture's path, or why there is none."""
+    """Draw trajectories; returns the picture's path, or the reason why there is none."""
     try:
         from lyceum_warp.viz.control_plot import control_plot
 

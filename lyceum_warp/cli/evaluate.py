@@ -8,10 +8,10 @@ import rich.box
 import tyro
 from rich.table import Table
 
-from lyceum_warp.algos.rollout_buffer import Episodes, evaluate
+from lyceum_warp.algos.evaluation import Episodes, evaluate
 from lyceum_warp.cli.arguments import Physics
-from lyceum_warp.cli.display import filmed, make_console
-from lyceum_warp.engines import ON_CPU_CORES
+from lyceum_warp.cli.display import make_console, policy_video
+from lyceum_warp.engines.placement import few_worlds
 from lyceum_warp.env import Env
 from lyceum_warp.runs import Run, load
 from lyceum_warp.viz.video import check_video
@@ -19,7 +19,7 @@ from lyceum_warp.viz.video import check_video
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Eval:
-    """Run the mean policy of a run for whole episodes, in the run's own physics, and print what came of them.
+    """Run the mean policy of a run for whole episodes, in the run's own physics, and print statistics of them.
 
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
     """
@@ -27,21 +27,22 @@ class Eval:
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     episodes: int = 32
-    """How many."""
+    """Number of episodes."""
     seed: int = 1
     """Seed of the initial states."""
     nworld: int = 32
-    """Worlds that step at once, at most; no more than there are episodes."""
+    """Largest number of worlds; never more than episodes."""
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """Another engine than the run's: mujoco, warp or auto."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """By default the run's, or CPU cores if it left the engine to choice: they step a few worlds fastest."""
+    """Another device than the run's. By default the run's, or the CPU if the run's engine is auto: a few worlds step
+    fastest there."""
     video: bool = False
-    """Whether to film the first episode of one world, into eval.mp4 in the run's folder."""
+    """Whether to write a video of one episode, eval.mp4 in the run's folder."""
 
 
 def evaluate_run(options: Eval) -> int:
-    """The command."""
+    """Run the command; returns the exit code."""
     if options.episodes < 1 or options.nworld < 1:
         raise ValueError(f"eval needs at least 1 episode and 1 world, not {options.episodes} and {options.nworld}")
     if options.video:
@@ -50,16 +51,16 @@ def evaluate_run(options: Eval) -> int:
     config = run.config
     nworld = min(options.nworld, options.episodes)
     engine, device = options.engine or config["engine"], options.device or config["device"]
-    where = {"engine": engine, "device": device} | Physics.of(config).options() | config["params"]
-    if engine == "auto" and options.device is None:
-        where |= ON_CPU_CORES
+    where = {"engine": engine, "device": device} | Physics.of(config).options().given() | config["params"]
+    if options.device is None:
+        where |= few_worlds(engine, device)
     env = Env(config["task"], nworld=nworld, **where)
     policy = load(run, device=env.obs.device)
     sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
     if sizes != wanted:
         raise ValueError(
             f"the policy in {options.run} takes {sizes[0]} observations and gives {sizes[1]} actions, but the task "
-            f"{env.task.name!r} now has {wanted[0]} and {wanted[1]}: evaluate it with the task as it was"
+            f"{env.task.name!r} now has {wanted[0]} and {wanted[1]}: evaluate it with the task that it was trained on"
         )
     episodes = evaluate(env, policy, options.episodes, seed=options.seed)
     episodes = Episodes(*(getattr(episodes, f.name)[: options.episodes] for f in dataclasses.fields(episodes)))
@@ -76,6 +77,6 @@ def evaluate_run(options: Eval) -> int:
     if env.task.functions["success"] is not None:
         console.print(f"success: {episodes.success.mean().item():.0%}")
     if options.video:
-        video = filmed(env, policy, run.folder / "eval.mp4", options.seed)
+        video = policy_video(env, policy, run.folder / "eval.mp4", options.seed)
         console.print(f"video: {video}", soft_wrap=True, markup=False)
     return 0

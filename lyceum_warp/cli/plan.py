@@ -10,27 +10,58 @@ import torch
 import tyro
 
 from lyceum_warp.algos.mppi import MPPI
+from lyceum_warp.algos.mppi_arguments import task_config
+from lyceum_warp.algos.mppi_config import MPPIConfig
 from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.cli.arguments import Interrupted, Physics, Words, parameter, portable
-from lyceum_warp.cli.display import PlanDisplay, filmed_states, make_console, plotted_control, report_table
+from lyceum_warp.cli.arguments import Physics, Words, optional_flags, parameter, portable
+from lyceum_warp.cli.display import PlanDisplay, make_console, plotted_control, report_table, states_video
+from lyceum_warp.cli.interrupts import Interrupted
 from lyceum_warp.control.control_report import control_report
-from lyceum_warp.control.loop import control, control_async
+from lyceum_warp.control.loop import control
+from lyceum_warp.control.real_time import control_async
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
+from lyceum_warp.options import OPTIONS
 from lyceum_warp.runs import Run, load_value
 from lyceum_warp.validate import whole_number
 
 
+@optional_flags(MPPIConfig, default="(default: the task's)")
+class Settings:
+    """How MPPI plans. Settings that are left out are those of the task."""
+
+    noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
+    """Standard deviation of the noise around the plan, in units of the action: one number or one for each action (its
+    covariance only in Python)."""
+    smoothing: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="B0 B1 B2")] = None
+    fill: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="WORD|FLOAT ...")] = None
+    """What fills the end of a plan that moves forward: zero, repeat, or an action, one number or one for each."""
+    termination: Annotated[str | None, tyro.conf.arg(metavar="stop|ignore")] = None
+
+    def on_top_of(self, config: MPPIConfig) -> MPPIConfig:
+        """A configuration with the settings that were given.
+
+        Raises:
+            ValueError: A setting is not valid.
+        """
+        given = {name: value for name, value in vars(self).items() if value is not None}
+        if self.fill is not None:
+            given["fill"] = _fill(self.fill)
+        if self.noise is not None and len(self.noise) == 1:
+            given["noise"] = self.noise[0]
+        return dataclasses.replace(config, **given)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Plan:
-    """Control a task with MPPI: plan anew at every step, and report how well and how fast.
+    """Control a task with MPPI: plan anew at every step, and report rewards, success and planning times.
 
     The folder then holds config.json, versions.json, a file for each episode (episode-000.npz: states, actions,
-    rewards, evaluations, times; numpy reads it), report.json, plan.png and video.mp4 of the first episode. What is
-    not given of the planner's settings comes from the task. After Ctrl-C, the episode under way has a file, too, but
-    no part in the report.
+    rewards, evaluations, times; numpy reads it), report.json, plan.png and video.mp4 of the first episode. Settings of
+    MPPI that are not given come from the task. After Ctrl-C the episode that was interrupted has a file, too, but is
+    not in the report.
 
-    --integrator, --solver, --deterministic and --unroll are the planner's: what is controlled keeps its own physics.
+    Options of the physics (--integrator, --solver, ...) are the planner's: the controlled world keeps its own.
 
     $ lyceum-warp plan reach
     $ lyceum-warp plan reach --real-time --episodes 10
@@ -42,7 +73,7 @@ class Plan:
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
     """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
     episodes: int = 1
-    """How many."""
+    """Number of episodes."""
     steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Steps of an episode; by default the task's horizon."""
     seed: int = 0
@@ -50,33 +81,13 @@ class Plan:
     real_time: bool = False
     """Let the world run at its own rate while the planner plans, instead of waiting for each plan."""
     rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
-    """Plans a second that are asked for, which makes the deadline; by default one a step."""
+    """Plans a second that the report requires, as the deadline of each; by default one a step."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """The folder, new or empty; runs/plan-TASK-DATE by default."""
-
-    horizon: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Steps of a plan."""
-    samples: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Roll-outs for each improvement of the plan."""
-    temperature: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """In units of reward: low ones follow the best sample, high ones average all."""
-    noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
-    """Standard deviation of the noise, one number or one for each action (a covariance only from Python)."""
-    smoothing: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="B0 B1 B2")] = None
-    """Weights of the noise, of the last step's and of the one before it; 1 0 0 is white noise."""
-    discount: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """Of rewards and of the terminal value, a step."""
-    iterations: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Improvements of the plan at every step."""
-    fill: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="WORD|FLOAT ...")] = None
-    """What fills the end of a plan that moves forward: zero, repeat, or an action, one number or one for each."""
-    termination: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """Whether a sample that ends its episode stops earning (stop) or not (ignore)."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """Run of NPG whose value function tells what the end of a plan is worth."""
-
+    """NPG run whose value function gives the value of the state where a plan ends."""
     engine: str = "auto"
-    """Engine of the planner: mujoco (C, on CPU cores), warp, or auto. The world itself runs on mujoco."""
+    """Engine of the planner: mujoco (C, on CPU cores), warp, or auto. The controlled world runs on mujoco."""
     device: str = "cpu"
     """Device of the planner: cpu, or a CUDA device such as cuda:0."""
     nthread: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
@@ -84,20 +95,15 @@ class Plan:
     param: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf; may be given several times."""
     planner_param: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
-    """Another value of a parameter, for the planner alone."""
+    """Another value of a parameter, only for the planner."""
     planner_model: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Another model for the planner than for the world."""
+    """Another model, only for the planner."""
     video: bool = True
-    """Whether to film the first episode."""
+    """Whether to make a video of the first episode."""
     plot: bool = True
     """Whether to draw rewards, planning times and ages."""
+    mppi: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
     planner_physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
-    """How the planner simulates; the world itself stays as it is."""
-
-
-_SETTINGS = (
-    "horizon", "samples", "temperature", "noise", "smoothing", "discount", "iterations", "fill", "termination",
-)  # fmt: skip
 
 
 def plan(options: Plan) -> int:
@@ -106,12 +112,12 @@ def plan(options: Plan) -> int:
     whole_number("seed", options.seed, low=0)
     whole_number("seed of the last episode", options.seed + options.episodes - 1, low=0)
     if options.rate is not None and not 0 < options.rate < float("inf"):
-        raise ValueError(f"rate has to be a positive number of plans a second, not {options.rate}")
+        raise ValueError(f"rate must be a positive number of plans a second, not {options.rate}")
     out = options.out or Path(
         "runs", f"plan-{task_name(find_task(options.task))}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
     )
     Run.check_free(out, resumable=False)
-    # all that can be wrong with the options comes to light before the folder is made
+    # every wrong option is found before the folder is made
     torch.set_num_threads(1)
     plant, planner = _worlds(options)
     config = {
@@ -126,41 +132,36 @@ def plan(options: Plan) -> int:
 
 
 def _worlds(options: Plan) -> tuple[Env, MPPI]:
+    """The world to control, and its planner."""
     params = dict(map(parameter, options.param))
     steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
     if plant.horizon == 0:
         raise ValueError(f"episodes of {plant.task.name!r} never end without a horizon: give --steps")
-    settings = {name: getattr(options, name) for name in _SETTINGS}
-    if options.noise is not None and len(options.noise) == 1:
-        settings["noise"] = options.noise[0]
-    if options.fill is not None:
-        settings["fill"] = _fill(options.fill, plant.action_space.size)
-    more: dict[str, Any] = {}
+    value = None if options.value is None else load_value(options.value)
+    config = options.mppi.on_top_of(task_config(plant.task.task, value))
+    words: dict[str, Any] = {"engine": options.engine, "device": options.device}
+    words |= options.planner_physics.options().given()
     if options.nthread is not None:
-        more["nthread"] = options.nthread
+        words["nthread"] = options.nthread
     if options.planner_model is not None:
-        more["model"] = _model(options.planner_model)
-    if options.value is not None:
-        more["value"] = load_value(options.value)
-    planner = MPPI(
-        options.task, **settings, engine=options.engine, device=options.device, **more,
-        **(options.planner_physics.given() | params | dict(map(parameter, options.planner_param))),
-    )  # fmt: skip
-    return plant, planner
+        words["model"] = _model(options.planner_model)
+    params |= map(parameter, options.planner_param)
+    words |= {name: params.pop(name) for name in [*params] if name in OPTIONS}
+    return plant, MPPI(plant.task.task, config, value=value, params=params, **words)
 
 
-def _fill(words: tuple[str, ...], nu: int) -> str | list[float]:
-    """What the option says: a word, or numbers, of which one stands for all."""
+def _fill(words: tuple[str, ...]) -> Any:
+    """A word, one number, or numbers."""
     try:
         numbers = [float(word) for word in words]
     except ValueError:
-        return " ".join(words)  # the planner knows the words, and says so
-    return numbers * nu if len(numbers) == 1 else numbers
+        return " ".join(words)  # MPPIConfig knows the words
+    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def _model(path: Path) -> Path:
-    """A model's file: here a path is meant, where a task may also name one that a package ships."""
+    """The file of a model, which here is a path; a task may also name one that a package ships."""
     path = path.expanduser().resolve()
     if not path.is_file():
         raise FileNotFoundError(f"--planner-model: there is no file {path}")
@@ -175,57 +176,58 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
         f"{'real time' if options.real_time else 'the world waits'}; files in {run.folder}",
         soft_wrap=True,
     )  # fmt: skip
-    trajectories: list[Trajectory] = []
-    part: list[Trajectory] = []
+    done: list[Trajectory] = []
+    aborted: list[Trajectory] = []
     method: Any = control_async if options.real_time else control
     shown: dict[str, Any] = dict(steps=plant.horizon, timestep=plant.timestep, real_time=options.real_time)
     try:
         for episode in range(options.episodes):
             with PlanDisplay(console, episode, options.episodes, **shown) as display:
                 seed = options.seed + episode
-                trajectory = method(plant, planner, seed=seed, on_step=display, on_abort=part.append)
-            trajectories.append(trajectory)
+                trajectory = method(plant, planner, seed=seed, on_step=display, on_abort=aborted.append)
+            done.append(trajectory)
             display.done(trajectory)
-            _save(run, trajectories, options)
-    except BaseException as error:  # a second signal does not disturb what follows
-        if trajectories:
-            _save(run, trajectories, options)
-        path = part[0].save(_file(run, len(trajectories))) if part else None
+            _save(run, done, options)
+    except BaseException as error:  # later signals are ignored, so that the files below are written
+        if done:
+            _save(run, done, options)
+        path = aborted[0].save(_file(run, len(done))) if aborted else None
         if isinstance(error, Interrupted):
-            told = f"interrupted by {signal.Signals(error.number).name} "
-            console.print(told + _left(run, len(trajectories), part, path), soft_wrap=True, markup=False)
+            message = f"interrupted by {signal.Signals(error.number).name} {_left(run, len(done), aborted, path)}"
+            console.print(message, soft_wrap=True, markup=False)
         raise
-    return _tell(run, plant, trajectories, options)
+    return _report(run, plant, done, options)
 
 
-def _left(run: Run, whole: int, part: list[Trajectory], path: Path | None) -> str:
-    """What an interrupted run leaves behind."""
-    steps = f"after {part[0].steps} step{'s' * (part[0].steps != 1)}" if part else "before its first step"
+def _left(run: Run, whole: int, aborted: list[Trajectory], path: Path | None) -> str:
+    """The files that an interrupted run leaves, after so many whole episodes."""
+    steps = f"after {aborted[0].steps} step{'s' * (aborted[0].steps != 1)}" if aborted else "before its first step"
     if not whole:
         where = f"it is in {path}" if path else f"{run.folder} holds no episode"
         return f"in the first episode, {steps}; {where}"
-    told = f"after {whole} episode{'s' * (whole != 1)}; in {run.folder}"
-    return f"{told}; the episode under way is in {path.name}, {steps}" if path else told
+    summary = f"after {whole} episode{'s' * (whole != 1)}; in {run.folder}"
+    return f"{summary}; the interrupted episode is in {path.name}, {steps}" if path else summary
 
 
 def _file(run: Run, episode: int) -> Path:
     return run.folder / f"episode-{episode:03d}.npz"
 
 
-def _save(run: Run, trajectories: list[Trajectory], options: Plan) -> None:
-    """Write the last episode, and the report of all."""
-    trajectories[-1].save(_file(run, len(trajectories) - 1))
-    control_report(trajectories, rate=options.rate).write(run.folder / "report.json")
+def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
+    """Write the last episode and the report of all."""
+    done[-1].save(_file(run, len(done) - 1))
+    control_report(done, rate=options.rate).write(run.folder / "report.json")
 
 
-def _tell(run: Run, plant: Env, trajectories: list[Trajectory], options: Plan) -> int:
+def _report(run: Run, plant: Env, done: list[Trajectory], options: Plan) -> int:
+    """Print the report, draw the plot and the video, and list the files."""
     console = make_console()
-    console.print(report_table(control_report(trajectories, rate=options.rate)))
+    console.print(report_table(control_report(done, rate=options.rate)))
     paths = [("episodes", str(run.folder / "episode-*.npz")), ("report", str(run.folder / "report.json"))]
     if options.plot:
-        paths.append(("plot", plotted_control(trajectories, run.folder / "plan.png")))
+        paths.append(("plot", plotted_control(done, run.folder / "plan.png")))
     if options.video:
-        paths.append(("video", filmed_states(plant, trajectories[0].states, run.folder / "video.mp4")))
+        paths.append(("video", states_video(plant, done[0].states, run.folder / "video.mp4")))
     for name, path in paths:
         console.print(f"{name + ':':<12}{path}", soft_wrap=True, markup=False)
     return 0

@@ -13,26 +13,43 @@ import tyro
 from rich.console import Console
 
 from lyceum_warp.algos.distributed import Team, join
-from lyceum_warp.algos.npg import NPG, NPGConfig, enough_samples
-from lyceum_warp.algos.rollout_buffer import Episodes, evaluate, moved
+from lyceum_warp.algos.evaluation import Episodes, evaluate, moved
+from lyceum_warp.algos.npg import NPG
+from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
 from lyceum_warp.binding.registry import find_task, task_name, task_names
-from lyceum_warp.cli.arguments import Interrupted, Physics, Words, parameter, portable, postponed, spelled
-from lyceum_warp.cli.display import Display, curve_table, filmed, make_console, plotted
+from lyceum_warp.cli.arguments import Physics, Words, parameter, portable, spelled
+from lyceum_warp.cli.display import Display, curve_table, make_console, plotted, policy_video
+from lyceum_warp.cli.interrupts import Interrupted, postponed
+from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.env import Env
-from lyceum_warp.graphs.compile_ahead import workers
+from lyceum_warp.machine import cpu_cores
 from lyceum_warp.runs import Run
 from lyceum_warp.versions import versions
 
 _FINAL_EPISODES = 32
 
 
+class NPGOptions(NPGConfig):
+    """Hyperparameters of the natural policy gradient."""
+
+    def __post_init__(self) -> None:
+        """Check nothing yet: the parser would print an error as several lines in a box."""
+
+    def checked(self) -> NPGConfig:
+        """The hyperparameters.
+
+        Raises:
+            ValueError: A value is of the wrong type, out of range or not finite.
+        """
+        return NPGConfig(**dataclasses.asdict(self))
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Train:
     """Train a policy on a task with the natural policy gradient.
 
-    The run's folder then holds config.json, versions.json, metrics.csv (a row an iteration), checkpoint.pt,
-    curve.png and video.mp4. The checkpoint is renewed after every iteration: Ctrl-C loses only the one that
-    is under way.
+    The run's folder then holds config.json, versions.json, metrics.csv (one row for each iteration), checkpoint.pt,
+    curve.png and video.mp4. Every iteration replaces the checkpoint, so that Ctrl-C loses only the current one.
 
     $ lyceum-warp train hopper --iterations 100 --seed 1
     $ lyceum-warp train half_cheetah --param ctrl_cost_weight=0.05 --param reset_noise_scale=0 --hidden 32 32
@@ -41,50 +58,50 @@ class Train:
     $ lyceum-warp train --resume runs/mine --iterations 200
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
-    Processes that torchrun starts share the worlds, on several machines, too. Their number makes no difference to
-    the run but for rounding, and a run may go on with another one; the first process writes and speaks. After Ctrl-C
-    or SIGTERM, to torchrun or to any of them, they finish the iteration and end together; torchrun waits 30 s for that,
-    or as long as its --shutdown-timeout says.
+    Processes that torchrun starts share the worlds, also on several machines. Their number changes only the rounding
+    of the results, and a run may continue with another number. The first process writes files and messages. After
+    Ctrl-C or SIGTERM, to torchrun or to any process, all processes finish the iteration and end together; torchrun
+    waits for them for 30 s, or for its --shutdown-timeout.
     """
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
     iterations: int = 100
-    """Iterations in total, those before --resume included."""
+    """Iterations in total, including those before --resume."""
     seed: int = 0
     """Seed of the networks, the noise and the worlds' initial states."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """The run's folder, new or empty; runs/TASK-DATE by default."""
     resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Continue the run in this folder, exactly and with all its settings. --iterations says up to where."""
+    """Continue the run in this folder, exactly and with all its settings, up to --iterations."""
     engine: str = "auto"
-    """mujoco (C, on CPU cores), warp, or auto: warp on CUDA and mujoco on the CPU."""
+    """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU."""
     device: str = "cpu"
-    """cpu, or a CUDA device such as cuda:0. Under torchrun each process takes the GPU of its own number."""
+    """cpu, or a CUDA device such as cuda:0. Under torchrun each process takes the GPU of its number."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Worlds that step at once, those of all processes together, each samples / nworld steps in an iteration: whole
-    episodes where those fit (the paper's way: 10 worlds for 10,000 samples and episodes of 1,000 steps), segments of
-    them elsewhere. By default 64, or 4096 for each GPU."""
+    """Worlds of all processes together; by default 64, or 4096 for each GPU. Each makes samples / nworld steps in an
+    iteration: whole episodes where those fit (as in the paper: 10 worlds for 10,000 samples and episodes of 1,000
+    steps), otherwise segments of episodes."""
     threads: int = 1
-    """Threads of torch on the CPU. Small networks gain little from more, and a number that is the same everywhere
-    keeps runs the same to the bit. The mujoco engine uses all cores in any case."""
+    """Threads of torch on the CPU. Small networks gain little from more. Runs are equal to the bit only with the same
+    number. The mujoco engine uses all cores in any case."""
     param: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf; may be given several times."""
     video: bool = True
-    """Whether to film an episode of the trained policy at the end."""
+    """Whether to write a video of one episode of the trained policy at the end."""
     plot: bool = True
     """Whether to draw the learning curve at the end."""
     require_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Exit with code 1 unless the trained mean policy's return exceeds this."""
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
-    npg: tyro.conf.OmitArgPrefixes[NPGConfig] = dataclasses.field(default_factory=NPGConfig)
+    npg: tyro.conf.OmitArgPrefixes[NPGOptions] = dataclasses.field(default_factory=NPGOptions)
 
 
 def train(options: Train) -> int:
-    """The command."""
+    """Run the command; returns the exit code."""
     with join(options.device) as team:
         with team.together():
-            # all that can be wrong with the options comes to light before the folder is made
+            # every mistake in the options is found before the folder is made
             config, out = _config(options, team), _folder(options)
             if team.leads:
                 Run.check_free(out)
@@ -98,21 +115,21 @@ def _config(options: Train, team: Team) -> dict[str, Any]:
         raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
     _check_iterations(options.iterations)
     find_task(options.task)
-    nworld = options.nworld
+    npg, nworld = options.npg.checked(), options.nworld
     if nworld is None:
         nworld = 4096 * team.size if options.device.startswith("cuda") else 64
     return {
         "algorithm": "npg",
         "task": portable(options.task),
         "params": dict(parameter(text) for text in options.param),
-        "physics": options.physics.options(),
+        "physics": options.physics.options().given(),
         "engine": options.engine,
         "device": options.device,
         "nworld": nworld,
         "threads": options.threads,
         "seed": options.seed,
         "iterations": options.iterations,
-        "npg": dataclasses.asdict(options.npg) | {"samples": enough_samples(options.npg, nworld)},
+        "npg": dataclasses.asdict(npg) | {"samples": enough_samples(npg, nworld)},
     }
 
 
@@ -122,10 +139,15 @@ def _folder(options: Train) -> Path:
 
 
 def saved_options(folder: Path) -> Train:
-    """The options that a run was started with."""
+    """The options that a run was started with.
+
+    Raises:
+        FileNotFoundError: The folder holds no run.
+        ValueError: The run's configuration is not one of NPG.
+    """
     config = Run.open(folder).config
     try:
-        npg = _hyperparameters(config)
+        npg = NPGOptions(**dataclasses.asdict(_hyperparameters(config)))
         for name in ("iterations", "seed", "nworld", "threads"):
             if not isinstance(config[name], int):
                 raise TypeError(f"{name} is {config[name]!r}")
@@ -136,12 +158,17 @@ def saved_options(folder: Path) -> Train:
             param=tuple(f"{name}={spelled(value)}" for name, value in config["params"].items()),
             physics=Physics.of(config), npg=npg,
         )  # fmt: skip
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{folder / 'config.json'} is not the configuration of an NPG run ({error})") from error
 
 
 def resume(options: Train, folder: Path) -> int:
-    """The command with --resume; ``options`` are those of the run, with what was given on top of them."""
+    """Run the command with --resume; returns the exit code.
+
+    Args:
+        options: The run's options, overridden by those on the command line.
+        folder: The run's folder.
+    """
     with join(options.device) as team:
         with team.together():
             run, npg = _reopened(options, folder, team)
@@ -153,23 +180,21 @@ def resume(options: Train, folder: Path) -> int:
 
 
 def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, NPG]:
-    """A run, and its algorithm as it was left."""
+    """A run, and its algorithm in the state of the checkpoint."""
     run = Run.open(folder)
     given, saved = (_settings(o) for o in (options, saved_options(folder)))
     for name, value in given.items():
         if value != saved[name]:
             raise ValueError(
                 f"the run in {folder} has {name} {spelled(saved[name])}, not {spelled(value)}, and a run keeps its "
-                f"settings: leave the option out, or start a new run without --resume"
+                f"settings: omit the option, or start a new run without --resume"
             )
     if options.out not in (None, folder):
-        raise ValueError(f"a resumed run stays in its folder {folder}: leave out --out")
+        raise ValueError(f"a resumed run stays in its folder {folder}: omit --out")
     checkpoint = run.read()
     done = checkpoint["iteration"]
     if options.iterations <= done:
-        raise ValueError(
-            f"the run in {folder} has {done} iterations already: ask for more, as in --iterations {2 * done}"
-        )
+        raise ValueError(f"the run in {folder} already has {done} iterations: give more, as in --iterations {2 * done}")
     npg = _algorithm(run.config, team)
     try:
         npg.load_state_dict(run.read(npg.env.obs.device)["state"])
@@ -181,26 +206,25 @@ def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, NPG]:
 
 
 def _settings(options: Train) -> dict[str, Any]:
-    """What a resumed run has to keep."""
+    """The settings that a resumed run must keep."""
     free = ("iterations", "out", "resume", "video", "plot", "require_return", "npg", "param", "physics")
     settings = {f.name: getattr(options, f.name) for f in dataclasses.fields(options) if f.name not in free}
     settings["task"] = portable(options.task or "")
     settings["param"] = dict(parameter(text) for text in options.param)
-    return settings | options.physics.options() | dataclasses.asdict(options.npg)
+    return settings | dataclasses.asdict(options.physics.options()) | dataclasses.asdict(options.npg)
 
 
 def _hyperparameters(config: dict[str, Any]) -> NPGConfig:
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in config["npg"].items()}
-    return NPGConfig(**values)
+    return NPGConfig(**config["npg"])
 
 
 def _algorithm(config: dict[str, Any], team: Team) -> NPG:
     if config["threads"] < 1:
-        raise ValueError(f"threads has to be at least 1, not {config['threads']}")
+        raise ValueError(f"threads must be at least 1, not {config['threads']}")
     torch.set_num_threads(config["threads"])
-    options = Physics.of(config).options() | config["params"]
+    options = Physics.of(config).options().given() | config["params"]
     if team.neighbours > 1 and _engine(config) == "mujoco":
-        options["nthread"] = max(1, workers() // team.neighbours)
+        options["nthread"] = max(1, cpu_cores() // team.neighbours)
     nworld = team.share(config["nworld"])
     env = Env(
         config["task"], nworld=nworld, first_world=team.rank * nworld, engine=config["engine"],
@@ -210,50 +234,50 @@ def _algorithm(config: dict[str, Any], team: Team) -> NPG:
 
 
 def _engine(config: dict[str, Any]) -> str:
-    automatic = "warp" if config["device"].startswith("cuda") else "mujoco"
-    return automatic if config["engine"] == "auto" else config["engine"]
+    """Name of the engine that a run's configuration selects."""
+    return engine_name(config["engine"], config["device"])
 
 
 def _learn(run: Run | None, npg: NPG, options: Train) -> int:
-    """Iterate; the process that has the run writes and speaks.
+    """Iterate; the process that has the run writes files and messages.
 
-    Processes that learn together finish the iteration in which a signal comes to one of them, and end together: one
-    that left in the middle of it would have the others wait for ever.
+    When one of several processes receives a signal, all of them finish the iteration and end together: the others
+    would wait endlessly for a process that ended within the iteration.
     """
     console, team = make_console(), npg.team
     display = None
     if run is not None:
-        console.print(_told(run, npg, options), soft_wrap=True)
+        console.print(_headline(run, npg, options), soft_wrap=True)
         display = Display(console, npg.iteration, options.iterations)
     try:
         with postponed(team.size > 1) as noted, display or contextlib.nullcontext():
             if npg.iteration == 0:
                 _save(run, npg)
             while npg.iteration < options.iterations:
-                record = next(npg)
+                iteration = next(npg)
                 if run is not None:
-                    run.write(dataclasses.asdict(record))
+                    run.write(dataclasses.asdict(iteration))
                 _save(run, npg)
                 if display is not None:
-                    display(record)
+                    display(iteration)
                 if number := team.largest(max(noted, default=0)):
                     raise Interrupted(number)
     except Interrupted as signalled:
         if run is not None and run.checkpoint.exists():
-            # iterations count when their checkpoint is complete; what is under way is lost
+            # an iteration counts once its checkpoint is complete; the current one is lost
             done = run.read()["iteration"]
             run.cut(done)
             name = signal.Signals(signalled.number).name
-            told = f"interrupted by {name} after {done} of {options.iterations} iterations"
+            text = f"interrupted by {name} after {done} of {options.iterations} iterations"
             if done < options.iterations:
-                told += f"; continue with\n  lyceum-warp train --resume {run.folder} --iterations {options.iterations}"
-            console.print(told, soft_wrap=True, markup=False)
+                text += f"; continue with\n  lyceum-warp train --resume {run.folder} --iterations {options.iterations}"
+            console.print(text, soft_wrap=True, markup=False)
         return 128 + signalled.number
     return 0 if run is None else _report(run, npg, options, console)
 
 
-def _told(run: Run, npg: NPG, options: Train) -> str:
-    """What is going to be done."""
+def _headline(run: Run, npg: NPG, options: Train) -> str:
+    """The task, its worlds and where the run goes."""
     env = npg.env
     processes = f" each in {npg.team.size} processes" if npg.team.size > 1 else ""
     return (
@@ -264,14 +288,14 @@ def _told(run: Run, npg: NPG, options: Train) -> str:
 
 
 def _save(run: Run | None, npg: NPG) -> None:
-    """Renew the checkpoint, which takes every process's worlds."""
+    """Replace the checkpoint; all processes must call this, because it holds all their worlds."""
     state = npg.state_dict()
     if run is not None:
         run.save(npg.iteration, npg.policy, state, npg.value)
 
 
 def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:
-    """What came of it: the table, the curve, the video, and whether it is enough."""
+    """Print the table, evaluate the policy, draw the curve and the video; returns the exit code."""
     rows = run.rows()
     console.print(curve_table(rows))
     few = npg.env.replicate_few(_FINAL_EPISODES)
@@ -281,13 +305,13 @@ def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:
     if options.plot:
         paths.append(("curve", plotted(run)))
     if options.video:
-        paths.append(("video", filmed(npg.env, npg.policy, run.folder / "video.mp4", options.seed + 1)))
+        paths.append(("video", policy_video(npg.env, npg.policy, run.folder / "video.mp4", options.seed + 1)))
     for name, path in paths:
         console.print(f"{name + ':':<12}{path}", soft_wrap=True, markup=False)
     final = episodes.returns.mean().item()
     if options.require_return is not None and not final > options.require_return:
         print(
-            f"lyceum-warp: the mean policy's return is {final:.1f}; --require-return asks for more than "
+            f"lyceum-warp: the mean policy's return is {final:.1f}; --require-return demands more than "
             f"{options.require_return:g}",
             file=sys.stderr,
         )
@@ -303,10 +327,10 @@ def _returns(episodes: Episodes) -> str:
 def _warn_of_versions(run: Run) -> None:
     changed = run.changed(versions(run.config["device"]))
     if changed:
-        told = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
-        print(f"lyceum-warp: the run goes on with other versions, so not to the bit: {told}", file=sys.stderr)
+        text = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
+        print(f"lyceum-warp: versions have changed, so the run may not continue to the bit: {text}", file=sys.stderr)
 
 
 def _check_iterations(iterations: int) -> None:
     if iterations < 1:
-        raise ValueError(f"iterations has to be at least 1, not {iterations}")
+        raise ValueError(f"iterations must be at least 1, not {iterations}")

@@ -7,21 +7,22 @@ from typing import Annotated
 import tyro
 
 from lyceum_warp.algos.mppi import MPPI
-from lyceum_warp.algos.npg import NPG, NPGConfig
+from lyceum_warp.algos.npg import NPG
+from lyceum_warp.algos.npg_config import NPGConfig
 from lyceum_warp.cli.arguments import Physics, Words, parameter
 from lyceum_warp.cli.display import make_console
-from lyceum_warp.engines.memory import free_memory
+from lyceum_warp.engines.memory import most_worlds
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.compile_ahead import cached
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Warmup:
-    """Compile a task's kernels ahead of time, so that no later run waits for them, and say what a world costs.
+    """Compile a task's kernels ahead of time, so that no later run waits for them, and print the memory of a world.
 
-    Warp keeps what it has compiled in its cache, for each kind of device. Sizes of the model's arrays are part of some
-    kernels, numbers of worlds are not. Which kernels a step needs depends on the options of physics
-    (--integrator, --solver, ...), too: give those of the run to come.
+    Warp caches compiled kernels for each kind of device. Some kernels contain sizes of the model's arrays, none
+    contains the number of worlds. The options of physics (--integrator, --solver, ...) also select kernels: give those
+    of the later run.
 
     $ lyceum-warp warmup hopper --device cuda:0 --nworld 4096 --npg
     $ lyceum-warp warmup reach --device cuda:0 --plan
@@ -31,46 +32,43 @@ class Warmup:
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
     """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
     engine: str = "auto"
-    """mujoco (C, on CPU cores), warp, or auto: warp on CUDA and mujoco on the CPU."""
+    """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU."""
     device: str = "cpu"
     """cpu, or a CUDA device such as cuda:0."""
     nworld: int = 64
-    """Worlds of the environment."""
+    """Number of worlds."""
     plan: bool = False
-    """Whether to compile what MPPI needs, too."""
+    """Whether to compile MPPI's kernels, too."""
     npg: bool = False
-    """Whether to compile what NPG needs, too."""
+    """Whether to compile NPG's kernels, too."""
     param: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf; may be given several times."""
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
 
 def warm_up(options: Warmup) -> int:
-    """The command."""
-    more = options.physics.given() | dict(parameter(text) for text in options.param)
+    """Run the command; returns the exit code."""
+    more = options.physics.options().given() | dict(parameter(text) for text in options.param)
     start, before = time.perf_counter(), cached()
     env = Env(options.task, nworld=options.nworld, engine=options.engine, device=options.device, **more)
-    for _ in range(3):  # unrecorded, recorded, replayed
+    for _ in range(3):  # run directly, captured as graphs, replayed
         env.step()
     if options.npg:
         next(NPG(env, config=NPGConfig(samples=2 * env.nworld, mean_every=0)))
         env.replicate_few(1).step()  # evaluations of the mean policy
     if options.plan:
-        engine = env.engine.name  # not what suits the number of samples, which is not known here
+        engine = env.engine.name  # auto would depend on the number of samples, which is not known here
         plan = MPPI(options.task, engine=engine, device=options.device, **more)
         for _ in range(3):
             plan(plan.state_of())
     new = cached().keys() - before.keys()
     seconds, megabytes = time.perf_counter() - start, sum(cached()[path] for path in new) / 1e6
     console = make_console()
-    built = f"compiled {len(new)} modules of kernels ({megabytes:.1f} MB)" if new else "every kernel was there"
+    built = f"compiled {len(new)} modules of kernels ({megabytes:.1f} MB)" if new else "all kernels were cached"
     console.print(f"{env.task.name} on {env.device.alias}: {built}, {seconds:.1f} s in all", soft_wrap=True)
-    text = f"memory: {env.bytes_per_world / 1e3:.1f} kB a world of {env.nworld}"
-    free = free_memory(env.device)
-    if env.engine.name == "warp" and free is not None:
-        footprint = env.engine.footprint()  # type: ignore[attr-defined]
-        most = footprint.largest(free)
-        place = f"the {free / 1e9:.1f} GB that are free" if most != footprint.most else "Warp's --deterministic buffers"
-        text += f"; at most some {most:,d} worlds fit into {place}"
+    text = f"memory: about {env.bytes_per_world / 1e3:.1f} kB a world"
+    most = most_worlds(env.bytes_per_world, env.device)
+    if most is not None:
+        text += f"; at most some {most:,d} worlds fit into the free memory"
     console.print(text, soft_wrap=True)
     return 0

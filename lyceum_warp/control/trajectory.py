@@ -1,8 +1,7 @@
-"""Trajectories of controlled worlds: what happened, and when."""
+"""Trajectories: one episode of a controlled world, in memory and in a file."""
 
 import dataclasses
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,14 +9,16 @@ from typing import Any
 import numpy as np
 import torch
 
+from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.done import Done
 from lyceum_warp.env import Env
+from lyceum_warp.files import newer_format, replaced
 from lyceum_warp.versions import versions
 
 FORMAT = 1
-"""Format of the file; one more whenever an older release could no longer read it."""
+"""Format of the file. It is raised when an older release could no longer read the file."""
 
-# every array of a trajectory: its type and axes, of which those with the same name have the same length
+# type and axes of every array of a trajectory; axes of the same name have the same length
 _ARRAYS = {
     "states": (torch.float64, ("steps + 1", "state_size")), "obs": (torch.float32, ("steps + 1", "nobs")),
     "actions": (torch.float32, ("steps", "nu")), "rewards": (torch.float32, ("steps",)),
@@ -34,19 +35,20 @@ _SCALARS: dict[str, Callable[[Any], Any]] = {
 }  # fmt: skip
 
 
+@document_attributes
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One episode of one world under a controller. All tensors lie on the CPU.
+    """One episode of one world, the plant, under a controller. All tensors lie on the CPU.
 
-    Step k leads from state k to state k + 1 under action k. ``set_state`` of the first state and the actions give
-    all the others again, to the bit, on the engine that they come from.
+    Step k leads from state k to state k + 1 under action k. On the engine that made them, ``set_state`` of the first
+    state and a step with each action give all other states again, to the bit.
 
-    Times are seconds of the wall clock since the run's clock started: with the first plan in a synchronous run, after
-    it in an asynchronous one.
+    Times are seconds of the wall clock since the start of the clock, which is before the first plan in a synchronous
+    run and after it in an asynchronous one.
     """
 
     states: torch.Tensor
-    """States, (steps + 1, state_size) float64. After a fault the last one is where the world began again."""
+    """States, (steps + 1, state_size) float64. After a fault the last one is the first of the next episode."""
     obs: torch.Tensor
     """Observations of the states, (steps + 1, nobs) float32. After a fault the last one is the last good one."""
     actions: torch.Tensor
@@ -54,55 +56,55 @@ class Trajectory:
     rewards: torch.Tensor
     """Rewards, (steps,) float32."""
     evals: torch.Tensor
-    """The evaluation metric of the states that the steps led to, (steps,) float32."""
+    """Evaluation metric of the state after each step, (steps,) float32."""
     success: torch.Tensor
-    """Whether the task's goal was met there, (steps,) bool."""
+    """Whether the task's goal is met in the state after each step, (steps,) bool."""
     times: torch.Tensor
     """When each action was applied, (steps,) float64, seconds."""
     ages: torch.Tensor
-    """How old each action was then, (steps,) float64, seconds: the time since the plant was in the state that the
-    action was planned from. A plant that waits has not moved meanwhile: there it is what the plan took."""
+    """Age of each action when it was applied, (steps,) float64, seconds: the time since the plant was in the state from
+    which the action was planned. In a synchronous run this is the planning time."""
     late: torch.Tensor
-    """Whether a step began late because the one before it was not done in time, (steps,) bool; never if the plant
-    waits."""
+    """Whether a step began late because the step before it was not finished in time, (steps,) bool. Always False in a
+    synchronous run."""
     plan_of: torch.Tensor
-    """Which plan each action came from, (steps,) int64."""
+    """Index of the plan that each action came from, (steps,) int64."""
     plan_steps: torch.Tensor
-    """The step whose state each plan was made from, (plans,) int64."""
+    """Step whose state each plan was made from, (plans,) int64."""
     plan_starts: torch.Tensor
-    """When each plan was begun, (plans,) float64, seconds; negative for the first one of an asynchronous run."""
+    """When each plan was begun, (plans,) float64, seconds. Negative for the first plan of an asynchronous run."""
     plan_times: torch.Tensor
-    """How long each plan took until its actions were there, (plans,) float64, seconds."""
+    """Planning time of each plan, until its actions were on the CPU, (plans,) float64, seconds."""
     plan_failed: torch.Tensor
-    """How many of the samples of each plan failed, (plans,) float64; NaN of controllers that don't tell."""
+    """Number of failed samples of each plan, (plans,) float64. NaN for controllers that do not report it."""
     plan_effective: torch.Tensor
-    """The effective number of the samples of each plan, (plans,) float64: 0 if all failed; NaN where unknown."""
+    """Effective number of samples of each plan, (plans,) float64: 0 if all failed, NaN where unknown."""
     timestep: float
     """Simulated seconds in a step."""
     period: float
-    """Seconds of the wall clock that a step has: at which the plant runs, or would run in real time if it waits."""
+    """Seconds of the wall clock between two steps; in a synchronous run the seconds of real time."""
     wall_seconds: float
-    """Seconds of the wall clock that all of it took."""
+    """Duration of the run by the wall clock, seconds."""
     mode: str
-    """"sync" if the plant waited for its plans, "async" if it kept its rate."""
+    """"sync" if the plant waited for each plan, "async" if it kept its rate."""
     done_reason: int
-    """Bits of ``Done``: why the episode ended; 0 if it went on, or was interrupted."""
+    """Bits of ``Done``: why the episode ended. 0 if it had not ended when the run stopped."""
     task: str
     """Name of the task."""
     engine: str
-    """Name of the engine."""
+    """Name of the plant's engine."""
     params: Mapping[str, Any]
-    """The task's parameters."""
+    """Parameters of the task."""
     versions: Mapping[str, Any]
     """Packages, Python, machine and commit."""
     seed: int | None
     """Seed of the initial state and of the controller, None if none was given."""
     controller: Mapping[str, Any]
-    """What planned: its ``name``, and its settings, ``engine`` and ``device`` if it has them."""
+    """The controller's ``name``, and its settings, ``engine`` and ``device`` if it has them."""
     state_parts: Mapping[str, Sequence[int]]
-    """Where the named parts of a state lie: [start, stop] in its columns."""
+    """Columns of the named parts of a state: [start, stop]."""
     obs_parts: Mapping[str, Sequence[int]]
-    """Where those of an observation lie."""
+    """Columns of the named parts of an observation."""
     action_names: Sequence[str]
     """Names of the actions' columns."""
 
@@ -118,32 +120,32 @@ class Trajectory:
 
     @property
     def terminated(self) -> bool:
-        """Whether the task, or a fault, ended the episode."""
+        """Whether the task or a fault ended the episode."""
         return bool(self.done_reason & ~Done.TRUNCATED)
 
     @property
     def truncated(self) -> bool:
-        """Whether the time limit was reached."""
+        """Whether the episode reached its time limit."""
         return bool(self.done_reason & Done.TRUNCATED)
 
     @property
     def succeeded(self) -> bool:
-        """Whether the task's goal was met at the end."""
+        """Whether the task's goal is met in the last state."""
         return bool(self.success[-1])
 
     @property
     def age_steps(self) -> torch.Tensor:
-        """Steps between the state that each action was planned from and the action, (steps,) int64."""
+        """Age of each action in steps: steps since the state from which it was planned, (steps,) int64."""
         return torch.arange(self.steps) - self.plan_steps[self.plan_of]
 
     def save(self, path: str | Path) -> Path:
-        """Write everything into one file, in one go: a reader finds the old file or the whole new one.
+        """Write the trajectory to a file. A reader finds the old file or the whole new one.
 
-        The file is a compressed ``.npz``, which numpy reads by itself, without pickle. Each array has the name, the
-        shape, the type and the unit of the attribute; ``info`` is JSON text, a string of no axis, with ``format``
-        (1), ``task``, ``engine``, ``params``, ``versions``, ``mode``, ``timestep``, ``period``, ``wall_seconds``,
-        ``done_reason``, ``seed``, ``controller``, ``state_parts``, ``obs_parts`` and ``action_names``: with
-        ``start, stop = info["state_parts"]["qpos"]``, the positions are ``states[:, start:stop]``.
+        The file is a compressed ``.npz``, which numpy reads without pickle. Each array has the name, the shape, the
+        type and the unit of its attribute. ``info`` is JSON text, a string array without axes, with ``format`` (1),
+        ``task``, ``engine``, ``params``, ``versions``, ``mode``, ``timestep``, ``period``, ``wall_seconds``,
+        ``done_reason``, ``seed``, ``controller``, ``state_parts``, ``obs_parts`` and ``action_names``. For example,
+        with ``start, stop = info["state_parts"]["qpos"]``, the positions are ``states[:, start:stop]``.
 
         Returns:
             The file's path.
@@ -153,22 +155,17 @@ class Trajectory:
         arrays: dict[str, Any] = {name: getattr(self, name).numpy() for name in _ARRAYS}
         arrays["info"] = np.array(json.dumps(info))
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(path.name + ".tmp")
-        try:
-            with temporary.open("wb") as file:  # by name, numpy would add a suffix
-                np.savez_compressed(file, **arrays)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with replaced(path) as temporary, temporary.open("wb") as file:  # numpy would add a suffix to a name
+            np.savez_compressed(file, **arrays)
         return path
 
     @classmethod
     def load(cls, path: str | Path) -> "Trajectory":
-        """Read a file that ``save`` wrote. Nothing in it is run.
+        """Read a file that ``save`` wrote. No code in the file is executed.
 
         Raises:
-            FileNotFoundError: There is no such file.
-            ValueError: It is broken, foreign, or of a newer release.
+            FileNotFoundError: The file does not exist.
+            ValueError: The file is broken, is not a trajectory, or was written by a newer release.
         """
         path = Path(path)
         try:
@@ -180,17 +177,14 @@ class Trajectory:
                     return cls(**content, **{name: kind(info[name]) for name, kind in _SCALARS.items()})
         except OSError:
             raise
-        except Exception as error:  # numpy and zipfile raise many kinds, depending on where the file is broken
+        except Exception as error:  # of many types, from numpy and zipfile
             text = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise ValueError(f"{path} is broken, or is no trajectory of lyceum_warp ({text[:200]})") from error
-        raise ValueError(
-            f"{path} was written by a newer lyceum_warp (format {info['format']}, this one reads up to {FORMAT}): "
-            "pip install --upgrade lyceum-warp"
-        )
+            raise ValueError(f"{path} is broken, or is not a trajectory of lyceum_warp ({text[:200]})") from error
+        raise newer_format(path, info["format"], FORMAT)
 
 
 def _check(arrays: Mapping[str, torch.Tensor]) -> None:
-    """Refuse arrays that don't belong together."""
+    """Refuse arrays whose types, axes or lengths do not fit together."""
     steps = len(arrays["actions"])
     lengths = {"steps": steps, "steps + 1": steps + 1, "plans": len(arrays["plan_times"])}
     for name, (dtype, axes) in _ARRAYS.items():
@@ -199,11 +193,11 @@ def _check(arrays: Mapping[str, torch.Tensor]) -> None:
         if not fits or not len(array):
             raise ValueError(f"{name} has type {array.dtype} and shape {tuple(array.shape)}")
     if not ((arrays["plan_of"] >= 0) & (arrays["plan_of"] < lengths["plans"])).all():
-        raise ValueError("plan_of names plans that are not there")
+        raise ValueError(f"plan_of has indices outside the {lengths['plans']} plans")
 
 
 def provenance(env: Env) -> dict[str, Any]:
-    """What a trajectory tells of where it comes from: the task, the engine, versions, and the columns' names."""
+    """Attributes of a trajectory that describe its origin: task, engine, versions, and the names of the columns."""
     params = {name: np.asarray(value).tolist() for name, value in env.task.params.items()}
     return {
         "task": env.task.name, "engine": env.engine.name, "params": params, "versions": versions(env.device.alias),

@@ -1,131 +1,118 @@
 """The contract between an environment and the physics behind it."""
 
 import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import mujoco
 import warp as wp
 
 from lyceum_warp.arrays import flat, launch_rows
+from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.fields import Field, Stage, describe
 from lyceum_warp.kernels.state import narrow, widen
 
 
+@document_attributes
 class Engine(abc.ABC):
     """Many worlds of one model, stepped together.
 
-    An engine knows nothing of tasks. Whatever it shows lies in Warp arrays with a leading ``nworld`` axis and
-    an address that never changes, so that launches which read them can be recorded once.
+    An engine knows nothing of tasks. Its fields lie in Warp arrays with a leading ``nworld`` axis, whose addresses
+    never change, so that graphs of launches that read them can be captured once.
 
-    The order of calls in a step is: write ``ctrl``, ``step``, read fields and ``fault``; for worlds that
-    begin again, ``reset``, then write state fields, then ``commit`` and ``refresh``.
+    The order of calls in a step is: write ``ctrl``, ``step``, ``find_faults``, read fields and ``fault``; for worlds
+    that restart, ``reset``, then write state fields, then ``commit`` and ``refresh``. After construction the arrays
+    hold no state yet: reset all worlds first.
 
     Args:
         model: The compiled model; the engine keeps it and does not change it.
         nworld: Number of worlds.
         device: Where the arrays live.
+        fields: The fields to keep, from ``fields.describe``. No other field can be read later.
+
+    Raises:
+        ValueError: A field is listed twice, once lagged and once current.
     """
 
     name: str
-    recordable: bool
-    """Whether every call is made of Warp launches, so that a whole step can be recorded as one graph.
+    """The engine's name, as in ``make(engine=...)``."""
+    capturable: bool
+    """Whether every method is made of Warp launches, so that a whole step can be captured as one graph.
 
-    Otherwise the launches between two calls of ``step``, ``refresh`` or ``set_state`` are recorded; so the methods
-    that say so have to be made of launches on every engine, and an engine keeps what they touch in Warp arrays.
+    Otherwise only the launches between two calls of ``step``, ``refresh`` and ``set_state`` are captured: the methods
+    whose docstrings say so must be made of launches on every engine, on arrays whose addresses never change.
     """
-
+    model: mujoco.MjModel
+    """The compiled model."""
+    nworld: int
+    """Number of worlds."""
+    device: wp.Device
+    """Where the arrays live."""
+    fields: dict[str, Field]
+    """The fields that are kept, by name; ``ctrl`` is always among them."""
+    arrays: dict[str, wp.array]
+    """The live arrays of the fields, (nworld, ...), by name; filled by each engine's constructor."""
     ctrl: wp.array
     """Controls of the next step, (nworld, nu), float32: the field of that name, reset and restored with the state."""
     fault: wp.array
     """Bits of ``Done`` for each world, (nworld,), int32; set by ``find_faults``."""
+    stage: Stage
+    """The stage that must be computed after the substeps, for the fields that belong to the new state."""
+    reset_stage: Stage
+    """The stage that must be computed for worlds that were reset."""
+    snapshots: list[Field]
+    """Fields that are not a function of the integration state, in the order of the state vector."""
+    integration_size: int
+    """Floats in one world's integration state (mjSTATE_INTEGRATION)."""
+    state_size: int
+    """Floats in one world's state: the integration state and the snapshots."""
 
-    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device) -> None:
+    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: Iterable[Field]) -> None:
         self.model = model
         self.nworld = nworld
         self.device = device
-        self.fields: dict[str, Field] = {}
-        self.arrays: dict[str, wp.array] = {}
+        self.fields = {}
+        for field in (describe(model, "ctrl"), *fields):
+            if self.fields.setdefault(field.name, field) != field:
+                raise ValueError(f"the field {field.name!r} is listed both lagged and current: list it once")
+        self.arrays = {}
         self.fault = wp.zeros(nworld, dtype=int, device=device)
+        self.stage = max(field.refresh for field in self.fields.values())
+        self.reset_stage = max(field.reset for field in self.fields.values())
+        self.snapshots = [field for field in self.fields.values() if field.snapshot]
+        self.integration_size = _integration_size(model)
+        self.state_size = self.integration_size + sum(field.size for field in self.snapshots)
         self._everyone = wp.full(nworld, True, dtype=bool, device=device)
-        spec = mujoco.mjtState.mjSTATE_INTEGRATION
-        self.integration_size = mujoco.mj_stateSize(model, spec.value)
 
-    # fields
+    @classmethod
+    def bytes_per_world(cls, model: mujoco.MjModel, fields: Iterable[Field], **options: Any) -> int:
+        """An estimate of the memory that the engine takes for each world, in bytes.
 
-    def field(self, name: str, *, lagged: bool = False) -> wp.array:
-        """Ask for a field by MuJoCo's name; from now on it is kept up to date.
+        The default counts a float64 state and one float32 array for each field.
 
         Args:
-            name: Attribute of MjData.
-            lagged: Want it as ``mj_step`` leaves it instead of belonging to the state. Quantities of the
-                acceleration stage always are.
-
-        Returns:
-            The live array, (nworld, ...).
-
-        Raises:
-            ValueError: There is no such field, or it was asked for the other way before.
+            model: The compiled model.
+            fields: The fields that the engine will keep.
+            options: The engine's options, as for its constructor.
         """
-        if name not in self.fields:
-            field = describe(self.model, name, lagged=lagged)
-            self.arrays[name] = self._bind(field)
-            self.fields[name] = field
-        elif lagged and not self.fields[name].snapshot and self.fields[name].reset > Stage.NONE:
-            raise ValueError(f"the field {name!r} is already kept current and can't be had lagged, too")
-        return self.arrays[name]
+        return 8 * _integration_size(model) + 4 * sum(field.size for field in fields) + 8
 
-    @property
-    def stage(self) -> Stage:
-        """What has to be computed after the substeps, for the fields that belong to the state."""
-        return max((field.refresh for field in self.fields.values()), default=Stage.NONE)
-
-    @property
-    def reset_stage(self) -> Stage:
-        """What has to be computed for worlds that were reset."""
-        return max((field.reset for field in self.fields.values()), default=Stage.NONE)
-
-    @property
-    def snapshots(self) -> list[Field]:
-        """Fields that are no function of the integration state, in the order of the state vector."""
-        return [field for field in self.fields.values() if field.snapshot]
-
-    @property
-    def state_size(self) -> int:
-        """Floats in one world's state: the integration state (mjSTATE_INTEGRATION) and the snapshots."""
-        return self.integration_size + sum(field.size for field in self.snapshots)
-
-    @abc.abstractmethod
-    def _bind(self, field: Field) -> wp.array:
-        """The array that will hold a field, (nworld, *field.shape) of field.dtype."""
-
-    # memory
-
-    @property
-    def shared_bytes(self) -> int:
-        """Bytes that any number of worlds share: the model's arrays."""
-        return 0
-
-    @property
-    def hidden_bytes(self) -> int:
-        """Bytes that all worlds together have in memory that no array of this object shows."""
-        return 0
-
-    def prepare(self) -> None:  # noqa: B027
-        """Set aside what recordings need; called when every kernel is compiled, before the first of them.
+    def prepare_capture(self) -> None:  # noqa: B027
+        """Allocate what graphs need; called when every kernel is compiled, before the first capture.
 
         Raises:
-            ValueError: So many worlds do not fit into memory.
+            ValueError: The memory is too small for this many worlds.
         """
 
     # physics
 
     @abc.abstractmethod
     def step(self, nstep: int) -> None:
-        """Advance every world by ``nstep`` substeps under ``ctrl`` and bring the fields up to date."""
+        """Advance every world by ``nstep`` substeps under ``ctrl`` and update the fields."""
 
     @abc.abstractmethod
     def find_faults(self, mask: wp.array) -> None:
-        """Write the masked worlds' ``fault``: a state that is not finite, and what was in their way since last time.
+        """Write the masked worlds' ``fault``: a state that is not finite, and overflows and warnings since last time.
 
         Made of Warp launches on every engine.
         """
@@ -139,39 +126,39 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def commit(self, mask: wp.array) -> None:
-        """Take over what was written into the masked worlds' state fields. Made of Warp launches."""
+        """Take the values in the masked worlds' state fields over into the engine. Made of Warp launches."""
 
     @abc.abstractmethod
     def refresh(self, mask: wp.array) -> None:
-        """Make every derived field of the masked worlds that of a forward pass at their state.
+        """Compute every derived field of the masked worlds as a forward pass at their state does.
 
-        Worlds outside the mask keep the values that they have.
+        Worlds outside the mask keep their values.
         """
 
     # roll-outs
 
-    def rollout(self, state: wp.array, controls: wp.array, nstep: int, records: Mapping[str, wp.array]) -> None:
-        """Step every world from a given state under given controls, and record fields along the way.
+    def rollout(self, state: wp.array, controls: wp.array, nstep: int, buffers: Mapping[str, wp.array]) -> None:
+        """Step every world from a given state under given controls, and copy fields into buffers along the way.
 
-        The state fields and ``find_faults`` then tell of the end; derived fields may be those of another time.
+        Afterwards the state fields and ``find_faults`` describe the end; derived fields may belong to another time.
 
         Args:
             state: States to start from, whose leading columns are those of ``get_state``; (nworld, ...) float64.
             controls: Controls of each step, (steps, nworld, nu) float32.
             nstep: Substeps in a step.
-            records: Where to record fields that were asked for, (steps + 1, nworld, ...): the first row is the start.
+            buffers: Where fields go, by their names, (steps + 1, nworld, ...): the first row is the start.
         """
-        self.reset(self._everyone)  # whatever the last roll-out left behind
+        self.reset(self._everyone)  # clears warnings and warm starts of the last roll-out
         self.set_state(state, self._everyone)
-        self._keep(records, 0)
+        self._copy_fields(buffers, 0)
         for t in range(len(controls)):
             wp.copy(self.ctrl, controls[t])
             self.step(nstep)
-            self._keep(records, t + 1)
+            self._copy_fields(buffers, t + 1)
 
-    def _keep(self, records: Mapping[str, wp.array], t: int) -> None:
-        for name, record in records.items():
-            wp.copy(record[t], self.arrays[name])
+    def _copy_fields(self, buffers: Mapping[str, wp.array], t: int) -> None:
+        for name, buffer in buffers.items():
+            wp.copy(buffer[t], self.arrays[name])
 
     # state
 
@@ -190,7 +177,7 @@ class Engine(abc.ABC):
             start += field.size
 
     def set_state(self, state: wp.array, mask: wp.array) -> None:
-        """Put the masked worlds into the given states, exactly; every field reflects them afterwards."""
+        """Put the masked worlds into the given states, exactly; afterwards every field belongs to them."""
         self._set_integration(state[:, : self.integration_size], mask)
         self._refresh_current(mask)
         start = self.integration_size
@@ -211,4 +198,11 @@ class Engine(abc.ABC):
 
 
 EngineFactory = Callable[..., Engine]
-"""Called with (model, nworld, device, **options), the options being those that were given; returns an engine."""
+"""Called with (model, nworld, device, fields, **options), the options being those that were given; returns an engine.
+
+A factory with an attribute ``bytes_per_world``, as an engine class has, is asked before it is called.
+"""
+
+
+def _integration_size(model: mujoco.MjModel) -> int:
+    return mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION.value)

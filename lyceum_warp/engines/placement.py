@@ -1,28 +1,209 @@
-"""TEMPORARY until the engines branch is merged."""
+"""Where worlds run: devices by name, what "auto" means, and the engine that is made for it."""
 
-from lyceum_warp.engines import ON_CPU_CORES, find_device as find_device
-from lyceum_warp.engines import open_engine as _open
+import importlib
+import inspect
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import mujoco
+import torch
+import warp as wp
+
+from lyceum_warp.engines.base import Engine, EngineFactory
+from lyceum_warp.engines.memory import check_fit
+from lyceum_warp.fields import Field
+from lyceum_warp.machine import cpu_cores
+
+_ENGINES = {
+    "mujoco": ("lyceum_warp.engines.c.mujoco_engine", "MujocoEngine"),
+    "warp": ("lyceum_warp.engines.warp.warp_engine", "WarpEngine"),
+}
+_DETERMINISTIC = "lyceum_warp.engines.deterministic"
+"""The room of the engine that takes the place of "warp" with deterministic=True on a CUDA device."""
+
+_ON_CPU_CORES = {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None}
+"""The options that move an environment from a GPU to the C engine, which takes no sizes of contacts and constraints."""
+
+_SAMPLES_PER_CORE = 40
+"""With fewer samples for each CPU core, the C engine plans faster than an H100. Measured with 16 cores, where the two
+meet at 27 samples a core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah (bench/README.md)."""
+
+_MOST_CORES = 16
+"""More cores were not measured, and a plan's work besides physics runs on one."""
+
+_NOSLIP = 6
+"""The factor on the samples where the planner's model has the noslip solver, which makes a substep on a GPU that much
+slower."""
 
 
-def few_worlds(engine, device):
-    return {} if device.is_cpu or engine != "auto" else dict(ON_CPU_CORES)
+def find_device(device: str | None) -> wp.Device:
+    """The Warp device of a name.
+
+    Raises:
+        ValueError: This machine has no such device.
+    """
+    name, error = str(device or "cpu"), None
+    if wp.is_cuda_available() or not name.startswith("cuda"):  # without a driver, Warp would print before it fails
+        try:
+            found = wp.get_device(name)
+        except (ValueError, RuntimeError) as cause:
+            error = cause
+        else:
+            if found.is_cuda and not torch.cuda.is_available():
+                raise ValueError(
+                    f"Warp has the device {name!r}, but torch {torch.__version__} is built without CUDA or does not "
+                    "see it: install a CUDA build of torch"
+                )
+            return found
+    names = ", ".join(repr(d.alias) for d in wp.get_devices())
+    raise ValueError(
+        f"there is no device {name!r} on this machine; it has {names} (for a GPU, check that nvidia-smi shows it "
+        "and that its driver is recent enough for Warp)"
+    ) from error
 
 
-def open_engine(options, model, device, fields, *, beside=0):
-    p = options.physics
-    e = _open(
-        options.engine,
-        model,
-        options.nworld,
-        device,
-        nthread=options.nthread,
-        nconmax=p.nconmax,
-        njmax=p.njmax,
-        deterministic=p.deterministic,
-        unroll=p.unroll,
-    )
-    for f in fields:
-        e.field(f.name, lagged=f.lagged)
-    e.capturable = e.recordable
-    e.prepare_capture = e.prepare
-    return e
+def engine_name(engine: str | EngineFactory, device: str | wp.Device | None) -> str:
+    """The name of an engine: "auto" stands for "warp" on a CUDA device and for "mujoco" on the CPU.
+
+    Args:
+        engine: A name, "auto", or an engine class or factory.
+        device: A device or its name; it need not exist on this machine.
+    """
+    if callable(engine):
+        return str(getattr(engine, "name", getattr(engine, "__name__", engine)))
+    if engine == "auto":
+        return "warp" if str(device or "cpu").startswith("cuda") else "mujoco"
+    return engine
+
+
+def open_engine(
+    engine: str | EngineFactory,
+    model: mujoco.MjModel,
+    nworld: int,
+    device: wp.Device,
+    fields: Iterable[Field],
+    *,
+    beside: int = 0,
+    **options: Any,
+) -> Engine:
+    """Make an engine by name, or by a class or factory of your own.
+
+    Args:
+        engine: "mujoco", "warp", "auto", or a callable with the signature of ``base.Engine``.
+        model: The compiled model.
+        nworld: Number of worlds.
+        device: Where they run.
+        fields: The fields to keep, from ``fields.describe``.
+        beside: Bytes for each world that the caller itself is going to allocate.
+        options: The engine's options, the keyword-only arguments of its constructor. None leaves an engine its default.
+            An engine that does not take an option that is True or False ignores it.
+
+    Raises:
+        ValueError: There is no such engine, the worlds do not fit into memory, or the engine refuses the model, the
+            device or an option.
+    """
+    fields = list(fields)
+    factory, given = _resolved(engine, device, options)
+    needed = _bytes_per_world(factory, model, fields, given)
+    if needed is not None:
+        check_fit(needed + beside, nworld, device, model=_model_name(model))
+    return factory(model, nworld, device, fields, **given)
+
+
+def bytes_per_world(
+    engine: str | EngineFactory, model: mujoco.MjModel, device: wp.Device, fields: Iterable[Field], **options: Any
+) -> int:
+    """An estimate of the memory for each world of the engine that ``open_engine`` makes, in bytes; 0 if unknown."""
+    factory, given = _resolved(engine, device, options)
+    return _bytes_per_world(factory, model, list(fields), given) or 0
+
+
+def few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
+    """The options to change for an environment of a few worlds, such as an evaluation's.
+
+    On a GPU a step of a few worlds takes nearly as long as one of thousands. With engine="auto" a few worlds therefore
+    step on CPU cores, through the C engine, in double precision.
+    """
+    return dict(_ON_CPU_CORES) if engine == "auto" and engine_name(engine, device) == "warp" else {}
+
+
+def place_samples(
+    engine: str | EngineFactory,
+    device: str | None,
+    *,
+    nthread: int | None,
+    samples: int,
+    has_noslip: Callable[[], bool],
+) -> dict[str, Any]:
+    """The options to change for a planner's worlds: engine="auto" on a GPU chooses by the number of samples.
+
+    Args:
+        engine: The engine that was asked for.
+        device: The device that was asked for.
+        nthread: Threads that the C engine would have, None for all cores.
+        samples: Number of samples, one a world.
+        has_noslip: Says whether the planner's model has the noslip solver; only called where that decides.
+
+    Raises:
+        ValueError: This machine has no such device.
+    """
+    if engine != "auto" or not find_device(device).is_cuda:
+        return {}
+    enough = _SAMPLES_PER_CORE * min(_MOST_CORES, nthread or cpu_cores())
+    if samples >= enough and (samples >= _NOSLIP * enough or not has_noslip()):
+        return {"engine": "warp", "nthread": None}
+    return dict(_ON_CPU_CORES)
+
+
+def _resolved(
+    engine: str | EngineFactory, device: wp.Device, options: dict[str, Any]
+) -> tuple[EngineFactory, dict[str, Any]]:
+    """The engine's class or factory, and those of the options that it is given."""
+    name = engine_name(engine, device.alias)
+    factory = engine if callable(engine) else _engine_class(name, device, bool(options.get("deterministic")))
+    given = {key: value for key, value in options.items() if value is not None and value is not False}
+    known = _options_of(factory)
+    if known is None:
+        return factory, given
+    if unknown := sorted(key for key, value in given.items() if key not in known and value is not True):
+        takes = f"it takes {', '.join(known)}" if known else "it takes no options"
+        raise ValueError(f"the {name} engine takes no {', '.join(unknown)}; {takes}")
+    return factory, {key: value for key, value in given.items() if key in known}
+
+
+def _engine_class(name: str, device: wp.Device, deterministic: bool) -> type[Engine]:
+    if name not in _ENGINES:
+        raise ValueError(f"there is no engine {name!r}: use one of 'auto', {', '.join(map(repr, _ENGINES))}")
+    module, attribute = _ENGINES[name]
+    if name == "warp" and deterministic and device.is_cuda:
+        module, attribute = f"{_DETERMINISTIC}.deterministic_engine", "DeterministicEngine"
+    try:
+        found: type[Engine] = getattr(importlib.import_module(module), attribute)
+    except ModuleNotFoundError as error:
+        if not str(error.name).startswith(_DETERMINISTIC):
+            raise
+        raise ValueError(
+            f"deterministic=True needs the package {_DETERMINISTIC}, which this installation lacks: leave it out"
+        ) from None
+    return found
+
+
+def _options_of(factory: EngineFactory) -> list[str] | None:
+    """The names of the options that an engine takes, or None where it takes any."""
+    parameters = inspect.signature(factory).parameters.values()
+    if any(parameter.kind == parameter.VAR_KEYWORD for parameter in parameters):
+        return None
+    return [parameter.name for parameter in parameters if parameter.kind == parameter.KEYWORD_ONLY]
+
+
+def _bytes_per_world(
+    factory: EngineFactory, model: mujoco.MjModel, fields: list[Field], given: dict[str, Any]
+) -> int | None:
+    estimate = getattr(factory, "bytes_per_world", None)
+    return None if estimate is None else int(estimate(model, fields, **given))
+
+
+def _model_name(model: mujoco.MjModel) -> str:
+    """The name in the model's file, or nothing if it has none."""
+    name = model.names[: model.names.index(b"\0")].decode(errors="replace")
+    return "" if name == "MuJoCo Model" else name

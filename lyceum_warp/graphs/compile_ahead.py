@@ -1,13 +1,12 @@
-"""Kernels compiled ahead of time, on all cores, while somebody is told about it.
+"""Kernels compiled ahead of time, on all cores, with progress on stderr.
 
-Warp compiles a module when the first of its kernels is launched, one after another and without a word. On a new GPU
-that takes a minute or more for a task. Here the launches of a step are rehearsed, the modules that Warp's cache lacks
-are compiled side by side, and each is reported. What is in the cache costs nothing and says nothing.
+Warp compiles a module when the first of its kernels is launched, one after another and silently. On a new GPU that
+takes a minute or more for a task. Here the launches of a step are rehearsed, the modules that Warp's cache lacks are
+compiled side by side, and each is reported. Modules that are in the cache cost nothing, and nothing is printed.
 """
 
 import concurrent.futures
 import dataclasses
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -19,32 +18,29 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from lyceum_warp.graphs.rehearsal import rehearse
+from lyceum_warp.machine import cpu_cores
 
 
 @dataclasses.dataclass(frozen=True)
 class Built:
-    """What was compiled."""
+    """Modules of kernels that were compiled."""
 
     modules: int = 0
-    """How many modules were compiled."""
+    """Number of modules that were compiled."""
     known: int = 0
-    """How many more were in the cache."""
+    """Number of further modules, which were in the cache."""
     seconds: float = 0.0
-    """How long compiling took, all together."""
-
-
-def workers() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Seconds that compiling took, all modules together."""
 
 
 def compile_ahead(function: Callable[[], None], device: wp.Device, what: str) -> Built:
-    """Compile every kernel that a function would launch and that is in no cache yet, and say so on stderr.
+    """Compile every kernel that a function would launch and that is not in the cache, and report it on stderr.
 
     Args:
-        function: Made of launches; it is gone through without launching anything, and may spoil its arrays.
+        function: Made of launches. It is called without launching anything, and may overwrite its arrays with
+            meaningless numbers.
         device: Where the kernels will run.
-        what: What they are for, as "hopper".
+        what: Their purpose, for the report, as "hopper".
     """
     with rehearse() as rehearsal:
         function()
@@ -53,12 +49,12 @@ def compile_ahead(function: Callable[[], None], device: wp.Device, what: str) ->
     if not missing:
         return Built(known=len(wanted))
     start = time.perf_counter()
-    with _Teller(len(missing), what, device) as tell:
-        pool = concurrent.futures.ThreadPoolExecutor(min(workers(), len(missing)))
+    with _Report(len(missing), what, device) as report:
+        pool = concurrent.futures.ThreadPoolExecutor(min(cpu_cores(), len(missing)))
         try:
             futures = [pool.submit(_load, module, block, device) for module, block in missing]
             for future in concurrent.futures.as_completed(futures):
-                tell(*future.result())
+                report(*future.result())
         finally:
             pool.shutdown(cancel_futures=True)  # after an error, or Ctrl-C
     return Built(len(missing), len(wanted) - len(missing), time.perf_counter() - start)
@@ -71,12 +67,15 @@ def _load(module: Any, block: int, device: wp.Device) -> tuple[str, float]:
 
 
 def _block(device: wp.Device, block: int | None) -> int:
-    """The block size that a launch comes to; on the CPU there are none."""
+    """The block size of a launch; on the CPU it is always 1."""
     return 1 if device.is_cpu else block or 256
 
 
 def _is_there(module: Any, block: int, device: wp.Device) -> bool:
-    """Whether a module is loaded or in Warp's cache; Warp has no public question for it, so that a no is no harm."""
+    """Whether a module is loaded or in Warp's cache.
+
+    Warp has no public function for this. Where its internals have changed the answer is no, which costs time only.
+    """
     if (device.context, block) in module.execs:
         return True
     try:
@@ -89,13 +88,13 @@ def _is_there(module: Any, block: int, device: wp.Device) -> bool:
 
 def cached() -> dict[Path, int]:
     """The compiled modules in Warp's cache, and their sizes in bytes."""
-    wp.init()  # which finds the cache
+    wp.init()  # finds the cache's folder
     files = Path(wp.config.kernel_cache_dir or "").glob("*/*")
     return {path: path.stat().st_size for path in files if path.suffix in (".o", ".ptx", ".cubin")}
 
 
-class _Teller:
-    """A bar on a terminal, and a line for each module elsewhere."""
+class _Report:
+    """A progress bar on a terminal, and a line for each module elsewhere."""
 
     def __init__(self, total: int, what: str, device: wp.Device) -> None:
         self._text = f"compiling kernels of {what} for {device.alias}"
@@ -108,10 +107,10 @@ class _Teller:
         self._bar = self._progress.add_task(self._text, total=total, last="")
         self._lines = not console.is_terminal
 
-    def __enter__(self) -> "_Teller":
+    def __enter__(self) -> "_Report":
         self._progress.start()
         if self._lines:
-            cores = f"{workers()} cores" if workers() > 1 else "1 core"
+            cores = f"{cpu_cores()} cores" if cpu_cores() > 1 else "1 core"
             print(f"{self._text}: {self._total} modules on {cores}, once", file=sys.stderr, flush=True)
         return self
 

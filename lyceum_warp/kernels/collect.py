@@ -1,4 +1,4 @@
-"""Recording of rollouts: what a step read and gave, written at a running index that lives on the device."""
+"""Kernels that store the inputs and results of steps in a rollout buffer, at an index that is kept on the device."""
 
 import warp as wp
 
@@ -9,8 +9,8 @@ _BITS = wp.constant(int(FAULTS).bit_length())
 
 
 @wp.struct
-class Record:
-    """What is kept of every step; arrays are (steps, nworld) with a last axis for vectors."""
+class RolloutArrays:
+    """The arrays of a rollout buffer, (steps, nworld), with a last axis for vectors."""
 
     obs: wp.array3d[float]
     action: wp.array3d[float]
@@ -26,11 +26,11 @@ class Record:
 
 
 @wp.kernel(enable_backward=False)
-def record_inputs(
+def store_inputs(
     index_in: wp.array[int], obs_in: wp.array2d[float], action_in: wp.array2d[float], step_in: wp.array[int],
-    out: Record,
+    out: RolloutArrays,
 ):  # fmt: skip
-    """Observation, action and step counter before a step; launched over (nworld, max(nobs, nact))."""
+    """Store observation, action and step counter before a step; launched over (nworld, max(nobs, nact))."""
     w, i = wp.tid()
     t = index_in[0]
     if i < obs_in.shape[1]:
@@ -42,7 +42,7 @@ def record_inputs(
 
 
 @wp.kernel(enable_backward=False)
-def record_outputs(
+def store_outputs(
     index_in: wp.array[int],
     final_obs_in: wp.array2d[float],
     reward_in: wp.array[float],
@@ -53,9 +53,9 @@ def record_outputs(
     done_reason_in: wp.array[int],
     return_inout: wp.array[float],
     fault_inout: wp.array[int],
-    out: Record,
+    out: RolloutArrays,
 ):
-    """What a step gave, the return of the episode so far, and faults since the record began; over (nworld, nobs)."""
+    """Store the results of a step and the return of the episode so far, and count faults; over (nworld, nobs)."""
     w, i = wp.tid()
     t = index_in[0]
     out.final_obs[t, w, i] = final_obs_in[w, i]

@@ -1,4 +1,4 @@
-"""Faults: what makes a world unfit to go on, found in each world as bits of ``Done``."""
+"""Faults: kernels that find in each world, as bits of ``Done``, why it can't go on."""
 
 import warp as wp
 
@@ -25,10 +25,10 @@ def faults_of_rows(
     warning_inout: wp.array3d[int],
     fault_out: wp.array[int],
 ):
-    """Faults of the C engine: time, qpos, qvel and act lead its rows, warnings are (nworld, kind, 2) counters.
+    """Find faults of the C engine: time, qpos, qvel and act lead its rows, warnings are (nworld, kind, 2) counters.
 
     The kinds are mjtWarning's: 0 inertia, 1 contacts full, 2 constraints full, 3 to 5 bad qpos, qvel, qacc,
-    6 bad control. A counter is cleared once seen.
+    6 bad control. A counter is cleared when it is read.
     """
     w = wp.tid()
     if not mask_in[w]:
@@ -60,7 +60,7 @@ def pool_overflow(
     bits: int,
     overflow_inout: wp.array[int],
 ):
-    """The overflow of a pool of pairs and contacts, as ``mujoco_warp.step`` sees it and ``forward`` does not."""
+    """Set the bits of an overflow of the pool of pairs and contacts, as ``mujoco_warp.step`` does."""
     w = wp.tid()
     if mask_in[w] and (npair_in[0] > nmax or ncontact_in[0] > nmax):
         overflow_inout[w] = overflow_inout[w] | bits
@@ -78,7 +78,7 @@ def faults_of_fields(
     ignored_bits: int,
     fault_out: wp.array[int],
 ):
-    """Faults of the Warp engine: its state fields, and its own overflow bits sorted into ours."""
+    """Find faults of the Warp engine: in its state fields, and in its own overflow bits."""
     w = wp.tid()
     if not mask_in[w]:
         return

@@ -1,4 +1,4 @@
-"""Planning by sampling: from actions to controls, noise around a plan, weights, and the plan that they average to.
+"""Planning by sampling: controls of open-loop roll-outs, noise around a plan, weights, and the weighted mean.
 
 Actions of samples are (horizon, nsample, nu), plans (horizon, nu).
 """
@@ -10,12 +10,12 @@ from lyceum_warp.kernels.random import stream, world_key
 
 ACTION = wp.constant(int(Done.ACTION))
 NOISE = wp.constant(-2)
-"""In the place of an episode: with the same seed, worlds draw initial states and samples draw noise independently."""
+"""Stands in for the number of an episode, so that worlds and samples of one seed draw from independent streams."""
 
 
 @wp.kernel(enable_backward=False)
 def broadcast(state_in: wp.array[wp.float64], state_out: wp.array2d[wp.float64]):
-    """The same state in every world; launched over (nworld, state_size)."""
+    """Copy one state to every world; launched over (nworld, state_size)."""
     w, i = wp.tid()
     state_out[w, i] = state_in[i]
 
@@ -28,7 +28,10 @@ def controls(
     fault_out: wp.array[int],
     ctrl_out: wp.array3d[float],
 ):
-    """Map actions to controls, within their ranges; one that is not finite counts as zero. Over (steps, nworld)."""
+    """Map actions to controls, within their ranges; launched over (steps, nworld).
+
+    An action with a number that is not finite becomes zero, and is a fault of its world.
+    """
     t, w = wp.tid()
     fault = int(0)
     for i in range(action_inout.shape[2]):
@@ -45,6 +48,7 @@ def controls(
 
 @wp.kernel(enable_backward=False)
 def merge_faults(fault_in: wp.array[int], fault_inout: wp.array[int]):
+    """Add the bits of one array of faults to another; launched over nworld."""
     w = wp.tid()
     fault_inout[w] = fault_inout[w] | fault_in[w]
 
@@ -54,7 +58,7 @@ def shift_plan(
     plan_in: wp.array2d[float], steps_in: wp.array[int], fill_in: wp.array[float], repeat: bool,
     nominal_out: wp.array2d[float],
 ):  # fmt: skip
-    """Move a plan forward in time, and fill its end; launched over (horizon, nu)."""
+    """Move a plan forward in time and fill its end; launched over (horizon, nu)."""
     t, i = wp.tid()
     last = plan_in.shape[0] - 1
     source = t + steps_in[0]
@@ -66,7 +70,7 @@ def shift_plan(
 
 @wp.kernel(enable_backward=False)
 def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.array3d[float]):
-    """Standard normal numbers that depend on (seed, sample, count, action, step); launched over (nsample, nu)."""
+    """Draw standard normal numbers by (seed, sample, count, action, step); launched over (nsample, nu)."""
     k, i = wp.tid()
     key = stream(world_key(seed_in[0], k), NOISE, 0)
     rng = stream(key, count_in[0], i)
@@ -85,10 +89,10 @@ def perturb(
     high_in: wp.array[float],
     action_out: wp.array3d[float],
 ):
-    """Actions around a plan: coloured, smoothed noise on top of it, within bounds; launched over (nsample, nu).
+    """Add coloured, smoothed noise to a plan and clip the sum to the bounds; launched over (nsample, nu).
 
-    ``scale`` is the lower Cholesky factor of the noise's covariance. Smoothing follows trajopt: from the third step
-    on, e_t <- b0 e_t + b1 e_(t-1) + b2 e_(t-2), with those before already smoothed.
+    ``scale_in`` is the lower Cholesky factor L of the noise's covariance: n_t = L z_t for standard normal z_t.
+    Smoothing follows trajopt: e_t = n_t in the first two steps, then e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2).
     """
     k, i = wp.tid()
     last, before_last = float(0.0), float(0.0)
@@ -114,9 +118,11 @@ def add_up(
     stop: bool,
     return_out: wp.array[float],
 ):
-    """Discounted returns of samples, minus infinity where one failed. A sample that ``stop``s at its end earns nothing
-    after it, the terminal value included.
-    """  # noqa: D205
+    """Add up the samples' discounted rewards and terminal values; launched over nsample.
+
+    With ``stop`` a sample earns nothing after the end of its episode, also no terminal value. The return of a sample
+    with a fault, or of one that is not finite, is minus infinity.
+    """
     k = wp.tid()
     total = float(0.0)
     weight = float(1.0)
@@ -136,10 +142,10 @@ def add_up(
 
 @wp.kernel(enable_backward=False)
 def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[float], summary_out: wp.array[float]):
-    """Weights of samples, exp((R - max R) / temperature) over their sum; all zero where every sample failed.
+    """Weigh samples by w = exp((R - max R) / temperature), divided by the sum; launched as one block.
 
-    The summary holds the best return, the mean return, the effective number of samples 1 / sum w^2, and how many
-    failed. One block.
+    All weights are zero where every sample failed. The summary is the best return, the mean return, the effective
+    number of samples 1 / sum w^2, and the number of failed samples.
     """
     _, lane = wp.tid()
     n = return_in.shape[0]
@@ -178,7 +184,10 @@ def average(
     summary_in: wp.array[float],
     plan_out: wp.array2d[float],
 ):
-    """The weighted mean of the samples' actions; without one good sample the plan stays. A block for each number."""
+    """Average the samples' actions by their weights; launched as one block for each number of the plan.
+
+    Where every sample failed the plan stays as it is.
+    """
     number, lane = wp.tid()
     t = number // plan_out.shape[1]
     i = number % plan_out.shape[1]
@@ -192,6 +201,7 @@ def average(
 
 @wp.kernel(enable_backward=False)
 def count_up(count_inout: wp.array[int]):
+    """Count one improvement of a plan; launched over 1."""
     count_inout[0] = count_inout[0] + 1
 
 
@@ -203,7 +213,7 @@ def value_kernel(value: wp.Function) -> wp.Kernel:
     """
     types = list(value.input_types.values())
     if len(types) != 1 or getattr(types[0], "ndim", 0) != 1 or types[0].dtype is not wp.float32:
-        raise ValueError("a value function in Warp has to be written as value(obs: Row[float]) -> float")
+        raise ValueError("a value function in Warp must be written as value(obs: Row[float]) -> float")
 
     @wp.kernel(module="unique", enable_backward=False)
     def values(obs_in: wp.array2d[float], value_out: wp.array[float]):

@@ -1,4 +1,4 @@
-"""Advantages and returns over recorded rollouts: one thread a world walks its steps backwards."""
+"""Advantages and returns of rollouts: one thread for each world goes through its steps backwards."""
 
 import warp as wp
 
@@ -17,9 +17,8 @@ def advantages(
 ):
     """Generalised advantage estimates (Schulman et al. 2016, eq. 16) and discounted returns, (steps, nworld).
 
-    ``next_value`` is the value of the state that a step led to, before any reset: it stands in for the rest of
-    an episode that a time limit or the end of the record cut short, and counts as 0 where the episode
-    terminated.
+    ``next_value`` is the value of the state that a step led to, before any reset. It stands for the rest of an
+    episode that a time limit or the end of the rollout cut off, and counts as 0 where the episode terminated.
     """
     w = wp.tid()
     last = reward_in.shape[0] - 1

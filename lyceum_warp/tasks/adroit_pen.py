@@ -145,4 +145,4 @@ class AdroitPen(lw.Task):
     lagged = ("xpos", "site_xpos")
     memory = 1
     action_range = (-1.0, 1.0)
-    planning = {"horizon": 32, "samples": 160, "temperature": 1.0, "noise": 1.0}  # the paper's
+    planning = lw.Planning(settings={"horizon": 32, "samples": 160, "temperature": 1.0, "noise": 1.0})  # the paper's

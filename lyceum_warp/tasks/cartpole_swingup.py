@@ -98,4 +98,4 @@ def cartpole() -> mujoco.MjSpec:
 class CartpoleSwingup(lw.Task):
     model = staticmethod(cartpole)
     obs = {"cart_position": 1, "pole_direction": 2, "cart_velocity": 1, "pole_velocity": 1}
-    planning = {"horizon": 100}
+    planning = lw.Planning(settings={"horizon": 100})

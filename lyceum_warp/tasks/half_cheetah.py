@@ -55,4 +55,4 @@ class HalfCheetah(lw.Task):
     model = "half_cheetah.xml"
     frame_skip = 5
     obs = staticmethod(lambda p: {"position": 9 - p.exclude_current_positions_from_observation, "velocity": 9})
-    planning = {"temperature": 1.0, "noise": 0.5, "smoothing": (1.0, 0.0, 0.0)}
+    planning = lw.Planning(settings={"temperature": 1.0, "noise": 0.5, "smoothing": (1.0, 0.0, 0.0)})

@@ -80,7 +80,8 @@ class Hopper(lw.Task):
     frame_skip = 4
     obs = staticmethod(lambda p: {"position": 6 - p.exclude_current_positions_from_observation, "velocity": 6})
     # a planner that sees a second ahead and no further would run itself off its leg: it is paid more for standing
-    planning = {
-        "horizon": 128, "samples": 128, "noise": 0.1, "integrator": "euler",
-        "healthy_reward": 2.0, "forward_reward_weight": 0.2,
-    }  # fmt: skip
+    planning = lw.Planning(
+        settings={"horizon": 128, "samples": 128, "noise": 0.1},
+        options={"integrator": "euler"},
+        params={"healthy_reward": 2.0, "forward_reward_weight": 0.2},
+    )

@@ -196,4 +196,5 @@ class Reach(lw.Task):
     obs = {"position": 7, "velocity": 7, "hand": 3, "error": 3}
     horizon = 75
     memory = REMEMBERED
-    planning = {"horizon": 16, "samples": 30, "temperature": 0.2, "noise": 1.0}  # the paper's: its 5 is an inverse
+    # the paper's; its temperature of 5 is an inverse one
+    planning = lw.Planning(settings={"horizon": 16, "samples": 30, "temperature": 0.2, "noise": 1.0})

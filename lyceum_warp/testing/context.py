@@ -96,7 +96,7 @@ class Context:
     @contextlib.contextmanager
     def changed(self, *envs: Env, **choices: Any) -> Iterator[None]:
         """Within a ``with`` block, give environments another ``horizon``, ``autoreset`` or ``graphs``."""
-        kept = [
+        kept: list[Any] = [
             {"horizon": env.horizon, "autoreset": env.autoreset, "graphs": env.worlds.programs.graphs.enabled}
             for env in envs
         ]

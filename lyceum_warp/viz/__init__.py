@@ -1,4 +1,4 @@
-"""Learning curves and videos; what they need is the extra ``viz``."""
+"""Plots and videos. They need the extra ``viz``."""
 
 EXTRA = "pip install 'lyceum-warp[viz]'"
-"""How to get what plots and videos need."""
+"""Command that installs the packages for plots and videos."""

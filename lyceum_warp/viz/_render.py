@@ -1,8 +1,8 @@
-"""Draws states into a video; a program of its own: ``python _render.py job.npz model.mjb out.mp4``.
+"""A program that draws states into a video: ``python _render.py job.npz model.mjb out.mp4``.
 
-MuJoCo chooses its graphics library once, when it is imported, and a driver that fails may end the process.
-``video.py`` therefore starts this file for each library that it tries. It imports nothing of the package.
-Exit code 3 means that this machine can't draw with this library; the last line on stderr says why.
+MuJoCo chooses its graphics library once, when it is imported, and a driver that fails may end the process. Therefore
+``video.py`` runs this file in a process for each library that it tries. The file imports nothing of the package. Exit
+code 3 means that this machine cannot draw with this library; the last line on stderr holds the reason.
 """
 
 import sys
@@ -14,9 +14,9 @@ CANNOT_DRAW = 3
 
 
 def camera(mujoco: Any, model: Any) -> Any:
-    """One that tracks, else one that is fixed to the world, else a free one that follows the first body."""
+    """Choose the first tracking camera, else the first one fixed to the world, else one that follows the first body."""
     modes = [int(mode) for mode in model.cam_mode]
-    # as numbers: an enum of MuJoCo equals no integer of NumPy
+    # as numbers, because MuJoCo's enums do not equal NumPy's integers
     tracking = (int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
     for i, mode in enumerate(modes):
         if mode in tracking:
@@ -32,7 +32,7 @@ def camera(mujoco: Any, model: Any) -> Any:
 
 
 def main(job_path: str, model_path: str, out: str) -> int:
-    """Draw the rows of qpos (and of the mocap poses) of the job, one frame each."""
+    """Draw one frame for each row of the job's qpos (and of its mocap poses)."""
     try:
         import mujoco
 
@@ -42,7 +42,7 @@ def main(job_path: str, model_path: str, out: str) -> int:
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
         model.vis.global_.offheight = max(model.vis.global_.offheight, height)
         renderer = mujoco.Renderer(model, height, width)
-    except Exception as error:  # each library fails in its own way
+    except Exception as error:  # of different types, depending on the library
         print(str(error).strip() or type(error).__name__, file=sys.stderr)
         return CANNOT_DRAW
     import imageio.v2 as imageio

@@ -1,4 +1,4 @@
-"""Pictures of controllers at work."""
+"""Plots of a controller's episodes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,92 +7,79 @@ from typing import Any
 import numpy as np
 
 from lyceum_warp.control.trajectory import Trajectory
-from lyceum_warp.viz import EXTRA
-
-_LINE, _ACCENT, _GRID = "#7a8ba3", "#c8502d", "#e4e7eb"
+from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_png
 
 
 def control_plot(trajectories: Trajectory | Sequence[Trajectory], out: str | Path, *, title: str | None = None) -> Path:
     """Draw episodes of a controller as PNG.
 
-    On the left reward and evaluation metric against simulated time; on the right planning times and ages of the
-    applied actions against the wall clock, and how often plans took how long. A dashed line is the deadline.
+    The left side shows reward and evaluation metric against simulated time. The right side shows planning times and
+    ages of the applied actions against the wall clock, and a histogram of the planning times. Dashed lines show the
+    deadline.
 
     Args:
-        trajectories: Episodes of one task; the deadline is that of the first.
-        out: The picture.
-        title: What stands above it; task, engine and mode by default.
+        trajectories: Episodes of one task. The deadline is the period of the first one.
+        out: The PNG file.
+        title: Title of the plot; by default task, engine and mode.
 
     Returns:
-        The picture's path.
+        The file's path.
 
     Raises:
-        ValueError: There are no trajectories.
+        ValueError: There is no trajectory.
         ImportError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-        from matplotlib.ticker import LogFormatter
-    except ImportError as error:
-        raise ImportError(f"drawing a controller's episodes needs matplotlib: {EXTRA}") from error
+    figure = new_figure("a controller's episodes", 10.0, 6.5)
+    from matplotlib.ticker import LogFormatter
 
     episodes = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
     if not episodes:
-        raise ValueError("a picture needs a trajectory at least")
-    figure = Figure(figsize=(10.0, 6.5), layout="constrained")
-    FigureCanvasAgg(figure)
+        raise ValueError("a plot needs at least one trajectory")
     grid = figure.add_gridspec(6, 2)
     reward, evaluation = (figure.add_subplot(grid[rows, 0]) for rows in (slice(0, 3), slice(3, 6)))
     planning, age, histogram = (figure.add_subplot(grid[rows, 1]) for rows in (slice(0, 2), slice(2, 4), slice(4, 6)))
     _draw_outcomes(reward, evaluation, episodes)
     _draw_times(planning, age, episodes)
     _draw_histogram(histogram, episodes)
-    histogram.xaxis.set_major_formatter(LogFormatter())  # 10, not a power of ten
+    histogram.xaxis.set_major_formatter(LogFormatter())  # writes 10 where the default writes a power of ten
     histogram.xaxis.set_minor_formatter(LogFormatter())
-    for axes in (reward, evaluation, planning, age, histogram):
-        axes.grid(color=_GRID)
-        axes.set_axisbelow(True)
-        axes.spines[["top", "right"]].set_visible(False)
+    finish_axes((reward, evaluation, planning, age, histogram))
     first = episodes[0]
     figure.suptitle(title or f"{first.task}, {first.engine}, {first.mode}", x=0.01, ha="left")
-    path = Path(out)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150, format="png")
-    return path
+    return save_png(figure, out)
 
 
-def _style(episodes: Sequence[Trajectory]) -> dict[str, Any]:
-    return dict(color=_LINE, linewidth=1.2, alpha=max(0.25, 1 / len(episodes) ** 0.5))
+def _line_style(episodes: Sequence[Trajectory]) -> dict[str, Any]:
+    return dict(color=LINE, linewidth=1.2, alpha=max(0.25, 1 / len(episodes) ** 0.5))
 
 
 def _draw_outcomes(reward: Any, evaluation: Any, episodes: Sequence[Trajectory]) -> None:
     for episode in episodes:
-        line = _style(episodes) | {"marker": "." if episode.steps < 3 else ""}  # a single point is no line
+        line = _line_style(episodes) | {"marker": "." if episode.steps < 3 else ""}  # else a single point is invisible
         seconds = episode.timestep * np.arange(1, episode.steps + 1)
         reward.plot(seconds, episode.rewards, **line)
         evaluation.plot(seconds, episode.evals, **line)
         if episode.succeeded:
-            evaluation.plot(seconds[-1], episode.evals[-1], color=_ACCENT, marker="o", markersize=4, linestyle="")
+            evaluation.plot(seconds[-1], episode.evals[-1], color=ACCENT, marker="o", markersize=4, linestyle="")
     reward.set_ylabel("reward")
     reward.tick_params(labelbottom=False)
     reward.sharex(evaluation)
     evaluation.set_ylabel("evaluation metric")
     evaluation.set_xlabel("simulated time (s)")
     if any(episode.succeeded for episode in episodes):
-        evaluation.plot([], [], color=_ACCENT, marker="o", markersize=4, linestyle="", label="success at the end")
+        evaluation.plot([], [], color=ACCENT, marker="o", markersize=4, linestyle="", label="success at the end")
         evaluation.legend(frameon=False, loc="best")
 
 
 def _draw_times(planning: Any, age: Any, episodes: Sequence[Trajectory]) -> None:
-    dots = _style(episodes) | {"linestyle": "", "marker": ".", "markersize": 3}
+    dots = _line_style(episodes) | {"linestyle": "", "marker": ".", "markersize": 3}
     for episode in episodes:
-        # without the first plan, which alone loads kernels: it would hide the others
+        # the first plan loads kernels: its time would compress the scale of the others
         planning.plot(episode.plan_starts[1:], 1000 * episode.plan_times[1:], **dots)
         age.plot(episode.times, 1000 * episode.ages, **dots)
     deadline = 1000 * episodes[0].period
-    planning.axhline(deadline, color=_ACCENT, linestyle="--", linewidth=1, label=f"deadline, {deadline:.3g} ms")
-    age.axhline(deadline, color=_ACCENT, linestyle="--", linewidth=1, label="one period")
+    planning.axhline(deadline, color=ACCENT, linestyle="--", linewidth=1, label=f"deadline, {deadline:.3g} ms")
+    age.axhline(deadline, color=ACCENT, linestyle="--", linewidth=1, label="one period")
     planning.legend(frameon=False, loc="best")
     age.legend(frameon=False, loc="best")
     planning.set_ylabel("planning (ms)")
@@ -110,8 +97,8 @@ def _draw_histogram(axes: Any, episodes: Sequence[Trajectory]) -> None:
     if len(times):
         low, high = times.min(), times.max()
         bins = np.geomspace(low / 1.05, high * 1.05, 41)
-        axes.hist(times, bins=bins, color=_LINE, log=True)
-    axes.axvline(1000 * episodes[0].period, color=_ACCENT, linestyle="--", linewidth=1)
+        axes.hist(times, bins=bins, color=LINE, log=True)
+    axes.axvline(1000 * episodes[0].period, color=ACCENT, linestyle="--", linewidth=1)
     axes.set_xscale("log")
     axes.set_xlabel("planning time (ms)")
     axes.set_ylabel("plans")

@@ -18,30 +18,33 @@ from lyceum_warp.env import Env
 from lyceum_warp.viz import EXTRA
 from lyceum_warp.viz._render import CANNOT_DRAW
 
-_MAX_RATE = 60  # frames per second: more than a screen shows would only make the file larger
+_MAX_RATE = 60  # frames per second; screens rarely show more
 _POSES = ("qpos", "mocap_pos", "mocap_quat")
 
 
 class NoVideoError(RuntimeError):
-    """Raised where a machine can't draw, or lacks a library for it; the message says which, and the mend."""
+    """The machine cannot draw, or lacks a package for videos. The message names it and the fix."""
 
 
 @torch.no_grad()
 def episode(env: Env, policy: Callable[[torch.Tensor], torch.Tensor], *, seed: int | None = None) -> torch.Tensor:
-    """States of one episode under a policy, the first and the last included, (steps + 1, state_space.size).
+    """Run one episode under a policy, and return all its states, (steps + 1, state_space.size), on the CPU.
 
     Args:
-        env: An environment of one world, made with ``autoreset=False`` so that the last state can be seen.
-        policy: Called with observations (1, nobs), returns actions (1, nact).
+        env: An environment of one world, made with ``autoreset=False`` so that the last state is kept.
+        policy: Called with observations, (1, nobs); returns actions, (1, nu).
         seed: Seed of the initial state.
 
     Raises:
-        ValueError: The environment has several worlds, resets by itself, or never ends an episode.
+        ValueError: The environment has several worlds or automatic resets, or its episodes may never end.
     """
     if env.nworld != 1 or env.autoreset:
-        raise ValueError("an episode is recorded in one world without automatic resets: make(..., autoreset=False)")
+        raise ValueError(
+            "a video shows one world without automatic resets, not "
+            f"nworld={env.nworld}, autoreset={env.autoreset}: make(..., autoreset=False)"
+        )
     if env.horizon == 0:
-        raise ValueError(f"episodes of {env.task.name!r} never end without a horizon: give make() a horizon")
+        raise ValueError(f"episodes of {env.task.name!r} may never end without a horizon: make(..., horizon=1000)")
     env.rand_reset(seed)
     states = [env.get_state()]
     while not env.done.item():
@@ -51,33 +54,34 @@ def episode(env: Env, policy: Callable[[torch.Tensor], torch.Tensor], *, seed: i
     return torch.cat(states).cpu()
 
 
-def record(
+def write_video(
     env: Env, states: torch.Tensor, out: str | Path, *, size: tuple[int, int] = (640, 480), speed: float = 1.0
 ) -> Path:
     """Draw states into an mp4 file.
 
-    The camera is the model's own: one that tracks, else one that is fixed to the world; without either a free
-    one follows the first body. At most 60 frames a second are drawn, so a short time step leaves out states.
+    The camera is the model's first tracking camera, else its first camera that is fixed to the world, else a camera
+    that follows the first body. The video has at most 60 frames per second: with a shorter time step, states are left
+    out.
 
     Args:
-        env: The environment that the states belong to.
-        states: One world's states, a row each step, (steps, state_space.size).
-        out: The file, overwritten.
+        env: Environment that the states come from.
+        states: States of one world, one row per step, (steps, state_space.size).
+        out: The file. It is overwritten.
         size: Width and height in pixels, even numbers.
-        speed: Simulated seconds in a second of the video.
+        speed: Simulated seconds per second of the video.
 
     Returns:
         The file's path.
 
     Raises:
-        ValueError: The states don't belong to the environment, or the size is odd.
-        NoVideoError: This machine can't draw, or lacks a library for it.
+        ValueError: The states do not have the environment's shape, or the size is odd.
+        NoVideoError: The machine cannot draw, or lacks a package for videos.
     """
     out = Path(out)
     if states.ndim != 2 or states.shape[1] != env.state_space.size or not len(states):
-        raise ValueError(f"states have to be of shape (steps, {env.state_space.size}), not {tuple(states.shape)}")
+        raise ValueError(f"states must have the shape (steps, {env.state_space.size}), not {tuple(states.shape)}")
     if any(pixels < 2 or pixels % 2 for pixels in size):
-        raise ValueError(f"a video's width and height have to be even numbers, not {size}")
+        raise ValueError(f"size must be two even numbers, the width and the height in pixels, not {size}")
     check_video()
     rate = speed / env.timestep
     stride = max(1, math.ceil(rate / _MAX_RATE - 1e-9))
@@ -94,29 +98,30 @@ def record(
 
 
 def check_video() -> None:
-    """Find out whether the libraries that videos need are installed.
+    """Check that the packages for videos are installed.
 
     Raises:
-        NoVideoError: They are not.
+        NoVideoError: One of them is not installed.
     """
     if missing := [name for name in ("imageio", "imageio_ffmpeg") if importlib.util.find_spec(name) is None]:
         raise NoVideoError(f"videos need {' and '.join(missing)}: {EXTRA}")
 
 
 def _libraries() -> list[str]:
-    """Values of MUJOCO_GL to try, in order; "" is MuJoCo's own choice."""
+    """Values of MUJOCO_GL to try, in order; "" is MuJoCo's default."""
     given = os.environ.get("MUJOCO_GL", "")
     others = ["egl", "osmesa"] if sys.platform.startswith("linux") else [""]
     return list(dict.fromkeys([given, *others] if given else others))
 
 
 def _draw(arguments: list[str]) -> None:
+    """Run ``_render.py`` with each graphics library until one works."""
     failures = []
     for library in _libraries():
         environment = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
         if library:
             environment["MUJOCO_GL"] = library
-        # -P: the folder of _render.py stays off the path, where its neighbours could hide other packages
+        # -P keeps the folder of _render.py off the path, where its other modules could shadow packages
         command = [sys.executable, "-P", str(Path(__file__).with_name("_render.py")), *arguments]
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
         if done.returncode == 0:
@@ -124,9 +129,9 @@ def _draw(arguments: list[str]) -> None:
         lines = done.stderr.strip().splitlines()
         reason = lines[-1].strip()[:160] if lines else f"it ended with code {done.returncode}"
         failures.append(f"{library or 'OpenGL'}: {reason}")
-        if done.returncode > 0 and done.returncode != CANNOT_DRAW:
-            raise NoVideoError(f"the video could not be written ({reason})")  # another library would not help
+        if done.returncode > 0 and done.returncode != CANNOT_DRAW:  # another graphics library would fail, too
+            raise NoVideoError(f"the video could not be written ({reason})")
     raise NoVideoError(
-        f"this machine can't draw off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
+        f"this machine cannot draw off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
         "libegl1 and libgl1-mesa-dri) or OSMesa (libosmesa6), or set MUJOCO_GL to a library that works"
     )

@@ -1,168 +1,154 @@
 """The C engine: MuJoCo itself, many worlds on a pool of threads (mujoco.batch), float64 inside."""
 
 import copy
-import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import mujoco
 import numpy as np
 import warp as wp
-from mujoco.batch import Batch, SimulationError
+from mujoco.batch import Batch
 
 from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
-from lyceum_warp.engines.memory import Footprint, check_fit
-from lyceum_warp.fields import STATE_FIELDS, Field, Stage
+from lyceum_warp.engines.c.world_errors import errors_as_warnings
+from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_rows64, fill_rows64, narrow, widen
 from lyceum_warp.mujoco_log import quiet
+from lyceum_warp.validate import whole_number
 
-log = logging.getLogger(__name__)
+_BATCH_BYTES = 150
+"""What ``Batch`` keeps for each world beside its state: warnings, a status, the message of an error."""
 
-
-# a world in trouble may hold more than a float32 does
-_overflow_ignored = np.errstate(over="ignore")
-
-_INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION.value
-
-# where errors are counted as well: a kind of warning that no other done reason stands for
-_OTHER_WARNING = mujoco.mjtWarning.mjWARN_INERTIA.value
+_MJDATA_BYTES = 165_000
+"""An MjData without its buffer and arena, most of it statistics of the solver (measured with MuJoCo 4.0)."""
 
 
 class MujocoEngine(Engine):
-    """Worlds as rows of float64 state in ``mujoco.batch.Batch``, with float32 copies for whoever asked.
+    """Worlds as rows of float64 state in ``mujoco.batch.Batch``, with float32 copies of the fields.
 
     Args:
         model: The compiled model.
         nworld: Number of worlds.
         device: Must be the CPU.
+        fields: The fields to keep.
         nthread: Threads of the pool; 0 takes all cores.
 
     Raises:
-        ValueError: The device is not the CPU, or so many worlds do not fit into memory.
+        ValueError: The device is not the CPU, or ``nthread`` is negative.
     """
 
     name = "mujoco"
-    recordable = False
+    capturable = False
 
-    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device, *, nthread: int = 0) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: Iterable[Field], *, nthread: int = 0
+    ) -> None:
         if not device.is_cpu:
             raise ValueError(
                 f"the mujoco engine runs on the CPU, not on {device.alias!r}: use device='cpu' or engine='warp'"
             )
-        row = 8 * mujoco.mj_stateSize(model, _INTEGRATION)
-        check_fit(Footprint(0, row), nworld, device)
-        super().__init__(model, nworld, device)
+        super().__init__(model, nworld, device, fields)
         quiet()
+        self.nthread = whole_number("nthread", nthread, low=0)
         self.native_model = copy.copy(model)
-        """The model as the batches run it."""
-        # a world in trouble is to be seen, not silently reset in the middle of a step
+        """The model as the batch runs it."""
+        # a world with a fault must be reported, not silently reset in the middle of a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self.nthread = nthread
-        self._rollouts: dict[Any, NativeRollout | None] = {}
-        self._open(persistent=False)
-        self.ctrl = self.field("ctrl")
-
-    def _open(self, *, persistent: bool) -> None:
-        self.batch = Batch(self.native_model, self.nworld, self.nthread, persistent)
-        # as the float32 fields show it, so that who asked for which fields makes no difference
-        initial = self.batch.state[0].astype(np.float32).astype(np.float64)
-        self._initial: wp.array = wp.array(initial, dtype=wp.float64, device=self.device)
+        self.batch = Batch(self.native_model, nworld, self.nthread, _is_persistent(self.fields.values()))
         self._rows = self._alias(self.batch.state)
-        self._warning: wp.array = wp.array(self.batch.warning, dtype=int, device=self.device, copy=False)
-        self._copies: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self._warning: wp.array = wp.array(self.batch.warning, dtype=int, device=device, copy=False)
+        self._initial = self._initial_state()
         self._columns: dict[str, wp.array] = {}
+        self._copies: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        for field in self.fields.values():
+            self._bind(field)
+        self.ctrl = self.arrays["ctrl"]
+        kept = list(self.fields.values())
+        self._state_fields = [field for field in kept if field.name in STATE_FIELDS]
+        self._derived = [field for field in kept if field.name not in STATE_FIELDS]
+        self._lagged = [field for field in kept if field.lagged]
+        self._unlagged = [field for field in kept if not field.lagged and field.name != "ctrl"]
+        self._rollouts: dict[Any, NativeRollout | None] = {}
 
     def _alias(self, rows: np.ndarray) -> wp.array:
         return wp.array(rows, dtype=wp.float64, device=self.device, copy=False)
 
-    @property
-    def hidden_bytes(self) -> int:
-        """Without what MuJoCo's arenas hold, which grows with a world's contacts."""
-        data = mujoco.MjData(self.model)
-        return self.nworld * int(data.nbuffer) if self.batch.persistent else 0
+    def _initial_state(self) -> wp.array:
+        """The model's initial state as float32 fields show it, whichever of them are kept."""
+        initial = self.batch.state[0].copy()
+        for name in STATE_FIELDS:
+            columns = state_columns(self.model, name)
+            initial[columns] = initial[columns].astype(np.float32)
+        return wp.array(initial, dtype=wp.float64, device=self.device)
 
-    # fields
-
-    def _bind(self, field: Field) -> wp.array:
-        if field.refresh > Stage.NONE and not self.batch.persistent:
-            # with an MjData for each world, the next step goes on from what was computed for this one
-            previous, old_stage = self.batch.state.copy(), self.stage
-            self._open(persistent=True)
-            self.batch.state[:] = previous
-            for known in self.fields.values():
-                self._connect(known)
-            if old_stage > Stage.NONE:
-                self.contained(self.batch.forward, stage=int(old_stage))
+    def _bind(self, field: Field) -> None:
+        """Make a field's float32 array, and find the float64 array that it copies."""
         array = wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
         self.arrays[field.name] = array
-        self._connect(field)
-        if field.reset > Stage.NONE:
-            self.contained(self.batch.forward, stage=int(field.reset))
-        self._copy(field)
-        return array
-
-    def _connect(self, field: Field) -> None:
-        """Find the engine's own float64 array behind a field."""
         if field.name in STATE_FIELDS:
-            component = STATE_FIELDS[field.name].value
-            start = mujoco.mj_stateSize(self.model, _INTEGRATION & (component - 1))
-            source = self.batch.state[:, start : start + mujoco.mj_stateSize(self.model, component)]
+            source = self.batch.state[:, state_columns(self.model, field.name)]
             self._columns[field.name] = self._alias(source)
         else:
             source = self.batch.bind(field.name)
-        target = self.arrays[field.name].numpy()
+        target = array.numpy()
         self._copies[field.name] = target, source.reshape(target.shape)
 
-    def _copy(self, field: Field, mask: np.ndarray | None = None) -> None:
-        target, source = self._copies[field.name]
-        if mask is None:
-            np.copyto(target, source, "unsafe")
-        else:
-            np.copyto(target, source, "unsafe", where=mask.reshape(-1, *[1] * (target.ndim - 1)))
+    @classmethod
+    def bytes_per_world(cls, model: mujoco.MjModel, fields: Iterable[Field], **options: Any) -> int:
+        fields = list(fields)
+        total = super().bytes_per_world(model, fields, **options) + _BATCH_BYTES
+        total += 8 * sum(field.size for field in fields if field.name not in STATE_FIELDS)
+        if _is_persistent(fields):
+            # of an arena only the pages that contacts and constraints touch: about half as much as the buffer
+            total += _MJDATA_BYTES + 3 * mujoco.MjData(model).nbuffer // 2
+        return total
 
     # physics
 
-    def contained(self, call: Callable[..., None], **arguments: Any) -> None:
-        """Run a call that may fail in some worlds: MuJoCo leaves those as they were and finishes the others."""
-        try:
-            call(**arguments)
-        except SimulationError as error:
-            log.debug("MuJoCo: %s", error)
-            self.batch.warning[error.ids, _OTHER_WARNING, 1] += 1
-
-    @_overflow_ignored
     def step(self, nstep: int) -> None:
         ctrl, rows = self._copies["ctrl"]
         np.copyto(rows, ctrl)
-        stage = self.stage
-        lagged = [field for field in self.fields.values() if field.lagged]
-        if lagged and stage > Stage.NONE:
-            self.contained(self.batch.step, nstep=nstep)
-            for field in lagged:
-                self._copy(field)
-            self.contained(self.batch.forward, stage=int(stage))
-        else:
-            self.contained(self.batch.step, nstep=nstep, stage=int(stage))
-            for field in lagged:
-                self._copy(field)
-        for field in self.fields.values():
-            if not field.lagged and field.name != "ctrl":
-                self._copy(field)
+        separate = bool(self._lagged) and self.stage > Stage.NONE
+        with errors_as_warnings(self.batch):
+            self.batch.step(nstep=nstep, stage=Stage.NONE if separate else self.stage)
+        self._copy(self._lagged)
+        if separate:
+            with errors_as_warnings(self.batch):
+                self.batch.forward(stage=self.stage)
+        self._copy(self._unlagged)
 
-    @_overflow_ignored
-    def rollout(self, state: wp.array, controls: wp.array, nstep: int, records: Mapping[str, wp.array]) -> None:
-        key = (len(controls), nstep, *records)
+    def _copy(self, fields: list[Field], mask: np.ndarray | None = None) -> None:
+        """Copy fields from the engine's float64 arrays into their float32 arrays, in all worlds or masked ones."""
+        with np.errstate(over="ignore"):  # a world with a fault may hold numbers beyond float32
+            for field in fields:
+                target, source = self._copies[field.name]
+                if mask is None:
+                    np.copyto(target, source, "unsafe")
+                else:
+                    np.copyto(target, source, "unsafe", where=mask.reshape(-1, *[1] * (target.ndim - 1)))
+
+    def rollout(self, state: wp.array, controls: wp.array, nstep: int, buffers: Mapping[str, wp.array]) -> None:
+        key = (len(controls), nstep, *buffers)
         if key not in self._rollouts:
-            exact = is_exact(self.model, [self.fields[name] for name in records])
-            self._rollouts[key] = NativeRollout(self, len(controls), nstep, records) if exact else None
+            fields = [self.fields[name] for name in buffers]
+            self._rollouts[key] = self._native_rollout(len(controls), nstep, fields)
         native = self._rollouts[key]
         if native is None:
-            super().rollout(state, controls, nstep, records)
-        else:
-            native(state, controls, records)
+            super().rollout(state, controls, nstep, buffers)
+            return
+        native(state, controls, buffers)
+        self.batch.state[:] = native.batch.state
+        self.batch.warning += native.batch.warning
+        self._copy(self._state_fields)
+
+    def _native_rollout(self, steps: int, nstep: int, fields: list[Field]) -> NativeRollout | None:
+        if not is_exact(self.model, fields):
+            return None
+        batch = Batch(self.native_model, self.nworld, self.nthread)
+        return NativeRollout(batch, steps, nstep, fields, self.snapshots)
 
     def find_faults(self, mask: wp.array) -> None:
         nphysics = 1 + self.model.nq + self.model.nv + self.model.na
@@ -171,6 +157,9 @@ class MujocoEngine(Engine):
 
     def reset(self, mask: wp.array) -> None:
         launch_rows(fill_rows64, mask, self._initial, self._rows)
+        self._read_state_fields(mask)
+
+    def _read_state_fields(self, mask: wp.array) -> None:
         for name, column in self._columns.items():
             launch_rows(narrow, mask, column, flat(self.arrays[name]))
 
@@ -179,22 +168,18 @@ class MujocoEngine(Engine):
             launch_rows(widen, mask, flat(self.arrays[name]), column)
 
     def refresh(self, mask: wp.array) -> None:
-        self._forward(mask, self.reset_stage, list(self.fields.values()))
+        self._forward(mask, self.reset_stage, self._derived)
 
     def _refresh_current(self, mask: wp.array) -> None:
-        current = [field for field in self.fields.values() if not field.snapshot]
-        self._forward(mask, self.stage, current)
-        for name, column in self._columns.items():
-            launch_rows(narrow, mask, column, flat(self.arrays[name]))
+        self._forward(mask, self.stage, [field for field in self._derived if not field.snapshot])
+        self._read_state_fields(mask)
 
-    @_overflow_ignored
     def _forward(self, mask: wp.array, stage: Stage, fields: list[Field]) -> None:
         chosen = mask.numpy()
         if stage > Stage.NONE and chosen.any():
-            self.contained(self.batch.forward, ids=chosen, stage=int(stage))
-            for field in fields:
-                if field.name not in STATE_FIELDS:
-                    self._copy(field, chosen)
+            with errors_as_warnings(self.batch):
+                self.batch.forward(ids=chosen, stage=stage)
+            self._copy(fields, chosen)
 
     # state
 
@@ -203,3 +188,8 @@ class MujocoEngine(Engine):
 
     def _set_integration(self, state_in: wp.array, mask: wp.array) -> None:
         launch_rows(copy_rows64, mask, state_in, self._rows)
+
+
+def _is_persistent(fields: Iterable[Field]) -> bool:
+    """Whether the batch keeps an MjData for each world, from which the next step continues what a refresh computed."""
+    return any(field.refresh > Stage.NONE for field in fields)

@@ -1,25 +1,23 @@
-"""Open-loop roll-outs on the C engine: a whole horizon of every world in one call, which no Python interrupts."""
+"""Open-loop roll-outs on the C engine: the whole horizon of every world in one native call."""
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
 import warp as wp
 from mujoco.batch import Batch
 
-from lyceum_warp.fields import STATE_FIELDS, Field, Stage
-
-if TYPE_CHECKING:
-    from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
+from lyceum_warp.engines.c.world_errors import errors_as_warnings
+from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
 
 
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
-    """Whether the records of ``Batch.rollout`` hold what a call of ``Batch.step`` for each step would show.
+    """Whether the rows of ``Batch.rollout`` hold what a call of ``Batch.step`` for each step would show.
 
-    A record is taken as ``mj_step`` leaves things. The state is then the new one, but what was computed from
-    positions and velocities belongs to the state before the last substep: it is found in the record of the next.
-    RK4 is the exception, where it belongs to an intermediate stage. Sensor data of both kinds can't be told apart.
+    A row is written as ``mj_step`` leaves things. The state is then the new one, but what was computed from positions
+    and velocities belongs to the state before the last substep: it is found in the next row. RK4 is the exception,
+    where it belongs to an intermediate stage. Sensor data of both kinds can't be told apart.
     """
     current = [field for field in fields if field.refresh > Stage.NONE]
     if any(field.snapshot for field in current):
@@ -28,86 +26,89 @@ def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
 
 
 class NativeRollout:
-    """Rolls out worlds of a C engine, in a batch of its own.
+    """Rolls out the worlds of a batch, which are then where the roll-outs ended.
 
     Args:
-        engine: The engine.
+        batch: The worlds; no field of it is bound yet.
         steps: Steps of the horizon.
         nstep: Substeps in a step.
-        names: The fields to record, of those that the engine keeps.
+        fields: The fields to copy into buffers.
+        snapshots: The fields that follow the integration state in a state vector, in order.
     """
 
-    def __init__(self, engine: "MujocoEngine", steps: int, nstep: int, names: Iterable[str]) -> None:
-        self.engine, self.nstep = engine, nstep
-        self.batch = Batch(engine.native_model, engine.nworld, engine.nthread)
-        self.control = np.zeros((engine.nworld, steps * nstep, engine.model.nu))
-        self.by_step = self.control.reshape(engine.nworld, steps, nstep, engine.model.nu)
+    def __init__(
+        self, batch: Batch, steps: int, nstep: int, fields: Iterable[Field], snapshots: Iterable[Field]
+    ) -> None:
+        self.batch, self.nstep = batch, nstep
+        model, nworld = batch.model, batch.nsim
+        self.control = np.zeros((nworld, steps * nstep, model.nu))
+        self.by_step = self.control.reshape(nworld, steps, nstep, model.nu)
         self._given: Any = None
         self._views: Any = None
-        self.fields = [engine.fields[name] for name in names]
+        self.fields = list(fields)
         self.stage = max((field.refresh for field in self.fields), default=Stage.NONE)
         self.start: dict[str, slice] = {}
         """Columns of the state vector that hold a field's value at the start."""
         self.final: dict[str, np.ndarray] = {}
-        """The values at the end of those fields that have to be computed for it."""
-        self.records: dict[Any, np.ndarray] = {}
-        column = engine.integration_size
-        for field in engine.snapshots:
+        """The values at the end of those fields that must be computed for it."""
+        self.rows: dict[Any, np.ndarray] = {}
+        """A row for each substep, of each component of the state and each derived field."""
+        column = batch.nstate
+        for field in snapshots:
             self.start[field.name] = slice(column, column + field.size)
             column += field.size
         for field in self.fields:
             if field.name in STATE_FIELDS:
-                component = STATE_FIELDS[field.name].value
-                size = mujoco.mj_stateSize(engine.model, component)
-                first = mujoco.mj_stateSize(engine.model, mujoco.mjtState.mjSTATE_INTEGRATION.value & (component - 1))
-                self.start[field.name] = slice(first, first + size)
-                self.records[component] = np.zeros((engine.nworld, steps * nstep, size))
+                columns = state_columns(model, field.name)
+                self.start[field.name] = columns
+                size = columns.stop - columns.start
+                self.rows[STATE_FIELDS[field.name].value] = np.zeros((nworld, steps * nstep, size))
             else:
-                bound = self.batch.bind(field.name)
-                self.records[field.name] = np.zeros((engine.nworld, steps * nstep, *bound.shape[1:]))
+                bound = batch.bind(field.name)
+                self.rows[field.name] = np.zeros((nworld, steps * nstep, *bound.shape[1:]))
                 if field.refresh > Stage.NONE:
                     self.final[field.name] = bound
 
-    def __call__(self, state: wp.array, controls: wp.array, records: Mapping[str, wp.array]) -> None:
+    def __call__(self, state: wp.array, controls: wp.array, buffers: Mapping[str, wp.array]) -> None:
         """Roll out; see ``Engine.rollout``."""
-        given = (state, controls, records)
+        given = (state, controls, buffers)
         if self._given is None or any(a is not b for a, b in zip(given, self._given, strict=True)):
-            self._given = given  # the views of Warp's arrays take longer to make than to fill
-            self._views = state.numpy(), controls.numpy(), {name: record.numpy() for name, record in records.items()}
+            self._given = given  # views of Warp's arrays take longer to make than to fill
+            self._views = state.numpy(), controls.numpy(), {name: buffer.numpy() for name, buffer in buffers.items()}
         self.run(*self._views)
 
-    def run(self, state: np.ndarray, controls: np.ndarray, targets: Mapping[str, np.ndarray]) -> None:
-        """Roll out and record. The engine's worlds are then where the roll-outs ended, with what went wrong in them.
+    def run(self, state: np.ndarray, controls: np.ndarray, buffers: Mapping[str, np.ndarray]) -> None:
+        """Roll out, and copy the fields. ``batch.state`` and ``batch.warning`` then hold the end and what went wrong.
 
         Args:
             state: States at the start, (nworld, at least state_size) float64.
             controls: Controls of each step, (steps, nworld, nu).
-            targets: Where each field goes, (steps + 1, nworld, ...) float32.
+            buffers: Where each field goes, (steps + 1, nworld, ...) float32.
         """
-        engine = self.engine
-        self.batch.state[:] = state[:, : engine.integration_size]
+        batch = self.batch
+        batch.state[:] = state[:, : batch.nstate]
+        batch.warning[:] = 0
         np.copyto(self.by_step, controls.transpose(1, 0, 2)[:, :, None])
-        count, control = self.control.shape[1], self.control
-        records: dict[str, Any] = {"record": list(self.records), "out": self.records}
-        engine.contained(self.batch.rollout, nstep=count, control=control, **records)
+        rows: dict[str, Any] = {"record": list(self.rows), "out": self.rows}
+        # a world that MuJoCo warns of stops there and repeats its last row: only the warning shows it
+        with errors_as_warnings(batch):
+            batch.rollout(nstep=self.control.shape[1], control=self.control, **rows)
         if self.stage > Stage.NONE:
-            engine.contained(self.batch.forward, stage=int(self.stage))
-        # a simulation that MuJoCo warns of stops there, and its records repeat: only the warning tells
-        engine.batch.state[:] = self.batch.state
-        engine.batch.warning += self.batch.warning
-        self.batch.warning[:] = 0
-        for field in self.fields:
-            self._copy(field, state, targets[field.name])
+            with errors_as_warnings(batch):
+                batch.forward(stage=self.stage)
+        with np.errstate(over="ignore"):  # a world with a fault may hold numbers beyond float32
+            for field in self.fields:
+                self._copy(field, state, buffers[field.name])
 
     def _copy(self, field: Field, state: np.ndarray, target: np.ndarray) -> None:
         key = STATE_FIELDS[field.name].value if field.name in STATE_FIELDS else field.name
-        record, nstep = self.records[key], self.nstep
+        rows, nstep = self.rows[key], self.nstep
         if field.name in self.final:
-            # the record after a step's first substep is of the state that the step began with
-            values, end = record[:, ::nstep], self.final[field.name]
+            # the row after a step's first substep belongs to the state that the step began with
+            values, end = rows[:, ::nstep], self.final[field.name]
             np.copyto(target[:-1], values.swapaxes(0, 1).reshape(target[:-1].shape), "unsafe")
             np.copyto(target[-1], end.reshape(target[-1].shape), "unsafe")
         else:
-            start, values = state[:, self.start[field.name]], record[:, nstep - 1 :: nstep]
+            start, values = state[:, self.start[field.name]], rows[:, nstep - 1 :: nstep]
             np.copyto(target[0], start.reshape(target[0].shape), "unsafe")
             np.copyto(target[1:], values.swapaxes(0, 1).reshape(target[1:].shape), "unsafe")

@@ -1,4 +1,4 @@
-"""What MuJoCo Warp 4.0 leaves to chance on a GPU, put in order: see ``kernels.order``."""
+"""The order of contacts and constraint rows, which MuJoCo Warp 4.0 leaves to chance on a GPU; see ``order_kernels``."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,17 +15,17 @@ _LANES = 8
 class CanonicalOrder:
     """Sorts contacts and constraint rows of a model and its data within every forward pass.
 
-    ``mujoco_warp``'s own deterministic mode makes sums of atomic additions repeatable, but its sorting of contacts and
-    rows is announced, not there. It calls back after the collisions, and again in the velocity stage, after the
-    constraints are made and before they are solved.
+    ``mujoco_warp``'s own deterministic mode makes sums of atomic additions repeatable, but does not sort contacts and
+    rows yet. It calls back after the collisions, and again in the velocity stage, after the constraints are made and
+    before they are solved.
 
     Args:
-        model: MuJoCo Warp's model; its callbacks are taken.
+        model: MuJoCo Warp's model, whose callbacks are set.
         data: MuJoCo Warp's data.
         between: Called between launches, twice in a forward pass.
 
     Raises:
-        ValueError: The model has what is not sorted, flexes.
+        ValueError: The model has flexes, or MuJoCo Warp's contacts have a field that is not sorted.
     """
 
     def __init__(self, model: mjw.Model, data: mjw.Data, between: Callable[[], None] = lambda: None) -> None:
@@ -33,25 +33,23 @@ class CanonicalOrder:
         if model.nflex > 0:
             raise ValueError("deterministic=True can't sort the contacts of flexes: use engine='mujoco'")
         self._contacts, self._sorted_contacts = order.Contacts(), order.Contacts()
-        self._own: list[wp.array] = []  # what Warp's structures hold cannot be counted
-
-        def like(array: wp.array) -> wp.array:
-            self._own.append(wp.empty_like(array))
-            return self._own[-1]
-
         for field in dataclasses.fields(data.contact):
-            if field.name in order.Contacts.vars:  # type: ignore[attr-defined]
-                words = _words(getattr(data.contact, field.name))
-                setattr(self._contacts, field.name, words)
-                setattr(self._sorted_contacts, field.name, like(words))
+            if field.name not in order.Contacts.vars:  # type: ignore[attr-defined]
+                raise ValueError(
+                    f"deterministic=True can't sort contacts with the field {field.name!r} of this mujoco_warp: use "
+                    "mujoco-warp 4.0"
+                )
+            words = _words(getattr(data.contact, field.name))
+            setattr(self._contacts, field.name, words)
+            setattr(self._sorted_contacts, field.name, wp.empty_like(words))
         self._rows, self._sorted_rows = order.Rows(), order.Rows()
         for name in order.Rows.vars:  # type: ignore[attr-defined]
             array = getattr(data.efc, name)
             setattr(self._rows, name, array)
-            if name == "J" and model.is_sparse:  # its entries stay where they are
+            if name == "J" and model.is_sparse:  # its entries keep their places
                 array = wp.empty((0, 0, 0), dtype=float)
             elif name != "jtdaj_nblock":
-                array = like(array)
+                array = wp.empty_like(array)
             setattr(self._sorted_rows, name, array)
         self._key = wp.empty(2 * data.naconmax, dtype=wp.int64)
         self._place = wp.empty(2 * data.naconmax, dtype=int)
@@ -60,7 +58,7 @@ class CanonicalOrder:
         model.callback.passive = self.sort_rows
 
     def sort_contacts(self, model: mjw.Model, data: mjw.Data) -> None:
-        """Sort the contacts."""
+        """Sort the contacts; called after the collisions."""
         self._between()
         n, count = data.naconmax, data.nacon
         wp.launch(order.contact_keys, n, [count, self._contacts, n, self._key, self._place])
@@ -70,7 +68,7 @@ class CanonicalOrder:
         wp.launch(order.gather_contacts, n, [count, self._place, False, n, *args[::-1]])
 
     def sort_rows(self, model: mjw.Model, data: mjw.Data) -> None:
-        """Sort the constraint rows of every world."""
+        """Sort the constraint rows of every world; called in the velocity stage."""
         self._between()
         nrow, shape = data.nefc, self._rank.shape
         wp.launch(order.rank_rows, shape, [nrow, model.eq_type, self._rows, self._rank])

@@ -1,8 +1,8 @@
-"""Contacts and constraint rows in an order that does not depend on which thread came first.
+"""Kernels that sort contacts and constraint rows, so that their order does not depend on the order of threads.
 
-MuJoCo Warp hands out places for contacts and for constraint rows by atomic counters. Sums over them are then rounded
-in another order each time, and on a GPU two runs drift apart. These kernels put contacts into the order of
-(world, geoms, place within the pair), and each world's rows into that of (kind, object, place within the constraint).
+MuJoCo Warp assigns places to contacts and to constraint rows with atomic counters. Sums over them are then rounded
+in another order each time, and on a GPU two runs drift apart. These kernels sort contacts by (world, geoms, place
+within the pair), and each world's rows by (kind, object, place within the constraint).
 """
 
 import warp as wp
@@ -40,7 +40,7 @@ class Contacts:
 def contact_keys(
     ncontact_in: wp.array[int], contacts: Contacts, nmax: int, key_out: wp.array[wp.int64], place_out: wp.array[int]
 ):
-    """24 bits of world, 14 of each geom, 11 of the place within the pair; places that are not used come last."""
+    """Keys of 24 bits for the world, 14 for each geom, 11 for the place within the pair; unused places come last."""
     c = wp.tid()
     place_out[c] = c
     key = _NO_CONTACT
@@ -63,7 +63,7 @@ def _move(source: wp.array2d[int], i: int, target: wp.array2d[int], j: int):
 def gather_contacts(
     ncontact_in: wp.array[int], place_in: wp.array[int], sort: bool, nmax: int, source: Contacts, target: Contacts
 ):
-    """Contacts in their new order, or, without ``sort``, back as they are."""
+    """Copy contacts into their new order, or, without ``sort``, back as they are."""
     c = wp.tid()
     if c >= wp.min(ncontact_in[0], nmax):
         return
@@ -113,7 +113,7 @@ class Rows:
 
 @wp.func
 def _kind(rows: Rows, w: int, r: int):
-    # a contact's rows keep together whatever its friction is
+    # a contact's rows stay together whatever its friction is
     return wp.min(rows.type[w, r], _FIRST_CONTACT)
 
 
@@ -121,7 +121,7 @@ def _kind(rows: Rows, w: int, r: int):
 def _object(rows: Rows, eq_type: wp.array[int], w: int, r: int) -> int:
     i = rows.id[w, r]
     if rows.type[w, r] == _EQUALITY:
-        # MuJoCo Warp relies on connects before welds before the others
+        # MuJoCo Warp needs connects before welds before the other equalities
         i = i + eq_type[i] * eq_type.shape[0]
     return i
 
@@ -157,7 +157,7 @@ def move_rows(
     source: Rows,
     target: Rows,
 ):
-    """Rows to their new places, or, without ``sort``, back as they are; each with ``lanes`` threads."""
+    """Copy rows to their new places, or, without ``sort``, back as they are; each with ``lanes`` threads."""
     w, r, lane = wp.tid()
     if r >= int(wp.min(nrow_in[w], rank_in.shape[1])):
         return
@@ -177,7 +177,7 @@ def move_rows(
     target.vel[w, to] = source.vel[w, r]
     target.aref[w, to] = source.aref[w, r]
     target.frictionloss[w, to] = source.frictionloss[w, r]
-    if sparse:  # the entries stay where they are
+    if sparse:  # the entries keep their places
         target.J_rownnz[w, to] = source.J_rownnz[w, r]
         target.J_rowadr[w, to] = source.J_rowadr[w, r]
         if source.jtdaj_adr.shape[1] > 0 and r < source.jtdaj_nblock[w]:
@@ -195,7 +195,7 @@ def move_rows(
 
 @wp.kernel(enable_backward=False)
 def move_addresses(ncontact_in: wp.array[int], rank_in: wp.array2d[int], nmax: int, contacts: Contacts):
-    """Let contacts know where their rows have gone."""
+    """Write the new places of their rows into contacts."""
     c, i = wp.tid()
     if c < wp.min(ncontact_in[0], nmax):
         row = contacts.efc_address[c, i]

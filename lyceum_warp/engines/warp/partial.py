@@ -1,43 +1,43 @@
 """A forward pass for a few worlds of many."""
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
+import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
 from lyceum_warp.arrays import flat
-from lyceum_warp.engines.memory import Arena
-from lyceum_warp.fields import STATE_FIELDS
-from lyceum_warp.kernels import faults, state
+from lyceum_warp.engines.warp import group_kernels as kernels
+from lyceum_warp.engines.warp.overflow import report_pool_overflow
+from lyceum_warp.engines.warp.reserve import Reserve, aligned
+
+_SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
 def group_size(nworld: int, device: wp.Device) -> int:
-    """Worlds of a group: more than usually begin again in one step, few enough to cost little."""
+    """Worlds of a group: more than usually restart in one step, few enough to cost little."""
     return min(nworld, max(1 if device.is_cpu else 64, nworld // 16))
 
 
-def report_overflow(data: mjw.Data, mask: wp.array) -> None:
-    """Set the overflow bits of the masked worlds where a forward pass had too little room for contacts."""
-    pool = [data.ncollision, data.nacon, data.naconmax, int(mjw.OverflowType.NARROWPHASE)]
-    wp.launch(faults.pool_overflow, data.nworld, [mask, *pool, data.overflow], device=mask.device)
-
-
 class PartialForward:
-    """Computes fields of the masked worlds in a group of other worlds, and brings them back.
+    """Computes fields of the masked worlds in a group of other worlds, and copies them back.
 
-    Few worlds begin again in a step, none in most steps of a small batch, and a whole forward pass of all costs as
-    much as a substep. So the masked worlds' states go to a small group, in as many turns as it takes.
+    Few worlds restart in a step, none in most steps of a small batch, and a forward pass of all worlds costs as much
+    as a substep. So the masked worlds' states are copied into a small group, in as many turns as it takes.
 
     Args:
+        model: MuJoCo Warp's model.
         data: MuJoCo Warp's data of all worlds.
         group: The same of the group.
+        states: Room for the integration states of all worlds, (nworld, integration size), float32.
     """
 
-    def __init__(self, data: mjw.Data, group: mjw.Data) -> None:
-        self._data, self._group = data, group
+    def __init__(self, model: mjw.Model, data: mjw.Data, group: mjw.Data, states: wp.array) -> None:
+        self._model, self._data, self._group, self._states = model, data, group, states
         self._device = wp.get_device(data.qpos.device)
         with wp.ScopedDevice(self._device):
+            self._group_states = wp.zeros((group.nworld, states.shape[1]), dtype=float)
             self._everyone = wp.full(group.nworld, True, dtype=bool)
             self._rank, self._world = wp.zeros(data.nworld, dtype=int), wp.zeros(group.nworld, dtype=int)
             self._count, self._first, self._left = (wp.zeros(1, dtype=int) for _ in range(3))
@@ -58,9 +58,10 @@ class PartialForward:
         with wp.ScopedDevice(self._device):
             self._count.zero_()
             self._first.zero_()
-            wp.launch(state.rank_worlds, self._data.nworld, [mask, self._rank, self._count])
-            wp.launch(state.next_group, 1, [self._count, 0, self._first, self._left])
-            with self._set_aside():
+            mjw.get_state(self._model, self._data, self._states, _SPEC, mask)
+            wp.launch(kernels.rank_worlds, self._data.nworld, [mask, self._rank, self._count])
+            wp.launch(kernels.next_group, 1, [self._count, 0, self._first, self._left])
+            with self._reserved():
                 wp.capture_while(self._left, while_body=turn)
 
     def _turn(self, mask: wp.array, forward: Callable[[mjw.Data], None], targets: Mapping[str, wp.array]) -> None:
@@ -68,22 +69,73 @@ class PartialForward:
             self._arena.open()
         data, group = self._data, self._group
         worlds = [self._world, self._left]
-        wp.launch(state.choose_group, data.nworld, [mask, self._rank, self._first, self._world])
-        for name in STATE_FIELDS:
-            if (source := getattr(data, name)).size:
-                rows = flat(getattr(group, name))
-                wp.launch(state.take_rows, rows.shape, [*worlds, flat(source), rows])
+        wp.launch(kernels.choose_group, data.nworld, [mask, self._rank, self._first, self._world])
+        wp.launch(kernels.take_rows, self._group_states.shape, [*worlds, self._states, self._group_states])
+        mjw.set_state(self._model, group, self._group_states, _SPEC)
         group.overflow.zero_()
         forward(group)
-        report_overflow(group, self._everyone)
-        for name, target in targets.items():
-            rows = flat(getattr(group, name))
-            wp.launch(state.return_rows, rows.shape, [*worlds, rows, flat(target)])
-        wp.launch(state.return_bits, group.nworld, [*worlds, group.overflow, data.overflow])
-        wp.launch(state.next_group, 1, [self._count, group.nworld, self._first, self._left])
+        report_pool_overflow(group, self._everyone)
+        results = {name: (getattr(group, name), target) for name, target in targets.items()}
+        if self._model.nhistory:  # a forward pass adds its sensors' samples to it
+            results["history"] = group.history, data.history
+        for source, target in results.values():
+            rows = flat(source)
+            wp.launch(kernels.return_rows, rows.shape, [*worlds, rows, flat(target)])
+        wp.launch(kernels.return_bits, group.nworld, [*worlds, group.overflow, data.overflow])
+        wp.launch(kernels.next_group, 1, [self._count, group.nworld, self._first, self._left])
 
-    def _set_aside(self) -> contextlib.AbstractContextManager[object]:
-        """Memory for what a turn allocates: within a loop of a CUDA graph nothing may be."""
+    def _reserved(self) -> contextlib.AbstractContextManager[object]:
+        """Memory for the temporary arrays of a turn: within a loop of a CUDA graph nothing may be allocated."""
         if self._arena is None:
             return contextlib.nullcontext()
         return self._arena.serving() if self._device.is_capturing else self._arena.counting()
+
+
+class Arena(Reserve):
+    """An allocator for code that may not allocate: it counts what a run outside a graph allocates, and reserves that.
+
+    While it counts, memory comes from the device. Graphs are served from the reserve; they never run at the same time,
+    so all of them may use the same memory.
+
+    Args:
+        device: A CUDA device.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        super().__init__(device)
+        self._size, self._used = 0, 0
+        self._serving = False
+
+    def open(self) -> None:
+        """Begin again at the start of the reserve."""
+        self._used = 0
+
+    @contextlib.contextmanager
+    def counting(self) -> Iterator[None]:
+        """Count what is allocated between one ``open`` and the next, and reserve the most at the end."""
+        self._serving = False
+        with wp.ScopedAllocator(self.device, self):
+            yield
+        if not self.blocks or self.blocks[-1].size < self._size:
+            self.add_block(self._size)
+
+    @contextlib.contextmanager
+    def serving(self) -> Iterator[None]:
+        """Hand out the reserve."""
+        self._serving = True
+        try:
+            with wp.ScopedAllocator(self.device, self):
+                yield
+        finally:
+            self._serving = False
+
+    def allocate(self, size_in_bytes: int) -> int:
+        """An address with so many bytes behind it."""
+        start = self._used
+        self._used += aligned(size_in_bytes)
+        if not self._serving:
+            self._size = max(self._size, self._used)
+            return int(self.below.allocate(size_in_bytes))
+        if not self.blocks or self._used > self.blocks[-1].size:
+            raise RuntimeError("a graph needs more memory than is reserved: call the function once before its capture")
+        return int(self.blocks[-1].ptr) + start

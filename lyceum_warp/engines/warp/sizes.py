@@ -1,4 +1,4 @@
-"""How many contacts and constraints a model needs: measured on random rollouts, not guessed."""
+"""How many contacts and constraints a model needs, measured on random roll-outs."""
 
 import contextlib
 import hashlib
@@ -16,10 +16,10 @@ _known: dict[str, tuple[int, int]] = {}
 
 
 def probe_sizes(model: mujoco.MjModel) -> tuple[int, int]:
-    """Contacts and constraints to make room for in each world: twice the peak of random rollouts.
+    """Contacts and constraints to make room for in each world: twice the peak of random roll-outs.
 
-    32 worlds start in the model's initial state or a keyframe, half of them with random velocities, and run
-    500 substeps on the C engine under random controls held for 20. The result is remembered per model.
+    32 worlds start in the model's initial state or a keyframe, half of them with random velocities, and take
+    500 substeps on the C engine under random controls held for 20. The result is remembered for each model.
 
     Returns:
         (nconmax, njmax), each at least 8 and a multiple of 8.
@@ -44,7 +44,7 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     for _ in range(_HOLDS):
         batch.ctrl[:] = rng.uniform(low, high, size=(_WORLDS, model.nu))
         for _ in range(_SUBSTEPS):
-            # a world that fails for want of memory has shown how much it needs
+            # a world that fails because memory is short has shown how much it needs
             with contextlib.suppress(SimulationError):
                 batch.step()
             contacts, constraints = max(contacts, int(ncon.max())), max(constraints, int(nefc.max()))

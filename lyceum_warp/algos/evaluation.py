@@ -1,0 +1,117 @@
+"""Evaluation of policies: whole episodes under the mean action."""
+
+import copy
+import dataclasses
+from typing import TypeVar
+
+import torch
+
+from lyceum_warp.algos.distributed import Team
+from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.env import Env
+
+Module = TypeVar("Module", bound=torch.nn.Module)
+
+MEAN_SEED = 2**31 - 1
+"""Seed of the initial states from which NPG evaluates the mean policy."""
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True)
+class Episodes:
+    """Finished episodes, one number each. All tensors have shape (episodes,) and lie on the CPU."""
+
+    returns: torch.Tensor
+    """Sums of rewards."""
+    lengths: torch.Tensor
+    """Numbers of steps."""
+    rewards: torch.Tensor
+    """Rewards of the last step."""
+    evals: torch.Tensor
+    """The evaluation metric at the end."""
+    success: torch.Tensor
+    """Whether the goal was met at the end, 1 or 0."""
+
+
+@torch.no_grad()
+def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | None = None) -> Episodes:
+    """Run a policy's mean action for whole episodes from random initial states.
+
+    Every world contributes the same number of episodes, its first ones. Otherwise worlds with short episodes would
+    contribute more of them, and the statistics would favour short episodes.
+
+    Args:
+        env: The environment; its worlds are reset.
+        policy: Called with observations (nworld, nobs), returns actions (nworld, nact).
+        episodes: Number of episodes, rounded up to a multiple of the number of worlds.
+        seed: Seed of the initial states; by default the worlds continue their random streams.
+
+    Raises:
+        ValueError: The task has no horizon, or the environment was made with ``autoreset=False``.
+    """
+    if env.horizon == 0:
+        raise ValueError(f"episodes of {env.task.name!r} never end without a horizon: give make() a horizon")
+    if not env.autoreset:
+        raise ValueError("evaluate needs an environment that resets automatically: make it with autoreset=True")
+    each = -(-episodes // env.nworld)
+    env.rand_reset(seed)
+    results = torch.zeros(5, each, env.nworld, device=env.obs.device)
+    count = torch.zeros(env.nworld, dtype=torch.long, device=env.obs.device)
+    total = torch.zeros(env.nworld, device=env.obs.device)
+    worlds = torch.arange(env.nworld, device=env.obs.device)
+    for t in range(each * env.horizon):
+        length = env.episode_step + 1.0
+        env.action.copy_(policy(env.obs))
+        env.step()
+        total += env.reward
+        now = torch.stack([total, length, env.reward, env.eval, env.success.float()])
+        slot = count.clamp_max(each - 1)
+        wanted = env.done & (count < each)
+        results[:, slot, worlds] = torch.where(wanted, now, results[:, slot, worlds])
+        total.masked_fill_(env.done, 0.0)
+        count += wanted
+        if t % 50 == 49 and bool((count >= each).all()):
+            break
+    return Episodes(*results.reshape(5, -1).cpu())
+
+
+class MeanPolicyEvaluation:
+    """Evaluates the mean policy during training, in a few worlds of its own.
+
+    The initial states are the same each time and are not trained on, so that only the policy differs between two
+    evaluations. The leading process evaluates; all processes get its numbers.
+
+    Args:
+        env: The environment of the training; its parameters at each evaluation are those of the evaluation.
+        episodes: Number of episodes.
+        team: The processes.
+    """
+
+    def __init__(self, env: Env, episodes: int, team: Team) -> None:
+        self.env, self.episodes, self.team = env, episodes, team
+        self._few: Env | None = None
+
+    def __call__(self, policy: torch.nn.Module) -> dict[str, float]:
+        """Means over the episodes, by their names in ``Iteration``."""
+        means = torch.zeros(len(MEAN_STATISTICS), dtype=torch.float64, device=self.env.obs.device)
+        if self.team.leads:
+            if self._few is None:
+                self._few = self.env.replicate_few(self.episodes)
+            self._few.follow(self.env)
+            episodes = evaluate(self._few, moved(policy, self._few), self.episodes, seed=MEAN_SEED)
+            parts = (episodes.returns, episodes.lengths, episodes.rewards, episodes.evals, episodes.success)
+            means.copy_(torch.stack([part.mean() for part in parts]))
+        self.team.copy_leader([means])
+        return dict(zip(MEAN_STATISTICS, means.tolist(), strict=True))
+
+
+MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")
+"""The attributes of ``Iteration`` that an evaluation of the mean policy sets."""
+
+
+def moved(module: Module, env: Env) -> Module:
+    """The module itself if its parameters are on the device of an environment's observations, else a copy there."""
+    device = env.obs.device
+    if all(parameter.device == device for parameter in module.parameters()):
+        return module
+    return copy.deepcopy(module).to(device)

@@ -1,0 +1,163 @@
+"""The settings of MPPI and their checks."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+import torch
+
+from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.spaces import Space
+from lyceum_warp.validate import whole_number
+
+Numbers: TypeAlias = float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray | torch.Tensor
+
+_SMALLEST = float(np.finfo(np.float32).tiny)
+"""The smallest temperature that float32, the type of the kernels, holds at full precision."""
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MPPIConfig:
+    """Settings of MPPI. Arrays and tensors are stored as tuples of floats.
+
+    Raises:
+        ValueError: A value is of the wrong type or out of range.
+    """
+
+    horizon: int = 32
+    """Steps of a plan."""
+    samples: int = 64
+    """Samples for each improvement of the plan; each is rolled out in a world of its own."""
+    temperature: float = 0.1
+    """Temperature of the weights, in units of reward: a low one follows the best sample, a high one averages all."""
+    noise: Numbers = 0.5
+    """Noise around the plan, in units of the action: its standard deviation, as one number or one for each action, or
+    its covariance, (nu, nu)."""
+    smoothing: tuple[float, float, float] = (0.25, 0.8, 0.0)
+    """Weights (b0, b1, b2) that smooth the noise n over time: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) from the third
+    step on. (1, 0, 0) is white noise."""
+    discount: float | None = None
+    """Discount of rewards and of the terminal value for each step. None is that of the value function, or else 1."""
+    iterations: int = 1
+    """Improvements of the plan in each call."""
+    fill: str | Numbers = "zero"
+    """What fills the end of a plan that moves forward: "zero" (the action nearest to zero), "repeat" (the last action),
+    or an action, as one number or one for each."""
+    termination: Literal["stop", "ignore"] = "stop"
+    """Whether a sample whose episode ends earns nothing afterwards ("stop"), or goes on ("ignore", as Lyceum and
+    trajopt do)."""
+
+    def __post_init__(self) -> None:
+        """Check everything that does not depend on the task."""
+        checked: dict[str, Any] = {
+            name: whole_number(name, getattr(self, name), low=1) for name in ("horizon", "samples", "iterations")
+        }
+        checked["temperature"] = _number("temperature", self.temperature, _SMALLEST)
+        checked["noise"] = _noise(self.noise)
+        checked["smoothing"] = _smoothing(self.smoothing)
+        if self.discount is not None:
+            checked["discount"] = _number("discount", self.discount, 0.0, 1.0)
+        checked["fill"] = _fill(self.fill)
+        if not isinstance(self.termination, str) or self.termination not in ("stop", "ignore"):
+            raise ValueError(f"termination must be 'stop' or 'ignore', not {self.termination!r}")
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+
+    def noise_factor(self, nu: int) -> np.ndarray:
+        """The lower Cholesky factor of the noise's covariance, (nu, nu).
+
+        Raises:
+            ValueError: ``noise`` is not for ``nu`` actions.
+        """
+        noise = np.asarray(self.noise)
+        if noise.shape in ((), (nu,)):
+            return np.diag(np.broadcast_to(noise, nu))
+        if noise.shape == (nu, nu):
+            return np.linalg.cholesky(noise)
+        raise ValueError(
+            f"noise must be a standard deviation, {nu} of them, or a positive definite covariance ({nu}, {nu}), "
+            f"not {self.noise!r}"
+        )
+
+    def fill_action(self, space: Space) -> np.ndarray:
+        """The action that fills the end of a plan and the whole first plan, within bounds, (nu,).
+
+        Raises:
+            ValueError: ``fill`` is not for the actions of this space.
+        """
+        fill = np.asarray(0.0 if isinstance(self.fill, str) else self.fill)
+        if fill.shape not in ((), (space.size,)):
+            raise ValueError(f"fill must be 'zero', 'repeat', a number or {space.size} of them, not {self.fill!r}")
+        return np.clip(np.broadcast_to(fill, space.size), space.low, space.high)
+
+
+SETTINGS = tuple(field.name for field in dataclasses.fields(MPPIConfig))
+"""Names of the settings."""
+
+
+def _number(name: str, value: Any, low: float, high: float = math.inf) -> float:
+    try:
+        number = math.nan if isinstance(value, (bool, str, bytes)) else float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (low <= number <= high and math.isfinite(number)):
+        bounds = f"number from {low:g} to {high:g}" if math.isfinite(high) else "finite number above 0"
+        raise ValueError(f"{name} must be a {bounds}, not {value!r}")
+    return number
+
+
+def _array(value: Any) -> np.ndarray | None:
+    """Finite numbers as float64; None where they are not."""
+    try:
+        array = np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value)
+        array = array.astype(np.float64) if array.dtype.kind in "iuf" else np.array(math.nan)
+    except (TypeError, ValueError):
+        return None
+    return array if np.isfinite(array).all() else None
+
+
+def _tuples(array: np.ndarray) -> Any:
+    """Numbers of any shape as a float or as tuples, which a frozen dataclass can compare and hash."""
+    return array.item() if array.ndim == 0 else tuple(map(_tuples, array))
+
+
+def _noise(noise: Any) -> Any:
+    array = _array(noise)
+    if array is not None and array.size:
+        if array.ndim < 2 and (array >= 0).all():
+            return _tuples(array)
+        if array.ndim == 2 and array.shape[0] == array.shape[1] and np.allclose(array, array.T):
+            try:
+                np.linalg.cholesky(array)
+                return _tuples(array)
+            except np.linalg.LinAlgError:
+                pass
+    raise ValueError(
+        f"noise must be a standard deviation, one for each action, or a positive definite covariance, not {noise!r}"
+    )
+
+
+def _smoothing(smoothing: Any) -> Any:
+    array = _array(smoothing)
+    if array is None or array.shape != (3,):
+        raise ValueError(f"smoothing must be 3 finite numbers, not {smoothing!r}")
+    b0, b1, b2 = array.tolist()
+    # the poles are the roots of z^2 - b1 z - b2 (the stability triangle of a filter of second order)
+    if not (abs(b2) < 1 and abs(b1) < 1 - b2):
+        raise ValueError(
+            f"smoothing {(b0, b1, b2)} is unstable: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) must have its poles inside "
+            "the unit circle, so choose |b2| < 1 and |b1| < 1 - b2"
+        )
+    return b0, b1, b2
+
+
+def _fill(fill: Any) -> Any:
+    if isinstance(fill, str) and fill in ("zero", "repeat"):
+        return fill
+    array = _array(fill)
+    if array is None or array.ndim > 1 or not array.size:
+        raise ValueError(f"fill must be 'zero', 'repeat' or an action of finite numbers, not {fill!r}")
+    return _tuples(array)

@@ -1,0 +1,78 @@
+"""Networks that policies and value functions are made of."""
+
+import itertools
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+
+from lyceum_warp.algos.distributed import Team
+
+
+def mlp(sizes: Sequence[int], *, last_scale: float = 1.0, generator: torch.Generator | None = None) -> nn.Sequential:
+    """A tanh network with Glorot-uniform weights and zero biases.
+
+    Args:
+        sizes: Widths of all layers, the input and the output included.
+        last_scale: Factor of the last layer's initial weights.
+        generator: Draws the initial weights.
+    """
+    layers: list[nn.Module] = []
+    for i, (n, m) in enumerate(itertools.pairwise(sizes)):
+        linear = nn.Linear(n, m)
+        nn.init.xavier_uniform_(linear.weight, gain=1.0, generator=generator)
+        nn.init.zeros_(linear.bias)
+        layers.append(linear)
+        if i < len(sizes) - 2:
+            layers.append(nn.Tanh())
+    with torch.no_grad():
+        linear.weight.mul_(last_scale)
+    return nn.Sequential(*layers)
+
+
+class Normalizer(nn.Module):
+    """Normalises observations by their running mean and variance; the identity until the first update.
+
+    Args:
+        size: Numbers in an observation.
+        limit: Normalised values are clipped to plus and minus this.
+    """
+
+    count: torch.Tensor
+    mean: torch.Tensor
+    square: torch.Tensor
+    shift: torch.Tensor
+    scale: torch.Tensor
+
+    def __init__(self, size: int, limit: float = 10.0) -> None:
+        super().__init__()
+        self.limit = limit
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("square", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("shift", torch.zeros(size))
+        self.register_buffer("scale", torch.ones(size))
+
+    @torch.no_grad()
+    def update(self, obs: torch.Tensor, team: Team | None = None) -> None:
+        """Take observations into the mean and variance (Chan et al. 1983, parallel mean and variance).
+
+        Args:
+            obs: Observations, (..., size).
+            team: The processes; each brings the same number of observations.
+        """
+        team = team or Team()
+        obs = obs.reshape(-1, obs.shape[-1]).double()
+        n = obs.shape[0] * team.size
+        mean = team.sum(obs.sum(0)) / n
+        square = team.sum((obs - mean).square().sum(0))
+        total, delta = self.count + n, mean - self.mean
+        self.square += square + delta.square() * (self.count * n / total)
+        self.mean += delta * (n / total)
+        self.count.copy_(total)
+        self.shift.copy_(self.mean)
+        self.scale.copy_((self.square / total).sqrt().clamp_min(1e-4).reciprocal())
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        """Normalised observations, (..., size)."""
+        return ((obs - self.shift) * self.scale).clamp(-self.limit, self.limit)

@@ -1,0 +1,104 @@
+"""Hyperparameters of NPG."""
+
+import dataclasses
+import math
+from typing import Literal
+
+from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.validate import finite_number, layer_sizes, whole_number
+
+_WHOLE = {
+    "samples": 1, "cg_iterations": 1, "value_epochs": 0, "value_batch": 1, "time_orders": 0, "mean_every": 0,
+    "mean_episodes": 1,
+}  # fmt: skip
+"""The smallest value of each whole number."""
+
+_REAL = {
+    "gamma": (0.0, 1.0), "lam": (0.0, 1.0), "delta": (0.0, math.inf), "damping": (0.0, math.inf),
+    "fisher_fraction": (0.0, 1.0), "log_std": (-math.inf, math.inf), "min_log_std": (-math.inf, math.inf),
+    "value_rate": (0.0, math.inf),
+}  # fmt: skip
+"""The smallest and the largest value of each number."""
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NPGConfig:
+    """Hyperparameters of NPG. The defaults are those of Rajeswaran et al. (2017), where the paper gives them.
+
+    Raises:
+        ValueError: A value is of the wrong type, out of range or not finite.
+    """
+
+    samples: int | None = None
+    """Samples in an iteration, rounded up to whole steps of all worlds; by default the paper's 10,000, or 16 steps of
+    every world where those are more."""
+    rollout: Literal["auto", "episodes", "segments"] = "auto"
+    """"episodes" begins new episodes in every iteration, as in the paper; "segments" continues those of the last
+    iteration, for many worlds and few steps of each; "auto" selects episodes where whole ones fit, that is where
+    samples / worlds >= horizon."""
+    gamma: float = 0.995
+    """Discount."""
+    lam: float = 0.97
+    """Decay of the generalised advantage estimate."""
+    delta: float = 0.1
+    """Squared length of a step in the Fisher metric: twice the KL divergence between old and new policy."""
+    whiten: bool = True
+    """Whether to scale the advantages to mean 0 and standard deviation 1 (as mjrl, unlike Lyceum)."""
+    cg_iterations: int = 10
+    """Iterations of conjugate gradient."""
+    damping: float = 1e-4
+    """Added to the diagonal of the Fisher information (as mjrl; Lyceum has none)."""
+    fisher_fraction: float = 1.0
+    """Share of the samples that the Fisher information is averaged over: every n-th, n being the whole number nearest
+    to 1 / fisher_fraction."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Widths of the policy's hidden layers."""
+    log_std: float = -0.5
+    """Initial logarithm of the policy's standard deviations."""
+    min_log_std: float = -3.0
+    """Lower limit of the logarithm of the policy's standard deviations (as mjrl; Lyceum has none)."""
+    value_hidden: tuple[int, ...] = (128, 128)
+    """Widths of the value function's hidden layers."""
+    value_epochs: int = 2
+    """Passes over the samples when the value function is fitted."""
+    value_batch: int | None = None
+    """Samples in a mini-batch of the value function's fit; by default a 256th of all samples, but at least the paper's
+    64, so that more samples cost no more steps."""
+    value_rate: float = 1e-3
+    """Learning rate of the value function's fit (Adam)."""
+    time_orders: int = 0
+    """Highest power of the value function's time feature; 0 for none."""
+    normalize: bool = False
+    """Whether policy and value function normalise observations by their running mean and variance."""
+    mean_every: int = 10
+    """Iterations between two evaluations of the mean policy; 0 for never."""
+    mean_episodes: int = 16
+    """Episodes in an evaluation of the mean policy."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        checked: dict[str, object] = {}
+        for name, low in _WHOLE.items():
+            if (number := getattr(self, name)) is not None or name not in ("samples", "value_batch"):
+                checked[name] = whole_number(name, number, low=low)
+        for name, (smallest, largest) in _REAL.items():
+            checked[name] = finite_number(name, getattr(self, name), low=smallest, high=largest)
+        for name in ("hidden", "value_hidden"):
+            checked[name] = tuple(layer_sizes(getattr(self, name), name))
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        if self.rollout not in ("auto", "episodes", "segments"):
+            raise ValueError(f"rollout must be 'auto', 'episodes' or 'segments', not {self.rollout!r}")
+        for name in ("whiten", "normalize"):
+            if not isinstance(flag := getattr(self, name), bool):
+                raise ValueError(f"{name} must be True or False, not {flag!r}")
+        if self.fisher_fraction == 0.0:
+            raise ValueError("fisher_fraction must be greater than 0, as in 0.1 for every tenth sample")
+        if self.log_std < self.min_log_std:
+            raise ValueError(f"log_std must not be below min_log_std, which is {self.min_log_std}, not {self.log_std}")
+
+
+def enough_samples(config: NPGConfig, nworld: int) -> int:
+    """Samples in an iteration of ``nworld`` worlds, those of all processes."""
+    return max(10_000, 16 * nworld) if config.samples is None else config.samples

@@ -1,0 +1,70 @@
+"""The states that a planner is given: made from their parts, and checked."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from lyceum_warp.env import Env
+from lyceum_warp.validate import described
+
+
+def state_from_parts(env: Env, initial: torch.Tensor, parts: Mapping[str, Any]) -> torch.Tensor:
+    """A copy of a state in which some parts have other values.
+
+    A ``time`` sets the step counter, too, unless ``step`` is among the parts.
+
+    Args:
+        env: The environment whose states these are.
+        initial: The state to copy, (state_space.size,) float64.
+        parts: Values by the names in ``env.state_space.parts``.
+
+    Returns:
+        (state_space.size,) float64.
+
+    Raises:
+        ValueError: A part is unknown, or its value has another size or is not a number.
+    """
+    space, state = env.state_space, initial.clone()
+    for name, value in parts.items():
+        if name not in space.parts:
+            raise ValueError(f"a state of {env.task.name!r} has no part {name!r}: it has {list(space.parts)}")
+        target = state[space.parts[name]]
+        try:
+            values = torch.as_tensor(value, dtype=torch.float64).ravel()
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ValueError(f"the part {name!r} of a state must be numbers, not {value!r}") from error
+        if values.shape != target.shape:
+            raise ValueError(f"the part {name!r} of a state has {len(target)} numbers, not {len(values)}")
+        target.copy_(values)
+    if "time" in parts and "step" not in parts:
+        state[space.parts["step"]] = torch.round(state[space.parts["time"]] / env.timestep)
+    return state
+
+
+def checked_state(env: Env, state: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    """One state of an environment, (state_space.size,) float64; a single row of states is unpacked.
+
+    Args:
+        env: The environment whose states these are.
+        state: The state.
+        like: The buffer for it.
+
+    Raises:
+        ValueError: The state has another shape or type, or it lies on the CPU and is not finite.
+    """
+    if isinstance(state, torch.Tensor) and state.ndim == 2 and len(state) == 1:
+        state = state[0]
+    if not isinstance(state, torch.Tensor) or state.shape != like.shape or state.dtype != like.dtype:
+        raise ValueError(
+            f"a state to plan from must be {described(like)}, not {described(state)}: take it from env.get_state() of "
+            "the same task, or make it by its parts with plan.state_of(qpos=..., qvel=...). (fields=[...] may make the "
+            "states of an environment longer.)"
+        )
+    # on a GPU this check would wait for the device; there every sample fails, and the plan stays
+    if state.device.type == "cpu" and not (finite := np.isfinite(state.numpy())).all():
+        column = int(np.flatnonzero(~finite)[0])
+        part = next(n for n, part in env.state_space.parts.items() if part.start <= column < part.stop)
+        raise ValueError(f"the state to plan from has {state[column].item()} in its {part!r}: it must be finite")
+    return state

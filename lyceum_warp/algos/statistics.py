@@ -1,0 +1,259 @@
+"""Statistics of an iteration of NPG: the numbers of each process, and their summary over all processes."""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import torch
+
+from lyceum_warp.algos.rollout_buffer import Rollout
+from lyceum_warp.docstrings import document_attributes
+
+Scalar: TypeAlias = Any
+"""A tensor of one number on the device, or, after the copy to the host, a float."""
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Iteration:
+    """Statistics of one iteration.
+
+    Numbers about episodes cover those that ended in the iteration; they are nan where none ended.
+    """
+
+    iteration: int
+    """Number of the iteration, from 1."""
+    samples: int
+    """Samples in all iterations so far."""
+    return_mean: float
+    """Mean return (sum of an episode's rewards) of the stochastic policy."""
+    return_std: float
+    """Standard deviation of these returns."""
+    return_min: float
+    """Smallest of these returns."""
+    return_max: float
+    """Largest of these returns."""
+    length_mean: float
+    """Mean number of steps in an episode."""
+    terminal_reward: float
+    """Mean reward of an episode's last step."""
+    eval_mean: float
+    """Mean evaluation metric at the end of an episode."""
+    success: float
+    """Share of the episodes that ended with the goal met."""
+    mean_return: float | None
+    """Mean return of the mean policy; None in iterations without an evaluation of it."""
+    mean_length: float | None
+    """Mean number of steps in an episode of the mean policy, or None."""
+    mean_terminal_reward: float | None
+    """Mean reward of the last step of an episode of the mean policy, or None."""
+    mean_eval: float | None
+    """Mean evaluation metric at the end of an episode of the mean policy, or None."""
+    mean_success: float | None
+    """Share of the mean policy's episodes that ended with the goal met, or None."""
+    kl: float
+    """KL divergence from the old to the new policy, averaged over the samples."""
+    step_norm: float
+    """Euclidean length of the step in the policy's parameters."""
+    gradient_norm: float
+    """Euclidean length of the vanilla policy gradient."""
+    std_mean: float
+    """Mean standard deviation of the policy's actions."""
+    value_error: float
+    """Squared error of the value function before the fit, relative to the squared error of predicting 0."""
+    explained_variance: float
+    """Share of the returns' variance that the value function explained before the fit."""
+    faults: int
+    """Faults of worlds in this iteration."""
+    time_sample: float
+    """Seconds of sampling."""
+    time_gradient: float
+    """Seconds for advantages and the vanilla gradient."""
+    time_solve: float
+    """Seconds of conjugate gradient and of the step."""
+    time_value: float
+    """Seconds of fitting the value function."""
+    time_mean: float
+    """Seconds of evaluating the mean policy."""
+    samples_per_second: float
+    """Samples divided by the seconds of sampling."""
+
+
+class UpdateNumbers(NamedTuple):
+    """The policy's update."""
+
+    finite: Scalar
+    """Whether the step is finite; all processes have the same."""
+    kl: Scalar
+    """KL divergence from the old to the new policy, averaged over the process's samples."""
+    step_norm: Scalar
+    """Euclidean length of the step; all processes have the same."""
+    gradient_norm: Scalar
+    """Euclidean length of the gradient; all processes have the same."""
+    std_mean: Scalar
+    """Mean standard deviation of the policy's actions; all processes have the same."""
+    faults: Scalar
+    """Faults of the process's worlds."""
+
+
+class ValueSums(NamedTuple):
+    """How well the value function predicted the returns of a process's samples."""
+
+    return_mean: Scalar
+    """Mean of the discounted returns."""
+    return_square: Scalar
+    """Sum of the squared deviations of the discounted returns from their mean."""
+    error_mean: Scalar
+    """Mean of the errors, return minus prediction."""
+    error_square: Scalar
+    """Sum of the squared deviations of the errors from their mean."""
+
+
+class EpisodeSums(NamedTuple):
+    """Sums over the episodes that ended in a process's worlds."""
+
+    episodes: Scalar
+    """Number of episodes."""
+    return_mean: Scalar
+    """Mean of their returns."""
+    return_square: Scalar
+    """Sum of the squared deviations of their returns from their mean."""
+    return_min: Scalar
+    """Smallest return; infinity where no episode ended."""
+    return_max: Scalar
+    """Largest return; minus infinity where no episode ended."""
+    length: Scalar
+    """Sum of their lengths."""
+    terminal_reward: Scalar
+    """Sum of their last rewards."""
+    eval: Scalar
+    """Sum of the evaluation metrics at their ends."""
+    success: Scalar
+    """Number of episodes that ended with the goal met."""
+
+
+class ProcessNumbers(NamedTuple):
+    """What one process contributes to the statistics of an iteration."""
+
+    update: UpdateNumbers
+    values: ValueSums
+    episodes: EpisodeSums
+
+    def pack(self) -> torch.Tensor:
+        """All numbers in one float64 tensor, so that one copy brings them to other processes and to the host."""
+        return torch.stack([number.double() for part in self for number in part])
+
+    @classmethod
+    def unpack(cls, numbers: Iterable[float]) -> "ProcessNumbers":
+        """The numbers of a tensor from ``pack``, once they are floats on the host."""
+        rest = iter(numbers)
+        return cls(
+            update=UpdateNumbers(*itertools.islice(rest, len(UpdateNumbers._fields))),
+            values=ValueSums(*itertools.islice(rest, len(ValueSums._fields))),
+            episodes=EpisodeSums(*itertools.islice(rest, len(EpisodeSums._fields))),
+        )
+
+
+class Moments(NamedTuple):
+    """Number, mean and sum of squared deviations from the mean of a set of numbers."""
+
+    n: float
+    mean: float
+    square: float
+
+
+def finished(rollout: Rollout) -> EpisodeSums:
+    """Sums over the episodes that ended within a rollout, scalar tensors on its device."""
+    ended = rollout.done & ~rollout.episode_return.isnan()
+    returns = rollout.episode_return.double()
+    infinity = torch.inf
+
+    def total(part: torch.Tensor) -> torch.Tensor:
+        return part.double().masked_fill(~ended, 0.0).sum()
+
+    episodes = ended.sum().double()
+    mean = total(returns) / episodes.clamp_min(1.0)
+    return EpisodeSums(
+        episodes=episodes,
+        return_mean=mean,
+        return_square=total((returns - mean).square()),
+        return_min=returns.masked_fill(~ended, infinity).min(),
+        return_max=returns.masked_fill(~ended, -infinity).max(),
+        length=total(rollout.episode_length),
+        terminal_reward=total(rollout.reward),
+        eval=total(rollout.eval),
+        success=total(rollout.success),
+    )
+
+
+def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums:
+    """How well a value function predicted returns, scalar tensors on their device."""
+    target, error = returns.double(), (returns - predicted).double()
+    return ValueSums(
+        return_mean=(return_mean := target.mean()),
+        return_square=(target - return_mean).square().sum(),
+        error_mean=(error_mean := error.mean()),
+        error_square=(error - error_mean).square().sum(),
+    )
+
+
+def summary(processes: Sequence[ProcessNumbers], samples: int) -> dict[str, Any]:
+    """Statistics of an iteration from the numbers of all processes, by their names in ``Iteration``.
+
+    Args:
+        processes: The numbers of each process, as floats.
+        samples: Samples of each process.
+    """
+    update = processes[0].update
+    return {
+        **episode_statistics([process.episodes for process in processes]),
+        "kl": sum(process.update.kl for process in processes) / len(processes),
+        "step_norm": update.step_norm,
+        "gradient_norm": update.gradient_norm,
+        "std_mean": update.std_mean,
+        **value_statistics([process.values for process in processes], samples),
+        "faults": round(sum(process.update.faults for process in processes)),
+    }
+
+
+def episode_statistics(sums: Sequence[EpisodeSums]) -> dict[str, float]:
+    """Statistics of finished episodes from the sums of all processes; nan where none ended."""
+    episodes, mean, square = pooled([Moments(part.episodes, part.return_mean, part.return_square) for part in sums])
+    if not episodes:
+        return dict.fromkeys(_EPISODE_STATISTICS, math.nan)
+    numbers = (
+        mean,
+        math.sqrt(square / episodes),
+        min(part.return_min for part in sums),
+        max(part.return_max for part in sums),
+        sum(part.length for part in sums) / episodes,
+        sum(part.terminal_reward for part in sums) / episodes,
+        sum(part.eval for part in sums) / episodes,
+        sum(part.success for part in sums) / episodes,
+    )
+    return dict(zip(_EPISODE_STATISTICS, numbers, strict=True))
+
+
+_EPISODE_STATISTICS = (
+    "return_mean", "return_std", "return_min", "return_max", "length_mean", "terminal_reward", "eval_mean", "success",
+)  # fmt: skip
+
+
+def value_statistics(sums: Sequence[ValueSums], samples: int) -> dict[str, float]:
+    """How well a value function predicted returns, from the sums of all processes; ``samples`` in each of them."""
+    n, mean, square = pooled([Moments(samples, part.return_mean, part.return_square) for part in sums])
+    _, error_mean, error_square = pooled([Moments(samples, part.error_mean, part.error_square) for part in sums])
+    error, size = error_square + n * error_mean**2, square + n * mean**2
+    return {
+        "value_error": error / max(size, 1e-20 * n),
+        "explained_variance": 1.0 - error_square / max(square, 1e-20 * n),
+    }
+
+
+def pooled(parts: Sequence[Moments]) -> Moments:
+    """The moments of several sets of numbers together, from the moments of each."""
+    n = sum(part.n for part in parts)
+    mean = sum(part.n * part.mean for part in parts) / n if n else 0.0
+    return Moments(n, mean, sum(part.square + part.n * (part.mean - mean) ** 2 for part in parts))

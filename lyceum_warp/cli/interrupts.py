@@ -1,0 +1,69 @@
+"""Ctrl-C and SIGTERM as an exception, at once or at a time of the program's choice."""
+
+import contextlib
+import signal
+from collections.abc import Callable, Iterator
+from typing import Any
+
+
+class Interrupted(BaseException):
+    """A signal asks the program to end."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+@contextlib.contextmanager
+def signals() -> Iterator[None]:
+    """Within the context the first Ctrl-C or SIGTERM raises Interrupted, and later ones are ignored."""
+
+    def interrupt(number: int, frame: Any) -> None:
+        for other in previous:
+            signal.signal(other, signal.SIG_IGN)
+        raise Interrupted(number)
+
+    previous = _handled_by(interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def postponed(when: bool = True) -> Iterator[list[int]]:
+    """Within ``signals``: list Ctrl-C and SIGTERM instead of raising Interrupted, which is left to the caller.
+
+    A signal that is still listed at the end of the context raises Interrupted there. Once Interrupted is raised,
+    later signals are ignored.
+
+    Args:
+        when: False leaves signals alone.
+
+    Raises:
+        Interrupted: A signal came, and the caller did not raise it.
+    """
+    noted: list[int] = []
+    previous = _handled_by(lambda number, frame: noted.append(number)) if when else {}
+    try:
+        yield noted
+    except Interrupted:
+        previous = dict.fromkeys(previous, signal.SIG_IGN)
+        raise
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+    if noted:
+        signal.raise_signal(signal.Signals(noted[0]))
+
+
+def _handled_by(handler: Callable[[int, Any], None]) -> dict[int, Any]:
+    """Handle Ctrl-C and SIGTERM, and return their previous handlers."""
+    previous: dict[int, Any] = {}
+    with contextlib.suppress(ValueError):  # only the main thread may set handlers
+        for number in (int(signal.SIGINT), int(signal.SIGTERM)):
+            # a shell that starts a program in the background has it ignore SIGINT on purpose
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                previous[number] = signal.signal(number, handler)
+    return previous

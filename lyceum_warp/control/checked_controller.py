@@ -1,0 +1,143 @@
+"""A controller as the loops call it, with its results checked."""
+
+import inspect
+import json
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+
+from lyceum_warp.control.controller import Controller
+from lyceum_warp.env import Env
+from lyceum_warp.validate import described, positive_number
+
+
+class CheckedController:
+    """Calls a controller, checks its actions, and converts the plant's steps to the controller's.
+
+    Args:
+        controller: The controller.
+        env: The plant.
+
+    Raises:
+        ValueError: The controller cannot be called with a state and an observation, plans in the plant itself, or has
+            a time step that is not positive.
+    """
+
+    def __init__(self, controller: Controller, env: Env) -> None:
+        _check_call(controller)
+        if getattr(controller, "env", None) is env:
+            raise ValueError(
+                "the controller plans in the environment that it controls, and planning changes its state: control "
+                "another environment, made with lw.make(..., autoreset=False)"
+            )
+        self._controller: Any = controller
+        self._names = list(env.action_space.parts)
+        timestep = getattr(controller, "timestep", env.timestep)
+        self._ratio = env.timestep / positive_number("the timestep of a controller", timestep, "seconds")
+        self._takes_shift = _takes_argument(controller, "shift")
+
+    def __call__(self, state: torch.Tensor, obs: torch.Tensor, shift: int, step: int) -> torch.Tensor:
+        """Make a plan for a state.
+
+        Args:
+            state: State of the plant, (state_size,) float64.
+            obs: Its observation, (nobs,).
+            shift: Steps of the controller since the state of its last plan.
+            step: Step of the plant, for error messages.
+
+        Returns:
+            The plan, (horizon, nu) float32, a copy on the CPU. A controller without a plan returns one action, which
+            is a plan of horizon 1.
+
+        Raises:
+            ValueError: The plan has another shape, or is not finite.
+        """
+        action = self._controller(state, obs, **({"shift": shift} if self._takes_shift else {}))
+        plan = getattr(self._controller, "actions", None)
+        # the plan contains the action: copying both from a GPU would wait for it twice
+        return self._checked(action, 1, step)[None] if plan is None else self._checked(plan, 2, step)
+
+    def reset(self, seed: int | None) -> None:
+        """Call the controller's ``reset``, if it has one."""
+        if callable(reset := getattr(self._controller, "reset", None)):
+            reset(seed)
+
+    def quality(self) -> tuple[float, float]:
+        """Number of failed samples of the last plan, and its effective number of samples; NaN where unknown."""
+        summary = getattr(self._controller, "summary", None)
+        if not isinstance(summary, Mapping):
+            return math.nan, math.nan
+        failed, effective = (float(summary.get(name, math.nan)) for name in ("failed_samples", "effective_samples"))
+        # if all samples failed, the weights are not defined: no sample is effective
+        return failed, 0.0 if failed == getattr(self._controller, "samples", None) else effective
+
+    def steps(self, plant_steps: int) -> int:
+        """Convert steps of the plant to steps of the controller, rounded."""
+        return math.floor(plant_steps * self._ratio + 0.5 + 1e-9)
+
+    def index(self, plant_steps: int, horizon: int) -> int:
+        """Index in a plan of the action to apply so many steps of the plant after the plan's state."""
+        return min(self.steps(plant_steps), horizon - 1)
+
+    def description(self) -> dict[str, Any]:
+        """Name, settings, engine and device of the controller; see ``Trajectory.controller``."""
+        controller = self._controller
+        found: dict[str, Any] = {"name": getattr(controller, "__name__", type(controller).__name__)}
+        if (samples := getattr(controller, "samples", None)) is not None:
+            found["samples"] = samples
+        if isinstance(settings := getattr(controller, "settings", None), Mapping):
+            found |= settings
+        if isinstance(env := getattr(controller, "env", None), Env):
+            found |= {"engine": env.engine.name, "device": env.device.alias}
+        # through JSON, so that it equals what a file gives back; a value that JSON cannot hold becomes text
+        return dict(json.loads(json.dumps(found, default=str)))
+
+    def _checked(self, value: Any, ndim: int, step: int) -> torch.Tensor:
+        nu, axes = len(self._names), tuple(value.shape) if isinstance(value, torch.Tensor) else ()
+        if len(axes) != ndim or axes[-1] != nu or axes[0] == 0:
+            wanted = f"return an action of shape ({nu},)" if ndim == 1 else f"have actions of shape (horizon, {nu})"
+            raise ValueError(f"a controller must {wanted}, not {described(value)}")
+        plan: torch.Tensor = value.detach().to("cpu", torch.float32, copy=True)  # the next call may overwrite it
+        if not (finite := torch.isfinite(plan)).all():
+            where = (~finite).nonzero()[0].tolist()
+            number, name = plan[tuple(where)].item(), self._names[where[-1]]
+            raise ValueError(f"the controller's action {name!r} at step {step} must be finite, not {number}")
+        return plan
+
+
+def _check_call(controller: Any) -> None:
+    """Refuse an object that cannot be called with a state and an observation."""
+    if not callable(controller):
+        raise ValueError(
+            f"a controller must be callable with (state, obs), not {described(controller)}: give a function, or "
+            "lw.MPPI(...)"
+        )
+    forward = controller.forward if isinstance(controller, torch.nn.Module) else controller
+    if _takes(forward, 1) and not _takes(forward, 2):
+        raise ValueError(
+            f"a controller is called with (state, obs), and {type(controller).__name__} takes one argument: give "
+            "lambda state, obs: policy(obs)"
+        )
+
+
+def _takes(function: Callable[..., Any], count: int) -> bool:
+    """Whether a function can be called with so many arguments; True where its signature is unknown."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # of some functions written in C
+        return True
+    try:
+        signature.bind(*[None] * count)
+    except TypeError:
+        return False
+    return True
+
+
+def _takes_argument(function: Callable[..., Any], name: str) -> bool:
+    """Whether a function has an argument of this name; False where its signature is unknown."""
+    try:
+        return name in inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        return False

@@ -1,0 +1,184 @@
+"""What both loops share: the limits of an episode, its progress, and the collection of its steps and plans."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import torch
+
+from lyceum_warp.control.checked_controller import CheckedController
+from lyceum_warp.control.trajectory import Trajectory, provenance
+from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.env import Env
+from lyceum_warp.validate import whole_number
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True)
+class ControlProgress:
+    """Progress of an episode after a step; ``on_step`` is called with it."""
+
+    step: int
+    """Number of steps so far."""
+    time: float
+    """Seconds of the wall clock so far, this step included."""
+    reward: float
+    """Reward of the step."""
+    eval: float
+    """Evaluation metric of the state after the step."""
+    success: bool
+    """Whether the task's goal is met in that state."""
+    plan_time: float
+    """Seconds that the plan took from which the action was applied."""
+    age: float
+    """Age of the action when it was applied, seconds; see ``Trajectory.ages``."""
+    plans: int
+    """Number of plans up to and including that plan."""
+
+
+OnStep = Callable[[ControlProgress], object]
+OnAbort = Callable[[Trajectory], object]
+
+
+@dataclasses.dataclass(frozen=True)
+class TimedPlan:
+    """A finished plan, with its number and its times."""
+
+    index: int
+    step: int  # of the state from which it was made
+    begun: float  # by the clock of the run
+    seconds: float
+    actions: torch.Tensor  # (horizon, nu)
+
+
+def step_limit(env: Env, steps: int | None) -> int:
+    """The number of steps after which a run stops.
+
+    Raises:
+        ValueError: The environment has several worlds or automatic resets, or its episodes may never end.
+    """
+    if env.nworld != 1 or env.autoreset:
+        raise ValueError(
+            "a controller controls one world without automatic resets, not "
+            f"nworld={env.nworld}, autoreset={env.autoreset}: make(..., nworld=1, autoreset=False)"
+        )
+    if steps is not None:
+        return whole_number("steps", steps, low=1)
+    if env.horizon == 0:
+        raise ValueError(f"episodes of {env.task.name!r} may never end without a horizon: give steps, or a horizon")
+    return env.horizon
+
+
+def begin_episode(env: Env, controller: CheckedController, seed: int | None, *, reset: bool) -> None:
+    """Reset the plant and the controller, unless the run continues from their states.
+
+    Raises:
+        ValueError: A seed is given without a reset, or the episode is already over.
+    """
+    if reset:
+        env.rand_reset(seed)
+        controller.reset(seed)
+    elif seed is not None:
+        raise ValueError(f"seed={seed} has no effect with reset=False: leave out one of them")
+    if env.done.item():
+        raise ValueError("the episode is over before its first step: reset the environment, or leave out reset=False")
+
+
+class EpisodeCollector:
+    """Collects the states, actions, outcomes and plans of an episode, and makes a ``Trajectory`` of them.
+
+    For each step, a loop calls ``before_step``, steps the plant and calls ``after_step``.
+
+    Args:
+        env: The plant, in its initial state.
+        controller: Its controller.
+        mode: "sync" or "async"; see ``Trajectory.mode``.
+        period: Seconds of the wall clock between two steps.
+        seed: Seed of the run.
+        now: The clock.
+    """
+
+    def __init__(
+        self, env: Env, controller: CheckedController, *, mode: str, period: float, seed: int | None,
+        now: Callable[[], float] = time.perf_counter,
+    ) -> None:  # fmt: skip
+        self.env, self.mode, self.period, self.seed = env, mode, period, seed
+        self.controller = controller.description()
+        self.states, self.obs = [env.get_state()[0]], [env.obs[0].clone()]
+        self.times: list[float] = []
+        self._actions: list[torch.Tensor] = []
+        self._outcomes: list[tuple[float, float, bool]] = []
+        self._ages: list[float] = []
+        self._late: list[bool] = []
+        self._plan_of: list[int] = []
+        self._plans: list[tuple[int, float, float, float, float]] = []
+        self._applied: TimedPlan | None = None
+        self._now = now
+        self.start = now()
+
+    def restart_clock(self) -> None:
+        """Count seconds from now on. The clock started when the collector was made."""
+        self.start = self._now()
+
+    def elapsed(self) -> float:
+        """Seconds since the clock started."""
+        return self._now() - self.start
+
+    def add_plan(self, plan: TimedPlan, quality: tuple[float, float]) -> None:
+        """Add a finished plan.
+
+        Args:
+            plan: The plan.
+            quality: Number of failed samples, and effective number of samples.
+        """
+        self._plans.append((plan.step, plan.begun - self.start, plan.seconds, *quality))
+
+    def before_step(self, plan: TimedPlan, now: float, age: float, *, late: bool) -> None:
+        """Add the action in ``env.action``, which is about to be applied.
+
+        Args:
+            plan: The plan that it comes from.
+            now: Seconds since the clock started.
+            age: Age of the action, seconds.
+            late: Whether the step begins late.
+        """
+        self._actions.append(self.env.action[0].clone())
+        self.times.append(now)
+        self._ages.append(age)
+        self._late.append(late)
+        self._plan_of.append(plan.index)
+        self._applied = plan
+
+    def after_step(self, on_step: OnStep | None) -> None:
+        """Add the state, the observation and the outcome of a step, and report the progress."""
+        env = self.env
+        self.states.append(env.get_state()[0])
+        self.obs.append(env.final_obs[0].clone())
+        self._outcomes.append((env.reward.item(), env.eval.item(), bool(env.success.item())))
+        if on_step is not None:
+            assert self._applied is not None
+            plan_time, plans = self._applied.seconds, self._applied.index + 1
+            step, outcome, age = len(self._outcomes), self._outcomes[-1], self._ages[-1]
+            on_step(ControlProgress(step, self.elapsed(), *outcome, plan_time, age, plans))
+
+    def abort(self, on_abort: OnAbort | None, wall_seconds: float) -> None:
+        """Call ``on_abort`` with the steps so far, if there are any."""
+        if on_abort is not None and self._outcomes and self._plans:
+            on_abort(self.trajectory(wall_seconds, done_reason=0))
+
+    def trajectory(self, wall_seconds: float, done_reason: int) -> Trajectory:
+        """Make the trajectory of all complete steps."""
+        steps = len(self._outcomes)  # outcomes are added last: an interrupted step has none
+        rewards, evals, success = zip(*self._outcomes, strict=True)
+        plan_steps, *plans = zip(*self._plans, strict=True)
+        plan_starts, plan_times, failed, effective = (torch.tensor(column, dtype=torch.float64) for column in plans)
+        times, ages = (torch.tensor(column[:steps], dtype=torch.float64) for column in (self.times, self._ages))
+        return Trajectory(
+            states=torch.stack(self.states[: steps + 1]).cpu(), obs=torch.stack(self.obs[: steps + 1]).cpu(),
+            actions=torch.stack(self._actions[:steps]).cpu(), rewards=torch.tensor(rewards), evals=torch.tensor(evals),
+            success=torch.tensor(success), times=times, ages=ages, late=torch.tensor(self._late[:steps]),
+            plan_of=torch.tensor(self._plan_of[:steps]), plan_steps=torch.tensor(plan_steps), plan_starts=plan_starts,
+            plan_times=plan_times, plan_failed=failed, plan_effective=effective, timestep=self.env.timestep,
+            period=self.period, wall_seconds=wall_seconds, mode=self.mode, done_reason=done_reason, seed=self.seed,
+            controller=self.controller, **provenance(self.env),
+        )  # fmt: skip

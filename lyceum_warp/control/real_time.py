@@ -1,0 +1,302 @@
+"""The loop against the clock: the plant keeps its rate while a thread plans."""
+
+import atexit
+import contextlib
+import ctypes
+import math
+import queue
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from typing import Protocol
+
+import torch
+
+from lyceum_warp.control.checked_controller import CheckedController
+from lyceum_warp.control.controller import Controller
+from lyceum_warp.control.episode_collector import (
+    EpisodeCollector,
+    OnAbort,
+    OnStep,
+    TimedPlan,
+    begin_episode,
+    step_limit,
+)
+from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.env import Env
+from lyceum_warp.validate import positive_number, whole_number
+
+_SPIN = 0.0005  # seconds before its end that a wait stops sleeping and polls the clock
+_PATIENCE = 0.2  # seconds that an unfinished plan delays an exception at most
+_EXIT_PATIENCE = 5.0  # seconds that an unfinished plan delays the end of the program at most
+_SWITCH_INTERVAL = 0.0005  # seconds; Python's default of 5 ms is most of a fast plant's period
+
+
+@torch.no_grad()
+def control_async(
+    env: Env,
+    controller: Controller,
+    *,
+    period: float | None = None,
+    steps: int | None = None,
+    seconds: float | None = None,
+    seed: int | None = None,
+    reset: bool = True,
+    on_step: OnStep | None = None,
+    on_abort: OnAbort | None = None,
+) -> Trajectory:
+    """Control one world, the plant, that keeps its rate by the wall clock and does not wait for plans.
+
+    The plant steps in the calling thread. Step k is due at ``k * period``; a late step does not delay the steps after
+    it. The controller plans in a second thread, each time from the newest state, and never twice from the same state.
+
+    Each step applies the newest finished plan. If d simulated seconds have passed since the plan's state, the action is
+    number ``round(d / timestep)`` of the plan, or the last one if the plan is shorter. A controller without a plan has
+    one action only. This compensates for the planning delay up to the length of the plan. The plant waits for the first
+    plan, so the first action has the age 0. All others are at least one step old, and exactly one step if every plan
+    takes less than a period.
+
+    Before the clock starts, the controller is called three times with the first state, and the plant takes three steps
+    and is set back to its state: this loads kernels and captures graphs, because Warp must not capture a graph while
+    another thread launches kernels. For the same reason ``on_step`` must not evaluate given states (as
+    ``env.get_reward(before, action, after)`` does).
+
+    During the run Python switches between threads more often than usual (``sys.setswitchinterval``). To keep the plant
+    on time, leave a core to it with ``nthread`` of the planner's environment. Put the plant on the CPU: on the
+    planner's GPU both would share Warp's one stream, and each step would wait for the plan before it.
+
+    When the episode ends, the unfinished plan is completed and counted. When an exception ends the run (Ctrl-C
+    included), a plan that takes longer than 0.2 seconds is left to its thread, and the controller must not be used
+    until that thread has ended.
+
+    Args:
+        env: The plant: one world, made with ``autoreset=False``.
+        controller: Called in the second thread; see ``lw.Controller``. It plans in an environment of its own.
+        period: Seconds of the wall clock between steps; by default the plant's time step, which is real time.
+        steps: Steps after which to stop if the episode has not ended.
+        seconds: Seconds of the wall clock after which to stop if the episode has not ended.
+        seed: Seed of the initial state and of the controller.
+        reset: Whether to reset the plant and the controller first. With False the run continues from the plant's state
+            and the controller's last plan.
+        on_step: Called with a ``ControlProgress`` after each step, in the calling thread. Its time delays the plant.
+        on_abort: Called with the trajectory of the complete steps, if there are any, when an exception ends the run
+            (Ctrl-C included). ``done_reason`` of that trajectory is 0. The exception is raised afterwards.
+
+    Returns:
+        The episode.
+
+    Raises:
+        ValueError: The environment has several worlds or automatic resets, the episode is over or may never end, a
+            number is out of range, or the controller does not return a finite action of the right shape.
+        Exception: Any exception that the controller raises.
+    """
+    period = positive_number("period", env.timestep if period is None else period, "seconds")
+    if seconds is not None:
+        ticks = max(1, math.ceil(positive_number("seconds", seconds, "seconds") / period - 1e-9))
+        steps = ticks if steps is None else min(whole_number("steps", steps, low=1), ticks)
+    limit = step_limit(env, steps)
+    checked = CheckedController(controller, env)
+    begin_episode(env, checked, seed, reset=reset)
+    _capture_graphs(env)
+    clock = Clock()
+    episode = EpisodeCollector(env, checked, mode="async", period=period, seed=seed, now=clock.now)
+    planner = _PlannerThread(checked, clock, seed, reset=reset)
+    with _frequent_thread_switches():
+        try:
+            planner.publish(0, episode.states[0], episode.obs[0])
+            planner.wait()
+            episode.restart_clock()
+            wall = run_plant(env, checked, planner, clock, episode, limit, on_step)
+            planner.stop()
+            planner.check()
+        except BaseException:
+            wall = episode.elapsed()
+            planner.stop(_PATIENCE)
+            planner.add_plans(episode)
+            episode.abort(on_abort, wall)
+            raise
+    planner.add_plans(episode)
+    return episode.trajectory(wall, int(env.done_reason.item()))
+
+
+class Clock:
+    """The wall clock, with a wait that is more precise than a sleep."""
+
+    def now(self) -> float:
+        """Seconds since an arbitrary moment."""
+        return time.perf_counter()
+
+    def wait_until(self, moment: float) -> None:
+        """Sleep until shortly before a moment of this clock, then poll the clock."""
+        while (left := moment - self.now()) > _SPIN:
+            time.sleep(left - _SPIN)
+        while self.now() < moment:
+            pass
+
+
+class PlanSource(Protocol):
+    """Makes plans of published states: the planner's thread, or a simulation of it in a test."""
+
+    def newest(self) -> TimedPlan:
+        """The newest finished plan."""
+        ...
+
+    def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor) -> None:
+        """Make the next plan from this state, unless a newer one is published first."""
+        ...
+
+
+def run_plant(
+    env: Env,
+    controller: CheckedController,
+    plans: PlanSource,
+    clock: Clock,
+    episode: EpisodeCollector,
+    limit: int,
+    on_step: OnStep | None,
+) -> float:
+    """Step the plant by the clock until its episode ends; return the seconds up to the end of the last period."""
+    start, period = episode.start, episode.period
+    for k in range(limit):
+        due = start + k * period
+        late = k > 0 and clock.now() > due
+        clock.wait_until(due)
+        plan = plans.newest()
+        env.action[0] = plan.actions[controller.index(k - plan.step, len(plan.actions))]
+        now = episode.elapsed()
+        # the first action has the age 0: the clock started when its plan was finished
+        planned_from = episode.times[plan.step] if plan.step < k else now
+        episode.before_step(plan, now, now - planned_from, late=late)
+        if k > 0:
+            plans.publish(k, episode.states[k], episode.obs[k])
+        env.step()
+        episode.after_step(on_step)
+        if env.done.item():
+            break
+    clock.wait_until(start + (k + 1) * period)
+    return episode.elapsed()
+
+
+def _capture_graphs(env: Env) -> None:
+    """Step the plant until its graphs are captured, and set it back to its state."""
+    before = env.get_state()
+    for _ in range(3):
+        env.step()
+        env.get_state()
+    env.set_state(before)
+
+
+@contextlib.contextmanager
+def _frequent_thread_switches() -> Iterator[None]:
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(min(before, _SWITCH_INTERVAL))
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+class _PlannerThread:
+    """A thread that calls a controller with the newest published state.
+
+    Args:
+        controller: The controller.
+        clock: The clock of the run.
+        seed: Seed of the run.
+        reset: Whether the run began with a reset.
+    """
+
+    def __init__(self, controller: CheckedController, clock: Clock, seed: int | None, *, reset: bool) -> None:
+        self._controller, self._clock, self._seed, self._reset = controller, clock, seed, reset
+        self._plans: list[TimedPlan] = []
+        self._qualities: list[tuple[float, float]] = []  # of the plans; that of the last one may not be there yet
+        self._error: BaseException | None = None
+        self._begun = threading.Event()  # set after the first plan, or an error
+        # written in C: a thread switch cannot happen while one side holds a lock that the other needs
+        self._states: queue.SimpleQueue[tuple[int, torch.Tensor, torch.Tensor] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="lyceum_warp planner", daemon=True)
+        self._thread.start()
+
+    def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor) -> None:
+        """Make the next plan from this state, unless a newer one is published first. The tensors must not change."""
+        self._states.put((step, state, obs))
+
+    def wait(self) -> None:
+        """Wait for the first plan."""
+        self._begun.wait()
+        self.check()
+
+    def check(self) -> None:
+        """Raise the thread's exception, if there is one."""
+        if self._error is not None:
+            raise self._error
+
+    def newest(self) -> TimedPlan:
+        """The newest finished plan."""
+        self.check()
+        return self._plans[-1]
+
+    def stop(self, patience: float | None = None) -> None:
+        """End the thread after its unfinished plan.
+
+        Args:
+            patience: Seconds to wait for that plan, None for no limit. A thread that takes longer ends after its plan,
+                or with the program.
+        """
+        self._states.put(None)
+        self._thread.join(patience)
+        if self._thread.is_alive():
+            atexit.register(_interrupt, self._thread)
+
+    def add_plans(self, episode: EpisodeCollector) -> None:
+        """Add the finished plans to an episode."""
+        qualities = list(self._qualities)
+        plans = self._plans[: len(qualities) + 1]  # the thread may be about to add the quality of the last one
+        qualities += [(math.nan, math.nan)] * (len(plans) - len(qualities))
+        for plan, quality in zip(plans, qualities, strict=True):
+            episode.add_plan(plan, quality)
+
+    # in the thread
+
+    def _run(self) -> None:
+        try:
+            with torch.no_grad():  # of the calling thread does not hold here
+                last = 0
+                while (published := self._newest_state()) is not None:
+                    self._plan(*published, last)
+                    last = published[0]
+                    self._begun.set()
+        except BaseException as error:
+            self._error = error
+        finally:
+            self._begun.set()
+
+    def _newest_state(self) -> tuple[int, torch.Tensor, torch.Tensor] | None:
+        published = self._states.get()
+        while not self._states.empty():
+            published = self._states.get()
+        return published
+
+    def _plan(self, step: int, state: torch.Tensor, obs: torch.Tensor, last: int) -> None:
+        controller = self._controller
+        if not self._plans:
+            controller(state, obs, 0 if self._reset else 1, step)
+            controller(state, obs, 0, step)
+            if self._reset:
+                controller.reset(self._seed)
+        begun = self._clock.now()
+        actions = controller(state, obs, controller.steps(step) - controller.steps(last), step)
+        self._plans.append(TimedPlan(len(self._plans), step, begun, self._clock.now() - begun, actions))
+        self._qualities.append(controller.quality())  # after the plan, for which the plant may be waiting
+
+
+def _interrupt(thread: threading.Thread) -> None:
+    """End a planner's thread at the end of the program.
+
+    Python would free the memory on which the engine still computes, and crash. An exception that is set in the thread
+    is raised when the engine's call returns, which is one improvement of the plan and not all of them.
+    """
+    if thread.is_alive() and thread.ident is not None:
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread.ident), ctypes.py_object(SystemExit))
+        thread.join(_EXIT_PATIENCE)

@@ -1,0 +1,99 @@
+"""The Warp engine with steps that are equal to the bit on a CUDA device."""
+
+import contextlib
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import warp as wp
+
+from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
+from lyceum_warp.engines.deterministic.scratch import LARGEST_BUFFER, Scratch, ScratchSizes
+from lyceum_warp.engines.memory import check_fit
+from lyceum_warp.engines.warp.warp_engine import WarpEngine
+from lyceum_warp.fields import Field
+
+_TIMES_THE_MEMORY = 5
+"""The least of what a world takes by what it takes on the plain Warp engine: measured 5 to 7 times on hopper,
+half_cheetah and humanoid. ``prepare_capture`` measures it for the model at hand."""
+
+_FEW = 256
+"""Up to so many worlds fit into any memory: their scratch is not measured, and allocated when it is needed."""
+
+
+class DeterministicEngine(WarpEngine):
+    """A Warp engine that takes the same steps to the bit each time, as every engine does on the CPU.
+
+    It puts contacts and constraint rows in order, has MuJoCo Warp sum in a fixed order, and shares the memory that this
+    takes among all launches. Its arguments are those of ``WarpEngine``.
+    """
+
+    partial_refresh = False
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        nworld: int,
+        device: wp.Device,
+        fields: Iterable[Field],
+        *,
+        nconmax: int | None = None,
+        njmax: int | None = None,
+        unroll: bool = False,
+    ) -> None:
+        self._scratch = Scratch(device)
+        super().__init__(model, nworld, device, fields, nconmax=nconmax, njmax=njmax, unroll=unroll)
+        with wp.ScopedDevice(device):
+            self._order = CanonicalOrder(self.m, self.d, self._scratch.open)
+
+    @classmethod
+    def bytes_per_world(cls, model: mujoco.MjModel, fields: Iterable[Field], **options: Any) -> int:
+        return _TIMES_THE_MEMORY * super().bytes_per_world(model, fields, **options)
+
+    def bare(self) -> tuple[mjw.Model, mjw.Data]:
+        """Another model and data of MuJoCo Warp with the same options and sizes, to measure it alone.
+
+        Their graphs take about a hundred times the memory, as no scratch is shared.
+        """
+        model, data = super().bare()
+        with wp.ScopedDevice(self.device):
+            CanonicalOrder(model, data)  # lives on in the model's callbacks
+        return model, data
+
+    def prepare_capture(self) -> None:
+        """Measure the scratch that graphs need, and allocate it; this compiles the kernels of a step."""
+        if self.nworld < _FEW:
+            return
+        sizes = ScratchSizes.probe(self._captured_step)
+        if self.nworld > sizes.most:
+            raise ValueError(
+                f"{self.nworld} worlds need buffers of more than the {LARGEST_BUFFER / 1e9:.3g} GB in which Warp can "
+                f"sort with deterministic=True: use nworld={sizes.most} at most, or leave it out"
+            )
+        plain = super().bytes_per_world(self.model, self.fields.values(), nconmax=self.nconmax, njmax=self.njmax)
+        needed = sizes.bytes_of(self.nworld) / self.nworld
+        try:
+            check_fit(plain + needed, self.nworld, self.device, held=self.nworld * plain)
+        except ValueError as error:
+            raise ValueError(f"{error}, or leave deterministic=True out, which takes most of it") from None
+        self._scratch.add_block(sizes.bytes_of(self.nworld))
+
+    def _captured_step(self, nworld: int) -> Scratch:
+        model, data, scratch = self._put_model(), self._make_data(nworld), Scratch(self.device)
+        with wp.ScopedDevice(self.device), scratch.serving():
+            CanonicalOrder(model, data, scratch.open)
+            mjw.step(model, data)
+            with wp.ScopedCapture(self.device):
+                mjw.step(model, data)
+        return scratch
+
+    def _put_model(self) -> mjw.Model:
+        model = super()._put_model()
+        model.opt.deterministic = mjw.DeterminismType.ALL
+        return model
+
+    @contextlib.contextmanager
+    def _on_device(self) -> Iterator[None]:
+        with super()._on_device(), self._scratch.serving():
+            yield

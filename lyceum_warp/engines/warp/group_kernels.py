@@ -1,0 +1,61 @@
+"""Kernels that move the masked worlds into a small group and back, a few at a time.
+
+Each masked world has a rank; a group holds the worlds from rank ``first`` on.
+"""
+
+import warp as wp
+
+
+@wp.kernel(enable_backward=False)
+def rank_worlds(mask_in: wp.array[bool], rank_out: wp.array[int], count_inout: wp.array[int]):
+    """Number the masked worlds, in no particular order, from a count of 0 on."""
+    w = wp.tid()
+    if mask_in[w]:
+        rank_out[w] = wp.atomic_add(count_inout, 0, 1)
+
+
+@wp.kernel(enable_backward=False)
+def next_group(count_in: wp.array[int], step: int, first_inout: wp.array[int], left_out: wp.array[int]):
+    """Advance by ``step`` worlds, and count how many are left from there on."""
+    first = first_inout[0] + step
+    first_inout[0] = first
+    left_out[0] = wp.max(0, count_in[0] - first)
+
+
+@wp.kernel(enable_backward=False)
+def choose_group(mask_in: wp.array[bool], rank_in: wp.array[int], first_in: wp.array[int], world_out: wp.array[int]):
+    """The world in each place of a group."""
+    w = wp.tid()
+    if mask_in[w]:
+        place = rank_in[w] - first_in[0]
+        if place >= 0 and place < world_out.shape[0]:
+            world_out[place] = w
+
+
+@wp.kernel(enable_backward=False)
+def take_rows(
+    world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array2d[float], target_out: wp.array2d[float]
+):
+    """Copy rows of the worlds in a group into the group."""
+    place, i = wp.tid()
+    if place < left_in[0]:
+        target_out[place, i] = source_in[world_in[place], i]
+
+
+@wp.kernel(enable_backward=False)
+def return_rows(
+    world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array2d[float], target_out: wp.array2d[float]
+):
+    """Copy rows of a group into the worlds that they belong to."""
+    place, i = wp.tid()
+    if place < left_in[0]:
+        target_out[world_in[place], i] = source_in[place, i]
+
+
+@wp.kernel(enable_backward=False)
+def return_bits(world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array[int], target_inout: wp.array[int]):
+    """Add bits of a group to those of the worlds that they belong to."""
+    place = wp.tid()
+    if place < left_in[0]:
+        world = world_in[place]
+        target_inout[world] = target_inout[world] | source_in[place]

@@ -1,0 +1,35 @@
+"""Files that are replaced whole, and formats that a newer release may have changed."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """Replace a file in one go: a reader finds the old file or the whole new one.
+
+    The block writes into the path that it is given, a temporary file beside the target. If the block raises, the target
+    stays as it is and the temporary file is deleted.
+    """
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def newer_format(path: Path, number: int, known: int) -> ValueError:
+    """The error for a file that a newer release wrote.
+
+    Args:
+        path: The file.
+        number: Its format.
+        known: The newest format that this release can read.
+    """
+    return ValueError(
+        f"{path} was written by a newer lyceum_warp (format {number}, this one reads up to {known}): "
+        "pip install --upgrade lyceum-warp"
+    )

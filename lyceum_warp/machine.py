@@ -1,0 +1,22 @@
+"""What this process may use of the machine: CPU cores and memory."""
+
+import os
+from pathlib import Path
+
+import warp as wp
+
+
+def cpu_cores() -> int:
+    """Number of CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def free_memory(device: wp.Device) -> int | None:
+    """Free bytes on a device, or None where the system does not report them."""
+    if device.is_cuda:
+        return int(device.free_memory)
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable")) * 1024
+    except (OSError, StopIteration, ValueError, IndexError):
+        return None

@@ -1,0 +1,46 @@
+"""The common style of all plots: figure, colours, axes, file."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from lyceum_warp.viz import EXTRA
+
+LINE, ACCENT, GRID = "#7a8ba3", "#c8502d", "#e4e7eb"
+
+
+def new_figure(purpose: str, width: float, height: float) -> Any:
+    """Make a figure, without pyplot: it needs no display, and shares no state with a user's own figures.
+
+    Args:
+        purpose: What is drawn, for the error message.
+        width: Width in inches.
+        height: Height in inches.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError(f"drawing {purpose} needs matplotlib: {EXTRA}") from error
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def finish_axes(all_axes: Iterable[Any]) -> None:
+    """Add a grid behind the lines, and remove the upper and the right border."""
+    for axes in all_axes:
+        axes.grid(color=GRID)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+
+
+def save_png(figure: Any, out: str | Path) -> Path:
+    """Write a figure to a PNG file, and make the folder for it; return the path."""
+    path = Path(out)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150, format="png")
+    return path

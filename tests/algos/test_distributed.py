@@ -1,0 +1,275 @@
+"""NPG in several processes: the same worlds, the same update, and a run that any number of them can continue."""
+
+import contextlib
+import csv
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.algos import distributed
+from lyceum_warp.algos.distributed import Team
+from lyceum_warp.runs import Run
+
+# everything that might differ between one process and two: unfinished episodes, a normaliser, a part of the samples
+# for the Fisher information, a smaller last mini-batch, an evaluation
+OPTIONS = ["--samples", "600", "--nworld", "12", "--hidden", "8", "--value-hidden", "8", "--mean-every", "1",
+           "--mean-episodes", "2", "--rollout", "segments", "--normalize", "--time-orders", "2",
+           "--fisher-fraction", "0.34"]  # fmt: skip
+QUIET = ["--no-video", "--no-plot"]
+
+
+def torchrun(
+    *arguments: str, options: list[str], program: tuple[str, ...] = ("-m", "lyceum_warp.cli")
+) -> subprocess.Popen[str]:
+    """``torchrun``, from this Python, on the loopback interface."""
+    command = [sys.executable, "-m", "torch.distributed.run", *options, *program, *arguments]
+    environment = os.environ | {"GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+    )  # fmt: skip
+
+
+def ended(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:
+    """Exit codes, outputs and error outputs."""
+    try:
+        outputs = [process.communicate(timeout=120) for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    return [(process.returncode, *texts) for process, texts in zip(processes, outputs, strict=True)]
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return listener.getsockname()[1]
+
+
+def table(run: Path) -> list[dict[str, float]]:
+    """The metrics without measured times."""
+    with (run / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    clocks = {name for name in rows[0] if "time" in name or name == "samples_per_second"}
+    return [{name: float(cell or "nan") for name, cell in row.items() if name not in clocks} for row in rows]
+
+
+def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
+    """The same numbers in the tables' last rows and in the checkpoints, to rounding."""
+    row, expected = table(one)[-1], table(other)[-1]
+    for name in expected:
+        np.testing.assert_allclose(row[name], expected[name], rtol=tolerance, atol=tolerance, err_msg=name)
+    state, wanted = (Run.open(folder).read()["state"] for folder in (one, other))
+    assert torch.equal(state["generator"], wanted["generator"])
+    close = dict(rtol=tolerance, atol=tolerance)
+    for part in ("policy", "value"):
+        for name, tensor in wanted[part].items():
+            torch.testing.assert_close(state[part][name], tensor, **close)
+    torch.testing.assert_close(state["returns"], wanted["returns"], **close, equal_nan=True)
+    if tolerance < 1e-4:  # later on a foot may touch the ground a step earlier
+        torch.testing.assert_close(state["env"], wanted["env"], **close)
+
+
+def test_two_machines_make_the_same_update_as_one_process(tmp_path: Path) -> None:
+    """Two torchrun commands, as on two machines, against one process; one process continues their run."""
+    two, one = tmp_path / "two", tmp_path / "one"
+    arguments = ["train", "hopper", *OPTIONS, *QUIET]
+    endpoint = f"--rdzv-endpoint=127.0.0.1:{free_port()}"
+    launch = ["--nnodes=2", "--nproc-per-node=1", "--monitor-interval=0.1", "--rdzv-backend=c10d", endpoint,
+              "--local-addr=127.0.0.1"]  # fmt: skip
+    machines = [torchrun(*arguments, "--iterations", "1", "--out", str(two), options=launch) for _ in range(2)]
+    assert cli.main([*arguments, "--iterations", "1", "--out", str(one)]) == 0  # meanwhile
+    results = ended(machines)
+    assert [code for code, _, _ in results] == [0, 0], results
+    assert not any("terminate called" in error for _, _, error in results)
+    # only one of them writes messages
+    outputs = sorted((out for _, out, _ in results), key=len)
+    assert outputs[0] == ""
+    assert "6 worlds each in 2 processes" in outputs[1] and "iteration    1/1" in outputs[1]
+    assert Run.open(two).config == Run.open(one).config
+    assert_equal_runs(two, one, tolerance=2e-5)
+    for run in (one, two):
+        assert cli.main(["train", "--resume", str(run), "--iterations", "2", *QUIET]) == 0
+    assert_equal_runs(two, one, tolerance=2e-3)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+def test_gpu_two_processes_make_the_same_update_as_one_and_end(tmp_path: Path) -> None:
+    """Through NCCL, which is part of the value fit's graph."""
+    two, one = tmp_path / "two", tmp_path / "one"
+    arguments = ["train", "hopper", *OPTIONS, *QUIET, "--device", "cuda", "--iterations", "1", "--out"]
+    assert cli.main([*arguments, str(one)]) == 0
+    [(code, _, error)] = ended([torchrun(*arguments, str(two), options=["--standalone", "--nproc-per-node=2"])])
+    assert code == 0, error
+    assert_equal_runs(two, one, tolerance=1e-3)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+def test_gpu_two_processes_end_when_torchrun_is_interrupted(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    arguments = ["train", "hopper", *OPTIONS, *QUIET, "--device", "cuda", "--iterations", "100000", "--out", str(run)]
+    process = torchrun(*arguments, options=["--standalone", "--nproc-per-node=2"])
+    assert process.stdout is not None
+    output = ""
+    for line in process.stdout:
+        output += line
+        if "iteration    2/" in line:
+            process.send_signal(signal.SIGTERM)
+            break
+    rest, error = process.communicate(timeout=25)  # after 30 s torchrun kills them
+    rows = table(run)
+    assert f"interrupted by SIGTERM after {len(rows)} of 100000 iterations" in output + rest, (output, rest, error)
+    assert Run.open(run).read()["iteration"] == len(rows) >= 2
+
+
+INTERRUPTED = """
+import os, signal, sys
+from lyceum_warp import NPG
+from lyceum_warp.cli import main
+
+where, rank = sys.argv.pop(1), sys.argv.pop(1)
+state_dict = NPG.state_dict
+
+def interrupting(npg):
+    state = state_dict(npg)
+    if npg.iteration == 2:
+        signal.raise_signal(signal.SIGTERM)
+    return state
+
+def interrupted(*args):
+    signal.raise_signal(signal.SIGTERM)
+
+if os.environ["RANK"] == rank:
+    if where == "learning":
+        NPG.state_dict = interrupting
+    else:
+        sys.modules["lyceum_warp.cli.train"]._algorithm = interrupted
+sys.exit(main())
+"""
+
+
+@pytest.mark.slow
+def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
+    """While they learn, they complete the iteration together; before that, the run leaves nothing behind."""
+    program, run = tmp_path / "interrupted.py", tmp_path / "learning"
+    program.write_text(INTERRUPTED)
+    arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations", "100000", "--out"]
+    options = ["--standalone", "--nproc-per-node=2"]
+    processes = [
+        torchrun(*arguments, str(tmp_path / where), options=options, program=(str(program), where, rank))
+        for where, rank in (("learning", "1"), ("beginning", "0"))
+    ]
+    (code, out, error), (early, nothing, early_error) = ended(processes)
+    assert code != 0 and early != 0
+    assert "interrupted by SIGTERM after 2 of 100000 iterations; continue with" in out, (out, error)
+    assert len(table(run)) == Run.open(run).read()["iteration"] == 2
+    assert nothing == "" and not (tmp_path / "beginning").exists()
+    assert "lyceum_warp/" not in error + early_error, (error, early_error)  # no traceback
+
+
+@pytest.mark.slow
+def test_an_error_in_one_process_ends_all_and_two_processes_continue_the_run_of_one(tmp_path: Path) -> None:
+    """The error is one that only the first process can see: the folder is taken."""
+    launch = ["--standalone", "--nproc-per-node=2"]
+    run, other = tmp_path / "run", tmp_path / "other"
+    arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations"]
+    assert cli.main([*arguments, "1", "--out", str(run)]) == 0
+    resume = ["train", "--resume", str(run), "--iterations", "2", *QUIET]
+    processes = [torchrun(*command, options=launch) for command in ([*arguments, "1", "--out", str(run)], resume)]
+    assert cli.main([*arguments, "2", "--out", str(other)]) == 0  # meanwhile
+    refused, resumed = ended(processes)
+    code, out, error = refused
+    assert code != 0 and out == "", refused
+    assert error.count(f"lyceum-warp: {run} holds a run") == 1
+    assert "lyceum_warp/algos" not in error  # no traceback of the other
+    code, out, error = resumed
+    assert code == 0 and out.count("iteration    2/2") == 1, resumed
+    assert_equal_runs(run, other, tolerance=2e-3)
+
+
+def test_first_world_selects_the_random_streams_of_the_worlds() -> None:
+    whole, part = lw.make("hopper", nworld=5), lw.make("hopper", nworld=2, first_world=3)
+    assert torch.equal(part.obs, whole.obs[3:])
+    for env in (whole, part):
+        env.rand_reset(4)
+        env.rand_reset()
+    assert torch.equal(part.obs, whole.obs[3:])
+    assert part.first_world == 3
+    assert part.replicate(nworld=1).first_world == 0
+
+
+def test_locate_finds_samples_among_those_of_a_processs_own_worlds() -> None:
+    """Of 4 steps of 6 worlds, shared by 3 processes."""
+    index = torch.arange(24)
+    samples = index.view(4, 6)
+    for rank in range(3):
+        places, own = Team(rank, 3).locate(index, 2)
+        mine = samples[:, 2 * rank : 2 * rank + 2]
+        assert torch.equal(index[own], mine.flatten())
+        assert torch.equal(mine.flatten()[places[own]], index[own])
+        assert not places[~own].any()
+
+
+def test_worlds_that_cannot_be_shared_evenly_are_refused() -> None:
+    assert Team(0, 3).share(9) == 3
+    with pytest.raises(ValueError, match="3 processes cannot share 8 worlds evenly: use a multiple of 3"):
+        Team(0, 3).share(8)
+    with pytest.raises(ValueError, match="needs an environment with first_world=4, not 0"):
+        lw.NPG(lw.make("point_mass", nworld=4), team=Team(1, 2))
+
+
+def test_fewer_gpus_than_processes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    for name, value in {"WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1"}.items():
+        monkeypatch.setenv(name, value)
+    refused = pytest.raises(ValueError, match="2 processes on this machine need a GPU each, and it has 1")
+    with refused, distributed.join("cuda"):
+        pass
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_graphs_are_reset_before_the_process_group_is_destroyed(fails: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """NCCL would wait for the graphs; after an error it may wait for other processes, too, and is not destroyed."""
+    order = []
+
+    class Graph:
+        def reset(self) -> None:
+            order.append("graph")
+
+    group = torch.distributed
+    for name, answer in {"init_process_group": None, "get_rank": 0, "get_backend": "nccl"}.items():
+        monkeypatch.setattr(group, name, lambda *args, answer=answer, **options: answer)
+    monkeypatch.setattr(group, "destroy_process_group", lambda: order.append("group"))
+    for name in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"):
+        monkeypatch.setenv(name, "2")
+    monkeypatch.setenv("MASTER_ADDR", "127.0.0.1")
+    graph = Graph()
+    with contextlib.suppress(KeyError), distributed.join("cpu") as team:
+        team.keep(graph)  # type: ignore[arg-type]
+        team.keep(Graph())  # type: ignore[arg-type]  # nothing refers to it any more
+        if fails:
+            raise KeyError
+    assert order == (["graph"] if fails else ["graph", "group"])
+
+
+def test_a_team_of_one_process_does_not_communicate() -> None:
+    with distributed.join("cpu") as team:
+        numbers = torch.arange(3.0)
+        assert team.leads and team.captures
+        assert team.sum(numbers) is numbers and team.gather(numbers) is numbers
+        team.copy_leader([numbers])
+        with team.together():
+            pass
+        with pytest.raises(KeyError), team.together():
+            raise KeyError
+    assert not torch.distributed.is_initialized()

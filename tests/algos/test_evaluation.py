@@ -1,0 +1,60 @@
+"""Evaluation of policies in whole episodes."""
+
+import numpy as np
+import pytest
+import torch
+
+import lyceum_warp as lw
+from lyceum_warp.algos.evaluation import moved
+
+
+def test_evaluate_leaves_no_gradients() -> None:
+    env = lw.make("point_mass", nworld=2)
+    lw.evaluate(env, lw.GaussianPolicy(env.obs_space.size, env.action_space.size), 2)
+    assert not env.action.requires_grad
+
+
+def test_evaluate_takes_the_same_number_of_episodes_of_every_world() -> None:
+    """Worlds with short episodes contribute no more of them; the numbers are those of a plain loop."""
+    env = lw.make("hopper", nworld=4, horizon=60)
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
+    got = lw.evaluate(env, policy, 8, seed=3)
+    env.rand_reset(3)
+    total, lengths, expected = torch.zeros(4), [0] * 4, [[] for _ in range(4)]
+    while min(map(len, expected)) < 2:
+        with torch.no_grad():
+            env.step(policy(env.obs))
+        total += env.reward
+        for w in range(4):
+            lengths[w] += 1
+            if env.done[w]:
+                expected[w].append((total[w].item(), lengths[w], env.eval[w].item()))
+                total[w], lengths[w] = 0.0, 0
+    flat = [episodes[i] for i in range(2) for episodes in expected]
+    np.testing.assert_allclose(got.returns, [e[0] for e in flat], rtol=1e-5)
+    np.testing.assert_array_equal(got.lengths, [e[1] for e in flat])
+    np.testing.assert_allclose(got.evals, [e[2] for e in flat], rtol=1e-5)
+
+
+def test_evaluate_needs_automatic_resets_and_a_horizon() -> None:
+    policy = lw.GaussianPolicy(6, 2)
+    with pytest.raises(ValueError, match="autoreset=True"):
+        lw.evaluate(lw.make("point_mass", autoreset=False), policy, 1)
+    with pytest.raises(ValueError, match="give make.. a horizon"):
+        lw.evaluate(lw.make("point_mass", horizon=0), policy, 1)
+
+
+def test_parameters_of_each_world_reach_the_worlds_of_the_mean_policy() -> None:
+    """Those that are changed later, too."""
+    env = lw.make("point_mass", nworld=4, horizon=12, success_distance=[0.0, 9.0, 0.0, 9.0])
+    config = lw.NPGConfig(samples=320, hidden=(8, 8), value_hidden=(16,), mean_every=1, mean_episodes=6)
+    npg = lw.NPG(env, config=config)
+    assert next(npg).mean_success == 0.5
+    env.set_params(success_distance=9.0)
+    it = next(npg)
+    assert it.mean_success == it.success == 1.0
+
+
+def test_a_module_on_the_right_device_is_not_copied() -> None:
+    policy = lw.GaussianPolicy(6, 2)
+    assert moved(policy, lw.make("point_mass")) is policy

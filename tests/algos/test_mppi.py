@@ -1,0 +1,482 @@
+"""MPPI against a plain version of it, in use, and in control of tasks.
+
+The planner's own arithmetic is float32; the plain version's is float64, and so the two drift apart by roundings.
+"""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from plain_mppi import Plain, PlainReach
+from rail_task import Picky, rail
+
+import lyceum_warp as lw
+from lyceum_warp import MPPI, Row
+from lyceum_warp.tasks.reach import arm
+
+ENGINES = ["mujoco", "warp"]
+BUFFERS = ("actions", "nominal", "standard_noise", "sampled", "returns", "weights")
+
+
+def place(obs: torch.Tensor) -> torch.Tensor:
+    """A value of point_mass: far from the target and fast is bad."""
+    return -2 * (obs[:, 0] - obs[:, 4]).abs() - 0.1 * obs[:, 2] * obs[:, 3]
+
+
+def reached(seed: int) -> tuple[lw.Env, torch.Tensor]:
+    plant = lw.make("reach", seed=seed)
+    return plant, plant.get_state()[0]
+
+
+def falling_hopper(plant: lw.Env) -> torch.Tensor:
+    """A hopper that leans and turns: it falls within a few steps, when exactly depends on its actions."""
+    plant.reset()
+    state, parts = plant.get_state(), plant.state_space.parts
+    state[:, parts["qpos"].start + 2], state[:, parts["qvel"].start + 2] = 0.15, 3.0
+    plant.set_state(state)
+    return state[0]
+
+
+def heavy_arm() -> mujoco.MjSpec:
+    spec = arm()
+    for geom in spec.body("forearm").geoms:
+        geom.density = 5000
+    return spec
+
+
+# planning of the task has other weights for the planner's worlds
+HOPPER = dict(task="hopper", horizon=12, samples=24, temperature=0.5, noise=0.8, healthy_reward=1.0,
+              forward_reward_weight=1.0, integrator="euler")  # fmt: skip
+POINT = dict(task="point_mass", horizon=9, samples=40, temperature=0.3)
+REACH = dict(task="reach", horizon=16, samples=30, temperature=0.2, noise=1.0)
+CASES: dict[str, dict[str, Any]] = {
+    "reach": REACH,
+    "stop": HOPPER | dict(termination="stop"),
+    "ignore": HOPPER | dict(termination="ignore"),
+    "value": POINT | dict(noise=[0.3, 0.6], discount=0.9, value=place, iterations=2, fill="repeat"),
+    "covariance": POINT | dict(noise=[[0.3, 0.2], [0.2, 0.25]], smoothing=(0.5, 0.3, 0.2), fill=[0.5, -0.25]),
+    "negative": POINT | dict(noise=[[0.3, -0.2], [-0.2, 0.25]], discount=0.5, iterations=3),
+    "frame_skip": REACH | dict(frame_skip=3),
+    "model": REACH | dict(model=heavy_arm),
+}
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("case", CASES)
+def test_plans_equal_those_of_the_plain_version(case: str, engine: str) -> None:
+    """In actions, returns and weights, call after call, while the plant moves."""
+    check_against(Plain, engine, **CASES[case])
+
+
+def test_plans_for_reach_equal_those_of_mujoco_and_numpy_alone() -> None:
+    check_against(PlainReach, "mujoco", **REACH)
+
+
+def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1, **settings: Any) -> None:
+    if callable(settings.get("model")):
+        settings["model"] = settings["model"]()
+    plan = MPPI(task, engine=engine, seed=5, iterations=iterations, **settings)
+    plain = kind(task, engine=engine, **settings)
+    # random numbers depend on the seed and on how many came before: a twin draws those of every iteration
+    twin = MPPI(task, seed=5, samples=plan.samples, horizon=plan.horizon, iterations=1)
+    plant = lw.make(task, engine=engine, seed=3, autoreset=False)
+    if task == "hopper":
+        falling_hopper(plant)
+    starts = set()
+    for call in range(5):
+        state = plant.get_state()[0]
+        starts.add(tuple(state.tolist()))
+        noises = []
+        for _ in range(iterations):
+            twin(twin.state_of())
+            noises.append(twin.standard_noise.double().numpy())
+        shift = (1, 1, 2, 0, 1)[call]
+        action = plan(state, shift=shift)
+        assert np.array_equal(plan.standard_noise.numpy(), noises[-1])
+        plain(state, noises, shift)
+        if task == "hopper" and call == 0:
+            steps = {plain.ended[:, k].argmax() for k in plain.ended.any(axis=0).nonzero()[0]}
+            assert len(steps) > 1 and not plain.ended.all(axis=0).any(), "they should end at different times"
+        assert torch.equal(action, plan.actions[0])
+        np.testing.assert_allclose(plan.sampled, plain.sampled, atol=2e-6, err_msg=f"samples of call {call}")
+        np.testing.assert_allclose(plan.returns, plain.returns, atol=5e-5, rtol=5e-6, err_msg=f"returns of call {call}")
+        np.testing.assert_allclose(plan.weights, plain.weights, atol=1e-4, err_msg=f"weights of call {call}")
+        np.testing.assert_allclose(plan.actions, plain.actions, atol=2e-4, err_msg=f"plan of call {call}")
+        summary = plan.summary
+        assert summary["best_return"] == pytest.approx(plain.returns.max(), rel=1e-4)
+        assert summary["mean_return"] == pytest.approx(plain.returns.mean(), rel=1e-4)
+        assert summary["effective_samples"] == pytest.approx(1 / (plain.weights**2).sum(), rel=1e-2)
+        assert summary["failed_samples"] == 0
+        plain.actions = plan.actions.double().numpy()  # low temperatures would make differences grow
+        plant.step(action[None])
+    assert len(starts) == 5
+
+
+def test_a_sample_that_stops_at_its_end_earns_less_than_one_that_goes_on() -> None:
+    state = falling_hopper(lw.make("hopper"))
+    stop, ignore = (MPPI(seed=1, **HOPPER | dict(termination=word)) for word in ("stop", "ignore"))
+    stop(state), ignore(state)
+    assert torch.equal(stop.sampled, ignore.sampled)
+    assert not torch.allclose(stop.returns, ignore.returns, atol=0.1)
+
+
+def test_the_terminal_value_belongs_to_samples_that_did_not_end() -> None:
+    state = falling_hopper(lw.make("hopper"))
+    stop = MPPI(seed=1, **HOPPER)
+    value = MPPI(seed=1, **HOPPER | dict(value=lambda obs: torch.full((len(obs),), 100.0)))
+    stop(state), value(state)
+    assert set((value.returns - stop.returns).round().tolist()) == {0.0, 100.0}
+
+
+# seeds and resets
+
+
+def numbers(plan: MPPI, state: torch.Tensor, calls: int = 4) -> list[torch.Tensor]:
+    """Every number of a few plans in a row."""
+    result = []
+    for _ in range(calls):
+        result.append(plan(state))
+        result += [getattr(plan, name).clone() for name in BUFFERS]
+    return result
+
+
+def same(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def test_equal_seeds_give_equal_plans_and_other_seeds_other_plans() -> None:
+    plan, twin, other = (MPPI("reach", seed=seed, horizon=8, samples=10) for seed in (4, 4, 5))
+    _, state = reached(0)
+    first = numbers(plan, state)
+    assert same(first, numbers(twin, state))
+    for a, b in zip(first, numbers(other, state), strict=True):
+        assert not torch.equal(a, b) or not a.any()  # the first plan starts from zeros
+
+
+def test_reset_starts_the_plan_and_the_noise_again() -> None:
+    plan, other = (MPPI("reach", seed=seed, horizon=8, samples=10) for seed in (4, 5))
+    _, state = reached(0)
+    first = numbers(plan, state)
+    assert not same(first, numbers(plan, state)), "without a reset, plans and noise go on"
+    plan.reset()
+    assert not plan.actions.any()
+    assert same(first, numbers(plan, state))
+    plan.reset(5)
+    assert same(numbers(plan, state), numbers(other, state))
+
+
+def test_an_action_is_a_copy_of_the_plans_first_row() -> None:
+    plan = MPPI("reach", horizon=8, samples=10)
+    action = plan(reached(0)[1])
+    assert torch.equal(action, plan.actions[0]) and action.data_ptr() != plan.actions.data_ptr()
+
+
+# failed samples
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("how", ["reward", "physics", "value"])
+def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
+    """After a reward or value that is not a number, or a roll-out that diverges."""
+    settings: dict[str, Any] = dict(horizon=4, samples=40, smoothing=(1, 0, 0), temperature=1.0, engine=engine)
+    if how == "physics":
+        # motors so strong that only small actions keep MuJoCo's accelerations, and Warp's velocities, under 1e10
+        settings |= dict(noise=1.0, limit=1e9, model=rail({"mujoco": 1e10, "warp": 2.5e12}[engine]))
+    elif how == "value":
+        settings |= dict(noise=1.0, limit=1e9, value=lambda obs: torch.where(obs[:, 0] > 0, torch.nan, 1.0))
+    else:
+        settings |= dict(noise=0.3)
+    plan = MPPI(Picky, **settings)
+    for _ in range(4):
+        state = plan.state_of()
+        plan(state)
+        bad = torch.isinf(plan.returns)
+        assert 0 < bad.sum() < 40, "all or none failed: nothing was tested"
+        if how == "reward":
+            assert torch.equal(bad, (plan.sampled > 0.5).any(0).any(-1))
+        good = plan.sampled[:, ~bad].double()
+        weights = torch.softmax(plan.returns[~bad].double(), 0)
+        assert not plan.weights[bad].any()
+        torch.testing.assert_close(plan.weights[~bad].double(), weights, atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(plan.actions.double(), torch.einsum("k,tki->ti", weights, good), atol=1e-4, rtol=0)
+        summary = plan.summary
+        assert summary["failed_samples"] == bad.sum()
+        assert summary["mean_return"] == pytest.approx(plan.returns[~bad].mean().item(), rel=1e-4, abs=1e-5)
+        assert summary["effective_samples"] == pytest.approx(1 / (weights**2).sum().item(), rel=1e-3)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_plan_whose_samples_all_fail_only_moves_forward(engine: str) -> None:
+    plan = MPPI(Picky, engine=engine, horizon=5, samples=8, noise=0.1, limit=10.0, seed=3)
+    plan(plan.state_of())
+    for _ in range(3):
+        old = plan.actions.clone()
+        plan.env.set_params(limit=-10.0)
+        action = plan(plan.state_of())
+        assert torch.equal(plan.actions, torch.cat([old[1:], torch.zeros(1, 1)]))
+        assert torch.equal(action, old[1]) and not plan.weights.any()
+        assert plan.summary["failed_samples"] == 8 and plan.summary["best_return"] == -np.inf
+        plan.env.set_params(limit=10.0)
+        plan(plan.state_of())
+        assert plan.summary["failed_samples"] == 0 and torch.isfinite(plan.actions).all()
+
+
+def test_samples_may_have_parameters_of_their_own() -> None:
+    """With one limit for each world, half of the samples fail."""
+    plan = MPPI(Picky, horizon=3, samples=6, noise=0.1, limit=np.array([-9.0, 9.0] * 3))
+    plan(plan.state_of())
+    assert torch.isinf(plan.returns).tolist() == [True, False] * 3
+
+
+# bounds and the plan's end
+
+
+def test_actions_stay_within_the_bounds_of_the_controls() -> None:
+    plan = MPPI("reach", noise=10.0, temperature=1e-3)
+    low, high = (torch.from_numpy(bound) for bound in (plan.env.action_space.low, plan.env.action_space.high))
+    plant, _ = reached(1)
+    for _ in range(4):
+        plant.step(plan(plant.get_state()[0])[None])
+        assert (plan.sampled >= low).all() and (plan.sampled <= high).all()
+        assert (plan.actions >= low).all() and (plan.actions <= high).all()
+        at_bounds = (plan.sampled == low) | (plan.sampled == high)
+        assert at_bounds.float().mean() > 0.5
+
+
+def test_actions_of_controls_without_limits_are_not_clipped() -> None:
+    free = MPPI(Picky, noise=10.0, horizon=4, limit=1e9)
+    free(free.state_of())
+    assert free.sampled.abs().max() > 10
+
+
+@pytest.mark.parametrize("fill", ["zero", "repeat", 0.5, [0.5, -0.25]])
+def test_plans_move_forward_by_the_steps_that_have_passed(fill: Any) -> None:
+    H = 6
+    plan = MPPI("point_mass", horizon=H, samples=5, fill=fill)
+    end = torch.zeros(2) if isinstance(fill, str) else torch.tensor(fill).expand(2)
+    assert torch.equal(plan.actions, end.expand(H, 2)), "the plan at first"
+    plan(plan.state_of())
+    for shift in (None, 0, 1, 3, H, H + 5):
+        old = plan.actions.clone()
+        plan(plan.state_of(), **({} if shift is None else {"shift": shift}))
+        steps = 1 if shift is None else shift
+        last = old[-1] if fill == "repeat" else end
+        expected = torch.cat([old[min(steps, H) :], last.expand(min(steps, H), 2)])
+        assert torch.equal(plan.nominal, expected), f"shift={shift}"
+
+
+@pytest.mark.parametrize("shift", [-1, 0.5, "a"])
+def test_a_shift_that_is_not_a_whole_number_is_refused(shift: Any) -> None:
+    plan = MPPI("point_mass", horizon=3, samples=2)
+    with pytest.raises(ValueError, match="shift must be a whole number from 0"):
+        plan(plan.state_of(), shift=shift)
+
+
+def test_a_fill_beyond_the_bounds_becomes_the_nearest_action() -> None:
+    model = rail(limits='ctrllimited="true" ctrlrange="0.2 0.4"')
+    for fill, filled in (("zero", 0.2), ([9.0], 0.4), ([0.25], 0.25)):
+        plan = MPPI(Picky, horizon=3, model=model, fill=fill)
+        torch.testing.assert_close(plan.actions, torch.full((3, 1), filled))
+
+
+def test_more_iterations_give_better_samples() -> None:
+    _, state = reached(0)
+    results = []
+    for iterations in (1, 8):
+        plan = MPPI("reach", iterations=iterations, noise=0.3)
+        plan(state)
+        results.append(plan.summary["mean_return"])
+    assert results[1] > results[0] + 1
+
+
+def test_several_iterations_move_the_plan_forward_once() -> None:
+    plan = MPPI("point_mass", horizon=5, iterations=3, noise=1e-6, temperature=1e9)
+    plan.actions.copy_(torch.linspace(0, 0.9, 10).view(5, 2))
+    old = plan.actions.clone()
+    plan(plan.state_of())
+    torch.testing.assert_close(plan.actions, torch.cat([old[1:], torch.zeros(1, 2)]), atol=1e-5, rtol=0)
+
+
+# the terminal value
+
+
+@wp.func
+def place_in_warp(obs: Row[float]) -> float:
+    return -2.0 * wp.abs(obs[0] - obs[4]) - 0.1 * obs[2] * obs[3]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_equal_values_in_torch_and_in_warp_give_equal_plans(engine: str) -> None:
+    settings = POINT | dict(engine=engine, noise=0.5, discount=0.9, iterations=2)
+    in_torch, column, in_warp, without = (
+        MPPI(value=value, **settings) for value in (place, lambda obs: place(obs)[:, None], place_in_warp, None)
+    )
+    plant = lw.make("point_mass", seed=2, engine=engine)
+    for _ in range(4):
+        state = plant.get_state()[0]
+        plant.step(in_torch(state)[None])
+        column(state), in_warp(state), without(state)
+        assert torch.equal(column.actions, in_torch.actions)
+        for name in BUFFERS:
+            torch.testing.assert_close(getattr(in_warp, name), getattr(in_torch, name), rtol=1e-5, atol=1e-5)
+        assert not torch.allclose(without.returns, in_torch.returns, atol=0.01)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_value_function_gets_the_step_at_the_end_of_the_plan(engine: str) -> None:
+    value = lw.ValueFunction(6, (16,), scale=50.0, time_orders=2, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        value.network[0].weight[:, 6:] *= 300  # so that ten steps make a difference
+    settings = POINT | dict(engine=engine, noise=0.5)
+    plan = MPPI(value=value, **settings)
+
+    def at_step(step: int) -> MPPI:
+        return MPPI(value=lambda obs: value(obs, torch.full((len(obs),), float(step))), **settings)
+
+    for step in (0, 100):
+        right, wrong = at_step(step + plan.horizon), at_step(step)
+        plan.reset()
+        for _ in range(3):
+            state = plan.state_of(step=step, qpos=[0.1, 0.2, -0.5, 0.3])
+            plan(state), right(state), wrong(state)
+            torch.testing.assert_close(plan.returns, right.returns, rtol=1e-6, atol=1e-6)
+            torch.testing.assert_close(plan.actions, right.actions, rtol=1e-5, atol=1e-5)
+            assert not torch.allclose(plan.returns, wrong.returns, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (lambda obs: obs, r"value must return 7 numbers for \(7, 6\) observations, not .* \(7, 6\)"),
+        (lambda obs: 0.0, "value must return 7 numbers for .*, not float 0.0"),
+        (torch.nn.Linear(5, 1), r"value cannot take observations .* \(7, 6\)"),
+        (3.0, "value must be a function of observations, or None, not float 3.0"),
+        ("a", "value must be a function of observations, or None, not str 'a'"),
+    ],
+)  # fmt: skip
+def test_a_value_that_does_not_fit_is_refused_when_the_planner_is_made(value: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        MPPI("point_mass", horizon=3, samples=7, value=value)
+
+
+# graphs, states, other models
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("value", [None, place, place_in_warp], ids=["none", "torch", "warp"])
+def test_plans_with_and_without_graphs_are_equal(value: Any, engine: str) -> None:
+    settings = POINT | dict(engine=engine, noise=0.5, iterations=3, value=value)
+    replayed, direct = (MPPI(graphs=graphs, **settings) for graphs in (True, False))
+    state = replayed.state_of(qpos=[0.1, 0.2, -0.5, 0.3])
+    assert same(numbers(replayed, state, 5), numbers(direct, state, 5))
+
+
+@pytest.mark.parametrize("plant_engine, engine", [("warp", "mujoco"), ("mujoco", "warp")])
+def test_plans_for_a_plant_on_the_other_engine_agree(plant_engine: str, engine: str) -> None:
+    """States mean the same on both engines: plans differ only by the engines' arithmetic."""
+    plant = lw.make("reach", engine=plant_engine, nworld=3, seed=1)
+    there, here = (MPPI("reach", engine=e, temperature=1.0) for e in (plant_engine, engine))
+    for _ in range(4):
+        state = plant.get_state()[2]
+        there.actions.copy_(here.actions)
+        action = here(state)
+        torch.testing.assert_close(there(state), action, atol=1e-3, rtol=0)
+        torch.testing.assert_close(there.returns, here.returns, atol=1e-3, rtol=1e-4)
+        plant.step(action.expand(3, -1).contiguous())
+
+
+def test_the_planner_may_have_another_model_or_time_step() -> None:
+    """The state is the same for all; a longer step looks further ahead."""
+    _, state = reached(2)
+    plain, heavy, long = MPPI("reach"), MPPI("reach", model=heavy_arm()), MPPI("reach", frame_skip=6)
+    for plan in (plain, heavy, long):
+        plan(state)
+    assert torch.equal(plain.sampled, heavy.sampled) and torch.equal(plain.sampled, long.sampled)
+    assert heavy.env.model.body_mass.sum() > plain.env.model.body_mass.sum() + 5
+    assert (plain.timestep, long.timestep) == (0.02, pytest.approx(0.06))
+    assert not torch.allclose(plain.returns, heavy.returns, atol=0.01)
+    assert not torch.allclose(plain.returns, long.returns, atol=0.01)
+
+
+# in control
+
+
+def drive(task: str, steps: int, seed: int, **settings: Any) -> tuple[lw.Env, np.ndarray, np.ndarray]:
+    """Drive a plant; return it, with its rewards and evaluations up to its end or success."""
+    plan = MPPI(task, seed=seed, **settings)
+    plant = lw.make(task, autoreset=False, seed=seed)
+    rewards, evals = [], []
+    for _ in range(steps):
+        plant.step(plan(plant.get_state()[0])[None])
+        rewards.append(plant.reward.item())
+        evals.append(plant.eval.item())
+        if plant.success.any() or plant.terminated.any():
+            break
+    return plant, np.array(rewards), np.array(evals)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_reach_succeeds(seed: int) -> None:
+    plant, rewards, evals = drive("reach", 75, seed)
+    assert plant.success.item(), f"{evals[-1]:.3f} m after {len(evals)} steps"
+    assert evals[-10:].mean() < 0.05 and rewards.sum() > -250
+
+
+def test_cartpole_swings_up_and_stays_up() -> None:
+    _, _, evals = drive("cartpole_swingup", 200, 0)
+    assert evals[0] < 0
+    assert evals[-20:].min() > 0.9, evals[-20:]
+
+
+def test_half_cheetah_runs() -> None:
+    _, _, evals = drive("half_cheetah", 50, 1)
+    assert evals[-1] - evals[0] > 2.5
+
+
+@pytest.mark.slow
+def test_hopper_hops_without_falling() -> None:
+    """With the settings of its planning; with those of other tasks it falls after some 100 steps."""
+    plant, rewards, evals = drive("hopper", 130, 1)
+    assert len(evals) == 130 and not plant.terminated.item()
+    assert evals[-1] > 0.3 and rewards.sum() > 165, (evals[-1], rewards.sum())
+
+
+# attributes and worlds
+
+
+@pytest.mark.parametrize("name", ["horizon", "samples", "temperature", "noise", "smoothing", "discount", "iterations",
+                                  "fill", "termination", "config", "value", "seed"])  # fmt: skip
+def test_settings_cannot_be_assigned(name: str) -> None:
+    plan = MPPI("point_mass", horizon=3, samples=2)
+    with pytest.raises(AttributeError, match=rf"make another MPPI with {name}=2\.0"):
+        setattr(plan, name, 2.0)
+
+
+@pytest.mark.parametrize("seed", [-1, 0.5, "a"])
+def test_a_seed_that_is_not_a_whole_number_is_refused(seed: Any) -> None:
+    with pytest.raises(ValueError, match="seed must be a whole number from 0"):
+        MPPI("point_mass", horizon=3, samples=2, seed=seed)
+    plan = MPPI("point_mass", horizon=3, samples=2)
+    with pytest.raises(ValueError, match="seed must be a whole number from 0"):
+        plan.reset(seed)
+
+
+def test_help_shows_arguments_and_attributes() -> None:
+    text = str(MPPI.__doc__)
+    assert all(f"    {name}: " in text for name in ("config", "value", "params", "words", "settings", *BUFFERS))
+
+
+def test_resets_of_the_planners_worlds_do_not_change_plans() -> None:
+    env = lw.make("reach", autoreset=False)
+    env.rand_reset(0)
+    plans = [MPPI("reach", horizon=3, samples=4) for _ in range(2)]
+    plans[0].env.reset(torch.tensor([True, False, False, False]))
+    for _ in range(3):
+        state = env.get_state()
+        first, second = (plan(state) for plan in plans)
+        assert torch.equal(first, second)
+        env.step(first[None])
+    assert plans[0].env.episode_step.tolist() == [2, 2, 2, 2]

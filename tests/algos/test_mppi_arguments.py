@@ -1,0 +1,259 @@
+"""The arguments of a call of MPPI: the three parts of a task's planning, and how the words of a call are sorted."""
+
+import dataclasses
+import json
+import types
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from rail_task import Picky, Rail, rail
+
+import lyceum_warp as lw
+from lyceum_warp import MPPI, MPPIConfig, Planning, Row
+from lyceum_warp.algos.mppi_arguments import planner_arguments, task_config
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.engines import placement
+
+# the planning of a task
+
+
+@wp.struct
+class NoisyParams:
+    dt: float
+    noise: float = 2.0
+    size: float = 1.0
+
+
+@wp.func
+def observe_noisy(s: Rail, p: NoisyParams, obs: Row[float]):
+    obs[0] = s.qpos[0] + p.noise
+
+
+class Noisy(lw.Task):
+    """One of its parameters has the name of a setting."""
+
+    model, obs = staticmethod(rail), {"x": 1}
+    World, Params, observe = Rail, NoisyParams, observe_noisy
+
+
+def planned(base: type[lw.Task] = Picky, **parts: Any) -> type[lw.Task]:
+    return type("Planned", (base,), {"planning": Planning(**parts)})
+
+
+def arguments(task: Any, config: MPPIConfig | None = None, value: Any = None, params: Any = None, **words: Any) -> Any:
+    return planner_arguments(find_task(task), config, words, params, value)
+
+
+def test_planning_gives_settings_options_and_parameters() -> None:
+    plan = MPPI("hopper", horizon=2, samples=2)
+    assert plan.config == MPPIConfig(horizon=2, samples=2, noise=0.1, discount=1.0)
+    assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    assert plan.env.task.params["healthy_reward"] == 2.0 and plan.env.task.params["forward_reward_weight"] == 0.2
+    assert lw.make("hopper").task.params["healthy_reward"] == 1.0
+
+
+def test_words_replace_parts_of_planning() -> None:
+    plan = MPPI("hopper", horizon=2, samples=2, healthy_reward=1.0, integrator="rk4")
+    assert plan.config.horizon == 2 and plan.config.noise == 0.1
+    assert plan.env.task.params["healthy_reward"] == 1.0 and plan.env.task.params["forward_reward_weight"] == 0.2
+    assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+
+
+def test_a_task_without_planning_has_the_defaults() -> None:
+    assert MPPI("point_mass").config == MPPIConfig(discount=1.0)
+    assert task_config(find_task("point_mass")) == MPPIConfig()
+    assert task_config(find_task("reach")) == MPPIConfig(horizon=16, samples=30, temperature=0.2, noise=1.0)
+
+
+@pytest.mark.parametrize(
+    ("planning", "message"),
+    [
+        ({"horizon": 3}, r"planning of the task 'planned' must be lw.Planning\(settings=\{...\}, options=\{...\}, "
+                         r"params=\{...\}\), not dict \{'horizon': 3\}"),
+        (Planning(settings={"horizont": 3}), "'horizont' in planning.settings of the task 'planned' is unknown: "
+                                             r"did you mean horizon\?"),
+        (Planning(settings={"integrator": "rk4"}), "'integrator' in planning.settings .*: it belongs to options"),
+        (Planning(settings={"limit": 1.0}), "'limit' in planning.settings .*: it belongs to params"),
+        (Planning(options={"integratr": "rk4"}), "'integratr' in planning.options .*: did you mean integrator"),
+        (Planning(options={"samples": 3}), "'samples' in planning.options .*: it belongs to settings"),
+        (Planning(params={"limt": 3.0}), "'limt' in planning.params of the task 'planned' .*: did you mean limit"),
+        (Planning(params={"qqq": 3.0}), "'qqq' in planning.params .*: there are limit, wrong"),
+        (Planning(params={"dt": 3.0}), "'dt' in planning.params of the task 'planned' is unknown"),
+        (Planning(settings={"horizon": 0}), "planning.settings of the task 'planned': horizon must be .* not 0"),
+        (Planning(options={"integrator": "rk5"}), "planning.options of the task 'planned': there is no integrator"),
+        (Planning(options={"nworld": 3}), "planning.options of the task 'planned': a planner takes no option nworld"),
+        (Planning(options={"horizon": 3}), "planning.options .*: a planner takes no option horizon"),
+        (Planning(options={"seed": 3}), "planning.options .*: a planner takes no option seed"),
+    ],
+)  # fmt: skip
+def test_planning_that_is_not_valid_is_refused_by_task_and_part(planning: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as raised:
+        MPPI(type("Planned", (Picky,), {"planning": planning}))
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("part", ["settings", "options", "params"])
+def test_a_part_of_planning_must_be_a_dict(part: str) -> None:
+    with pytest.raises(ValueError, match=rf"{part} of lw.Planning must be a dict, not \['horizon'\]"):
+        Planning(**{part: ["horizon"]})
+
+
+# the words of a call
+
+
+def test_a_configuration_replaces_the_settings_of_the_task() -> None:
+    config, options, params = arguments("hopper", MPPIConfig(horizon=3))
+    assert config == MPPIConfig(horizon=3, discount=1.0)
+    assert options.physics.integrator == "euler" and params["healthy_reward"] == 2.0
+
+
+def test_flat_settings_replace_single_ones() -> None:
+    assert arguments("reach", samples=7)[0] == dataclasses.replace(
+        task_config(find_task("reach")), samples=7, discount=1.0
+    )
+    assert arguments("reach", MPPIConfig(horizon=3, samples=8), samples=7)[0] == MPPIConfig(
+        horizon=3, samples=7, discount=1.0
+    )
+
+
+def test_a_flat_setting_of_none_is_not_given() -> None:
+    assert arguments("reach", samples=None, discount=None)[0] == arguments("reach")[0]
+
+
+def test_words_are_sorted_into_settings_options_and_parameters() -> None:
+    task = planned(settings={"noise": 0.2}, options={"integrator": "euler", "cone": "elliptic"}, params={"limit": 2.0})
+    config, options, params = arguments(task, samples=3, integrator="rk4", nthread=2, wrong=5.0)
+    assert config == MPPIConfig(noise=0.2, samples=3, discount=1.0)
+    assert options.given() == {"integrator": "rk4", "cone": "elliptic", "nthread": 2}
+    assert params == {"limit": 2.0, "wrong": 5.0}
+
+
+def test_physics_in_one_piece_replace_those_of_planning() -> None:
+    physics = lw.make("point_mass", integrator="implicit").options.physics
+    task = planned(options={"integrator": "euler", "cone": "elliptic"})
+    assert arguments(task, physics=physics)[1].physics == physics
+
+
+def test_a_word_that_is_a_setting_and_a_parameter_is_refused() -> None:
+    message = (
+        r"'noise' is a setting of MPPI and a parameter of the task 'noisy': give the setting as "
+        r"config=lw.MPPIConfig\(noise=...\), or the parameter as params=\{'noise': ...\}"
+    )
+    with pytest.raises(ValueError, match=message):
+        MPPI(Noisy, noise=0.3)
+
+
+def test_params_and_config_say_an_ambiguous_word_explicitly() -> None:
+    plan = MPPI(Noisy, MPPIConfig(horizon=2, samples=2, noise=0.25), params={"noise": 3.0}, size=4.0)
+    assert plan.config.noise == 0.25
+    assert (plan.env.task.params["noise"], plan.env.task.params["size"]) == (3.0, 4.0)
+    assert plan.settings["noise"] == 0.25 and plan.settings["size"] == 4.0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"sample": 3}, "the task 'reach' has no parameter 'sample': did you mean samples"),
+        ({"temprature": 1.0}, "no parameter 'temprature': did you mean temperature"),
+        ({"horizont": 1.0}, r"no parameter 'horizont': did you mean horizon\?"),
+        ({"sucess_distance": 1.0}, "no parameter 'sucess_distance': did you mean success_distance"),
+        ({"integratr": "rk4"}, "no parameter 'integratr': did you mean integrator"),
+        ({"record": False}, "no parameter 'record': did you mean graphs"),
+        ({"qqqqq": 3}, "no parameter 'qqqqq': it has .*success_distance"),
+        ({"dt": 3}, "no parameter 'dt'"),
+        ({"params": {"samples": 3}}, "no parameter 'samples': it is a setting of MPPI: give it outside params"),
+        ({"params": {"nthread": 3}}, "no parameter 'nthread': it is an option of its worlds: give it outside params"),
+        ({"params": [3]}, r"params must be a dict of parameters of the task, not list \[3\]"),
+        ({"config": {"samples": 3}}, r"config must be a lw.MPPIConfig, as .*, not dict \{'samples': 3\}"),
+        ({"nworld": 1}, "a planner takes no option nworld: samples is the number of its worlds"),
+        ({"autoreset": True}, "a planner takes no option autoreset"),
+        ({"nthread": -1}, "nthread must be a whole number"),
+        ({"nthread": "a"}, "nthread must be a whole number"),
+        ({"integrator": "rk5"}, "no integrator 'rk5'"),
+        ({"solver": 4}, "solver must be a dict of limits"),
+        ({"horizon": 0}, "horizon must be a whole number from 1"),
+    ],
+)  # fmt: skip
+def test_words_that_do_not_fit_are_refused_with_a_suggestion(words: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as raised:
+        MPPI("reach", **words)
+    assert "\n" not in str(raised.value)
+
+
+def test_with_a_value_the_parameters_of_planning_do_not_apply() -> None:
+    """A value function was fitted to the rewards of the task itself."""
+    plan = MPPI("hopper", horizon=2, samples=2, value=lambda obs: obs[:, 0])
+    assert plan.env.task.params["healthy_reward"] == 1.0 and plan.env.task.params["forward_reward_weight"] == 1.0
+    assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER and plan.settings["noise"] == 0.1
+
+
+@pytest.mark.parametrize(
+    ("words", "fitted", "expected"),
+    [
+        ({}, 0.9, 0.9),
+        ({}, None, 0.8),
+        ({"discount": 0.5}, 0.9, 0.5),
+        ({"config": MPPIConfig()}, 0.9, 0.9),
+        ({"config": MPPIConfig()}, None, 1.0),
+        ({"config": MPPIConfig(discount=0.7)}, 0.9, 0.7),
+    ],
+)
+def test_the_discount_is_the_given_one_or_else_that_of_the_value_function(
+    words: dict[str, Any], fitted: float | None, expected: float
+) -> None:
+    value = lw.ValueFunction(6)
+    value.discount = fitted
+    assert arguments(planned(settings={"discount": 0.8}), value=value, **words)[0].discount == expected
+
+
+# where samples are rolled out
+
+
+@pytest.mark.parametrize(
+    ("task", "words", "expected"),
+    [
+        ("reach", dict(samples=79), ("mujoco", "cpu")),
+        ("reach", dict(samples=80), ("warp", "cuda:0")),
+        ("reach", dict(samples=79, nthread=1), ("warp", "cuda:0")),
+        ("reach", dict(samples=639, nthread=128), ("mujoco", "cpu")),
+        ("reach", dict(samples=640, nthread=128), ("warp", "cuda:0")),  # more than 16 cores were not measured
+        ("reach", dict(samples=79, nconmax=16), ("mujoco", "cpu")),
+        ("reach", dict(samples=1, engine="warp"), ("warp", "cuda:0")),
+        ("reach", dict(samples=4096, device="cpu"), ("auto", "cpu")),
+        ("reach", dict(samples=4096, device=None), ("auto", None)),
+        ("reach", dict(samples=100, solver={"noslip_iterations": 3}), ("mujoco", "cpu")),
+        # the hand's noslip solver is slow on a GPU, unless it is turned off
+        ("adroit_pen", dict(samples=160), ("mujoco", "cpu")),
+        ("adroit_pen", dict(samples=479, solver={"iterations": 4}), ("mujoco", "cpu")),
+        ("adroit_pen", dict(samples=480), ("warp", "cuda:0")),
+        ("adroit_pen", dict(samples=160, solver={"noslip_iterations": 0}), ("warp", "cuda:0")),
+    ],
+)  # fmt: skip
+def test_auto_on_a_gpu_places_samples_by_their_number(
+    task: str, words: dict[str, Any], expected: tuple[str, str | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cuda = types.SimpleNamespace(is_cuda=True), types.SimpleNamespace(is_cuda=False)
+    monkeypatch.setattr(placement, "find_device", lambda name: cuda[not str(name).startswith("cuda")])
+    options = arguments(task, **{"device": "cuda:0", "nthread": 2} | words)[1]
+    assert (options.engine, options.device) == expected
+    assert options.physics.nconmax is None, "only the Warp engine takes sizes"
+
+
+# reports
+
+
+def test_settings_are_what_json_can_hold() -> None:
+    plan = MPPI(
+        Picky, horizon=2, samples=2, noise=torch.tensor([[0.5]]), fill=[0.1], solver={"iterations": 3}, model=rail(),
+        limit=np.array([1.0, 2.0]), wrong=torch.tensor(3.0), fields=["xpos"],
+    )  # fmt: skip
+    assert json.loads(json.dumps(plan.settings)) == plan.settings == {
+        "horizon": 2, "samples": 2, "temperature": 0.1, "noise": [[0.5]], "smoothing": [0.25, 0.8, 0.0],
+        "discount": 1.0, "iterations": 1, "fill": [0.1], "termination": "stop", "solver": {"iterations": 3},
+        "model": "MjSpec 'MuJoCo Model'", "limit": [1.0, 2.0], "wrong": 3.0, "fields": ["xpos"],
+    }  # fmt: skip
+    assert MPPI("hopper", horizon=2, samples=2).settings["healthy_reward"] == 2.0

@@ -1,0 +1,107 @@
+"""Settings of MPPI and their checks."""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from lyceum_warp import MPPI, MPPIConfig
+from lyceum_warp.spaces import Space
+
+
+def test_defaults_are_those_of_the_documentation() -> None:
+    assert MPPIConfig() == MPPIConfig(
+        horizon=32, samples=64, temperature=0.1, noise=0.5, smoothing=(0.25, 0.8, 0.0), discount=None, iterations=1,
+        fill="zero", termination="stop",
+    )  # fmt: skip
+
+
+def test_help_shows_every_setting() -> None:
+    text = str(MPPIConfig.__doc__)
+    assert all(f"    {field.name}: " in text for field in dataclasses.fields(MPPIConfig))
+
+
+def test_a_configuration_cannot_be_changed_or_given_by_position() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        MPPIConfig().horizon = 3  # type: ignore[misc]
+    with pytest.raises(TypeError):
+        MPPIConfig(3)  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "message"),
+    [
+        ("horizon", [0, -1, 2.5, "a", math.nan, None], "horizon must be a whole number from 1"),
+        ("samples", [0, -1, 2.5, "a", math.inf], "samples must be a whole number from 1"),
+        ("iterations", [0, -1, 2.5, "a"], "iterations must be a whole number from 1"),
+        ("temperature", [0, -1, math.nan, math.inf, "a", "0.5", True, None, 1e-60],
+         "temperature must be a finite number above 0"),
+        ("discount", [2, -0.1, math.nan, "a", True], "discount must be a number from 0 to 1"),
+        ("noise", [-1, math.nan, math.inf, [1, -1], [], [[1, 2], [2, 1]], [[1, 0.5], [0.2, 1]], np.ones((2, 3)), "a",
+                   [1, [2, 3]], None, True], "noise must be a standard deviation, one for each action, or"),
+        ("smoothing", [(1, 0), 1, (1, 0, math.nan), "abc", [1, [2, 3], 4], None], "smoothing must be 3 finite numbers"),
+        ("fill", ["x", [1, math.nan], ["a", "b"], [[1.0]], [], None, math.inf], "fill must be 'zero', 'repeat' or"),
+        ("termination", ["x", True, 3, ["stop"]], "termination must be 'stop' or 'ignore'"),
+    ],
+)  # fmt: skip
+def test_a_setting_out_of_range_is_refused_by_name(name: str, wrong: list[Any], message: str) -> None:
+    for value in wrong:
+        with pytest.raises(ValueError, match=message):
+            MPPIConfig(**{name: value})
+            pytest.fail(f"{name}={value!r} was accepted")
+
+
+@pytest.mark.parametrize("smoothing", [(0.25, 0.8, 0.3), (1, 1, 0), (1, 0, 1), (1, 0, -1), (1, -1.5, 0), (1, 1.9, -1)])
+def test_smoothing_with_a_pole_outside_the_unit_circle_is_refused(smoothing: tuple[float, float, float]) -> None:
+    assert max(abs(np.roots([1, -smoothing[1], -smoothing[2]]))) >= 1 - 1e-12
+    with pytest.raises(ValueError, match=r"smoothing .* is unstable: .* \|b2\| < 1 and \|b1\| < 1 - b2"):
+        MPPIConfig(smoothing=smoothing)
+
+
+@pytest.mark.parametrize("smoothing", [(1, 0, 0), (0.5, 0.3, 0.2), (5, 1.9, -0.95), (1, -0.9, 0), (1, 0, 0.99)])
+def test_smoothing_with_all_poles_inside_the_unit_circle_is_accepted(smoothing: tuple[float, float, float]) -> None:
+    assert max(abs(np.roots([1, -smoothing[1], -smoothing[2]]))) < 1
+    assert MPPIConfig(smoothing=smoothing).smoothing == smoothing
+
+
+def test_arrays_and_tensors_become_tuples_of_floats() -> None:
+    config = MPPIConfig(
+        horizon=np.int64(3), noise=torch.eye(2), smoothing=[1, 0, 0], fill=np.array([1, 2])  # type: ignore[arg-type]
+    )  # fmt: skip
+    assert (config.horizon, config.noise, config.smoothing, config.fill) == (
+        3, ((1.0, 0.0), (0.0, 1.0)), (1.0, 0.0, 0.0), (1.0, 2.0)
+    )  # fmt: skip
+    assert hash(config) == hash(dataclasses.replace(config))
+
+
+@pytest.mark.parametrize("noise", [[1, 2, 3], np.eye(3), [1.0]])
+def test_noise_for_another_number_of_actions_is_refused(noise: Any) -> None:
+    message = r"noise must be a standard deviation, 2 of them, or a positive definite covariance \(2, 2\)"
+    with pytest.raises(ValueError, match=message):
+        MPPI("point_mass", horizon=3, samples=4, noise=noise)
+
+
+@pytest.mark.parametrize("fill", [[1], [1, 2, 3]])
+def test_a_fill_for_another_number_of_actions_is_refused(fill: Any) -> None:
+    with pytest.raises(ValueError, match=r"fill must be 'zero', 'repeat', a number or 2 of them, not \(1.0,"):
+        MPPI("point_mass", horizon=3, samples=4, fill=fill)
+
+
+def test_the_factor_of_the_noise_is_its_lower_cholesky_factor() -> None:
+    covariance = np.array([[0.3, -0.2], [-0.2, 0.25]])
+    np.testing.assert_array_equal(MPPIConfig(noise=0.5).noise_factor(2), np.diag([0.5, 0.5]))
+    np.testing.assert_array_equal(MPPIConfig(noise=[0.5, 0.1]).noise_factor(2), np.diag([0.5, 0.1]))
+    factor = MPPIConfig(noise=covariance).noise_factor(2)
+    np.testing.assert_allclose(factor @ factor.T, covariance)
+    assert not np.triu(factor, 1).any()
+
+
+def test_the_action_of_a_fill_is_within_the_bounds() -> None:
+    low, high = np.array([-1.0, 0.2]), np.array([1.0, 0.4])
+    space = dataclasses.replace(MPPI("point_mass", samples=1).env.action_space, low=low, high=high)
+    assert isinstance(space, Space)
+    for fill, action in (("zero", [0, 0.2]), ("repeat", [0, 0.2]), (0.3, [0.3, 0.3]), ([-5, 5], [-1, 0.4])):
+        np.testing.assert_array_equal(MPPIConfig(fill=fill).fill_action(space), action)

@@ -1,0 +1,100 @@
+"""Planning on a GPU."""
+
+import pytest
+import torch
+import warp as wp
+from test_gpu import CUDA, no_word_to_the_host
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+pytestmark = pytest.mark.gpu
+
+
+@wp.func
+def first_squared(obs: Row[float]) -> float:
+    return 3.0 * obs[0] * obs[0]
+
+
+def plant(task: str) -> lw.Env:
+    env = lw.make(task, autoreset=False)
+    env.rand_reset(1)
+    return env
+
+
+@pytest.mark.parametrize("task, horizon", [("reach", 16), ("half_cheetah", 8), ("cartpole_swingup", 20)])
+def test_plans_agree_with_those_of_the_cpu(task: str, horizon: int) -> None:
+    env = plant(task)
+    # a high temperature: a low one would let rounding choose between samples
+    gpu, cpu = (
+        lw.MPPI(task, device=device, engine=engine, horizon=horizon, samples=30, temperature=10.0, seed=3)
+        for device, engine in ((CUDA, "warp"), ("cpu", "mujoco"))
+    )
+    for _ in range(4):
+        state = env.get_state()[0]
+        action, other = gpu(state), cpu(state)
+        torch.testing.assert_close(gpu.standard_noise.cpu(), cpu.standard_noise, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(gpu.returns.cpu(), cpu.returns, rtol=2e-2, atol=2e-2)
+        torch.testing.assert_close(action.cpu(), other, rtol=1e-2, atol=1e-2)
+        cpu.actions.copy_(gpu.actions)
+        env.step(other[None])
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_a_replayed_plan_equals_one_without_graphs(iterations: int) -> None:
+    env = plant("reach")
+    replayed, direct = (
+        lw.MPPI("reach", device=CUDA, engine="warp", deterministic=True, graphs=graphs, iterations=iterations)
+        for graphs in (True, False)
+    )
+    for _ in range(4):
+        state = env.get_state()[0]
+        assert torch.equal(replayed(state), direct(state))
+        assert torch.equal(replayed.returns, direct.returns)
+        env.step(replayed.actions[:1].cpu())
+
+
+@pytest.mark.parametrize("kind", ["none", "warp", "torch"])
+def test_plans_allocate_nothing_and_do_not_wait_for_the_device(kind: str) -> None:
+    value = {"none": None, "warp": first_squared, "torch": lambda obs: 3.0 * obs[:, 0] ** 2}[kind]
+    plan = lw.MPPI("reach", device=CUDA, engine="warp", samples=256, value=value)
+    state = plan.state_of(mocap_pos=[0.1, 0.1, 0.2])
+    for _ in range(3):
+        plan(state)
+    memory = torch.cuda.memory_allocated(), wp.get_mempool_used_mem_current(CUDA)
+    with no_word_to_the_host():
+        for _ in range(50):
+            plan(state)
+    assert (torch.cuda.memory_allocated(), wp.get_mempool_used_mem_current(CUDA)) == memory
+
+
+def test_values_in_torch_and_in_warp_agree() -> None:
+    warp, tensor = (
+        lw.MPPI("reach", device=CUDA, engine="warp", samples=64, value=value, temperature=10.0, deterministic=True)
+        for value in (first_squared, lambda obs: 3.0 * obs[:, 0] ** 2)
+    )
+    state = warp.state_of(mocap_pos=[0.1, 0.1, 0.2])
+    for _ in range(3):
+        torch.testing.assert_close(warp(state), tensor(state), rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(warp.returns, tensor.returns, rtol=1e-4, atol=1e-4)
+
+
+def test_a_planner_on_the_gpu_controls_a_plant_on_the_cpu() -> None:
+    done = lw.control(plant("reach"), lw.MPPI("reach", device=CUDA, engine="warp", samples=128), seed=0)
+    assert done.succeeded
+
+
+@pytest.mark.parametrize("samples", [8, 2048])
+def test_a_value_function_moves_to_the_device_of_the_plans(samples: int) -> None:
+    env = lw.make("hopper")
+    for device in ("cpu", CUDA):
+        value = lw.ValueFunction(env.obs_space.size, (8,), scale=1.0).to(device)
+        plan = lw.MPPI("hopper", device=CUDA, horizon=2, samples=samples, nthread=1, value=value)
+        assert plan.env.device.is_cpu == (samples == 8)
+        assert torch.isfinite(plan(plan.state_of())).all()
+
+
+def test_few_samples_are_rolled_out_on_the_cpu() -> None:
+    assert lw.MPPI("reach", device=CUDA, samples=8).env.engine.name == "mujoco"
+    assert lw.MPPI("reach", device=CUDA, samples=8, nthread=1, nconmax=16).env.device.is_cpu
+    assert lw.MPPI("reach", device=CUDA, samples=64, nthread=1).env.engine.name == "warp"

@@ -1,0 +1,222 @@
+"""NPG as a whole: steps of the right length, exact resumption, and a task that it can learn."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from conftest import TaskFile
+
+import lyceum_warp as lw
+
+SMALL = lw.NPGConfig(samples=320, hidden=(8, 8), value_hidden=(16,), mean_every=2, mean_episodes=2)
+
+
+@pytest.fixture(scope="module")
+def env() -> lw.Env:
+    return lw.make("point_mass", nworld=16, horizon=12, nthread=1)
+
+
+def test_a_step_has_the_kl_divergence_that_delta_sets(env: lw.Env) -> None:
+    env.rand_reset(0)
+    npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=3200, delta=1e-3), seed=0)
+    before = torch.cat([p.detach().flatten() for p in npg.policy.parameters()])
+    it = next(npg)
+    after = torch.cat([p.detach().flatten() for p in npg.policy.parameters()])
+    # KL = step.F.step / 2 to second order
+    assert it.kl == pytest.approx(0.0005, rel=0.1)
+    assert (after - before).norm().item() == pytest.approx(it.step_norm, rel=1e-4)
+
+
+@pytest.mark.parametrize("rollout", ["episodes", "segments"])
+def test_a_run_is_reproducible_and_resumes_to_the_bit(env: lw.Env, rollout: str) -> None:
+    config = dataclasses.replace(SMALL, rollout=rollout, time_orders=2, normalize=True)
+
+    def numbers(it: lw.Iteration) -> dict[str, object]:
+        skipped = {"samples_per_second", "faults"}
+        values = dataclasses.asdict(it).items()
+        return {k: v for k, v in values if not k.startswith("time_") and k not in skipped}
+
+    def fresh(seed: int) -> lw.NPG:
+        env.rand_reset(7)
+        return lw.NPG(env, config=config, seed=seed)
+
+    npg = fresh(1)
+    first = [numbers(next(npg)) for _ in range(2)]
+    saved = npg.state_dict()
+    rest = [numbers(next(npg)) for _ in range(2)]
+    again = fresh(1)
+    np.testing.assert_equal([numbers(next(again)) for _ in range(4)], first + rest)
+    resumed = fresh(2)
+    resumed.load_state_dict(saved)
+    np.testing.assert_equal([numbers(next(resumed)) for _ in range(2)], rest)
+
+
+def test_a_state_of_another_number_of_worlds_is_refused(env: lw.Env) -> None:
+    npg = lw.NPG(env, config=SMALL)
+    with pytest.raises(ValueError, match="the state has 16 worlds, but the environment has 3"):
+        lw.NPG(lw.make("point_mass", nworld=3), config=SMALL).load_state_dict(npg.state_dict())
+
+
+def test_mini_batches_grow_with_the_samples(env: lw.Env) -> None:
+    def batch(samples: int, given: int | None = None) -> int:
+        return lw.NPG(env, config=dataclasses.replace(SMALL, samples=samples, value_batch=given)).fit.batch
+
+    assert [batch(320), batch(16 * 2048)] == [64, 128]
+    assert batch(320, 10) == 10
+
+
+def test_samples_are_rounded_up_to_whole_steps() -> None:
+    counts = [lw.NPG(lw.make("point_mass", nworld=n)).count for n in (10, 64, 1000)]
+    assert counts == [10_000, 10_048, 16_000]
+
+
+def test_segments_continue_where_the_last_ones_ended(env: lw.Env) -> None:
+    env.rand_reset(0)
+    npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=16 * 5, mean_every=0))
+    assert npg.segments  # selected automatically: 5 steps hold no episode of 12
+    lengths, steps = [], []
+    for _ in range(6):
+        lengths.append(next(npg).length_mean)
+        steps.append(npg.rollout.step.clone())
+    joined = torch.cat(steps)
+    assert torch.equal(joined, (joined[0] + torch.arange(30.0)[:, None]) % 12)
+    assert len(joined[0].unique()) > 5  # the worlds' episodes end at different times
+    # an episode that began in its middle does not count, whole ones do
+    assert math.isnan(lengths[0])
+    assert lengths[-1] == 12.0
+
+
+def test_a_gradient_that_is_not_finite_leaves_the_policy_unchanged(env: lw.Env) -> None:
+    env.rand_reset(0)
+    npg = lw.NPG(env, config=SMALL)
+    with torch.no_grad():
+        npg.policy.log_std.fill_(-4.0)  # below its limit, which a step would restore
+        npg.value.network[0].weight[0, 0] = math.nan
+    before = [p.clone() for p in (*npg.policy.parameters(), *npg.value.parameters())]
+    with pytest.raises(FloatingPointError, match="gradient of iteration 1 is not finite; .* finite: make the step"):
+        next(npg)
+    after = (*npg.policy.parameters(), *npg.value.parameters())
+    assert all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(before, after, strict=True))
+
+
+def test_point_mass_learns_to_reach_the_target() -> None:
+    """A short run with the original's own settings for this task; its full run is in the README's figures."""
+    env = lw.make("point_mass", nworld=16)
+    config = lw.NPGConfig(
+        samples=16 * 256, gamma=0.97, lam=0.95, delta=0.02, hidden=(16, 16), value_hidden=(32, 32), mean_every=0
+    )
+    npg = lw.NPG(env, config=config, seed=0)
+    rewards = [next(npg).terminal_reward for _ in range(25)]
+    assert np.mean(rewards[:3]) < 0.4
+    assert np.mean(rewards[-3:]) > 0.7, rewards
+
+
+def test_weights_and_noise_have_different_seeds(env: lw.Env) -> None:
+    env.rand_reset(0)
+    npg = lw.NPG(env, config=SMALL, seed=5)
+    same_seed = torch.Generator().manual_seed(5)
+    assert not torch.equal(npg.generator.get_state(), same_seed.get_state())
+
+
+def test_wrong_arguments_are_refused(env: lw.Env) -> None:
+    with pytest.raises(ValueError, match=r"env of NPG .* of type Env, as lw.make\(...\) .*, not str 'hopper'"):
+        lw.NPG("hopper")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"config of NPG .* of type NPGConfig .* not dict"):
+        lw.NPG(env, config={"samples": 3})  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="autoreset=True"):
+        lw.NPG(lw.make("point_mass", autoreset=False))
+
+
+NAN = """
+import warp as wp
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    qvel: Row[float]
+
+@wp.struct
+class Params:
+    dt: float
+    where: int = 0
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    obs[0] = s.qpos[0]
+    obs[1] = s.qpos[1]
+    if p.where == 1:
+        obs[2] = wp.sqrt(s.qpos[1] - 1.2)
+    else:
+        obs[2] = 0.0
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    if p.where == 0 and s1.qpos[1] < 1.2:
+        return wp.sqrt(s1.qpos[1] - 1.2)
+    return 0.0
+
+class Fragile(lw.Task):
+    model = "hopper.xml"
+    obs = {"place": 2, "root": 1}
+"""
+
+
+@pytest.mark.parametrize("where, what", [
+    (0, r"The reward of the task 'fragile' is -?nan, \d+ steps after a reset of world \d, and not finite in \d+ of 32"),
+    (1, r"The observation of the task 'fragile' is -?nan in 'root', \d+ steps after a reset of world \d, and not"),
+])  # fmt: skip
+def test_a_reward_or_observation_that_is_not_finite_is_named(where: int, what: str, task_file: TaskFile) -> None:
+    env = lw.make(str(task_file("fragile.py", NAN)), nworld=4, where=where, horizon=80)
+    npg = lw.NPG(env, config=dataclasses.replace(SMALL, mean_every=0))
+    with pytest.raises(FloatingPointError, match=what):
+        for _ in range(5):
+            next(npg)
+
+
+def on_gpu(**changes: object) -> lw.NPG:
+    """NPG on Hopper on a GPU after 2 iterations, when everything is compiled and captured."""
+    env = lw.make("hopper", nworld=64, device="cuda")
+    config = lw.NPGConfig(samples=64 * 16, rollout="segments", mean_every=0, value_batch=100, **changes)
+    npg = lw.NPG(env, config=config, seed=1)
+    for _ in range(2):
+        next(npg)
+    return npg
+
+
+@pytest.mark.gpu
+def test_gpu_an_iteration_waits_for_one_copy_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every other call that makes torch wait for the device raises."""
+    npg = on_gpu(normalize=True)
+    copies = []
+
+    def tolist(tensor: torch.Tensor) -> list[list[float]]:
+        torch.cuda.set_sync_debug_mode("default")
+        copies.append(tensor.shape)
+        numbers = tensor.cpu().numpy().tolist()
+        torch.cuda.set_sync_debug_mode("error")
+        return numbers
+
+    monkeypatch.setattr(torch.Tensor, "tolist", tolist)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        it = next(npg)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert len(copies) == 1 and math.isfinite(it.kl)
+
+
+@pytest.mark.gpu
+def test_gpu_a_resumed_run_continues() -> None:
+    """A captured fit has the addresses of its optimizer's moments: after loading others it is captured again."""
+    npg = on_gpu()
+    saved = npg.state_dict()
+    first = next(npg)
+    npg.load_state_dict(saved)
+    again = next(npg)
+    assert again.kl == pytest.approx(first.kl, rel=1e-2)
+    assert again.value_error == pytest.approx(first.value_error, rel=1e-2)
+    assert again.gradient_norm == pytest.approx(first.gradient_norm, rel=1e-2)

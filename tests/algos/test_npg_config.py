@@ -1,0 +1,70 @@
+"""Hyperparameters of NPG: every wrong value is refused with its name."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+
+import lyceum_warp as lw
+from lyceum_warp.algos.npg_config import enough_samples
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "wanted"),
+    [
+        ("gamma", 1.5, "a finite number from 0 to 1"),
+        ("gamma", math.nan, "a finite number from 0 to 1"),
+        ("lam", -0.1, "a finite number from 0 to 1"),
+        ("samples", 0, "a whole number from 1"),
+        ("samples", 10.5, "a whole number from 1"),
+        ("delta", -1.0, "a finite number of at least 0"),
+        ("delta", math.inf, "a finite number of at least 0"),
+        ("damping", "small", "a finite number of at least 0"),
+        ("value_batch", 0, "a whole number from 1"),
+        ("value_rate", None, "a finite number of at least 0"),
+        ("cg_iterations", None, "a whole number from 1"),
+        ("mean_every", -1, "a whole number from 0"),
+        ("log_std", math.nan, "a finite number"),
+        ("log_std", True, "a finite number"),
+        ("min_log_std", math.nan, "a finite number"),
+        ("log_std", -5.0, "not be below min_log_std, which is -3.0"),
+        ("fisher_fraction", 0, "be greater than 0"),
+        ("fisher_fraction", 2, "a finite number from 0 to 1"),
+        ("rollout", "foo", "be 'auto', 'episodes' or 'segments'"),
+        ("whiten", 1, "be True or False"),
+        ("normalize", "yes", "be True or False"),
+        ("hidden", 8, r"the widths of the hidden layers, as in \(64, 64\)"),
+        ("value_hidden", (8, 0), r"the widths of the hidden layers, as in \(64, 64\)"),
+        ("hidden", "wide", "the widths of the hidden layers"),
+    ],
+)
+def test_wrong_values_are_refused_by_name(name: str, value: object, wanted: str) -> None:
+    with pytest.raises(ValueError, match=rf"^{name} must .*{wanted}"):
+        lw.NPGConfig(**{name: value})  # type: ignore[arg-type]
+
+
+def test_every_field_is_checked() -> None:
+    for field in dataclasses.fields(lw.NPGConfig):
+        with pytest.raises(ValueError, match=f"^{field.name} must "):
+            lw.NPGConfig(**{field.name: object()})
+
+
+def test_numbers_of_other_types_and_lists_are_converted() -> None:
+    config = lw.NPGConfig(samples=1e4, gamma=1, hidden=[8.0, 8])  # type: ignore[arg-type]
+    assert config == lw.NPGConfig(samples=10_000, gamma=1.0, hidden=(8, 8))
+    assert (type(config.samples), type(config.gamma)) == (int, float)
+
+
+def test_a_configuration_survives_json() -> None:
+    config = lw.NPGConfig(samples=500, hidden=(8,), rollout="segments")
+    assert lw.NPGConfig(**json.loads(json.dumps(dataclasses.asdict(config)))) == config
+
+
+def test_help_lists_every_hyperparameter() -> None:
+    assert all(f"    {field.name}: " in (lw.NPGConfig.__doc__ or "") for field in dataclasses.fields(lw.NPGConfig))
+
+
+def test_default_samples_are_the_papers_or_16_steps_of_every_world() -> None:
+    assert [enough_samples(lw.NPGConfig(), n) for n in (10, 64, 1000)] == [10_000, 10_000, 16_000]
+    assert enough_samples(lw.NPGConfig(samples=5), 1000) == 5

@@ -1,0 +1,91 @@
+"""States that a planner is given: made from their parts, and checked."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+
+import lyceum_warp as lw
+
+
+@pytest.fixture(scope="module")
+def reach() -> lw.MPPI:
+    return lw.MPPI("reach", horizon=4, samples=4)
+
+
+@pytest.fixture(scope="module")
+def point() -> lw.MPPI:
+    return lw.MPPI("point_mass", horizon=3, samples=4)
+
+
+def reset_state(task: str) -> tuple[torch.Tensor, dict[str, slice]]:
+    plant = lw.make(task, autoreset=False)
+    plant.reset()
+    return plant.get_state()[0], dict(plant.state_space.parts)
+
+
+def test_state_of_without_parts_is_the_fixed_reset(reach: lw.MPPI) -> None:
+    assert torch.equal(reach.state_of(), reset_state("reach")[0])
+
+
+def test_state_of_sets_the_given_parts_and_keeps_the_rest(reach: lw.MPPI) -> None:
+    qpos = np.linspace(-0.5, -0.1, 7)
+    state = reach.state_of(qpos=qpos, qvel=[0.1] * 7, time=0.3, mocap_pos=torch.tensor([[0.1, 0.2, 0.3]]), step=15)
+    expected, parts = reset_state("reach")
+    expected[parts["qpos"]], expected[parts["qvel"]] = torch.from_numpy(qpos), 0.1
+    expected[parts["time"]], expected[parts["step"]] = 0.3, 15
+    expected[parts["mocap_pos"]] = torch.tensor([0.1, 0.2, 0.3]).double()
+    assert torch.equal(state, expected)
+    assert torch.equal(reach.state_of(), reset_state("reach")[0]), "one state has changed the next"
+    reach(state)
+
+
+def test_state_of_a_time_sets_the_step_unless_it_is_given(reach: lw.MPPI) -> None:
+    step = reach.env.state_space.parts["step"]
+    assert reach.state_of(time=0.2)[step] == 10
+    assert reach.state_of(time=0.2, step=3)[step] == 3
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"qpoz": [0.0] * 7}, "a state of 'reach' has no part 'qpoz': it has .*'qpos'"),
+        ({"qpos": [0.0] * 6}, "the part 'qpos' of a state has 7 numbers, not 6"),
+        ({"qpos": "zero"}, "the part 'qpos' of a state must be numbers, not 'zero'"),
+        ({"time": "now"}, "the part 'time' of a state must be numbers, not 'now'"),
+    ],
+)
+def test_state_of_refuses_parts_that_do_not_fit(parts: dict[str, object], message: str, reach: lw.MPPI) -> None:
+    with pytest.raises(ValueError, match=message):
+        reach.state_of(**parts)
+
+
+def test_a_state_of_another_shape_or_type_is_refused(point: lw.MPPI) -> None:
+    state, before = point.state_of(), point.actions.clone()
+    size = len(state)
+    for wrong, found in (
+        (state.float(), f"a float64 tensor of shape ({size},), not a float32 tensor of shape ({size},)"),
+        (state[1:], f"not a float64 tensor of shape ({size - 1},)"),
+        (state.expand(2, -1), f"not a float64 tensor of shape (2, {size})"),
+        (state.numpy(), f"not a ndarray of shape ({size},)"),
+        (None, "not NoneType None"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(found)):
+            point(wrong)  # type: ignore[arg-type]
+    assert torch.equal(point.actions, before), "a refused state has changed the plan"
+
+
+@pytest.mark.parametrize(("part", "number"), [("qvel", np.nan), ("qpos", np.inf), ("time", -np.inf)])
+def test_a_state_that_is_not_finite_is_refused_by_its_part(part: str, number: float, point: lw.MPPI) -> None:
+    broken, before = point.state_of(), point.actions.clone()
+    broken[point.env.state_space.parts[part]] = number
+    with pytest.raises(ValueError, match=f"the state to plan from has {number} in its '{part}': it must be finite"):
+        point(broken)
+    assert torch.equal(point.actions, before)
+
+
+def test_one_row_of_states_is_one_state() -> None:
+    row, single = (lw.MPPI("point_mass", horizon=3, samples=4) for _ in range(2))
+    state = row.state_of()
+    assert torch.equal(row(state[None]), single(state))

@@ -1,0 +1,109 @@
+"""Statistics of an iteration, against plain ones."""
+
+import dataclasses
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+import lyceum_warp as lw
+from lyceum_warp.algos.statistics import (
+    EpisodeSums,
+    Moments,
+    ProcessNumbers,
+    UpdateNumbers,
+    ValueSums,
+    episode_statistics,
+    finished,
+    pooled,
+    prediction_sums,
+    summary,
+    value_statistics,
+)
+
+
+def floats(sums: EpisodeSums) -> EpisodeSums:
+    return EpisodeSums(*(number.item() for number in sums))
+
+
+def test_episode_statistics_are_those_of_the_episodes_that_ended() -> None:
+    """In one rollout, and pooled from two parts of its worlds."""
+    env = lw.make("hopper", nworld=6)
+    rollout = lw.Rollout(env, 60)
+    rollout.running_return[0] = math.nan  # an episode that began in its middle does not count
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, log_std=0.0)
+    rollout.collect(policy, torch.randn(rollout.action.shape, generator=torch.Generator().manual_seed(0)))
+    ended = rollout.done & ~rollout.episode_return.isnan()
+    assert 6 < ended.sum() < rollout.done.sum()
+    returns = rollout.episode_return[ended].double()
+    tensors = {
+        "return_mean": returns.mean(), "return_std": returns.std(correction=0), "return_min": returns.min(),
+        "return_max": returns.max(), "length_mean": rollout.episode_length[ended].mean(),
+        "terminal_reward": rollout.reward[ended].mean(), "eval_mean": rollout.eval[ended].mean(),
+        "success": rollout.success[ended].float().mean(),
+    }  # fmt: skip
+    expected = {name: tensor.item() for name, tensor in tensors.items()}
+    assert episode_statistics([floats(finished(rollout))]) == pytest.approx(expected, rel=1e-5)
+    names = ("done", "episode_return", "episode_length", "reward", "eval", "success")
+    parts = [
+        floats(finished(SimpleNamespace(**{name: getattr(rollout, name)[:, part] for name in names})))  # type: ignore[arg-type]
+        for part in (slice(0, 1), slice(1, None))
+    ]
+    assert parts[0].episodes < parts[1].episodes
+    assert episode_statistics(parts) == pytest.approx(expected, rel=1e-5)
+
+
+def test_episode_statistics_are_nan_where_no_episode_ended() -> None:
+    assert all(math.isnan(number) for number in episode_statistics([EpisodeSums(*[0.0] * 9)]).values())
+
+
+def test_value_statistics_of_two_processes_equal_those_of_all_samples() -> None:
+    returns, predicted = 3.0 + torch.randn(2, 50, dtype=torch.float64), 2.0 + torch.randn(2, 50, dtype=torch.float64)
+    sums = [ValueSums(*(x.item() for x in prediction_sums(r, p))) for r, p in zip(returns, predicted, strict=True)]
+    error = returns - predicted
+    assert value_statistics(sums, 50) == pytest.approx(
+        {
+            "value_error": (error.square().sum() / returns.square().sum()).item(),
+            "explained_variance": (1.0 - error.var() / returns.var()).item(),
+        }
+    )
+
+
+def test_pooled_moments_equal_those_of_all_numbers() -> None:
+    numbers = torch.randn(30, dtype=torch.float64)
+    parts = [
+        Moments(len(part), part.mean().item(), (part - part.mean()).square().sum().item())
+        for part in numbers.split([4, 20, 6])
+    ]
+    square = (numbers - numbers.mean()).square().sum().item()
+    assert pooled(parts) == pytest.approx(Moments(30, numbers.mean().item(), square))
+    assert pooled([Moments(0, 0.0, 0.0)]) == Moments(0, 0.0, 0.0)
+
+
+def process(first: float, faults: float) -> ProcessNumbers:
+    """Numbers that count upwards from the first."""
+    numbers = iter(torch.arange(first, first + 19))
+    parts = [kind(*(next(numbers) for _ in kind._fields)) for kind in (UpdateNumbers, ValueSums, EpisodeSums)]
+    return ProcessNumbers(*parts)._replace(update=parts[0]._replace(faults=torch.tensor(faults)))  # type: ignore[arg-type,call-arg]
+
+
+def test_packed_numbers_are_unpacked_under_their_names() -> None:
+    packed = process(1.0, 4).pack()
+    assert (packed.dtype, packed.shape) == (torch.float64, (19,))
+    unpacked = ProcessNumbers.unpack(packed.tolist())
+    assert unpacked == process(1.0, 4)
+    assert (unpacked.update.kl, unpacked.update.faults, unpacked.values.return_mean) == (2.0, 4.0, 7.0)
+    assert (unpacked.episodes.episodes, unpacked.episodes.success) == (11.0, 19.0)
+
+
+def test_summary_averages_kl_sums_faults_and_sets_attributes_of_an_iteration() -> None:
+    both = summary([ProcessNumbers.unpack(process(*numbers).pack().tolist()) for numbers in ((1, 4), (3, 5))], 10)
+    assert (both["kl"], both["faults"], both["step_norm"], both["return_max"]) == (3.0, 9, 3.0, 17.0)
+    others = {"iteration", "samples", "samples_per_second"}
+    names = {field.name for field in dataclasses.fields(lw.Iteration)} - others
+    assert both.keys() == {name for name in names if not name.startswith(("time_", "mean_"))}
+
+
+def test_help_describes_every_attribute_of_an_iteration() -> None:
+    assert all(f"    {field.name}: " in (lw.Iteration.__doc__ or "") for field in dataclasses.fields(lw.Iteration))

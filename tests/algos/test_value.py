@@ -1,0 +1,30 @@
+"""Value functions."""
+
+from pathlib import Path
+
+import torch
+
+import lyceum_warp as lw
+from lyceum_warp.runs import Run
+
+
+def test_a_value_function_has_the_discount_of_the_returns_that_it_was_fitted_to(tmp_path: Path) -> None:
+    env = lw.make("point_mass", nworld=2, horizon=12)
+    config = lw.NPGConfig(samples=24, gamma=0.9)
+    value = lw.ValueFunction(env.obs_space.size, (4,))
+    assert value.discount is None
+    npg = lw.NPG(env, value=value, config=config)
+    assert value.discount == lw.NPG(env, config=config).value.discount == 0.9
+    run = Run.create(tmp_path, {}, device="cpu")
+    run.save(0, npg.policy, {}, value)
+    assert lw.load_value(run).discount == 0.9
+    content = torch.load(run.checkpoint)
+    del content["value"]["shape"]["discount"]  # as older releases saved it
+    torch.save(content, run.checkpoint)
+    assert lw.load_value(run).discount is None
+
+
+def test_time_features_are_powers_of_the_step() -> None:
+    value = lw.ValueFunction(2, (4,), time_orders=3)
+    features = value.features(torch.zeros(1, 2), torch.tensor([500.0]))
+    torch.testing.assert_close(features, torch.tensor([[0.0, 0.0, 0.5, 0.25, 0.125]]))

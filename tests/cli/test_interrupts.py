@@ -1,0 +1,58 @@
+"""Ctrl-C and SIGTERM within a program."""
+
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from lyceum_warp.cli.interrupts import Interrupted, postponed, signals
+
+
+@pytest.fixture(autouse=True)
+def default_sigterm() -> Iterator[None]:
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+def test_the_first_signal_raises_and_later_ones_are_ignored() -> None:
+    with signals():
+        with pytest.raises(Interrupted) as raised:
+            signal.raise_signal(signal.SIGTERM)
+        assert raised.value.number == signal.SIGTERM
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_postponed_signal_is_raised_at_the_end_of_the_context() -> None:
+    with signals():
+        with pytest.raises(Interrupted) as raised, postponed() as noted:
+            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGINT)
+            assert noted == [signal.SIGTERM, signal.SIGINT]
+        assert raised.value.number == signal.SIGTERM
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_signals_are_ignored_after_the_caller_raised_a_postponed_one() -> None:
+    with signals():
+        with pytest.raises(Interrupted), postponed() as noted:
+            signal.raise_signal(signal.SIGTERM)
+            raise Interrupted(max(noted))
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_signals_after_an_empty_postponement_raise_again() -> None:
+    with signals():
+        with postponed():
+            pass
+        with pytest.raises(Interrupted):
+            signal.raise_signal(signal.SIGTERM)
+
+
+def test_postponed_false_leaves_signals_alone() -> None:
+    with signals():
+        with pytest.raises(Interrupted), postponed(False) as noted:
+            signal.raise_signal(signal.SIGTERM)
+        assert noted == []

@@ -1,0 +1,37 @@
+"""Runs of earlier releases go on: a folder that was written before the rooms were divided."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+import lyceum_warp as lw
+from lyceum_warp.cli import main
+
+OLD = Path(__file__).parent.parent / "data" / "run_before_rooms"
+
+
+@pytest.fixture
+def old_run(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(OLD, tmp_path / "run"))
+
+
+def test_the_policy_and_the_value_function_of_an_old_run_load(old_run: Path) -> None:
+    policy, value = lw.load(old_run), lw.load_value(old_run)
+    assert policy(torch.zeros(2, policy.nobs)).shape == (2, 3)
+    assert value(torch.zeros(2, policy.nobs), torch.zeros(2)).shape == (2,)
+    assert value.discount == 0.995
+
+
+def test_an_old_run_is_evaluated_in_its_own_physics(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eval", str(old_run), "--episodes", "2"]) == 0
+    assert "hopper: 2 episodes of the mean policy" in capsys.readouterr().out
+
+
+def test_an_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["train", "--resume", str(old_run), "--iterations", "3", "--no-video", "--no-plot"]
+    assert main(arguments) == 0
+    assert [row["iteration"] for row in lw.runs.Run.open(old_run).rows()] == [1, 2, 3]
+    out = capsys.readouterr().out
+    assert "4 worlds, mujoco engine on cpu" in out

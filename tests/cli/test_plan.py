@@ -1,0 +1,274 @@
+"""lyceum-warp plan, called as a shell would."""
+
+import dataclasses
+import inspect
+import json
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from conftest import TaskFile
+from rich.console import Console
+from training_runs import QUIET, TINY, interrupted, refused
+
+import lyceum_warp as lw
+from lyceum_warp import Trajectory, cli
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.cli.display import PlanDisplay
+from lyceum_warp.cli.plan import Settings
+
+# tests may run in the background, where a shell has its children ignore SIGINT
+TAKE_SIGINT = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+SMALL = ["--horizon", "10", "--samples", "8", "--temperature", "0.01", "--noise", "0.3", "--steps", "40"]
+
+
+def plan(out: Path, *options: str, task: str = "point_mass") -> int:
+    return cli.main(["plan", task, "--out", str(out), *SMALL, *options])
+
+
+def test_help_shows_examples_and_every_setting(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["plan", "--help"])
+    assert ended.value.code == 0
+    out = capsys.readouterr().out
+    assert "$ lyceum-warp plan reach" in out
+    settings = [field.name for field in dataclasses.fields(lw.MPPIConfig)]
+    assert all(f"--{name} " in out for name in (*settings, "value", "rate", "integrator"))
+    assert "--real-time, --no-real-time" in out and "(default: the task's)" in out
+
+
+def test_a_run_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    assert plan(out, "--episodes", "2", "--seed", "3", "--no-video") == 0
+    shown = capsys.readouterr().out
+    assert "episode 1/2" in shown and "episode 2/2" in shown
+    assert "planning time p50" in shown and "real-time factor" in shown
+    assert sorted(path.name for path in out.iterdir()) == [
+        "config.json", "episode-000.npz", "episode-001.npz", "plan.png", "report.json", "versions.json",
+    ]  # fmt: skip
+    config = json.loads((out / "config.json").read_text())
+    assert config["planner"]["horizon"] == 10 and config["planner"]["noise"] == 0.3 and config["seed"] == 3
+    report = json.loads((out / "report.json").read_text())
+    assert report["episodes"] == 2 and report["steps"] == 80
+    with np.load(out / "episode-001.npz", allow_pickle=False) as file:  # as a user without this package would
+        assert file["actions"].shape == (40, 2) and file["rewards"].shape == (40,)
+    # the same controller, called from Python, gives the same episode
+    env = lw.make("point_mass", autoreset=False, horizon=40)
+    planner = lw.MPPI("point_mass", horizon=10, samples=8, temperature=0.01, noise=0.3)
+    again = lw.control(env, planner, seed=4)
+    assert torch.equal(again.states, Trajectory.load(out / "episode-001.npz").states)
+
+
+def test_a_video_is_made_of_the_first_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert plan(tmp_path / "run", "--no-plot") == 0
+    lines = capsys.readouterr().out.splitlines()
+    video = next(line for line in lines if line.startswith("video:")).split(maxsplit=1)[1]
+    if video.startswith("none: this machine cannot draw"):
+        pytest.skip(video)
+    assert Path(video).read_bytes()[4:8] == b"ftyp"
+
+
+def test_real_time_keeps_the_rate_of_the_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert plan(tmp_path / "run", *QUIET, "--real-time", "--rate", "10") == 0
+    assert "async" in capsys.readouterr().out
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["mode"] == "async" and report["deadline_ms"] == 100.0
+    assert 0.5 < report["real_time_factor"] < 1.01  # 40 steps of 20 ms, and however late a busy machine was
+
+
+def test_a_value_function_of_a_run_changes_plans(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "npg"
+    assert cli.main(["train", "point_mass", "--out", str(run), *TINY, *QUIET, "--iterations", "1"]) == 0
+    assert plan(tmp_path / "with", *QUIET, "--value", str(run), "--discount", "0.97") == 0
+    assert plan(tmp_path / "without", *QUIET, "--discount", "0.97") == 0
+    with_value, without = (Trajectory.load(tmp_path / name / "episode-000.npz") for name in ("with", "without"))
+    assert torch.equal(with_value.states[0], without.states[0])
+    assert not torch.equal(with_value.actions, without.actions)
+    assert json.loads((tmp_path / "with" / "config.json").read_text())["value"] == str(run)
+    capsys.readouterr()
+    assert plan(tmp_path / "none", "--value", str(tmp_path / "nowhere")) == 2
+    refused(capsys, "nowhere")
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_planner_param_changes_the_planner_alone(tmp_path: Path) -> None:
+    options = ["--param", "success_distance=0.2", "--planner-param", "success_distance=0.1"]
+    assert plan(tmp_path / "run", *QUIET, *options) == 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["params"] == {"success_distance": 0.2} and config["planner_params"] == {"success_distance": 0.1}
+    assert Trajectory.load(tmp_path / "run" / "episode-000.npz").params["success_distance"] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("options, name, integrator", [
+    ([], "euler", mujoco.mjtIntegrator.mjINT_EULER),  # as the task suggests
+    (["--integrator", "implicitfast"], "implicitfast", mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
+])  # fmt: skip
+def test_options_of_the_physics_change_the_planner_alone(
+    options: list[str], name: str, integrator: int, tmp_path: Path, made_envs: list[lw.Env]
+) -> None:
+    out = tmp_path / "run"
+    options = [*options, "--solver", "iterations=5", "--solver", "noslip_iterations=0", "--deterministic"]
+    assert plan(out, *QUIET, "--steps", "3", "--episodes", "2", *options, task="hopper") == 0
+    plant, planner = made_envs
+    own = lw.make("hopper").model.opt
+    assert (plant.model.opt.integrator, plant.model.opt.iterations) == (own.integrator, own.iterations)
+    assert (planner.model.opt.integrator, planner.model.opt.iterations) == (integrator, 5)
+    assert planner.options.physics.deterministic and not plant.options.physics.deterministic
+    settings = json.loads((out / "config.json").read_text())["planner"]
+    assert settings["solver"] == {"iterations": 5, "noslip_iterations": 0}
+    assert (settings["integrator"], settings["deterministic"]) == (name, True)
+
+
+@pytest.mark.parametrize("options, words", [
+    (["--horizon", "0"], ["horizon", "0"]),
+    (["--samples", "0"], ["samples", "0"]),
+    (["--temperature", "0"], ["temperature", "0"]),
+    (["--temperature", "inf"], ["temperature", "inf"]),
+    (["--smoothing", "0.25", "0.8", "0.3"], ["smoothing", "unstable"]),
+    (["--noise", "-1"], ["noise", "-1"]),
+    (["--noise", "1", "2", "3"], ["noise", "2"]),
+    (["--discount", "1.5"], ["discount", "1.5"]),
+    (["--fill", "hold"], ["fill", "hold"]),
+    (["--termination", "maybe"], ["termination", "maybe"]),
+    (["--episodes", "0"], ["episodes", "0"]),
+    (["--steps", "0"], ["steps", "0"]),
+    (["--rate", "0"], ["rate", "0"]),
+    (["--param", "mass=2"], ["mass"]),
+    (["--planner-param", "mass=2"], ["mass"]),
+    (["--planner-model", "nowhere.xml"], ["there is no file", str(Path("nowhere.xml").resolve())]),
+    (["--fill", "1", "2", "3"], ["fill", "2 of them"]),
+    (["--fill", "1", "zero"], ["fill", "1 zero"]),
+    (["--seed", "-1"], ["seed", "-1"]),
+    (["--seed", "2147483647", "--episodes", "2"], ["seed of the last episode", "2147483648"]),
+    (["--engine", "bullet"], ["bullet"]),
+    (["--integrator", "rk5"], ["no integrator 'rk5'", "'euler'"]),
+    (["--solver", "iterations=0"], ["solver's iterations", "not 0"]),
+    (["--device", "cuda:7"], ["cuda:7"]),
+])  # fmt: skip
+def test_an_option_out_of_range_is_one_line_and_leaves_no_folder(
+    options: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert plan(tmp_path / "run", *options) == 2
+    refused(capsys, *words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_that_is_not_empty_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.tex").write_text("")
+    assert plan(tmp_path / "run") == 2
+    refused(capsys, "run")
+    (tmp_path / "run" / "config.json").write_text("{}")
+    assert plan(tmp_path / "run") == 2
+    assert "--resume" not in (error := capsys.readouterr().err) and "holds a run: give another --out" in error
+
+
+def test_an_unknown_task_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["plan", "no_such_task"]) == 2
+    refused(capsys, "no_such_task")
+
+
+def test_an_interrupt_keeps_whole_episodes(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    argv = ["plan", "point_mass", "--out", str(out), *SMALL, *QUIET, "--episodes", "100000"]
+    program = f"{TAKE_SIGINT}import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if "episode 2/" in line:
+                process.send_signal(signal.SIGINT)
+                break
+        rest = process.stdout.read()
+    assert process.returncode == 130
+    files = sorted(out.glob("episode-*.npz"))
+    part = f"the interrupted episode is in {files[-1].name}" in rest
+    whole = len(files) - part
+    assert f"after {whole} episodes" in rest and whole >= 2
+    assert all(Trajectory.load(path).steps == 40 for path in files[:whole])
+    assert json.loads((out / "report.json").read_text())["episodes"] == whole
+
+
+@pytest.mark.parametrize("mode", [[], ["--real-time"]])
+def test_an_interrupt_keeps_the_interrupted_episode(
+    mode: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def third(display: PlanDisplay, now: lw.ControlProgress) -> None:
+        if now.step == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(PlanDisplay, "__call__", third)
+    out = tmp_path / "run"
+    options = ["--horizon", "10", "--samples", "8", "--steps", "100000", *QUIET, *mode]
+    assert interrupted(["plan", "point_mass", "--out", str(out), *options]) == 130
+    path = out / "episode-000.npz"
+    assert f"interrupted by SIGINT in the first episode, after 3 steps; it is in {path}" in capsys.readouterr().out
+    part = Trajectory.load(path)
+    assert part.steps == 3 and part.done_reason == 0 and len(part.states) == 4
+    assert not (out / "report.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "fill"), [(["-0.5"], -0.5), (["-0.5", "0.25"], [-0.5, 0.25]), (["repeat"], "repeat")]
+)
+def test_fill_is_a_word_or_one_number_or_an_action(words: list[str], fill: object, tmp_path: Path) -> None:
+    assert plan(tmp_path / "run", *QUIET, "--steps", "1", "--fill", *words) == 0
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["planner"]["fill"] == fill
+
+
+def test_settings_that_are_not_given_are_those_of_the_task(tmp_path: Path) -> None:
+    argv = ["plan", "reach", "--out", str(tmp_path / "run"), *QUIET, "--steps", "1", "--samples", "7"]
+    assert (
+        cli.main([*argv, "--noise", "0.3", "0.4", "0.5", "0.6", "0.7", "0.8", "0.9", "--smoothing", "1", "0", "0"]) == 0
+    )
+    settings = json.loads((tmp_path / "run" / "config.json").read_text())["planner"]
+    assert (settings["samples"], settings["horizon"], settings["temperature"]) == (7, 16, 0.2)
+    assert settings["noise"] == [0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9] and settings["smoothing"] == [1, 0, 0]
+
+
+def test_every_setting_has_a_flag() -> None:
+    flags = [field.name for field in dataclasses.fields(Settings)]
+    assert flags == [field.name for field in dataclasses.fields(lw.MPPIConfig)]
+    assert Settings().on_top_of(lw.MPPIConfig(horizon=3)) == lw.MPPIConfig(horizon=3)
+    given = Settings(noise=(0.25,), fill=("0.5",), horizon=4)  # type: ignore[call-arg]
+    assert given.on_top_of(lw.MPPIConfig(samples=3)) == lw.MPPIConfig(samples=3, noise=0.25, fill=0.5, horizon=4)
+
+
+def test_a_parameter_with_the_name_of_a_setting_is_given_by_param(task_file: TaskFile, tmp_path: Path) -> None:
+    source = Path(inspect.getfile(find_task("point_mass"))).read_text()
+    source = source.replace("@lw.register\n", "").replace("success_distance", "temperature")
+    file = task_file("warm_mass.py", source)
+    options = ["--param", "temperature=0.5", "--temperature", "0.25", "--planner-param", "temperature=0.75"]
+    assert plan(tmp_path / "run", *QUIET, "--steps", "1", *options, task=str(file)) == 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["planner"]["temperature"] == 0.25 and config["params"] == {"temperature": 0.5}
+    assert Trajectory.load(tmp_path / "run" / "episode-000.npz").params["temperature"] == 0.5
+
+
+def test_an_option_among_the_params_is_that_of_world_and_planner(tmp_path: Path, made_envs: list[lw.Env]) -> None:
+    assert plan(tmp_path / "run", *QUIET, "--steps", "1", "--param", "frame_skip=3") == 0
+    assert [env.task.frame_skip for env in made_envs] == [3, 3]
+
+
+def test_the_live_display_shows_steps_reward_and_rate(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console(force_terminal=True, width=120)
+    env = lw.make("point_mass", autoreset=False, horizon=3)
+    with PlanDisplay(console, 0, 1, 3, env.timestep) as display:
+        lw.control(env, lambda state, obs: torch.zeros(2), seed=0, on_step=display)
+        display.progress.refresh()
+    shown = capsys.readouterr().out
+    assert all(word in shown for word in ("3/3", "reward", "eval", "Hz", "real time"))
+
+
+def test_the_live_display_shows_the_real_time_factor_or_the_age(capsys: pytest.CaptureFixture[str]) -> None:
+    now = lw.ControlProgress(10, 0.5, 1.0, 2.0, True, 0.01, 0.03, plans=6)
+    for real_time, words in ((False, "20 Hz 0.40x real time"), (True, "10 plans/s action 30 ms old")):
+        with PlanDisplay(Console(force_terminal=True, width=120), 0, 1, 20, 0.02, real_time=real_time) as display:
+            display(now)
+            display.progress.refresh()
+        assert f"10/20 reward 1 eval 2 {words}" in re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", capsys.readouterr().out)

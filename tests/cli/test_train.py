@@ -1,0 +1,306 @@
+"""lyceum-warp train: new runs, resumed runs, refused ones, and runs that are interrupted."""
+
+import dataclasses
+import inspect
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import pytest
+import torch
+from conftest import TaskFile
+from training_runs import QUIET, TINY, interrupted, metrics, refused, train
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.algos.distributed import Team
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.cli.train import Train, _config
+from lyceum_warp.runs import Run
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "four"
+    assert train(out, "--iterations", "4") == 0
+    return out
+
+
+def test_a_task_file_is_trained_and_evaluated(
+    task_file: TaskFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = Path(inspect.getfile(find_task("point_mass"))).read_text()
+    source = source.replace("@lw.register\n", "").replace("PointMass", "Mine").replace("horizon = 256", "horizon = 20")
+    mine = task_file("mine.py", source)
+    monkeypatch.chdir(tmp_path)
+    options = ["--iterations", "2", "--param", "success_distance=0.1", "--seed", "5"]
+    assert cli.main(["train", os.path.relpath(mine), "--out", "deep/run", *TINY, *options]) == 0
+    output = capsys.readouterr().out
+    out = Path("deep/run")
+    assert "iteration    2/2" in output
+    assert f"checkpoint: {out / 'checkpoint.pt'}" in output
+    for name, file in (("curve", out / "curve.png"), ("video", out / "video.mp4")):
+        assert f"{name}:      {file if file.exists() else 'none: '}" in output
+    config = Run.open(out).config
+    assert (config["task"], config["seed"]) == (str(mine.resolve()), 5)
+    assert config["params"] == {"success_distance": 0.1}
+    assert config["npg"]["hidden"] == [8]
+    rows = metrics(out)
+    assert [row["iteration"] for row in rows] == ["1", "2"]
+    assert [bool(row["mean_return"]) for row in rows] == [False, True]
+    monkeypatch.chdir("/")  # the task is found from another folder, too
+    assert cli.main(["eval", str(tmp_path / out), "--episodes", "2", "--video"]) == 0
+    video = tmp_path / out / "eval.mp4"
+    assert f"video: {video if video.exists() else 'none: '}" in capsys.readouterr().out
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert train(out, "--iterations", "2") == 0
+    # an iteration whose checkpoint was never written
+    with (out / "metrics.csv").open("a") as file:
+        file.write(",".join(["3", *["1"] * 26]) + "\n4,")
+    assert cli.main(["train", "--resume", str(out), "--iterations", "4", *QUIET]) == 0
+    assert "iteration    3/4" in capsys.readouterr().out
+    assert metrics(out) == metrics(trained)
+    one, other = Run.open(out).read()["state"], Run.open(trained).read()["state"]
+    assert torch.equal(one["env"], other["env"])
+    assert torch.equal(one["generator"], other["generator"])
+    assert all(torch.equal(one["policy"][name], other["policy"][name]) for name in one["policy"])
+    assert all(torch.equal(one["value"][name], other["value"][name]) for name in one["value"])
+    assert Run.open(out).config == Run.open(trained).config
+
+
+def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    resume = ["train", "--resume", str(trained), *QUIET]
+    before = {path: path.read_bytes() for path in trained.iterdir()}
+    for options, words in [
+        (["--iterations", "4"], ["already has 4 iterations", "--iterations 8"]),
+        (["--iterations", "9", "--gamma", "0.9"], ["has gamma 0.995, not 0.9", "without --resume"]),
+        (["--iterations", "9", "--seed", "1"], ["has seed 0, not 1"]),
+        (["--iterations", "9", "--param", "success_distance=1"], ["has param"]),
+        (["--iterations", "9", "--out", str(tmp_path)], ["stays in its folder"]),
+    ]:
+        assert cli.main([*resume, *options]) == 2
+        refused(capsys, *words)
+    assert before == {path: path.read_bytes() for path in trained.iterdir()}
+    assert cli.main(["train", "--resume", str(tmp_path / "none")]) == 2
+    refused(capsys, "there is no run in")
+
+
+def physics(env: lw.Env) -> tuple[int, int, int, bool]:
+    opt = env.model.opt
+    return opt.integrator, opt.iterations, opt.ls_iterations, env.options.physics.deterministic
+
+
+def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    options = ["--integrator", "euler", "--solver", "iterations=7", "--solver", "ls_iterations=9", "--deterministic"]
+    assert train(out, "--iterations", "1", *options, task="hopper") == 0  # whose own integrator is RK4
+    solver = {"iterations": 7, "ls_iterations": 9}
+    given = {"integrator": "euler", "solver": solver, "deterministic": True}
+    assert Run.open(out).config["physics"] == given
+    resume = ["train", "--resume", str(out), *QUIET, "--iterations"]
+    assert cli.main([*resume, "2"]) == 0
+    assert cli.main([*resume, "3", "--solver", "iterations=7", "--integrator", "euler"]) == 0
+    assert cli.main(["eval", str(out), "--episodes", "2", "--video"]) == 0
+    assert {physics(env) for env in made_envs} == {(mujoco.mjtIntegrator.mjINT_EULER, 7, 9, True)}
+    assert {env.nworld for env in made_envs} == {1, 2, 32}  # a video, all iterations and eval, the final evaluation
+    capsys.readouterr()
+    for other, words in [
+        (["--integrator", "rk4"], "has integrator euler, not rk4"),
+        (["--solver", "iterations=8"], "has solver {'iterations': 7, 'ls_iterations': 9}, not {'iterations': 8,"),
+        (["--no-deterministic"], "has deterministic True, not False"),
+    ]:
+        assert cli.main([*resume, "4", *other]) == 2
+        refused(capsys, words, "without --resume")
+
+
+def changed_config(trained: Path, folder: Path, change: Any) -> list[str]:
+    """Copy a run, change its configuration, and return a command that resumes it."""
+    shutil.copytree(trained, folder)
+    config = Run.open(folder).config
+    change(config)
+    (folder / "config.json").write_text(json.dumps(config))
+    return ["train", "--resume", str(folder), "--iterations", "5", *QUIET]
+
+
+def test_a_run_without_saved_physics_has_that_of_the_model(
+    trained: Path, tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]
+) -> None:
+    resume = changed_config(trained, tmp_path / "run", lambda config: config.pop("physics"))
+    assert cli.main([*resume, "--integrator", "rk4"]) == 2
+    refused(capsys, "has integrator None, not rk4")
+    assert cli.main(resume) == 0
+    assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2"]) == 0
+    assert {physics(env) for env in made_envs} == {physics(lw.make("point_mass"))}
+
+
+@pytest.mark.parametrize("change, words", [
+    (lambda config: config["npg"].update(fisher_fraction=0.0), "fisher_fraction must be greater than 0"),
+    (lambda config: config["npg"].update(momentum=0.9), "momentum"),
+    (lambda config: config.update(npg="defaults"), "npg"),
+    (lambda config: config.update(nworld="many"), "nworld is 'many'"),
+    (lambda config: config.pop("params"), "'params'"),
+])  # fmt: skip
+def test_a_configuration_that_does_not_fit_is_one_line(
+    change: Any, words: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(changed_config(trained, tmp_path / "run", change)) == 2
+    refused(capsys, "config.json is not the configuration of an NPG run (", words)
+
+
+def test_a_configuration_of_an_earlier_release_has_the_defaults_of_newer_hyperparameters(
+    trained: Path, tmp_path: Path
+) -> None:
+    resume = changed_config(trained, tmp_path / "run", lambda config: config["npg"].pop("time_orders"))
+    assert cli.main(resume) == 0
+
+
+def test_resume_refuses_a_broken_checkpoint(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    resume = changed_config(trained, tmp_path / "run", lambda config: None)
+    checkpoint = tmp_path / "run" / "checkpoint.pt"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-1000])
+    assert cli.main(resume) == 2
+    refused(capsys, str(checkpoint), "cut off", "restore the file from a copy")
+    other = changed_config(trained, tmp_path / "other", lambda config: config.update(nworld=3))
+    assert cli.main(other) == 2
+    refused(capsys, "does not fit the configuration beside it")
+    for folder in ("run", "other"):
+        assert (tmp_path / folder / "metrics.csv").read_bytes() == (trained / "metrics.csv").read_bytes()
+
+
+def test_train_refuses_to_overwrite_a_run(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.read_bytes() for path in trained.iterdir()}
+    assert train(trained, "--iterations", "9") == 2
+    refused(capsys, str(trained), "--resume", "another --out")
+    assert before == {path: path.read_bytes() for path in trained.iterdir()}
+
+
+@pytest.mark.parametrize(
+    "task, options, words",
+    [
+        ("point_mas", [], ["no task 'point_mas'", "did you mean point_mass?"]),
+        ("nowhere.py", [], ["no task file 'nowhere.py'"]),
+        ("point_mass", ["--engine", "bullet"], ["no engine 'bullet'", "'mujoco'"]),
+        ("point_mass", ["--device", "cuda:77"], ["no device 'cuda:77'"]),
+        ("point_mass", ["--nworld", "0"], ["nworld", "not 0"]),
+        ("point_mass", ["--threads", "0"], ["threads", "not 0"]),
+        ("point_mass", ["--iterations", "0"], ["iterations", "not 0"]),
+        ("point_mass", ["--seed", "-1"], ["seed", "-1"]),
+        ("point_mass", ["--gamma", "1.5"], ["gamma must be", "from 0 to 1, not 1.5"]),
+        ("point_mass", ["--log-std", "nan"], ["log_std must be", "not nan"]),
+        ("point_mass", ["--hidden", "8", "0"], ["hidden must be", "not (8, 0)"]),
+        ("point_mass", ["--param", "distance=1"], ["no parameter 'distance'"]),
+        ("point_mass", ["--param", "success_distance"], ["NAME=VALUE", "'success_distance'"]),
+        ("point_mass", ["--param", "success_distance="], ["NAME=VALUE"]),
+        ("point_mass", ["--param", "success_distance=near"], ["'success_distance=near'", "number"]),
+        ("point_mass", ["--integrator", "rk5"], ["no integrator 'rk5'", "'euler'"]),
+        ("point_mass", ["--solver", "iteration=3"], ["no limit 'iteration'", "'iterations'"]),
+        ("point_mass", ["--solver", "iterations=0"], ["solver's iterations", "not 0"]),
+        ("point_mass", ["--solver", "iterations"], ["'iterations'", "NAME=VALUE"]),
+    ],
+)
+def test_a_bad_option_is_one_line_and_leaves_no_folder(
+    task: str, options: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(tmp_path / "run", *options, task=task) == 2
+    refused(capsys, *words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_train_without_a_task_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["train"]) == 2
+    refused(capsys, "train needs a task", "hopper")
+
+
+def test_a_return_that_is_too_small_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert train(tmp_path / "easy", "--iterations", "1", "--require-return", "-1e6") == 0
+    assert train(tmp_path / "hard", "--iterations", "1", "--require-return", "1e6") == 1
+    assert "--require-return demands more than 1e+06" in capsys.readouterr().err
+    assert (tmp_path / "hard" / "checkpoint.pt").exists()
+
+
+def test_the_default_number_of_worlds_depends_on_the_device() -> None:
+    options = Train(task="hopper")
+    found = []
+    for device, size, given in (("cpu", 2, None), ("cuda:0", 1, None), ("cuda", 2, None), ("cuda", 2, 96)):
+        config = _config(dataclasses.replace(options, device=device, nworld=given), Team(0, size))
+        found.append((config["nworld"], config["npg"]["samples"]))
+    assert found == [(64, 10_000), (4096, 65_536), (8192, 131_072), (96, 10_000)]
+
+
+# interruptions
+
+
+def assert_continues(out: Path, output: str, trained: Path) -> None:
+    """A run that was interrupted after its third iteration has lost nothing, and prints how to continue it."""
+    done = Run.open(out).read()["iteration"]
+    assert f"after {done} of 100000 iterations" in output
+    assert f"lyceum-warp train --resume {out} --iterations 100000" in output
+    rows = metrics(out)
+    assert [int(row["iteration"]) for row in rows] == list(range(1, done + 1))
+    assert rows[:3] == metrics(trained)[:3]
+    assert cli.main(["train", "--resume", str(out), "--iterations", str(done + 1), *QUIET]) == 0
+    assert len(metrics(out)) == done + 1
+
+
+def test_a_terminated_run_continues(trained: Path, tmp_path: Path) -> None:
+    if os.name == "nt":
+        pytest.skip("signals are POSIX's")
+    out = tmp_path / "run"
+    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "100000"]
+    program = f"import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if "iteration    3/" in line:
+                process.send_signal(signal.SIGTERM)
+                break
+        rest = process.stdout.read()
+    assert process.returncode == 143
+    assert_continues(out, rest, trained)
+
+
+def test_an_interrupted_run_continues(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Within this process; the tests of plan interrupt a command from outside."""
+    out = tmp_path / "run"
+    save = Run.save
+
+    def interrupting(run: Run, iteration: int, *args: Any) -> None:
+        save(run, iteration, *args)
+        if iteration == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Run, "save", interrupting)
+    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "100000"]
+    assert interrupted(argv) == 130
+    monkeypatch.undo()
+    assert_continues(out, capsys.readouterr().out, trained)
+
+
+def test_a_killed_run_continues(trained: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "100000"]
+    program = f"import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.DEVNULL) as process:
+        limit = time.monotonic() + 60
+        while not (out / "metrics.csv").exists() or len(metrics(out)) < 2:
+            assert process.poll() is None and time.monotonic() < limit
+            time.sleep(0.01)
+        process.kill()
+    total = max(4, Run.open(out).read()["iteration"] + 1)
+    assert cli.main(["train", "--resume", str(out), "--iterations", str(total), *QUIET]) == 0
+    assert metrics(out)[:4] == metrics(trained)[:4]
+    assert len(metrics(out)) == total

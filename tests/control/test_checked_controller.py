@@ -1,0 +1,97 @@
+"""A controller as the loops call it: what is refused, which action is applied, how it is described."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from toy_controllers import SamplingPlanner, StepPlanner
+
+import lyceum_warp as lw
+from lyceum_warp.control.checked_controller import CheckedController
+from lyceum_warp.control.loop import control
+from lyceum_warp.control.real_time import control_async
+from lyceum_warp.control.trajectory import Trajectory
+
+Run = Callable[..., Trajectory]
+BOTH = pytest.mark.parametrize("run", [control, control_async])
+
+
+@pytest.fixture(scope="module")
+def env() -> lw.Env:
+    return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
+
+
+def test_an_object_that_is_not_callable_is_refused(env: lw.Env) -> None:
+    with pytest.raises(ValueError, match=r"must be callable with \(state, obs\), not str 'towards': give a function"):
+        control(env, "towards")  # type: ignore[arg-type]
+
+
+def test_a_policy_of_one_argument_is_refused(env: lw.Env) -> None:
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
+    with pytest.raises(ValueError, match=r"GaussianPolicy takes one argument: give lambda state, obs: policy\(obs\)"):
+        control(env, policy, steps=2)
+    assert control(env, lambda state, obs: policy(obs), steps=2).steps == 2
+
+
+@BOTH
+def test_a_planner_cannot_control_its_own_environment(run: Run) -> None:
+    plan = lw.MPPI("point_mass", horizon=4, samples=1)
+    with pytest.raises(ValueError, match="plans in the environment that it controls.*: control another environment"):
+        run(plan.env, plan, steps=4)
+
+
+@pytest.mark.parametrize("timestep", [0.0, math.nan, "fast"])
+def test_a_time_step_that_is_not_positive_is_refused(env: lw.Env, timestep: object) -> None:
+    planner = StepPlanner(env)
+    planner.timestep = timestep  # type: ignore[assignment]
+    with pytest.raises(ValueError, match="the timestep of a controller must be a positive number of seconds"):
+        CheckedController(planner, env)
+
+
+@BOTH
+def test_an_action_of_another_shape_is_refused(run: Run, env: lw.Env) -> None:
+    with pytest.raises(ValueError, match=r"return an action of shape \(2,\), not a float32 tensor of shape \(1, 2\)"):
+        run(env, lambda state, obs: torch.zeros(1, 2))
+    with pytest.raises(ValueError, match=r"must return an action of shape \(2,\), not NoneType None"):
+        run(env, lambda state, obs: None)
+
+
+@BOTH
+def test_a_plan_of_another_shape_is_refused(run: Run, env: lw.Env) -> None:
+    bad = type("Bad", (), {"actions": torch.zeros(8, 3), "__call__": lambda *_: torch.zeros(2)})
+    with pytest.raises(ValueError, match=r"must have actions of shape \(horizon, 2\), not a float32 tensor"):
+        run(env, bad())
+
+
+@BOTH
+def test_an_action_that_is_not_finite_is_refused_by_name(run: Run, env: lw.Env) -> None:
+    with pytest.raises(ValueError, match=r"the controller's action 'y' at step 0 must be finite, not nan"):
+        run(env, lambda state, obs: torch.tensor([0.0, math.nan]))
+
+
+def test_index_converts_steps_of_the_plant_to_steps_of_the_plan(env: lw.Env) -> None:
+    planner = StepPlanner(env)
+    planner.timestep = 2 * env.timestep
+    coarse = CheckedController(planner, env)
+    assert [coarse.index(steps, 3) for steps in range(8)] == [0, 1, 1, 2, 2, 2, 2, 2]
+    planner.timestep = env.timestep / 2
+    fine = CheckedController(planner, env)
+    assert [fine.index(steps, 8) for steps in range(6)] == [0, 2, 4, 6, 7, 7]
+
+
+def test_a_function_is_described_by_its_name(env: lw.Env, tmp_path: Path) -> None:
+    def zeros(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(2)
+
+    episode = control(env, zeros, steps=1)
+    assert episode.controller == {"name": "zeros"} and episode.seed is None
+    assert Trajectory.load(episode.save(tmp_path / "a.npz")).seed is None
+
+
+def test_settings_are_described_as_json_holds_them(env: lw.Env, tmp_path: Path) -> None:
+    episode = control(env, SamplingPlanner(0), steps=1)
+    assert episode.controller["name"] == "SamplingPlanner" and episode.controller["smoothing"] == [1.0, 0.0]
+    assert isinstance(episode.controller["odd"], str)
+    assert Trajectory.load(episode.save(tmp_path / "a.npz")).controller == episode.controller

@@ -1,0 +1,186 @@
+"""Reports: their numbers, their JSON and their rows."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from toy_controllers import SamplingPlanner, simulated_run, towards
+
+import lyceum_warp as lw
+from lyceum_warp.control.control_report import control_report
+from lyceum_warp.control.loop import control
+from lyceum_warp.control.real_time import control_async
+from lyceum_warp.control.trajectory import Trajectory
+
+
+@pytest.fixture(scope="module")
+def env() -> lw.Env:
+    return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
+
+
+@pytest.fixture(scope="module")
+def episode(env: lw.Env) -> Trajectory:
+    return control(env, towards, seed=3)
+
+
+def with_plan_times(episode: Trajectory, times: np.ndarray) -> Trajectory:
+    """The episode with other planning times; the first plan takes one second."""
+    plans = len(times) + 1
+    return dataclasses.replace(
+        episode, plan_times=torch.tensor([1.0, *times], dtype=torch.float64), plan_of=torch.zeros_like(episode.plan_of),
+        plan_starts=torch.arange(plans, dtype=torch.float64), plan_steps=torch.zeros(plans, dtype=torch.int64),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def times() -> np.ndarray:
+    return np.random.default_rng(0).gamma(2, 0.005, 1000)
+
+
+def test_planning_times_are_summarised_without_the_first_plan(episode: Trajectory, times: np.ndarray) -> None:
+    report = control_report(with_plan_times(episode, times))
+    for name, q in (("p50", 0.5), ("p90", 0.9), ("p99", 0.99), ("p99_9", 0.999), ("max", 1.0)):
+        assert getattr(report, f"plan_{name}_ms") == pytest.approx(1000 * np.quantile(times, q))
+    assert report.plan_jitter_ms == pytest.approx(1000 * times.std(ddof=1))
+    assert report.first_plan_ms == 1000
+
+
+def test_the_rate_sets_the_deadline(episode: Trajectory, times: np.ndarray) -> None:
+    timed = with_plan_times(episode, times)
+    assert control_report(timed).misses == (times > episode.timestep).sum()
+    assert control_report(timed, rate=100).misses == (times > 0.01).sum()
+
+
+@pytest.mark.parametrize("plans, missing", [(999, "p99_9"), (99, "p99"), (9, "p90"), (1, "p50"), (0, "max")])
+def test_a_quantile_of_too_few_plans_is_missing(
+    episode: Trajectory, times: np.ndarray, plans: int, missing: str
+) -> None:
+    report = control_report(with_plan_times(episode, times[:plans]))
+    assert getattr(report, f"plan_{missing}_ms") is None
+
+
+def test_a_report_without_plans_has_no_share_of_misses(episode: Trajectory, times: np.ndarray) -> None:
+    report = control_report(with_plan_times(episode, times[:0]))
+    assert report.miss_share is None and ("planning time max", "-") in report.rows()
+
+
+def test_several_episodes_make_one_report(episode: Trajectory) -> None:
+    met = torch.ones_like(episode.success)
+    three = [
+        dataclasses.replace(episode, success=met & (i < 3), rewards=met * float(i), wall_seconds=float(i))
+        for i in (1, 2, 3)
+    ]
+    report = control_report(three)
+    assert (report.episodes, report.steps, report.plans) == (3, 120, 117)
+    assert report.return_mean == 80 and report.return_std == pytest.approx(40)
+    assert report.success == pytest.approx(2 / 3)
+    assert report.episode_seconds_mean == 2 and report.real_time_factor == pytest.approx(120 * episode.timestep / 6)
+    assert report.eval_mean == pytest.approx(float(episode.evals[-1]))
+    assert report.tick_jitter_ms is None and report.late_ticks is None
+
+
+@pytest.mark.parametrize("rate", [0.0, math.inf, "fast"])
+def test_a_rate_that_is_not_positive_is_refused(episode: Trajectory, rate: object) -> None:
+    with pytest.raises(ValueError, match=f"rate must be a positive number of plans per second, not {rate!r}"):
+        control_report(episode, rate=rate)  # type: ignore[arg-type]
+
+
+def test_an_empty_list_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one trajectory"):
+        control_report([])
+
+
+def test_episodes_of_different_kinds_are_refused(env: lw.Env) -> None:
+    one = control(env, SamplingPlanner(0), steps=2)
+    with pytest.raises(ValueError, match="differ in their mode"):
+        control_report([one, dataclasses.replace(one, mode="async")])
+    controller = {**one.controller, "samples": 9}
+    with pytest.raises(ValueError, match=r"differ in their controller \(samples\)"):
+        control_report([one, dataclasses.replace(one, controller=controller)])
+    with pytest.raises(ValueError, match=r"differ in their params \(success_distance\)"):
+        control_report([one, dataclasses.replace(one, params={**one.params, "success_distance": 1.0})])
+
+
+def test_episodes_with_equal_nan_parameters_are_of_one_kind(env: lw.Env) -> None:
+    one = control(env, SamplingPlanner(0), steps=2)
+    odd = dataclasses.replace(one, params={**one.params, "odd": math.nan})
+    assert control_report([odd, dataclasses.replace(odd, params={**one.params, "odd": float("nan")})]).episodes == 2
+
+
+# samples
+
+
+def test_failed_samples_are_reported(env: lw.Env, tmp_path: Path) -> None:
+    episode = control(env, SamplingPlanner(0, 8, 8, 2), steps=4, seed=1)
+    assert episode.plan_failed.tolist() == [0, 8, 8, 2] and episode.plan_effective.tolist() == [2, 0, 0, 2]
+    report = control_report(episode)
+    assert (report.blind_plans, report.known_plans, report.failed_share) == (2, 4, 18 / 32)
+    assert report.effective_samples_mean == 1.0
+    rows = dict(report.rows())
+    assert rows["plans without a good sample"] == "2 of 4" and rows["failed samples"] == "56.2 %"
+    assert rows["effective samples, mean"] == "1"
+    loaded = Trajectory.load(episode.save(tmp_path / "episode.npz"))
+    assert torch.equal(loaded.plan_failed, episode.plan_failed) and loaded.plan_failed.dtype == torch.float64
+
+
+def test_failed_samples_are_reported_against_the_clock(env: lw.Env) -> None:
+    assert (control_async(env, SamplingPlanner(8), steps=3, period=0.01).plan_failed == 8).all()
+
+
+def test_a_controller_without_samples_has_no_statistics_of_them(env: lw.Env) -> None:
+    episode = control(env, lambda state, obs: torch.zeros(2), steps=3)
+    assert episode.plan_failed.isnan().all() and episode.plan_effective.isnan().all()
+    report = control_report(episode)
+    assert report.blind_plans is None and report.failed_share is None and report.effective_samples_mean is None
+    assert not any("sample" in label for label, _ in report.rows())
+
+
+@pytest.mark.parametrize("run", [control, control_async])
+def test_plans_of_mppi_without_a_good_sample_are_counted(run: Callable[..., Trajectory], env: lw.Env) -> None:
+    options = dict(horizon=4, samples=3, nthread=1)
+    blind = lw.MPPI("point_mass", **options, value=lambda obs: torch.full((3,), math.nan))
+    report = control_report(run(env, blind, steps=4, seed=0))
+    assert report.blind_plans == report.known_plans > 0 and report.failed_share == 1
+    assert report.effective_samples_mean == 0
+    report = control_report(run(env, lw.MPPI("point_mass", **options), steps=4, seed=0))
+    assert report.blind_plans == 0 and report.failed_share == 0
+    assert report.effective_samples_mean is not None and 1 <= report.effective_samples_mean <= 3
+
+
+# JSON and rows
+
+
+def test_json_has_null_for_infinite_numbers(episode: Trajectory, tmp_path: Path) -> None:
+    def refuse(text: str) -> None:
+        raise AssertionError(text)
+
+    rewards = torch.full_like(episode.rewards, math.inf)
+    odd, even = (dataclasses.replace(e, params={"range": (0.7, math.inf)}) for e in (episode, episode))
+    odd = dataclasses.replace(odd, rewards=rewards)
+    path = control_report([odd, even]).write(tmp_path / "new" / "report.json")
+    content = json.loads(path.read_text(), parse_constant=refuse)
+    assert content["return_mean"] is None and content["params"] == {"range": [0.7, None]}
+    assert content["steps"] == 80 and content["task"] == "point_mass" and content["plan_p99_9_ms"] is None
+    assert [file.name for file in path.parent.iterdir()] == ["report.json"]
+
+
+def test_rows_have_units_and_dashes_for_missing_values(episode: Trajectory, env: lw.Env) -> None:
+    rows = dict(control_report(episode).rows())
+    assert rows["episodes"] == "1 of point_mass (40 steps, sync)"
+    assert rows["planning time p99.9"] == "-" and rows["planning time p50"].endswith(" ms")
+    assert "late ticks" not in rows
+    rows = dict(control_report(simulated_run(env, seconds=2.5, steps=9)).rows())
+    assert rows["late ticks"] == "0 of 9" and rows["missed deadlines (1000 ms)"].endswith("(100.0%)")
+    assert rows["age of the action, max"] == "5 steps (5000 ms)"
+
+
+def test_rows_show_ages_in_steps_and_milliseconds(env: lw.Env) -> None:
+    episode = control(env, SamplingPlanner(0), steps=3)
+    old = dataclasses.replace(episode, plan_steps=episode.plan_steps - 1, ages=episode.ages * 0 + 0.0202)
+    rows = dict(control_report(old).rows())
+    assert rows["age of the action, max"] == rows["age of the action, mean"] == "1 step (20.2 ms)"

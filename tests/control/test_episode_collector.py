@@ -1,0 +1,117 @@
+"""What both loops share: limits, progress, and the trajectory of an interrupted episode."""
+
+import time
+from collections.abc import Callable
+
+import pytest
+import torch
+from conftest import SharedEnv
+from toy_controllers import SamplingPlanner, towards
+
+import lyceum_warp as lw
+from lyceum_warp.control.control_report import control_report
+from lyceum_warp.control.episode_collector import ControlProgress
+from lyceum_warp.control.loop import control
+from lyceum_warp.control.real_time import control_async
+from lyceum_warp.control.trajectory import Trajectory
+
+Run = Callable[..., Trajectory]
+BOTH = pytest.mark.parametrize("run", [control, control_async])
+
+
+@pytest.fixture(scope="module")
+def env() -> lw.Env:
+    return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
+
+
+@BOTH
+def test_several_worlds_and_automatic_resets_are_refused(run: Run, shared_env: SharedEnv) -> None:
+    with pytest.raises(ValueError, match="one world without automatic resets, not nworld=1, autoreset=True"):
+        run(shared_env("point_mass"), towards)
+    with pytest.raises(ValueError, match="one world without automatic resets, not nworld=2, autoreset=False"):
+        run(shared_env("point_mass", nworld=2, autoreset=False), towards)
+
+
+@BOTH
+def test_an_episode_without_a_horizon_needs_steps(run: Run, shared_env: SharedEnv) -> None:
+    with pytest.raises(ValueError, match="give steps, or a horizon"):
+        run(shared_env("point_mass", autoreset=False, horizon=0), towards)
+
+
+@BOTH
+def test_zero_steps_are_refused(run: Run, env: lw.Env) -> None:
+    with pytest.raises(ValueError, match="steps must be a whole number from 1 to .*, not 0"):
+        run(env, towards, steps=0)
+
+
+@BOTH
+def test_a_seed_without_a_reset_is_refused(run: Run, env: lw.Env) -> None:
+    with pytest.raises(ValueError, match="seed=1 has no effect with reset=False"):
+        run(env, towards, seed=1, reset=False)
+
+
+@BOTH
+def test_a_finished_episode_is_refused_without_a_reset(run: Run, env: lw.Env) -> None:
+    control(env, towards)
+    with pytest.raises(ValueError, match="over before its first step: reset the environment"):
+        run(env, towards, reset=False)
+
+
+@BOTH
+def test_progress_includes_the_step_and_counts_the_plans(
+    run: Run, env: lw.Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = env.step
+
+    def slow() -> None:
+        time.sleep(0.01)
+        step()
+
+    monkeypatch.setattr(env, "step", slow)
+    seen: list[ControlProgress] = []
+    episode = run(env, SamplingPlanner(0), steps=6, on_step=seen.append)
+    assert seen[0].time >= 0.01  # after the step, not before it
+    assert all(now.step / now.time <= 100 for now in seen)
+    assert [now.plans - 1 for now in seen] == episode.plan_of.tolist()
+
+
+@BOTH
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, RuntimeError])
+def test_on_abort_gets_the_complete_steps(run: Run, kind: type[BaseException], env: lw.Env) -> None:
+    def stop(progress: ControlProgress) -> None:
+        if progress.step == 5:
+            raise kind
+
+    parts: list[Trajectory] = []
+    with pytest.raises(kind):
+        run(env, SamplingPlanner(0), seed=3, on_step=stop, on_abort=parts.append)
+    (part,) = parts
+    assert part.steps == 5 and len(part.states) == 6 and part.done_reason == 0 and part.seed == 3
+    assert len(part.times) == len(part.plan_of) == len(part.late) == 5 and part.wall_seconds > part.times[-1]
+    whole = control(env, SamplingPlanner(0), seed=3)
+    assert torch.equal(part.states, whole.states[:6])
+    assert control_report(part).steps == 5
+
+
+@BOTH
+def test_on_abort_is_not_called_before_the_first_step(run: Run, env: lw.Env) -> None:
+    def fails(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        run(env, fails, on_abort=lambda part: pytest.fail("there was no step"))
+
+
+def test_an_interrupted_step_is_left_out(env: lw.Env, monkeypatch: pytest.MonkeyPatch) -> None:
+    step, calls, parts = env.step, [], []
+
+    def stop() -> None:
+        calls.append(0)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        step()
+
+    monkeypatch.setattr(env, "step", stop)
+    with pytest.raises(KeyboardInterrupt):
+        control(env, SamplingPlanner(0), on_abort=parts.append)
+    assert parts[0].steps == 2 and len(parts[0].actions) == 2 and len(parts[0].plan_times) == 3

@@ -1,0 +1,210 @@
+"""The loop against the clock: on a simulated clock, where every time is exact, and with a thread on the real one."""
+
+import math
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+from toy_controllers import SamplingPlanner, StepPlanner, hundredths, simulated_run, towards
+
+import lyceum_warp as lw
+from lyceum_warp.control.control_report import control_report
+from lyceum_warp.control.episode_collector import ControlProgress
+from lyceum_warp.control.loop import control
+from lyceum_warp.control.real_time import Clock, control_async
+
+
+@pytest.fixture(scope="module")
+def env() -> lw.Env:
+    return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
+
+
+# the simulated clock
+
+
+def test_a_fast_planner_is_one_step_behind(env: lw.Env) -> None:
+    episode = simulated_run(env, seconds=0.3, steps=6)
+    assert episode.times.tolist() == pytest.approx([0, 1, 2, 3, 4, 5])
+    assert episode.age_steps.tolist() == [0, 1, 1, 1, 1, 1]
+    assert episode.ages.tolist() == pytest.approx([0, 1, 1, 1, 1, 1])
+    assert hundredths(episode.actions[:, 0]) == [0, 0, 1, 2, 3, 4]  # the step of the plan's state
+    assert hundredths(episode.actions[:, 1]) == [0, 1, 1, 1, 1, 1]  # the second action of each plan
+    assert episode.wall_seconds == pytest.approx(6)
+    report = control_report(episode)
+    assert (report.misses, report.late_ticks, report.age_steps_max, report.deadline_ms) == (0, 0, 1, 1000)
+    assert report.tick_jitter_ms == pytest.approx(0, abs=1e-6)
+    assert report.real_time_factor == pytest.approx(env.timestep)
+
+
+def test_a_slow_planner_misses_its_deadlines(env: lw.Env) -> None:
+    episode = simulated_run(env, seconds=2.5, steps=9)
+    # the plan from state 1 ends at 3.5; the next one, from the newest state at that time, takes from 3.5 to 6
+    assert episode.plan_of.tolist() == [0, 0, 0, 0, 1, 1, 2, 2, 2]
+    assert episode.plan_steps[:3].tolist() == [0, 1, 3]
+    assert episode.ages.tolist() == pytest.approx([0, 1, 2, 3, 3, 4, 3, 4, 5])
+    assert hundredths(episode.actions[:, 1]) == [0, 1, 2, 3, 3, 4, 3, 4, 5]
+    report = control_report(episode)
+    assert report.misses == report.plans == len(episode.plan_times) - 1 and report.miss_share == 1
+    assert report.age_steps_max == 5 and report.age_max_ms == pytest.approx(5000)
+    assert control_report(episode, rate=0.1).misses == 0
+
+
+def test_the_last_action_of_a_plan_is_applied_until_the_next_plan(env: lw.Env) -> None:
+    assert hundredths(simulated_run(env, seconds=100, steps=6, horizon=3).actions[:, 1]) == [0, 1, 2, 2, 2, 2]
+    assert hundredths(simulated_run(env, seconds=100, steps=4, horizon=1).actions[:, 1]) == [0, 0, 0, 0]
+
+
+def test_a_slow_step_does_not_delay_the_schedule(env: lw.Env) -> None:
+    episode = simulated_run(env, seconds=0.1, steps=6, busy={1: 2.25})
+    assert episode.times.tolist() == pytest.approx([0, 1, 3.25, 3.25, 4, 5])
+    assert episode.late.tolist() == [False, False, True, True, False, False]
+    report = control_report(episode)
+    assert report.misses == 0 and report.late_ticks == 2 and report.tick_delay_max_ms == pytest.approx(1250)
+    assert report.tick_jitter_ms == pytest.approx(np.std([0, 0, 1250, 250, 0, 0], ddof=1))
+
+
+# the thread, with long periods and planners that are much slower
+
+
+def planner_threads() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "lyceum_warp planner"]
+
+
+def test_a_slow_planner_in_a_thread_plans_while_the_plant_steps(env: lw.Env) -> None:
+    planner, interval = StepPlanner(env, seconds=0.12), sys.getswitchinterval()
+    episode = control_async(env, planner, period=0.04, seconds=0.4, seed=6)
+    assert episode.steps == 10 and episode.mode == "async" and episode.period == 0.04
+    assert planner.resets == [6, 6]
+    assert planner.shifts[:3] == [0, 0, 0]
+    assert planner.shifts[3:] == episode.plan_steps.diff().tolist()
+    # on a busy machine, too, each action is the one that its plan has for its step
+    assert hundredths(episode.actions[:, 0]) == episode.plan_steps[episode.plan_of].tolist()
+    assert hundredths(episode.actions[:, 1]) == episode.age_steps.clamp(max=7).tolist()
+    assert episode.plan_starts[0] < 0 and episode.ages[0] == 0 and (episode.plan_starts[1:] > 0).all()
+    report = control_report(episode)
+    assert report.misses == report.plans > 0 and report.age_steps_max > 1 and report.age_max_ms > 80
+    assert report.plan_max_ms is not None and report.plan_max_ms >= 120
+    assert episode.wall_seconds >= 0.4
+    assert not planner_threads() and sys.getswitchinterval() == interval
+    for k, action in enumerate(episode.actions):
+        env.set_state(episode.states[k : k + 1])
+        env.step(action[None])
+        assert torch.equal(env.get_state()[0], episode.states[k + 1])
+
+
+def test_a_policy_in_a_thread_acts_on_the_state_of_its_plan(env: lw.Env) -> None:
+    episode = control_async(env, towards, period=0.03, steps=12, seed=6)
+    assert episode.age_steps[0] == 0 and (episode.age_steps[1:] >= 1).all()
+    for k in range(12):
+        made_from = int(episode.plan_steps[episode.plan_of[k]])
+        assert torch.allclose(episode.actions[k], towards(episode.states[made_from], episode.obs[made_from]))
+
+
+def test_mppi_in_a_thread_makes_the_same_plans_as_without(env: lw.Env) -> None:
+    mppi = lw.MPPI("point_mass", horizon=6, samples=4, nthread=1)
+    episode = control_async(env, mppi, period=0.004, seed=5)
+    mppi.reset(5)
+    plans, last = [], 0
+    for step in episode.plan_steps.tolist():
+        mppi(episode.states[step], shift=step - last)
+        plans.append(mppi.actions.clone())
+        last = step
+    for k, (plan, age) in enumerate(zip(episode.plan_of, episode.age_steps, strict=True)):
+        assert torch.equal(episode.actions[k], plans[plan][min(int(age), 5)])
+    assert torch.equal(control(env, mppi, seed=5, steps=4).states, control(env, mppi, seed=5, steps=4).states)
+
+
+def test_the_run_ends_with_its_episode(env: lw.Env) -> None:
+    episode = control_async(env, towards, period=0.001, steps=1000)
+    assert episode.steps == 40 and episode.truncated
+
+
+@pytest.mark.parametrize("period", [0.0, math.nan, math.inf, "fast"])
+def test_a_period_that_is_not_positive_is_refused(env: lw.Env, period: object) -> None:
+    with pytest.raises(ValueError, match=f"period must be a positive number of seconds, not {period!r}"):
+        control_async(env, towards, period=period)  # type: ignore[arg-type]
+
+
+# errors
+
+
+@pytest.mark.parametrize("fails_at", [1, 3, 5])
+def test_an_exception_of_the_controller_is_raised(env: lw.Env, fails_at: int) -> None:
+    calls = []
+
+    def failing(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        calls.append(threading.current_thread())
+        if len(calls) == fails_at:
+            raise ZeroDivisionError("the controller's own")
+        return torch.zeros(2)
+
+    with pytest.raises(ZeroDivisionError, match="the controller's own"):
+        control_async(env, failing, period=0.01)
+    assert len(calls) == fails_at and not planner_threads()
+
+
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, RuntimeError])
+def test_an_exception_of_the_plant_ends_the_thread(env: lw.Env, kind: type[BaseException]) -> None:
+    def stop(progress: ControlProgress) -> None:
+        if progress.step == 3:
+            raise kind
+
+    interval = sys.getswitchinterval()
+    with pytest.raises(kind):
+        control_async(env, StepPlanner(env, seconds=0.02), period=0.01, on_step=stop)
+    assert not planner_threads() and sys.getswitchinterval() == interval
+
+
+def test_an_exception_does_not_wait_for_an_unfinished_plan(env: lw.Env) -> None:
+    released = threading.Event()
+
+    class Slow(SamplingPlanner):
+        def __call__(self, state: torch.Tensor, obs: torch.Tensor) -> object:
+            if state[env.state_space.parts["step"]] > 0:
+                released.wait(20)
+            return None
+
+    def stop(progress: ControlProgress) -> None:
+        if progress.step == 4:
+            raised.append(time.perf_counter())
+            raise KeyboardInterrupt
+
+    raised: list[float] = []
+    with pytest.raises(KeyboardInterrupt):
+        control_async(env, Slow(0), period=0.01, on_step=stop)
+    took = time.perf_counter() - raised[0]
+    released.set()
+    assert took < 5
+
+
+def test_a_program_ends_normally_while_mppi_plans() -> None:
+    program = """
+import threading, time, torch, lyceum_warp as lw
+plan = lw.MPPI("point_mass", horizon=20, samples=4000, iterations=300, nthread=1)
+env = lw.make("point_mass", autoreset=False)
+def stop(progress):
+    if progress.step == 3:
+        raise KeyboardInterrupt
+class Late:
+    timestep = plan.timestep
+    def __call__(self, state, obs):
+        return torch.zeros(2) if state[env.state_space.parts["step"]] == 0 else plan(state)
+try:
+    lw.control_async(env, Late(), on_step=stop)
+except KeyboardInterrupt:
+    print("ended", sum(thread.name == "lyceum_warp planner" for thread in threading.enumerate()))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and done.stdout == "ended 1\n", done.stderr
+
+
+def test_the_real_clock_never_waits_too_short() -> None:
+    clock = Clock()
+    for wait in (-1.0, 0.0, 0.0002, 0.004):
+        moment = clock.now() + wait
+        clock.wait_until(moment)
+        assert clock.now() >= moment

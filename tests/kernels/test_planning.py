@@ -1,0 +1,130 @@
+"""The kernels of planning: noise against its formulas, weights against theirs, and values in Warp."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from plain_mppi import smoothed
+
+import lyceum_warp as lw
+from lyceum_warp import MPPI, Row
+from lyceum_warp.kernels import planning
+
+
+@pytest.fixture(scope="module")
+def many() -> MPPI:
+    """Many samples of little noise, which bounds never touch."""
+    return MPPI("point_mass", horizon=8, samples=4000, noise=[0.02, 0.05], temperature=1e9)
+
+
+def first_state(seed: int) -> torch.Tensor:
+    return lw.make("reach", seed=seed).get_state()[0]
+
+
+def test_noise_is_standard_normal_and_independent(many: MPPI) -> None:
+    """Of steps, actions, samples, plans and seeds."""
+    many.reset(0)
+    draws = []
+    for seed in (0, 0, 1):
+        if seed:
+            many.reset(seed)
+        many(many.state_of())
+        draws.append(many.standard_noise.permute(1, 0, 2).reshape(4000, 16).double().numpy())
+    numbers = np.hstack(draws)
+    assert abs(numbers.mean()) < 4 / np.sqrt(numbers.size)
+    assert np.abs(numbers.mean(0)).max() < 4.5 / np.sqrt(4000)
+    np.testing.assert_allclose(numbers.std(0), 1, atol=4.5 / np.sqrt(2 * 4000))
+    np.testing.assert_allclose((numbers**4).mean(), 3, atol=0.1)
+    for k, share in ((1, 0.6827), (2, 0.9545), (3, 0.9973)):
+        np.testing.assert_allclose((np.abs(numbers) < k).mean(), share, atol=0.004)
+    correlation = np.corrcoef(numbers.T) - np.eye(48)
+    assert np.abs(correlation).max() < 5 / np.sqrt(4000), "steps, actions, plans or seeds are correlated"
+    for lag in (1, 2, 3, 17, 2000):
+        for one, other in ((0, 0), (0, 1), (0, 2), (2, 0)):
+            product = (draws[one][lag:] * draws[other][:-lag]).mean()
+            assert abs(product) < 5 / np.sqrt(16 * (4000 - lag)), f"samples {lag} apart are correlated"
+
+
+@pytest.mark.parametrize("betas", [(0.25, 0.8, 0.0), (1.0, 0.0, 0.0), (0.5, 0.3, 0.2)])
+def test_smoothed_noise_has_the_spread_of_the_formula(betas: tuple[float, float, float]) -> None:
+    """1, 1, 0.838, 0.716, ... of the standard deviation, with the default weights."""
+    plan = MPPI("point_mass", horizon=12, samples=4000, noise=[0.02, 0.05], smoothing=betas)
+    plan(plan.state_of())
+    added = (plan.sampled - plan.nominal[:, None]).double().numpy()
+    answers = smoothed(np.eye(12), betas)  # the answer of every step to an impulse at every other
+    spread = np.sqrt((answers**2).sum(1))[:, None] * [0.02, 0.05]
+    np.testing.assert_allclose(added.std(1), spread, rtol=0.05)
+    correlation = answers @ answers.T / np.sqrt(np.outer((answers**2).sum(1), (answers**2).sum(1)))
+    for i in range(2):
+        np.testing.assert_allclose(np.corrcoef(added[:, :, i]), correlation, atol=0.08)
+    assert betas != (0.25, 0.8, 0.0) or spread[2, 0] == pytest.approx(0.02 * np.sqrt(0.25**2 + 0.8**2))
+
+
+def test_noise_has_the_given_covariance() -> None:
+    wanted = 1e-3 * np.array([[1.0, -0.6], [-0.6, 0.5]])
+    plan = MPPI("point_mass", horizon=10, samples=4000, noise=wanted, smoothing=(1, 0, 0))
+    plan(plan.state_of())
+    added = (plan.sampled - plan.nominal[:, None]).double().numpy().reshape(-1, 2)
+    np.testing.assert_allclose(np.cov(added.T), wanted, atol=3e-5)
+
+
+def test_one_number_standard_deviations_and_a_diagonal_covariance_give_equal_samples() -> None:
+    plans = [MPPI("point_mass", horizon=10, noise=noise) for noise in (0.1, [0.1, 0.1], np.diag([0.01, 0.01]))]
+    for plan in plans:
+        plan(plan.state_of())
+        torch.testing.assert_close(plan.sampled, plans[0].sampled)
+
+
+def test_noise_of_a_sample_is_independent_of_the_number_of_samples() -> None:
+    few, more = (MPPI("point_mass", horizon=6, samples=n, seed=2) for n in (8, 50))
+    for _ in range(3):
+        few(few.state_of()), more(more.state_of())
+        assert torch.equal(few.standard_noise, more.standard_noise[:, :8])
+
+
+@pytest.mark.parametrize("temperature", [0.01, 1.0, 100.0])
+def test_weights_are_positive_and_add_up_to_one(temperature: float) -> None:
+    plan = MPPI("reach", temperature=temperature)
+    plan(first_state(0))
+    assert plan.weights.sum().item() == pytest.approx(1, abs=1e-5) and (plan.weights >= 0).all()
+
+
+@pytest.mark.parametrize("temperature", [1e-6, 1e-30])
+def test_a_low_temperature_follows_the_best_sample(temperature: float) -> None:
+    plan = MPPI("reach", temperature=temperature)
+    plan(first_state(0))
+    best = plan.returns.argmax()
+    assert plan.weights[best] == 1 and plan.weights.sum() == 1
+    assert torch.equal(plan.actions, plan.sampled[:, best])
+    assert plan.summary["effective_samples"] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("temperature", [1e9, 1e60])
+def test_a_high_temperature_averages_all_samples(temperature: float) -> None:
+    plan = MPPI("reach", temperature=temperature)
+    plan(first_state(0))
+    torch.testing.assert_close(plan.actions, plan.sampled.mean(1))
+    assert plan.summary["effective_samples"] == pytest.approx(plan.samples)
+
+
+def test_weights_differ_by_the_exponential_of_returns_over_temperature() -> None:
+    plan = MPPI("reach", temperature=3.0)
+    plan(first_state(0))
+    ratio = ((plan.returns[0] - plan.returns[1]) / 3.0).exp()
+    torch.testing.assert_close(plan.weights[0] / plan.weights[1], ratio, rtol=1e-4, atol=0)
+
+
+@wp.func
+def value_of_two(obs: Row[float], step: float) -> float:
+    return obs[0] + step
+
+
+@wp.func
+def value_of_whole_numbers(obs: Row[int]) -> float:
+    return float(obs[0])
+
+
+@pytest.mark.parametrize("value", [value_of_two, value_of_whole_numbers], ids=["two arguments", "int"])
+def test_a_value_in_warp_with_other_arguments_is_refused(value: wp.Function) -> None:
+    with pytest.raises(ValueError, match=r"must be written as value\(obs: Row\[float\]\) -> float"):
+        planning.value_kernel(value)

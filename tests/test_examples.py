@@ -1,0 +1,75 @@
+"""Each program in examples/ runs as a newcomer runs it, and prints what it promises."""
+
+import os
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture):
+    """``run("train.py", "--nworld", "4")`` runs an example in this process, in an empty folder: the lines it prints."""
+
+    def lines(name: str, *args: str) -> list[str]:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [name, *args])
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        return capsys.readouterr().out.splitlines()
+
+    return lines
+
+
+def numbers(pattern: str, lines: list[str]) -> list[float]:
+    """The number in parentheses of a pattern, in each line that matches."""
+    return [float(match[1]) for line in lines if (match := re.search(pattern, line))]
+
+
+def test_train_improves_and_saves_the_policy(run, tmp_path: Path) -> None:
+    lines = run("train.py", "--iterations", "5", "--samples", "2000")
+    returns = numbers(r"return +(-?[\d.]+)", lines)
+    assert len(returns) == 6  # five iterations and the mean policy
+    assert returns[-1] > 2 * returns[0] > 0
+    assert lines[-1] == "saved in policy.pt: 5126 parameters"
+    assert (tmp_path / "policy.pt").is_file()
+
+
+def test_plan_reaches_the_target_in_each_episode(run) -> None:
+    lines = run("plan.py", "--episodes", "2")
+    assert sum("success after" in line for line in lines) == 2
+    assert "success: 100% of 2 episodes" in lines
+    assert 0 < numbers(r"median ([\d.]+) ms", lines)[0] < 1000
+
+
+def test_own_task_keeps_the_rules_and_steps() -> None:
+    # in a process of its own: the task is registered, and its module is __main__
+    command = [sys.executable, str(EXAMPLES / "own_task.py")]
+    environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)
+    assert done.returncode == 0, done.stderr
+    first, *_, last = done.stdout.splitlines()
+    assert first.startswith("pendulum on the mujoco engine") and first.endswith("keeps the rules:")
+    # it hangs almost straight down, and pays 0.1 * 0.5² for the action
+    assert last.startswith("reward after 0.04 s")
+    assert numbers(r": (-[\d.]+)", [last])[0] == pytest.approx(-1.025, abs=2e-3)
+
+
+def test_torch_loop_learns_to_approach_the_target(run) -> None:
+    lines = run("torch_loop.py", "--iterations", "24")
+    distances = numbers(r"256 episodes ended ([\d.]+) m", lines)
+    assert len(distances) == 6  # an episode of 128 steps ends in every fourth iteration of 32
+    assert distances[-1] < 0.75 * distances[0]
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
+def test_examples_are_short_and_use_public_names_only(path: Path) -> None:
+    source = path.read_text()
+    assert len(source.splitlines()) < 60
+    modules = set(re.findall(r"^(?:from|import) (lyceum_warp[\w.]*)", source, re.MULTILINE))
+    assert modules <= {"lyceum_warp", "lyceum_warp.testing"}
+    assert not re.search(r"\b(env|plan|npg)\._", source)

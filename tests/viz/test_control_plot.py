@@ -1,0 +1,53 @@
+"""Plots of a controller's episodes."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from toy_controllers import simulated_run, towards
+
+import lyceum_warp as lw
+from lyceum_warp.control.loop import control
+from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.viz.control_plot import control_plot
+
+
+@pytest.fixture(scope="module")
+def env() -> lw.Env:
+    return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
+
+
+@pytest.fixture(scope="module")
+def episode(env: lw.Env) -> Trajectory:
+    return control(env, towards, seed=3)
+
+
+@pytest.mark.parametrize("case", ["one episode", "two episodes", "async", "one step"])
+def test_episodes_are_drawn_as_png(case: str, episode: Trajectory, env: lw.Env, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    match case:
+        case "one episode":
+            episodes = [episode]
+        case "two episodes":
+            episodes = [episode, control(env, towards, seed=8)]
+        case "async":
+            episodes = [simulated_run(env, seconds=2.5, steps=9)]
+        case "one step":
+            episodes = [control(env, towards, steps=1)]
+    given = episodes if len(episodes) > 1 else episodes[0]
+    path = control_plot(given, tmp_path / "new" / "control.png", title="a title")
+    assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
+
+
+def test_an_empty_list_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    with pytest.raises(ValueError, match="at least one trajectory"):
+        control_plot([], tmp_path / "none.png")
+
+
+def test_a_missing_matplotlib_is_reported_with_the_extra(
+    episode: Trajectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ImportError, match=r"needs matplotlib: pip install 'lyceum-warp\[viz\]'"):
+        control_plot(episode, tmp_path / "none.png")

@@ -1,0 +1,48 @@
+"""Plots of learning curves."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from lyceum_warp.runs import Run
+from lyceum_warp.viz.learning_curve import learning_curve
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    run = Run.create(tmp_path / "run", {"task": "point_mass", "seed": 3})
+    for i in range(1, 8):
+        run.write({
+            "iteration": i, "samples": 100 * i, "return_mean": float(i), "return_std": 0.5, "eval_mean": 1 / i,
+            "mean_return": 2.0 * i if i % 3 == 0 else None, "mean_eval": 0.5 if i % 3 == 0 else None,
+        })  # fmt: skip
+    return run
+
+
+def is_png(path: Path) -> bool:
+    return path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
+
+
+def test_a_run_is_drawn_into_its_folder(run: Run) -> None:
+    pytest.importorskip("matplotlib")
+    assert learning_curve(run) == run.folder / "curve.png"
+    assert is_png(run.folder / "curve.png")
+
+
+def test_a_table_is_drawn_into_a_given_file(run: Run, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    assert is_png(learning_curve(run.metrics, tmp_path / "new" / "other.png", title="by table"))
+
+
+def test_a_run_without_rows_is_refused(run: Run) -> None:
+    pytest.importorskip("matplotlib")
+    run.cut(0)
+    with pytest.raises(ValueError, match="has no complete iteration to draw: train it first"):
+        learning_curve(run)
+
+
+def test_a_missing_matplotlib_is_reported_with_the_extra(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ImportError, match=r"needs matplotlib: pip install 'lyceum-warp\[viz\]'"):
+        learning_curve(run)
