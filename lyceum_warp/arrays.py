@@ -20,7 +20,7 @@ def torch_view(array: wp.array) -> torch.Tensor:
 
 
 def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.array) -> None:
-    """Launch one of the kernels above over the masked rows of the target, (nworld, n)."""
+    """Launch one of the copying kernels of ``kernels.state`` over the masked rows of the target, (nworld, n)."""
     if target.size == 0:
         return
     lanes = min(32, target.shape[1]) if wp.get_device(target.device).is_cuda else 1

@@ -1,7 +1,8 @@
-"""Who may import whom: downwards only, no circle, no two modules of one name."""
+"""Who may import whom, what is private to whom, and where tests lie."""
 
 import ast
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ import pytest
 import lyceum_warp as lw
 
 ROOT = Path(lw.__file__).parent
-PATHS = sorted(ROOT.rglob("*.py"))
+TESTS = Path(__file__).parent
 
 LEVELS = {
     "docstrings": -1, "arrays": 0, "done": 0, "files": 0, "machine": 0, "mujoco_log": 0, "validate": 0, "versions": 0,
@@ -24,7 +25,13 @@ LEVELS = {
     "viz": 9,
     "cli": 10,
 }  # fmt: skip
-"""Every room's floor: a room imports from lower floors, or from itself."""
+"""The floor of every room: a room imports from lower floors, or from itself."""
+
+TESTED_BY = {"done": "test_faults.py", "testing": "conformance", "versions": "test_runs.py"}
+"""Tests of rooms that have none of their own name."""
+
+NAMEDTUPLE = {"_fields", "_asdict", "_replace", "_make"}
+"""Public in spite of their names."""
 
 
 def module_name(path: Path) -> str:
@@ -32,28 +39,32 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-MODULES = {module_name(path): path for path in PATHS}
+MODULES = {module_name(path): path for path in sorted(ROOT.rglob("*.py"))}
+TREES = {name: ast.parse(path.read_text()) for name, path in MODULES.items()}
 
 
 def room(module: str) -> str:
     return [*module.split("."), "__init__"][1]
 
 
-def imported_modules(path: Path) -> set[str]:
-    """Modules of the package that a file imports anywhere, under TYPE_CHECKING and within functions too."""
+def imported_modules(name: str) -> set[str]:
+    """Modules of the package that a module imports anywhere, under TYPE_CHECKING and within functions too."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(TREES[name]):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path} imports relatively"
+            assert node.level == 0, f"{name} imports relatively"
             for alias in node.names:
                 whole = f"{node.module}.{alias.name}"
                 found.add(whole if whole in MODULES else str(node.module))
-    return {name for name in found if name in MODULES}
+    return {module for module in found if module in MODULES}
 
 
-IMPORTS = {name: imported_modules(path) for name, path in MODULES.items()}
+IMPORTS = {name: imported_modules(name) for name in MODULES}
+
+
+# imports
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if room(name) not in ("__init__", "tasks")])
@@ -61,6 +72,10 @@ def test_imports_point_to_lower_rooms(name: str) -> None:
     own = room(name)
     for other in IMPORTS[name]:
         assert room(other) == own or LEVELS.get(room(other), 99) < LEVELS[own], f"{name} imports {other}"
+
+
+def test_every_level_belongs_to_a_room() -> None:
+    assert set(LEVELS) == {room(name) for name in MODULES} - {"__init__", "tasks"}
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if room(name) == "tasks"])
@@ -74,13 +89,12 @@ def test_no_module_imports_itself_through_others() -> None:
     def visit(name: str, path: tuple[str, ...]) -> None:
         assert name not in path, " imports ".join([*path[path.index(name) :], name])
         if name not in finished:
-            for other in IMPORTS[name]:
+            for other in IMPORTS[name] - {"lyceum_warp"}:  # only tasks import the public names, and tasks have no users
                 visit(other, (*path, name))
             finished.add(name)
 
     for name in MODULES:
-        if name != "lyceum_warp":  # the public names: tasks import them, and are imported by name alone
-            visit(name, ("lyceum_warp",))
+        visit(name, ())
 
 
 def test_module_names_are_unique() -> None:
@@ -90,13 +104,74 @@ def test_module_names_are_unique() -> None:
     assert not {last: names for last, names in places.items() if len(names) > 1 and last != "__main__"}
 
 
-def test_no_room_uses_private_names_of_another_module() -> None:
-    for name, path in MODULES.items():
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lyceum_warp"):
-                private = [alias.name for alias in node.names if alias.name.startswith("_")]
-                assert not private, f"{name} imports {private} of {node.module}"
+# private names
 
 
-def test_each_public_name_is_there() -> None:
+def is_private(name: str) -> bool:
+    return name.startswith("_") and not name.endswith("__") and name not in NAMEDTUPLE
+
+
+def is_own(node: ast.Attribute) -> bool:
+    """Whether an attribute is one of self, cls or super()."""
+    value = node.value
+    if isinstance(value, ast.Call):
+        return isinstance(value.func, ast.Name) and value.func.id == "super"
+    return isinstance(value, ast.Name) and value.id in ("self", "cls")
+
+
+def defined_names(tree: ast.AST) -> Iterator[str]:
+    """Names of functions, classes, variables and attributes that a module defines."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store) and is_own(node):
+            yield node.attr
+
+
+PRIVATE = defaultdict(set)
+for module, tree in TREES.items():
+    for defined in filter(is_private, defined_names(tree)):
+        PRIVATE[defined].add(module)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_no_module_imports_private_names(name: str) -> None:
+    for node in ast.walk(TREES[name]):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lyceum_warp"):
+            private = [alias.name for alias in node.names if alias.name.startswith("_")]
+            assert not private, f"{name} imports {private} of {node.module}"
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_no_module_uses_private_attributes_of_another_modules_objects(name: str) -> None:
+    """Found by the attribute's name; private names of Warp, MuJoCo and torch are not defined in the package."""
+    found = [
+        f"line {node.lineno}: {ast.unparse(node)}, of {', '.join(sorted(PRIVATE[node.attr] - {name}))}"
+        for node in ast.walk(TREES[name])
+        if isinstance(node, ast.Attribute) and not is_own(node) and PRIVATE[node.attr] - {name}
+    ]
+    assert not found, f"{name} uses private attributes: {'; '.join(found)}"
+
+
+def test_each_public_name_is_there_and_listed_in_order() -> None:
     assert all(hasattr(lw, name) for name in lw.__all__)
+    assert len(set(lw.__all__)) == len(lw.__all__)
+
+
+# tests
+
+
+@pytest.mark.parametrize("own", sorted({room(name) for name in MODULES} - {"__init__"}))
+def test_every_room_has_tests_of_its_name(own: str) -> None:
+    places = [TESTS / TESTED_BY[own]] if own in TESTED_BY else [TESTS / own, TESTS / f"test_{own}.py"]
+    assert any(place.exists() for place in places), f"no tests of {own}: none of {', '.join(map(str, places))}"
+
+
+def test_names_of_test_files_are_unique() -> None:
+    """Pytest imports them as modules of one folder."""
+    places = defaultdict(list)
+    for path in TESTS.rglob("*.py"):
+        places[path.name].append(str(path.relative_to(TESTS)))
+    assert not {name: paths for name, paths in places.items() if len(paths) > 1}

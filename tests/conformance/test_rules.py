@@ -85,7 +85,7 @@ BREAKS: list[tuple[str, Any, str, Callable[[Function], Function]]] = [
     ("memory", lw.Env, "get_state", then(lambda env: env.__dict__.setdefault("kept", []).append(env.obs.clone()))),
     ("bad_state", MujocoEngine, "find_faults", nothing),
     ("bad_action", Worlds, "_judge", without_action_faults),
-    ("bad_warmstart", MujocoEngine, "_open", then(keep_warm_start)),
+    ("bad_warmstart", MujocoEngine, "__init__", then(keep_warm_start)),
 ]
 """A rule, and the function whose change breaks it."""
 

@@ -377,7 +377,9 @@ def default_numbers() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("task", "name", "value"), CASES)
-def test_a_parameter_has_the_effect_of_gymnasiums(task: str, name: str, value: Any, default_numbers: dict[str, Any]) -> None:
+def test_a_parameter_has_the_effect_of_gymnasiums(
+    task: str, name: str, value: Any, default_numbers: dict[str, Any]
+) -> None:
     """On the numbers and on the observation's size.
 
     Worlds reset automatically, because some of the ranges exclude the initial state: without resets a world that is

@@ -381,7 +381,9 @@ def test_a_state_beyond_the_limit_is_terminated(module: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_another_model_frame_skip_and_cone_take_effect(module: ModuleType, path: Path, engine: str, tmp_path: Path) -> None:
+def test_another_model_frame_skip_and_cone_take_effect(
+    module: ModuleType, path: Path, engine: str, tmp_path: Path
+) -> None:
     xml = tmp_path / "light.xml"
     xml.write_text(module.XML.replace('size=".03"', 'size=".02"'))
     env = lw.make("follow_target", engine=engine, model=xml, frame_skip=3, cone="elliptic")

@@ -1,0 +1,72 @@
+"""Counted random streams: draws depend on (seed, world, episode, step) alone."""
+
+import itertools
+
+import numpy as np
+import pytest
+import warp as wp
+from checks import check_normal, check_uniform
+
+from lyceum_warp.kernels.random import normal, seed_worlds, stream, uniform, world_key
+
+
+@wp.kernel(enable_backward=False)
+def draw(
+    seed_in: wp.array[int], world_in: wp.array[int], episode_in: wp.array[int], step_in: wp.array[int],
+    rng_inout: wp.array2d[wp.uint32], value_out: wp.array2d[float],
+):  # fmt: skip
+    """Draw two uniform and two normal numbers from the start of a stream."""
+    i = wp.tid()
+    rng = rng_inout[i]
+    rng[0] = stream(world_key(seed_in[i], world_in[i]), episode_in[i], step_in[i])
+    value_out[i, 0] = uniform(rng, -1.0, 1.0)
+    value_out[i, 1] = uniform(rng, -1.0, 1.0)
+    value_out[i, 2] = normal(rng)
+    value_out[i, 3] = normal(rng)
+
+
+def draws(counters: np.ndarray) -> np.ndarray:
+    """Four draws of each row (seed, world, episode, step)."""
+    columns = [wp.array(column, dtype=int, device="cpu") for column in counters.T]
+    rng = wp.zeros((len(counters), 1), dtype=wp.uint32, device="cpu")
+    values = wp.zeros((len(counters), 4), dtype=float, device="cpu")
+    wp.launch(draw, len(counters), [*columns, rng, values], device="cpu")
+    return values.numpy()
+
+
+def test_the_same_counters_give_the_same_draws_in_any_order() -> None:
+    counters = np.array(list(itertools.product(range(3), range(4), range(3), range(3))))
+    order = np.random.default_rng(0).permutation(len(counters))
+    np.testing.assert_array_equal(draws(counters)[order], draws(counters[order]))
+
+
+def test_different_counters_give_different_draws() -> None:
+    """Also those with the same sum: the counters are hashed one inside the other."""
+    counters = np.array(list(itertools.product(range(6), range(6), range(6), range(6))))
+    found = draws(counters)
+    assert len(np.unique(found[:, 0])) > 0.999 * len(counters)
+
+
+@pytest.mark.parametrize("counter", ["seed", "world", "episode", "step"])
+def test_draws_are_independent_along_every_counter(counter: str) -> None:
+    counters = np.zeros((4000, 4), dtype=int)
+    counters[:, ["seed", "world", "episode", "step"].index(counter)] = np.arange(4000)
+    values = draws(counters)
+    check_uniform(values[:, :2])
+    check_normal(values[:, 2:])
+    check_uniform(np.stack([values[:-1, 0], values[1:, 0]], axis=1))
+
+
+def test_seed_worlds_starts_only_masked_worlds_and_counts_from_the_first() -> None:
+    mask = wp.array([True, False, True], dtype=bool, device="cpu")
+    seed = wp.array([5], dtype=int, device="cpu")
+    keys, episodes = [], []
+    for first in (0, 2):
+        key = wp.zeros(3, dtype=wp.uint32, device="cpu")
+        episode = wp.full(3, 7, dtype=int, device="cpu")
+        wp.launch(seed_worlds, 3, [mask, seed, first, key, episode], device="cpu")
+        keys.append(key.numpy())
+        episodes.append(episode.numpy().tolist())
+    assert episodes == [[-1, 7, -1]] * 2
+    assert keys[0][1] == 0
+    assert keys[0][2] == keys[1][0] != keys[0][0]

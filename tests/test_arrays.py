@@ -1,0 +1,43 @@
+"""Views of the same memory under another shape or in torch."""
+
+import pytest
+import torch
+import warp as wp
+
+from lyceum_warp.arrays import flat, launch_rows, torch_view
+from lyceum_warp.kernels import state
+
+
+@pytest.mark.parametrize(("dtype", "shape", "columns"), [(float, (2, 3), 3), (wp.vec3, (2, 4), 12), (int, 2, 1)])
+def test_flat_has_a_row_of_numbers_a_world_in_the_same_memory(
+    dtype: type, shape: tuple[int, ...], columns: int
+) -> None:
+    array = wp.zeros(shape, dtype=dtype, device="cpu")
+    alias = flat(array)
+    assert alias.shape == (2, columns)
+    assert alias.dtype == wp.float32
+    assert alias.ptr == array.ptr
+
+
+def test_flat_keeps_the_memory_alive() -> None:
+    alias = flat(wp.full((2, 3), 5.0, dtype=float, device="cpu"))
+    assert alias.numpy().tolist() == [[5.0] * 3] * 2
+
+
+def test_a_torch_view_shares_memory() -> None:
+    array = wp.zeros((2, 3), dtype=float, device="cpu")
+    torch_view(array).fill_(2.0)
+    assert array.numpy().tolist() == [[2.0] * 3] * 2
+
+
+def test_launch_rows_writes_masked_rows_alone() -> None:
+    source, target = (wp.full((3, 4), value, dtype=float, device="cpu") for value in (1.0, 2.0))
+    mask = wp.array([True, False, True], dtype=bool, device="cpu")
+    launch_rows(state.copy_rows, mask, source, target)
+    assert torch_view(target)[:, 0].tolist() == [1.0, 2.0, 1.0]
+
+
+def test_launch_rows_of_an_empty_array_launches_nothing() -> None:
+    empty = wp.zeros((3, 0), dtype=float, device="cpu")
+    launch_rows(state.copy_rows, wp.full(3, True, dtype=bool, device="cpu"), empty, empty)
+    assert torch.equal(torch_view(empty), torch.zeros(3, 0))

@@ -1,0 +1,30 @@
+"""CPU cores and memory that this process may use."""
+
+import os
+
+import pytest
+import warp as wp
+
+from lyceum_warp.machine import cpu_cores, free_memory
+
+
+def test_cpu_cores_counts_those_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 3, 5}, raising=False)
+    assert cpu_cores() == 3
+
+
+def test_cpu_cores_counts_all_where_the_system_does_not_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    assert cpu_cores() == (os.cpu_count() or 1)
+
+
+def test_free_memory_is_a_number_of_bytes_or_unknown() -> None:
+    free = free_memory(wp.get_device("cpu"))
+    assert free is None or 2**20 < free < 2**50
+
+
+@pytest.mark.gpu
+def test_free_memory_of_a_gpu_is_less_than_its_memory() -> None:
+    device = wp.get_device("cuda")
+    free = free_memory(device)
+    assert free is not None and 0 < free < device.total_memory
