@@ -113,7 +113,7 @@ BREAKS: list[tuple[str, type, str, Callable[[Method], Method]]] = [
     ("bad_state", MujocoEngine, "find_faults", nothing),
     ("bad_action", lw.Env, "_judge", lambda method: lambda self, mask, fault, action_fault, **how: method(
         self, mask, fault, self._no_fault, **how)),
-    ("bad_warmstart", MujocoEngine, "_open", then(keep_warm_start)),
+    ("bad_warmstart", MujocoEngine, "__init__", then(keep_warm_start)),
 ]  # fmt: skip
 
 
