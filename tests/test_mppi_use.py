@@ -14,6 +14,7 @@ from test_mppi import POINT, Picky, heavy_arm, numbers, place, reached, same
 import lyceum_warp as lw
 from lyceum_warp import MPPI, Row
 from lyceum_warp.algos import mppi
+from lyceum_warp.engines import placement
 
 ENGINES = ["mujoco", "warp"]
 BUFFERS = ("actions", "nominal", "standard_noise", "sampled", "returns", "weights")
@@ -306,7 +307,9 @@ def test_a_planner_is_not_disturbed_by_resets_of_its_worlds() -> None:
 
 def test_auto_chooses_by_the_number_of_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a GPU; what was chosen by hand stays."""
-    monkeypatch.setattr(mppi, "find_device", lambda name: types.SimpleNamespace(is_cuda=str(name).startswith("cuda")))
+    monkeypatch.setattr(
+        placement, "find_device", lambda name: types.SimpleNamespace(is_cuda=str(name).startswith("cuda"))
+    )
 
     def chosen(task: str, samples: int, **options: Any) -> tuple[str | None, str | None]:
         placed = mppi._placed(task, {"device": "cuda:0", "nthread": 2} | options, samples)

@@ -470,11 +470,3 @@ def test_what_makes_no_sense_is_refused(shared_env: SharedEnv) -> None:
     for horizon in (0, -1, 2.5, "a"):
         with pytest.raises(ValueError, match="horizon has to be a whole number from 1"):
             OpenLoop(env, horizon)  # type: ignore[arg-type]
-
-
-def test_a_field_that_comes_later_is_refused() -> None:
-    loop = lw.OpenLoop(lw.make("point_mass", nworld=2, autoreset=False), 3)
-    loop.run()
-    loop.env.field("qacc")  # of the acceleration stage: it becomes part of the state
-    with pytest.raises(ValueError, match="asked for later"):
-        loop.run()
