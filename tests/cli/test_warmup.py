@@ -1,5 +1,7 @@
 """lyceum-warp warmup."""
 
+import re
+
 import mujoco
 import pytest
 
@@ -13,7 +15,7 @@ def test_warmup_prints_compiled_kernels_and_memory(capsys: pytest.CaptureFixture
     assert out.startswith("point_mass on cpu: ")
     assert re.search(r"memory: about \d+\.\d kB a world; at most some [\d,]+ worlds fit into the free memory", out)
     assert main(["warmup", "point_mass", "--nworld", "8", "--plan", "--npg"]) == 0
-    assert "kB a world of 8\n" in capsys.readouterr().out
+    assert " kB a world; " in capsys.readouterr().out
     assert main(["warmup", "nothing"]) == 2
 
 
