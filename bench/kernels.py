@@ -2,9 +2,9 @@
 
     python bench/kernels.py --tasks hopper humanoid --nworld 4096 --device cuda
 
-The launches of a step, and of a plan, are caught while they run once unrecorded; each is then repeated in a graph of
-its own. Its bytes are those of all arrays that it is given, each counted once: a kernel that reads only a part, the
-worlds that begin again for instance, seems faster than it is, and one that hits caches faster than memory.
+The launches of a step, and of a plan, are intercepted while they run once without graphs; each is then repeated in a
+graph of its own. Its bytes are those of all arrays that it gets, each counted once: a kernel that reads only a part,
+the worlds that restart for instance, seems faster than it is, and one that hits caches seems faster than memory.
 """
 
 import collections
@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import records
+import measurements
 import torch
 import tyro
 import warp as wp
@@ -43,7 +43,7 @@ class Options:
     repeats: int = 20
     """Timings of each kernel; medians are printed."""
     out: Path | None = None
-    """JSON file for the record."""
+    """JSON file for the results."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,7 +178,7 @@ def main(options: Options) -> None:
                       f"{row.megabytes:.2f}", f"{row.gigabytes_per_second:.1f}", f"{row.of_copy:.0%}")  # fmt: skip
     console.print(table)
     if options.out is not None:
-        records.write(
+        measurements.write(
             options.out, rows, options.device, nworld=options.nworld, copy_gigabytes_per_second=bandwidth / 1e9
         )
 

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-import records
+import measurements
 import torch
 import tyro
 from rich.console import Console
@@ -143,8 +143,8 @@ def write(options: Options, rows: list[dict[str, Any]]) -> None:
         writer.writeheader()
         writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
     settings = {name: value for name, value in dataclasses.asdict(options).items() if name != "out"}
-    record = {"options": settings, "versions": records.context(options.device)}
-    options.out.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n")
+    content = {"options": settings, "versions": measurements.context(options.device)}
+    options.out.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n")
 
 
 def spread(rows: list[dict[str, Any]], key: str) -> tuple[str, str]:

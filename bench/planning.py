@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import measurements
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
-import records
 import torch
 import tyro
 import warp as wp
@@ -328,7 +328,7 @@ def main(options: Options) -> None:
                           *("" if number is None else f"{number:.3f}" for number in numbers))  # fmt: skip
     console.print(table)
     if options.out is not None:
-        records.write(options.out, rows, options.device)
+        measurements.write(options.out, rows, options.device)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import statistics
 from pathlib import Path
 from typing import Any
 
-import records
+import measurements
 import torch
 import tyro
 from rich.console import Console
@@ -157,7 +157,7 @@ def main(options: Options) -> None:
                               str(row.faults), f"{row.bytes_per_world / 1e3:,.1f}")  # fmt: skip
     Console(width=120).print(table)
     if options.out is not None:
-        records.write(options.out, rows, options.device, states=options.states)
+        measurements.write(options.out, rows, options.device, states=options.states)
 
 
 if __name__ == "__main__":

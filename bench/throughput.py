@@ -2,12 +2,12 @@
 
     python bench/throughput.py --tasks hopper humanoid --nworld 256
 
-Environment and bare engine take turns of ten steps: the bare engine is given each state that the environment
-has left, by a copy outside the clock, so that both step the same states, resets included, on a machine of the
-same mood. The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the
-same model, controls and number of substeps. ``kept`` is bare time by environment time; ``added`` the difference.
-``refresh`` is what the Warp engine spends on fields that ``mj_step`` leaves behind, as a share of the step: those of
-the new state where the task reads positions, a forward pass of the worlds that begin again where it reads forces.
+Environment and bare engine take turns of ten steps: each state that the environment starts a step from is copied to
+the bare engine, outside the clock, so that both step the same states, resets included, under the same load of the
+machine. The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the same model,
+controls and number of substeps. ``kept`` is bare time by environment time; ``added`` is the difference. ``refresh`` is
+the Warp engine's time for fields that ``mj_step`` leaves behind, as a share of the step: those of the new state where
+the task reads positions, a forward pass of the restarted worlds where it reads forces.
 """
 
 import dataclasses
@@ -17,10 +17,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium
+import measurements
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
-import records
 import torch
 import tyro
 import warp as wp
@@ -61,7 +61,7 @@ class Options:
     npg: bool = True
     """Whether to measure NPG's sampling on the first task, too."""
     out: Path | None = None
-    """JSON file for the record."""
+    """JSON file for the results."""
 
 
 class BareC:
@@ -175,7 +175,7 @@ def measure(
     """
     bare = bare_engine(env)
     whole, alone = [], []
-    warm = max(2, env.horizon // 500)  # recordings, and states that are no longer the first ones
+    warm = max(2, env.horizon // 500)  # graphs are captured, and states are no longer the first ones
     for repetition in range(warm + options.blocks):
         start = env.get_state()
         time_env = seconds(env, block)
@@ -203,14 +203,14 @@ def measure(
 
 
 def refresh_seconds(env: lw.Env) -> float:
-    """Seconds that a step's refreshes take by themselves, for the worlds that began again in the last step."""
+    """Seconds of a step's refreshes alone, for the worlds that restarted in the last step."""
     engine = env.engine
     assert isinstance(engine, WarpEngine)
     if engine.stage == engine.reset_stage == Stage.NONE:
         return 0.0
     with wp.ScopedDevice(env.device), wp.ScopedCapture() as capture:
         engine._refresh_current()
-        engine.refresh(env._restarting)
+        engine.refresh(env.worlds.restarting)
     times = [seconds(env, lambda: wp.capture_launch(capture.graph)) for _ in range(30)]
     return statistics.median(times)
 
@@ -240,7 +240,7 @@ def measure_env(task: str, nworld: int, options: Options) -> Row:
 
 
 def measure_sampling(task: str, nworld: int, options: Options) -> Row:
-    """NPG's sampling: the policy's forward passes, the noise and the record are part of it."""
+    """NPG's sampling: the policy's forward passes, the noise and the rollout buffer are part of it."""
     env, first = first_step(task, nworld, options)
     npg = lw.NPG(env, config=lw.NPGConfig(samples=BLOCK * nworld, mean_every=0))
 
@@ -293,7 +293,7 @@ def main(options: Options) -> None:
     console.print(table)
     if options.out is not None:
         gym = {task: {"mode": mode, "env_steps_per_second": rate} for task, (mode, rate) in baseline.items()}
-        records.write(options.out, rows, options.device, gymnasium=gym)
+        measurements.write(options.out, rows, options.device, gymnasium=gym)
 
 
 def cells(row: Row) -> list[str]:

@@ -1,6 +1,6 @@
-"""Records of measurements: what was measured on what, and a comparison of two of them.
+"""Files of measurements: the results with their machine and versions, and a comparison of two files.
 
-    python bench/records.py old.json new.json
+    python bench/measurements.py old.json new.json
 
 Numbers of different hardware are not compared: the difference would be the hardware's.
 """
@@ -21,7 +21,7 @@ from rich.table import Table
 from lyceum_warp.versions import versions
 
 HARDWARE = ("cpu", "cores", "gpu", "driver", "power_limit")
-"""What has to be the same in two records for their numbers to be compared."""
+"""Entries that must be equal in two files for their numbers to be compared."""
 
 _QUERY = {
     "driver": "driver_version",
@@ -50,39 +50,39 @@ def context(device: str = "cpu") -> dict[str, Any]:
 def write(path: Path, rows: Sequence[Any], device: str = "cpu", **more: Any) -> None:
     """Write rows (dataclasses) with the context of their measurement as JSON.
 
-    Call it right after the measurement: the clocks are those of now.
+    Call it right after the measurement, because it reads the clocks as they are now.
     """
-    record = {"versions": context(device), "rows": [dataclasses.asdict(row) for row in rows], **more}
+    content = {"versions": context(device), "rows": [dataclasses.asdict(row) for row in rows], **more}
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(record, indent=2) + "\n")
+    path.write_text(json.dumps(content, indent=2) + "\n")
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Ratios of two records' numbers, new by old."""
+    """Ratios of the numbers in two files, new by old."""
 
     old: tyro.conf.Positional[Path]
-    """Record."""
+    """File of a measurement."""
     new: tyro.conf.Positional[Path]
-    """Another record of the same measurement on the same hardware."""
+    """File of the same measurement on the same hardware."""
 
 
 def compare(old: dict[str, Any], new: dict[str, Any]) -> Table:
-    """A row for each case that both records have, with the ratios of all numbers.
+    """A row for each case that both files have, with the ratios of all numbers.
 
     Raises:
-        ValueError: The records are of different hardware, or of different measurements.
+        ValueError: The files are of different hardware, or of different measurements.
     """
     for name in HARDWARE:
         here, there = new["versions"].get(name), old["versions"].get(name)
         if here != there:
             raise ValueError(
-                f"the records are of different hardware: {name} is {there!r} in one and {here!r} in the other"
+                f"the files are of different hardware: {name} is {there!r} in one and {here!r} in the other"
             )
     rows, others = {case(row): row for row in old["rows"]}, {case(row): row for row in new["rows"]}
     both = [key for key in rows if key in others]
     if not both:
-        raise ValueError("the records have no case in common")
+        raise ValueError("the files have no case in common")
     numbers = [name for name, value in rows[both[0]].items() if isinstance(value, float)]
     table = Table("case", *numbers)
     for key in both:
@@ -92,21 +92,21 @@ def compare(old: dict[str, Any], new: dict[str, Any]) -> Table:
 
 
 def case(row: dict[str, Any]) -> tuple[Any, ...]:
-    """What a row is about: its words and whole numbers."""
+    """The case of a row: its words and whole numbers."""
     return tuple(value for value in row.values() if isinstance(value, (str, int)) and not isinstance(value, bool))
 
 
 def main(options: Options) -> int:
-    records = [json.loads(path.read_text()) for path in (options.old, options.new)]
+    files = [json.loads(path.read_text()) for path in (options.old, options.new)]
     try:
-        Console().print(compare(*records))
+        Console().print(compare(*files))
     except ValueError as error:
         print(error, file=sys.stderr)
         return 2
-    changed = {k: (v, records[1]["versions"].get(k)) for k, v in records[0]["versions"].items()}
+    changed = {k: (v, files[1]["versions"].get(k)) for k, v in files[0]["versions"].items()}
     for name, (before, after) in changed.items():
         if before != after:
-            print(f"{name}: {before} then, {after} now")
+            print(f"{name}: {before} before, {after} now")
     return 0
 
 
