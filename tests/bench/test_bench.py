@@ -1,4 +1,4 @@
-"""Records of measurements."""
+"""Files of measurements: they name the hardware and the versions, and only equal hardware is compared."""
 
 import dataclasses
 import importlib.util
@@ -19,45 +19,45 @@ class Row:
 
 
 @pytest.fixture(scope="module")
-def records() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("records", BENCH / "records.py")
+def measurements() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("measurements", BENCH / "records.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
-def written(records: ModuleType, path: Path, rate: float) -> dict:
-    records.write(path, [Row("hopper", 4, rate), Row("hopper", 8, 1.0)], nthread=2)
+def written(measurements: ModuleType, path: Path, rate: float) -> dict:
+    measurements.write(path, [Row("hopper", 4, rate), Row("hopper", 8, 1.0)], nthread=2)
     return json.loads(path.read_text())
 
 
-def test_a_record_tells_where_it_comes_from(records: ModuleType, tmp_path: Path) -> None:
-    record = written(records, tmp_path / "new" / "record.json", 2.0)
-    assert record["rows"][0] == {"task": "hopper", "nworld": 4, "steps_per_second": 2.0}
-    assert record["nthread"] == 2
-    assert {"mujoco", "warp_lang", "torch", "python", "cpu", "cores"} <= record["versions"].keys()
+def test_a_file_names_its_rows_options_versions_and_hardware(measurements: ModuleType, tmp_path: Path) -> None:
+    found = written(measurements, tmp_path / "new" / "found.json", 2.0)
+    assert found["rows"][0] == {"task": "hopper", "nworld": 4, "steps_per_second": 2.0}
+    assert found["nthread"] == 2
+    assert {"mujoco", "warp_lang", "torch", "python", "cpu", "cores"} <= found["versions"].keys()
 
 
-def test_records_of_one_machine_are_compared(records: ModuleType, tmp_path: Path) -> None:
-    old, new = (written(records, tmp_path / f"{rate}.json", rate) for rate in (2.0, 3.0))
-    table = records.compare(old, new)
+def test_a_comparison_shows_ratios_of_new_by_old(measurements: ModuleType, tmp_path: Path) -> None:
+    old, new = (written(measurements, tmp_path / f"{rate}.json", rate) for rate in (2.0, 3.0))
+    table = measurements.compare(old, new)
     assert list(table.columns[1].cells) == ["1.500", "1.000"]
 
 
-@pytest.mark.parametrize("name, value", [("gpu", "NVIDIA H100"), ("cores", 3), ("driver", "580"), ("cpu", "abacus")])
-def test_records_of_different_hardware_are_refused(
-    name: str, value: object, records: ModuleType, tmp_path: Path
+@pytest.mark.parametrize(("name", "value"), [("gpu", "NVIDIA H100"), ("cores", 3), ("driver", "580"), ("cpu", "abacus")])
+def test_measurements_on_different_hardware_are_not_compared(
+    name: str, value: object, measurements: ModuleType, tmp_path: Path
 ) -> None:
-    old, new = (written(records, tmp_path / f"{rate}.json", rate) for rate in (2.0, 3.0))
+    old, new = (written(measurements, tmp_path / f"{rate}.json", rate) for rate in (2.0, 3.0))
     new["versions"][name] = value
     with pytest.raises(ValueError, match=f"different hardware: {name}"):
-        records.compare(old, new)
+        measurements.compare(old, new)
 
 
-def test_other_measurements_are_refused(records: ModuleType, tmp_path: Path) -> None:
-    old, new = (written(records, tmp_path / f"{rate}.json", rate) for rate in (2.0, 3.0))
+def test_measurements_without_a_common_case_are_not_compared(measurements: ModuleType, tmp_path: Path) -> None:
+    old, new = (written(measurements, tmp_path / f"{rate}.json", rate) for rate in (2.0, 3.0))
     for row in new["rows"]:
         row["task"] = "walker2d"
     with pytest.raises(ValueError, match="no case in common"):
-        records.compare(old, new)
+        measurements.compare(old, new)
