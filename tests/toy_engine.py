@@ -1,6 +1,7 @@
-"""A third engine, written against the contract in ``lyceum_warp.engines.base`` alone: one MjData a world, one loop."""
+"""A third engine, written against the contract in ``lyceum_warp.engines.base`` alone: an MjData for each world."""
 
 import copy
+from collections.abc import Iterable
 
 import mujoco
 import numpy as np
@@ -8,24 +9,24 @@ import warp as wp
 
 from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.fields import STATE_FIELDS, Field, Stage
+from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
 from lyceum_warp.kernels import faults, state
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
 class ToyEngine(Engine):
-    """The state lies in float64 rows; a world's MjData takes it from there and gives it back.
+    """The state lies in float64 rows; a step loads each row into its world's MjData and saves it afterwards.
 
-    What a step launches between two calls of the engine is recorded, so that ``reset``, ``commit``,
-    ``find_faults`` and getting the state are Warp launches on those rows.
+    Launches between two calls of the engine are captured, so ``reset``, ``commit``, ``find_faults`` and getting the
+    state are Warp launches on those rows.
     """
 
     name = "toy"
-    recordable = False
+    capturable = False
 
-    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device) -> None:
-        super().__init__(model, nworld, device)
+    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: Iterable[Field]) -> None:
+        super().__init__(model, nworld, device, fields)
         mujoco.set_mju_user_warning(lambda message: None)
         self._model = copy.copy(model)
         self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -37,22 +38,13 @@ class ToyEngine(Engine):
         self._initial = wp.array(rows[0].astype(np.float32).astype(float), dtype=wp.float64, device=device)
         self._warning = wp.zeros((nworld, len(self.worlds[0].warning.number), 2), dtype=int, device=device)
         self._columns: dict[str, wp.array] = {}
-        self.ctrl = self.field("ctrl")
+        for name, field in self.fields.items():
+            self.arrays[name] = wp.zeros((nworld, *field.shape), dtype=field.dtype, device=device)
+            if name in STATE_FIELDS:
+                self._columns[name] = self._rows[:, state_columns(model, name)]
+        self.ctrl = self.arrays["ctrl"]
 
     # fields
-
-    def _bind(self, field: Field) -> wp.array:
-        array = wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
-        self.arrays[field.name] = array
-        if field.name in STATE_FIELDS:
-            bit = STATE_FIELDS[field.name].value
-            start = mujoco.mj_stateSize(self._model, _SPEC & (bit - 1))
-            self._columns[field.name] = self._rows[:, start : start + field.size]
-        for w in range(self.nworld):
-            self._load(w)
-            self._compute(w, field.reset)
-            self._show(w, [field])
-        return array
 
     def _load(self, w: int) -> None:
         mujoco.mj_setState(self._model, self.worlds[w], self._rows.numpy()[w], _SPEC)

@@ -135,7 +135,7 @@ def rank_rows(nrow_in: wp.array[int], eq_type_in: wp.array[int], rows: Rows, ran
         return
     kind = _kind(rows, w, r)
     number = _object(rows, eq_type_in, w, r)
-    rank = 0
+    rank = int(0)
     for s in range(n):
         other = _kind(rows, w, s)
         if other < kind:
@@ -185,7 +185,7 @@ def move_rows(
             to = r
             if sort:
                 first = rank_in[w, first]
-                to = 0
+                to = int(0)
                 for b in range(source.jtdaj_nblock[w]):
                     if rank_in[w, source.jtdaj_adr[w, b]] < first:
                         to += 1

@@ -1,0 +1,227 @@
+"""The deterministic mode: contacts and rows in order, scratch memory that graphs share, a room that can be left out."""
+
+import contextlib
+import copy
+import dataclasses
+import itertools
+import os
+import shutil
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import pytest
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp.engines.deterministic import order_kernels as order
+from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
+from lyceum_warp.engines.deterministic.scratch import LARGEST_BUFFER, Scratch, ScratchSizes
+from lyceum_warp.engines.warp.warp_engine import WarpEngine
+from lyceum_warp.fields import describe
+
+WITHOUT = """
+import types
+import lyceum_warp as lw
+from lyceum_warp.engines.placement import open_engine
+
+for engine in ("warp", "mujoco"):
+    env = lw.make("hopper", engine=engine, nworld=2, deterministic=True)
+    for _ in range(3):
+        env.step()
+    print(lw.__file__, env.engine.name, bool(env.obs.isfinite().all()))
+gpu = types.SimpleNamespace(is_cpu=False, is_cuda=True, alias="cuda:0")
+try:
+    open_engine("auto", env.model, 2, gpu, [], deterministic=True)
+except ValueError as error:
+    print(error)
+"""
+
+
+def test_the_package_works_without_the_deterministic_room(tmp_path: Path) -> None:
+    """Its folder is left out of a copy of the package; only the option on a CUDA device then says so."""
+    package = Path(lw.__file__).parent
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(package, tmp_path / "lyceum_warp", ignore=ignored)
+    shutil.rmtree(tmp_path / "lyceum_warp/engines/deterministic")
+    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", WITHOUT], env=env, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    *steps, message = done.stdout.splitlines()
+    path = tmp_path / "lyceum_warp/__init__.py"
+    assert steps == [f"{path} warp True", f"{path} mujoco True"]
+    assert message == (
+        "deterministic=True needs the package lyceum_warp.engines.deterministic, which this installation lacks: "
+        "leave it out"
+    )
+
+
+def test_no_other_room_mentions_the_deterministic_room() -> None:
+    package = Path(lw.__file__).parent
+    for path in package.rglob("*.py"):
+        inside = path.parent.name == "deterministic" or path.name == "placement.py"
+        assert inside or "engines.deterministic" not in path.read_text(), path
+
+
+# the order that MuJoCo Warp leaves to chance on a GPU is shuffled here by hand, and restored
+
+
+@pytest.fixture(scope="module", params=["dense", "sparse"])
+def forwarded(request: pytest.FixtureRequest) -> tuple[WarpEngine, CanonicalOrder]:
+    """Humanoids that lie on the ground, with contacts and limits, and the order for their model and data."""
+    model = copy.copy(lw.make("humanoid").model)
+    model.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{request.param.upper()}")
+    engine = WarpEngine(model, 3, wp.get_device("cpu"), [describe(model, "qpos")])
+    qpos = engine.arrays["qpos"].numpy()
+    qpos[:, 2] = (1.2, 0.25, 0.3)
+    qpos[1:, 3:7] = (0.7, 0.0, 0.7, 0.0)
+    qpos[:, 7:] = np.random.default_rng(0).uniform(-1.5, 1.5, qpos[:, 7:].shape)
+    sorter = CanonicalOrder(engine.m, engine.d)
+    return engine, sorter
+
+
+def contents(*owners: object) -> dict[str, np.ndarray]:
+    return {f.name: getattr(o, f.name).numpy().copy() for o in owners for f in dataclasses.fields(o)}  # type: ignore[arg-type]
+
+
+def test_shuffled_contacts_are_sorted_into_the_same_order(forwarded: tuple[WarpEngine, CanonicalOrder]) -> None:
+    engine, _ = forwarded
+    m, d = engine.m, engine.d
+    sort_rows, m.callback.passive = m.callback.passive, None
+    mjw.fwd_position(m, d)
+    n, wanted = int(d.nacon.numpy()[0]), contents(d.contact)
+    assert n > 8 and len(set(wanted["worldid"][:n])) > 1
+    assert (np.diff(wanted["worldid"][:n]) >= 0).all()
+    shuffle = np.random.default_rng(1).permutation(n)
+    assert (shuffle != np.arange(n)).any()
+    for name, values in wanted.items():
+        if len(values):
+            getattr(d.contact, name).numpy()[:n] = values[:n][shuffle]
+    m.callback.contactfilter(m, d)
+    for name, values in contents(d.contact).items():
+        np.testing.assert_array_equal(values[:n], wanted[name][:n], err_msg=name)
+    m.callback.passive = sort_rows
+
+
+def test_shuffled_rows_are_sorted_into_the_same_order(forwarded: tuple[WarpEngine, CanonicalOrder]) -> None:
+    engine, sorter = forwarded
+    m, d = engine.m, engine.d
+    mjw.fwd_position(m, d)
+    sorter.sort_rows(m, d)
+    wanted, counts = contents(d.efc), d.nefc.numpy()
+    addresses = d.contact.efc_address.numpy().copy()
+    assert counts.max() > 20
+    names = [name for name in order.Rows.vars if not name.startswith("jtdaj")]  # type: ignore[attr-defined]
+    rng = np.random.default_rng(2)
+    for w, n in enumerate(counts):
+        kinds = np.minimum(wanted["type"][w, :n], 5)
+        groups = {key: rng.random() for key in zip(kinds, wanted["id"][w, :n], strict=True)}
+        keys = [groups[kind, i] for kind, i in zip(kinds, wanted["id"][w, :n], strict=True)]
+        shuffle = np.argsort(keys, kind="stable")  # rows of one constraint come together and in order
+        place = np.argsort(shuffle)
+        for name in names:
+            array = getattr(d.efc, name).numpy()
+            if not (name == "J" and m.is_sparse) and array.shape[1]:
+                array[w, :n] = wanted[name][w, :n][shuffle]
+        mine = d.contact.worldid.numpy()[: int(d.nacon.numpy()[0])] == w
+        rows = d.contact.efc_address.numpy()[: len(mine)]
+        rows[mine] = np.where(addresses[: len(mine)][mine] >= 0, place[addresses[: len(mine)][mine]], -1)
+        if m.is_sparse:
+            blocks = rng.permutation(nblock := wanted["jtdaj_nblock"][w])
+            d.efc.jtdaj_adr.numpy()[w, :nblock] = place[wanted["jtdaj_adr"][w, blocks]]
+            d.efc.jtdaj_nrow.numpy()[w, :nblock] = wanted["jtdaj_nrow"][w, blocks]
+    assert (d.efc.id.numpy() != wanted["id"]).any()
+    sorter.sort_rows(m, d)
+    found = contents(d.efc)
+    for name in names:
+        for w, n in enumerate(counts):
+            np.testing.assert_array_equal(found[name][w, :n], wanted[name][w, :n], err_msg=name)
+    for w, nblock in enumerate(wanted["jtdaj_nblock"] if m.is_sparse else ()):
+        for name in ("jtdaj_adr", "jtdaj_nrow"):
+            np.testing.assert_array_equal(found[name][w, :nblock], wanted[name][w, :nblock], err_msg=name)
+    n = int(d.nacon.numpy()[0])
+    np.testing.assert_array_equal(d.contact.efc_address.numpy()[:n], addresses[:n])
+
+
+def test_sorting_changes_results_by_no_more_than_rounding(forwarded: tuple[WarpEngine, CanonicalOrder]) -> None:
+    engine, sorter = forwarded
+    m, d = engine.m, engine.d
+    mjw.forward(m, d)
+    ordered = d.qacc.numpy().copy()
+    m.callback.contactfilter = m.callback.passive = None
+    mjw.forward(m, d)
+    plain = d.qacc.numpy().copy()
+    m.callback.contactfilter, m.callback.passive = sorter.sort_contacts, sorter.sort_rows
+    np.testing.assert_allclose(ordered, plain, rtol=1e-3, atol=1e-3 * np.abs(plain).max())
+
+
+def test_a_contact_field_that_is_not_sorted_is_refused(
+    forwarded: tuple[WarpEngine, CanonicalOrder], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A new version of MuJoCo Warp may add one."""
+    engine, _ = forwarded
+    known = {name: kind for name, kind in order.Contacts.vars.items() if name != "adhesion"}  # type: ignore[attr-defined]
+    monkeypatch.setattr(order.Contacts, "vars", known)
+    with pytest.raises(ValueError, match="can't sort contacts with the field 'adhesion' of this mujoco_warp"):
+        CanonicalOrder(copy.copy(engine.m), engine.d)
+
+
+# scratch memory
+
+
+class Capturing:
+    """Stands for a CUDA device during a capture: Warp allocates some memory within it, and some outside."""
+
+    is_capturing = True
+
+    def __init__(self) -> None:
+        self.stream = types.SimpleNamespace(is_capturing=False)
+        self.freed: list[int] = []
+
+    def get_allocator(self) -> "Capturing":
+        return self
+
+    def allocate(self, size: int) -> int:
+        return -size
+
+    def deallocate(self, address: int, size: int) -> None:
+        self.freed.append(address)
+
+
+def test_captured_launches_share_their_scratch(monkeypatch: pytest.MonkeyPatch) -> None:
+    device, empty = Capturing(), wp.empty
+    monkeypatch.setattr(wp, "ScopedAllocator", lambda *args: contextlib.nullcontext())
+    monkeypatch.setattr(wp, "empty", lambda shape, dtype, device: empty(shape, dtype=dtype, device="cpu"))
+    scratch = Scratch(device)  # type: ignore[arg-type]
+    scratch.add_block(5000)
+    launches = []
+    for sizes in ([1000, 2000], [512, 1500, 1000], [4000]):
+        scratch.open()
+        launches.append([range(start := scratch.allocate(size), start + size) for size in sizes])
+    for pieces in launches:  # those of one launch lie beside each other, within the block
+        for before, after in itertools.pairwise(pieces):
+            assert before.stop <= after.start
+        assert pieces[0].start == launches[0][0].start and pieces[-1].stop <= pieces[0].start + 5120
+    assert (scratch.peak, scratch.largest) == (4096, 4096)
+    more = scratch.allocate(2000)  # the block is used up
+    assert more not in range(launches[0][0].start, launches[0][0].start + 5120)
+    scratch.deallocate(more, 2000)
+    assert not device.freed
+    for within in (True, False):
+        device.stream.is_capturing, device.is_capturing = within, within  # part of the graph, or no capture at all
+        assert scratch.allocate(300) == -300
+        scratch.deallocate(-300, 300)
+    assert device.freed == [-300, -300] and scratch.peak == 4096 + 2048
+
+
+def test_scratch_is_extrapolated_from_few_worlds() -> None:
+    def capture(nworld: int) -> Scratch:
+        return types.SimpleNamespace(peak=1000 + 7 * nworld, largest=100 + 3 * nworld)  # type: ignore[return-value]
+
+    sizes = ScratchSizes.probe(capture)
+    assert sizes == ScratchSizes(fixed=1000, each=7, most=(LARGEST_BUFFER - 100) // 3)
+    assert sizes.bytes_of(10**6) == 7_001_000

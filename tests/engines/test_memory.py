@@ -1,0 +1,88 @@
+"""Whether worlds fit into memory: one estimate for each engine, checked before anything is allocated."""
+
+import time
+import types
+from typing import Any
+
+import pytest
+import torch
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp.engines import memory
+from lyceum_warp.engines.memory import check_fit, most_worlds
+from lyceum_warp.fields import Stage
+
+CPU = wp.get_device("cpu")
+
+
+def test_check_fit_names_the_largest_number_of_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "free_memory", lambda device: 10_000_000)
+    assert most_worlds(1000, CPU) == 9000
+    check_fit(1000, 9000, CPU)
+    message = r"^9001 worlds need about 0.009 GB \(1 kB each\), and cpu has 0.01 GB free: use nworld=9000 at most$"
+    with pytest.raises(ValueError, match=message):
+        check_fit(1000, 9001, CPU)
+    with pytest.raises(ValueError, match="^1 worlds of a whale need .*: not even one world fits$"):
+        check_fit(20_000_000, 1, CPU, model="a whale")
+    check_fit(1000, 17_000, CPU, held=9_000_000)
+    monkeypatch.setattr(memory, "free_memory", lambda device: None)
+    check_fit(1000, 10**9, CPU)
+    assert most_worlds(1000, CPU) is None
+
+
+def test_check_fit_first_frees_what_torch_keeps_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    free, gpu = [1000], types.SimpleNamespace(is_cuda=True, alias="cuda:0")
+    monkeypatch.setattr(memory, "free_memory", lambda device: free[0])
+    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: free.__setitem__(0, 5000))
+    check_fit(100, 45, gpu)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"cuda:0 has 5e-06 GB free: use nworld=45 at most"):
+        check_fit(100, 46, gpu)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_ten_million_humanoids_are_refused_at_once(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    lw.make("humanoid", engine=engine)  # compiles the kernels
+    monkeypatch.setattr(memory, "free_memory", lambda device: 64 * 10**9)
+    start = time.perf_counter()
+    with pytest.raises(ValueError, match=r"10000000 worlds of humanoid need about \d+ GB .* use nworld=\d+ at most"):
+        lw.make("humanoid", engine=engine, nworld=10**7)
+    assert time.perf_counter() - start < 5
+
+
+def test_the_warp_engine_s_estimate_covers_its_arrays() -> None:
+    """Those of MuJoCo Warp's data, and with them the group's and temporary arrays."""
+    for task in ("hopper", "humanoid"):
+        env = lw.make(task, engine="warp", nworld=64)
+        engine: Any = env.engine
+        found = sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays_in(engine.d)) / 64
+        pool = engine.spare * 500 / 64  # additional contacts, for all worlds together
+        estimate = type(engine).bytes_per_world(env.model, engine.fields.values())
+        assert found - pool < estimate < 1.6 * found, task
+        assert estimate < env.bytes_per_world < 1.3 * estimate
+
+
+def arrays_in(data: Any) -> list[wp.array]:
+    found = []
+    for value in vars(data).values():
+        if isinstance(value, wp.array):
+            found.append(value)
+        elif hasattr(value, "__dataclass_fields__"):
+            found += arrays_in(value)
+    return found
+
+
+def test_the_c_engine_s_estimate_counts_an_mjdata_for_each_world_of_a_persistent_batch() -> None:
+    """Only fields of the new state need one."""
+    for task, fields, persistent in (("hopper", (), False), ("hopper", ("xpos",), True), ("humanoid", (), False)):
+        env = lw.make(task, nworld=2, fields=fields)
+        assert env.engine.batch.persistent == persistent == (env.engine.stage > Stage.NONE)  # type: ignore[attr-defined]
+        own = 4 * (2 * env.obs_space.size + 2 * env.action_space.size) + 8 * env.state_space.size
+        assert own < env.bytes_per_world
+        assert (env.bytes_per_world > 170_000) == persistent
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_bytes_per_world_do_not_depend_on_the_number_of_worlds(engine: str) -> None:
+    few, many = (lw.make("point_mass", engine=engine, nworld=n).bytes_per_world for n in (2, 64))
+    assert few == many > 0

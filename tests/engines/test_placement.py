@@ -1,0 +1,132 @@
+"""One place decides where worlds run: devices, "auto", options of engines, few worlds, a planner's samples."""
+
+import types
+from typing import Any
+
+import mujoco
+import pytest
+import torch
+import warp as wp
+from toy_engine import ToyEngine
+
+import lyceum_warp as lw
+from lyceum_warp.engines import memory, placement
+from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
+from lyceum_warp.engines.placement import engine_name, few_worlds, find_device, open_engine, place_samples
+from lyceum_warp.engines.warp.warp_engine import WarpEngine
+
+ON_CPU = {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None}
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    return lw.gymnasium_model("hopper.xml").compile()
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A CUDA device that is there by name only."""
+    device = types.SimpleNamespace(is_cpu=False, is_cuda=True, alias="cuda:0", free_memory=10**9)
+    found = placement.find_device
+    monkeypatch.setattr(placement, "find_device", lambda name: device if str(name).startswith("cuda") else found(name))
+    return device
+
+
+def test_find_device_takes_names_and_torch_devices() -> None:
+    assert find_device(None).is_cpu
+    assert find_device(torch.device("cpu")).is_cpu  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="no device 'tpu' on this machine; it has 'cpu'"):
+        find_device("tpu")
+
+
+def test_engine_name_resolves_auto_by_the_device() -> None:
+    assert [engine_name("auto", device) for device in ("cpu", None, "cuda", "cuda:1")] == [
+        "mujoco", "mujoco", "warp", "warp"
+    ]  # fmt: skip
+    assert engine_name("auto", wp.get_device("cpu")) == "mujoco"
+    assert engine_name("warp", "cpu") == "warp" and engine_name("mujoco", "cuda") == "mujoco"
+    assert engine_name(ToyEngine, "cpu") == "toy"
+
+
+def test_open_engine_makes_the_named_engine(model: mujoco.MjModel) -> None:
+    cpu = wp.get_device("cpu")
+    for engine, wanted in (("auto", MujocoEngine), ("mujoco", MujocoEngine), ("warp", WarpEngine), (ToyEngine,) * 2):
+        made = open_engine(engine, model, 2, cpu, [], nthread=None, deterministic=False, unroll=False)
+        assert type(made) is wanted and made.nworld == 2
+    for engine in ("bullet", None):
+        with pytest.raises(ValueError, match=f"no engine {engine!r}: use one of 'auto', 'mujoco', 'warp'"):
+            open_engine(engine, model, 2, cpu, [])  # type: ignore[arg-type]
+
+
+def test_options_are_read_from_the_signature_of_an_engine(model: mujoco.MjModel) -> None:
+    cpu = wp.get_device("cpu")
+
+    class Curious(ToyEngine):
+        def __init__(self, *args: Any, patience: int = 3, strict: bool = False) -> None:
+            super().__init__(*args)
+            self.given = patience, strict
+
+    def any_options(*args: Any, **options: Any) -> Engine:
+        engine = ToyEngine(*args)
+        engine.given = options  # type: ignore[attr-defined]
+        return engine
+
+    def opened(engine: Any, **options: Any) -> Any:
+        return open_engine(engine, model, 2, cpu, [], **options).given  # type: ignore[attr-defined]
+
+    assert opened(Curious) == (3, False)
+    assert opened(Curious, patience=5, strict=True, deterministic=True, unroll=True) == (5, True)
+    assert opened(any_options, patience=None, njmax=8, unroll=False, strict=True) == {"njmax": 8, "strict": True}
+    with pytest.raises(ValueError, match="the toy engine takes no njmax, nthread; it takes patience, strict"):
+        opened(Curious, nthread=2, njmax=8)
+    with pytest.raises(ValueError, match="the toy engine takes no nthread; it takes no options"):
+        opened(ToyEngine, nthread=2)
+    with pytest.raises(ValueError, match="the mujoco engine takes no njmax; it takes nthread"):
+        opened("mujoco", njmax=64)
+    with pytest.raises(ValueError, match="the warp engine takes no nthread; it takes nconmax, njmax, unroll"):
+        opened("warp", nthread=2)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp", ToyEngine])
+def test_worlds_that_do_not_fit_are_refused_before_the_engine_is_made(
+    engine: Any, model: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the caller allocates beside the engine counts, too."""
+    cpu = wp.get_device("cpu")
+    each = placement.bytes_per_world(engine, model, cpu, [])
+    assert each > 8 * mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION.value)
+    monkeypatch.setattr(memory, "free_memory", lambda device: int(10.5 * each / 0.9))
+    open_engine(engine, model, 10, cpu, [])
+    open_engine(engine, model, 5, cpu, [], beside=each)
+    with pytest.raises(ValueError, match=r"11 worlds of hopper need about .* use nworld=10 at most"):
+        open_engine(engine, model, 11, cpu, [])
+    with pytest.raises(ValueError, match=r"6 worlds of hopper need about .* use nworld=5 at most"):
+        open_engine(engine, model, 6, cpu, [], beside=each)
+
+
+def test_few_worlds_move_from_a_gpu_to_cpu_cores_with_auto_only() -> None:
+    assert few_worlds("auto", "cuda:0") == ON_CPU
+    for engine, device in (("auto", "cpu"), ("auto", None), ("warp", "cuda:0"), ("mujoco", "cpu"), (ToyEngine, "cuda")):
+        assert few_worlds(engine, device) == {}
+
+
+def test_place_samples_chooses_by_the_number_of_samples(gpu: Any) -> None:
+    """With engine="auto" on a GPU; an engine that was chosen stays."""
+
+    def chosen(
+        samples: int, engine: str = "auto", device: str = "cuda:0", nthread: int = 2, noslip: bool = False
+    ) -> Any:
+        return place_samples(engine, device, nthread=nthread, samples=samples, has_noslip=lambda: noslip)
+
+    on_gpu = {"engine": "warp", "nthread": None}
+    assert [chosen(n) for n in (79, 80)] == [ON_CPU, on_gpu]
+    assert chosen(79, nthread=1) == on_gpu and chosen(1, engine="warp") == {}
+    assert chosen(640, nthread=128) == on_gpu, "more than 16 cores were not measured"
+    assert chosen(4096, device="cpu") == {}
+    assert [chosen(n, noslip=True) for n in (160, 479, 480)] == [ON_CPU, ON_CPU, on_gpu]
+
+
+def test_the_c_engine_refuses_a_gpu(model: mujoco.MjModel, gpu: Any) -> None:
+    with pytest.raises(ValueError, match="runs on the CPU, not on 'cuda:0': use device='cpu' or engine='warp'"):
+        open_engine("mujoco", model, 1, gpu, [])

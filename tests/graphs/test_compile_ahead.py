@@ -1,0 +1,57 @@
+"""Kernels are compiled ahead of the first step, with progress, and by ``lyceum-warp warmup``."""
+
+import os
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+SCRIPT = """
+import warp as wp
+from lyceum_warp.graphs.compile_ahead import compile_ahead
+
+@wp.kernel(module="unique", enable_backward=False)
+def one(a: wp.array[float]):
+    a[wp.tid()] = 1.0
+
+@wp.kernel(module="unique", enable_backward=False)
+def two(a: wp.array[float]):
+    a[wp.tid()] = 2.0
+
+@wp.kernel(module="unique", enable_backward=False)
+def never(a: wp.array[float]):
+    a[wp.tid()] = 3.0
+
+def launches():
+    a = wp.zeros(4, dtype=float)
+    wp.launch(one, 4, [a])
+    wp.launch(two, 4, [a])
+    wp.launch(two, 4, [a])
+    wp.launch(never, 0, [a])
+
+built = compile_ahead(launches, wp.get_device("cpu"), "a test")
+print(built.modules, built.known)
+"""
+
+
+def test_compiling_is_reported_and_done_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A process of its own compiles; this one, which does not have these kernels, finds them in its cache."""
+    script, cache = tmp_path / "script.py", tmp_path / "cache"
+    script.write_text(SCRIPT)
+    env = {**os.environ, "WARP_CACHE_PATH": str(cache)}
+    done = subprocess.run([sys.executable, script], env=env, capture_output=True, text=True, check=True)
+    lines = [line for line in done.stderr.splitlines() if "CUDA" not in line]
+    assert done.stdout.strip() == "2 0"
+    assert lines[0].startswith("compiling kernels of a test for cpu: 2 modules on ")
+    assert len(lines) == 3 and all(line.strip().startswith(f"{i}/2 ") for i, line in enumerate(lines[1:], 1))
+    assert {line.split()[1].rsplit("_", 1)[0] for line in lines[1:]} == {"one", "two"}
+    (folder,) = {path.parent.parent for path in cache.rglob("*.o")}
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(folder))
+    runpy.run_path(str(script))
+    said = capsys.readouterr()
+    assert (said.out.strip(), said.err) == ("0 2", "")

@@ -1,0 +1,149 @@
+"""A rehearsal finds the kernels that a function would launch, and leans on names of Warp that must not change."""
+
+import inspect
+import subprocess
+import sys
+import threading
+
+import pytest
+import warp as wp
+
+from lyceum_warp.graphs import compile_ahead
+from lyceum_warp.graphs.rehearsal import rehearse
+from lyceum_warp.kernels.state import fill_rows64
+
+REPLACED = {
+    wp: ("launch", "launch_tiled", "capture_while", "capture_if"),
+    wp.utils: ("radix_sort_pairs", "segmented_sort_pairs", "array_scan"),
+}
+
+WHOLE_STEP = """
+import mujoco_warp as mjw
+import warp as wp
+import lyceum_warp as lw
+from lyceum_warp.graphs.rehearsal import rehearse
+
+wp.config.log_level = wp.LOG_INFO  # Warp then prints each module that it loads
+compiled = lw.gymnasium_model("hopper.xml").compile()
+model, data = mjw.put_model(compiled), mjw.make_data(compiled, nworld=2)
+mask = wp.full(2, True, dtype=bool)
+
+def step():
+    mjw.step(model, data)
+    mjw.forward(model, data)
+    mjw.reset_data(model, data, reset=mask)
+
+with rehearse() as rehearsal:
+    step()
+print("rehearsed:", *sorted({module.name for module, _ in rehearsal.modules}), flush=True)
+step()
+"""
+
+
+def launch(mask: wp.array, row: wp.array, rows: wp.array) -> None:
+    wp.launch(fill_rows64, (3, 1), [mask, row, rows, 1], device="cpu")
+
+
+@pytest.fixture
+def arrays() -> tuple[wp.array, wp.array, wp.array]:
+    """A mask, a row of ones and three rows of zeros."""
+    mask = wp.full(3, True, dtype=bool, device="cpu")
+    return mask, wp.full(2, 1, dtype=wp.float64, device="cpu"), wp.zeros((3, 2), dtype=wp.float64, device="cpu")
+
+
+def test_a_rehearsal_notes_launches_instead_of_making_them(arrays: tuple[wp.array, wp.array, wp.array]) -> None:
+    flag = wp.zeros(1, dtype=int, device="cpu")
+    with rehearse() as rehearsal:
+        launch(*arrays)
+        wp.capture_if(flag, on_true=lambda: launch(*arrays))  # whatever the flag is
+        wp.capture_while(flag, while_body=lambda: launch(*arrays))
+    assert list(rehearsal.modules) == [(fill_rows64.module, None)]
+    assert not arrays[2].numpy().any()
+    launch(*arrays)
+    assert arrays[2].numpy().all()
+
+
+def originals() -> list[object]:
+    return [getattr(owner, name) for owner, names in REPLACED.items() for name in names]
+
+
+def test_a_rehearsal_restores_warp_also_after_an_error(arrays: tuple[wp.array, wp.array, wp.array]) -> None:
+    before = originals()
+    with pytest.raises(ZeroDivisionError), rehearse():
+        assert not set(originals()) & set(before)
+        raise ZeroDivisionError
+    assert originals() == before
+
+
+def test_overlapping_rehearsals_of_two_threads_take_turns(arrays: tuple[wp.array, wp.array, wp.array]) -> None:
+    """The second waits for the first, and Warp is restored in the end."""
+    before, order = originals(), []
+    inside, release = threading.Event(), threading.Event()
+
+    def first() -> None:
+        with rehearse() as rehearsal:
+            inside.set()
+            release.wait(10)
+            launch(*arrays)
+            order.append(("first", len(rehearsal.modules)))
+
+    def second() -> None:
+        with rehearse() as rehearsal:
+            launch(*arrays)
+            order.append(("second", len(rehearsal.modules)))
+
+    threads = [threading.Thread(target=first), threading.Thread(target=second)]
+    threads[0].start()
+    assert inside.wait(10)
+    threads[1].start()
+    threads[1].join(0.2)
+    assert threads[1].is_alive() and not order
+    launch(*arrays)  # other threads launch as usual
+    assert arrays[2].numpy().all()
+    release.set()
+    for thread in threads:
+        thread.join(10)
+    assert order == [("first", 1), ("second", 1)]
+    assert originals() == before
+
+
+# names of Warp; a failure here means that graphs/rehearsal.py or graphs/compile_ahead.py needs the new ones
+
+
+def test_warp_has_the_functions_that_a_rehearsal_replaces() -> None:
+    for owner, names in REPLACED.items():
+        for name in names:
+            assert callable(getattr(owner, name, None)), f"{owner.__name__}.{name}"
+    wanted = {
+        "launch": ["kernel", "dim", "inputs", "outputs", "block_dim"],
+        "capture_while": ["condition", "while_body", "stream", "kwargs"],
+        "capture_if": ["condition", "on_true", "on_false", "stream", "kwargs"],
+    }
+    for name, arguments in wanted.items():
+        found = list(inspect.signature(getattr(wp, name)).parameters)
+        assert [argument for argument in found if argument in arguments] == arguments, name
+
+
+def test_warp_has_the_internals_that_compiling_ahead_reads(arrays: tuple[wp.array, wp.array, wp.array]) -> None:
+    launch(*arrays)
+    kernel, device = fill_rows64, wp.get_device("cpu")
+    assert kernel.is_generic is False
+    module = kernel.module
+    assert (device.context, 1) in module.execs
+    assert {"device", "modules", "block_dim", "max_workers"} <= set(inspect.signature(wp.force_load).parameters)
+    module.get_module_hash(1)
+    name = module.get_module_identifier(1)
+    assert isinstance(name, str) and isinstance(wp.config.kernel_cache_dir, str)
+    output = module._get_compile_output_name(device, block_dim=1)
+    assert any(path.parent.name == name and path.name == output for path in compile_ahead.cached())
+
+
+def test_a_rehearsal_finds_every_module_that_a_step_loads() -> None:
+    """In a process of its own: MuJoCo Warp must launch nothing by other functions than those that are replaced."""
+    done = subprocess.run([sys.executable, "-c", WHOLE_STEP], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    (first,) = (i for i, line in enumerate(lines) if line.startswith("rehearsed: "))
+    rehearsed = set(lines[first].split()[1:])
+    loaded = {line.split()[1] for line in lines[first:] if line.startswith("Module ")}
+    assert len(loaded) > 20 and loaded <= rehearsed, sorted(loaded - rehearsed)
