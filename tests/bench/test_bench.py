@@ -45,7 +45,9 @@ def test_a_comparison_shows_ratios_of_new_by_old(measurements: ModuleType, tmp_p
     assert list(table.columns[1].cells) == ["1.500", "1.000"]
 
 
-@pytest.mark.parametrize(("name", "value"), [("gpu", "NVIDIA H100"), ("cores", 3), ("driver", "580"), ("cpu", "abacus")])
+@pytest.mark.parametrize(
+    ("name", "value"), [("gpu", "NVIDIA H100"), ("cores", 3), ("driver", "580"), ("cpu", "abacus")]
+)
 def test_measurements_on_different_hardware_are_not_compared(
     name: str, value: object, measurements: ModuleType, tmp_path: Path
 ) -> None:
