@@ -209,7 +209,7 @@ _OTHER_WORDS = {
 
 
 def suggestion(word: str, others: Iterable[str] = ()) -> str:
-    """What somebody who wrote an unknown word may have meant, as "did you mean ...?"; empty where nothing is close.
+    """The known words that an unknown one may stand for, as "did you mean ...?"; empty where nothing is close.
 
     Args:
         word: The word.

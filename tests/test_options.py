@@ -57,7 +57,7 @@ def test_options_in_one_piece_and_by_name_make_the_same_environment() -> None:
         assert (env.nworld, env.horizon) == (2, 5)
 
 
-def test_a_replica_has_the_options_of_the_original_but_for_the_changes() -> None:
+def test_a_replica_has_the_options_of_the_original_except_for_the_changes() -> None:
     env = lw.make("hopper", nworld=2, horizon=5, integrator="euler", solver={"iterations": 4}, seed=3)
     replica = env.replicate(nworld=3, horizon=6)
     assert replica.options.given() == {

@@ -1,4 +1,4 @@
-"""The README's Python runs as it stands."""
+"""The README's Python runs unchanged."""
 
 import re
 from pathlib import Path
@@ -11,10 +11,10 @@ import lyceum_warp as lw
 README = Path(__file__).parent.parent / "README.md"
 
 
-def test_the_readmes_python_runs(task_file: TaskFile, capsys: pytest.CaptureFixture) -> None:
+def test_every_python_block_runs(task_file: TaskFile, capsys: pytest.CaptureFixture) -> None:
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     assert len(blocks) == 4
-    # Warp compiles the source of functions: it has to lie in a file, as a user's does
+    # Warp compiles the source of functions, so it must lie in a file, as a user's does
     env = lw.make(str(task_file("my_hopper.py", blocks[0])), nworld=2)
     assert env.task.name == "my_hopper"
     scope = {"lw": lw, "MyHopper": env.task.task}
@@ -27,7 +27,7 @@ def test_the_readmes_python_runs(task_file: TaskFile, capsys: pytest.CaptureFixt
     assert planned.startswith("success: True")
 
 
-def test_the_readmes_task_is_shorter_than_the_papers() -> None:
+def test_the_task_is_shorter_than_in_the_paper() -> None:
     """The paper's appendix takes 39 lines for Hopper without its comments."""
     source = re.search(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     assert source is not None

@@ -38,7 +38,7 @@ def register(task: type[Task]) -> type[Task]:
     if known is None and not task.__module__.startswith(_PACKAGE) and name in _package_tasks():
         owner = f"{_PACKAGE}{name}"
     elif task.__module__.startswith(_FILE) and (known is None or known.__module__.startswith(_FILE)):
-        _tasks[name] = task  # tasks that are given as files are told apart by them
+        _tasks[name] = task  # two files may hold tasks of one name
         return task
     elif known is not None and known.__module__ != task.__module__ and _file(known) != _file(task):
         owner = f"{known.__module__}.{known.__qualname__}"

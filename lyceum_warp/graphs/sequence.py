@@ -1,6 +1,6 @@
 """Phases: what a step, a reset or a plan is made of, and how their launches become graphs.
 
-Whoever has something to launch lists it as phases, in order. ``Graphs.sequence`` turns the list into calls: phases that
+Code with launches lists them as phases, in order. ``Graphs.sequence`` turns the list into calls: phases that
 follow one another and are made of Warp launches become one graph, captured once and replayed. On an engine whose own
 calls are launches a whole step is one graph; on others the engine's calls stay between the graphs.
 """

@@ -28,7 +28,7 @@ HIGHEST = wp.constant(vec7(*(joint[2][1] for joint in JOINTS)))
 REMEMBERED = 10
 """Distances that the task remembers, one a step."""
 FAR = 10.0
-"""Metres in the place of a distance that is not there yet: while there is one, the average is no success."""
+"""Metres in the place of a distance that is not there yet: with one of these, the average is never a success."""
 
 
 @wp.struct

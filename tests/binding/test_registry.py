@@ -50,7 +50,7 @@ def test_every_task_of_the_package_is_found_by_its_name() -> None:
 
 
 @pytest.mark.parametrize("name", ["hopper.xml", "foo.bar", "./t", ""])
-def test_a_name_that_is_no_task_is_refused(name: str) -> None:
+def test_an_unknown_name_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match="there is no task"):
         find_task(name)
 
