@@ -63,7 +63,7 @@ def main(options: Options) -> None:
     plan = lw.MPPI(options.task, nthread=options.nthread)
     reports = {}
     for name in ("as it is", "slowed"):
-        # one long episode, so that nothing but the clock ends it
+        # one long episode, so that only the clock ends it
         env = lw.make(options.task, autoreset=False, horizon=0, nthread=1)
         controller = plan if name == "as it is" else Slowed(plan, options.slow * env.timestep)
         done = lw.control_async(env, controller, seconds=options.seconds, seed=0)

@@ -1,6 +1,6 @@
 """A world's fault stays in that world, and a wrong argument is refused with its value and how to fix it.
 
-The conformance suite covers not-a-number, infinite and absurd states and actions for every task and engine. Here
+The conformance suite covers not-a-number, infinite and out of range states and actions for every task and engine. Here
 are the faults that need a particular model. Both engines can produce each kind. The C engine has no shared pool of
 contacts, so only the Warp engine's contact overflow reaches other worlds.
 """

@@ -4,7 +4,7 @@ import warp as wp
 
 from lyceum_warp.done import Done
 
-ABSURD = wp.constant(1.0e10)
+MAX_MAGNITUDE = wp.constant(1.0e10)
 NAN = wp.constant(int(Done.NAN))
 CONTACT = wp.constant(int(Done.CONTACT_OVERFLOW))
 CONSTRAINT = wp.constant(int(Done.CONSTRAINT_OVERFLOW))
@@ -12,9 +12,9 @@ WARNING = wp.constant(int(Done.ENGINE_WARNING))
 
 
 @wp.func
-def is_absurd(x: float) -> bool:
-    # written so that not-a-number, for which every comparison is false, counts as absurd
-    return not (wp.abs(x) < ABSURD)
+def is_out_of_range(x: float) -> bool:
+    # written so that not-a-number, for which every comparison is false, counts as out of range
+    return not (wp.abs(x) < MAX_MAGNITUDE)
 
 
 @wp.kernel(enable_backward=False)
@@ -35,7 +35,7 @@ def faults_of_rows(
         return
     fault = int(0)
     for i in range(nphysics):
-        if not (wp.abs(state_in[w, i]) < wp.float64(ABSURD)):
+        if not (wp.abs(state_in[w, i]) < wp.float64(MAX_MAGNITUDE)):
             fault = fault | NAN
     for kind in range(warning_inout.shape[1]):
         if warning_inout[w, kind, 1] > 0:
@@ -84,13 +84,13 @@ def faults_of_fields(
         return
     fault = int(0)
     for i in range(qpos_in.shape[1]):
-        if is_absurd(qpos_in[w, i]):
+        if is_out_of_range(qpos_in[w, i]):
             fault = fault | NAN
     for i in range(qvel_in.shape[1]):
-        if is_absurd(qvel_in[w, i]):
+        if is_out_of_range(qvel_in[w, i]):
             fault = fault | NAN
     for i in range(act_in.shape[1]):
-        if is_absurd(act_in[w, i]):
+        if is_out_of_range(act_in[w, i]):
             fault = fault | NAN
     overflow = overflow_in[w] & ~ignored_bits
     if (overflow & contact_bits) != 0:

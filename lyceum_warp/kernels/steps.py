@@ -168,7 +168,7 @@ def make_kernels(
                 out.eval[w] = evaluate(s1, p)
             elif transition:
                 last = evaluate(s0, p)
-                if not faults.is_absurd(last):  # else keep the evaluation of an earlier state
+                if not faults.is_out_of_range(last):  # else keep the evaluation of an earlier state
                     out.eval[w] = last
         else:
             out.eval[w] = gain

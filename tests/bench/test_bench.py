@@ -1,4 +1,4 @@
-"""Records of measurements."""
+"""Files of measurements."""
 
 import dataclasses
 import importlib.util

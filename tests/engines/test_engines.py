@@ -329,17 +329,17 @@ def test_an_unrolled_solver_gives_the_same_numbers() -> None:
     lw.make("half_cheetah", engine="mujoco", unroll=True).step()
 
 
-PHASES = ["act", "physics", "judge", "restart", "refresh", "look"]
+PHASES = ["act", "physics", "judge", "restart", "refresh", "observe"]
 
 
-@pytest.mark.parametrize("record", [True, False])
+@pytest.mark.parametrize("graphs", [True, False])
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_a_profiler_sees_each_phase(engine: str, record: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_profiler_sees_each_phase(engine: str, graphs: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     seen, open_ranges = [], []
     monkeypatch.setattr(torch.backends.cuda, "is_built", lambda: True)
     monkeypatch.setattr(torch.cuda.nvtx, "range_push", lambda name: open_ranges.append(name))
     monkeypatch.setattr(torch.cuda.nvtx, "range_pop", lambda: seen.append(open_ranges.pop()))
-    marked = lw.make("reach", engine=engine, nworld=2, nvtx=True, record=record)
+    marked = lw.make("reach", engine=engine, nworld=2, nvtx=True, graphs=graphs)
     plain = lw.make("reach", engine=engine, nworld=2)
     for _ in range(4):
         seen.clear()
@@ -350,7 +350,7 @@ def test_a_profiler_sees_each_phase(engine: str, record: bool, monkeypatch: pyte
     assert torch.equal(marked.get_state(), plain.get_state()) and torch.equal(marked.obs, plain.obs)
 
 
-def test_the_contact_pool_has_room_for_one_absurd_world() -> None:
+def test_the_contact_pool_has_room_for_one_world_in_which_everything_touches() -> None:
     env = lw.make("humanoid", engine="warp", nworld=4)
     engine = env.engine
     assert isinstance(engine, WarpEngine)

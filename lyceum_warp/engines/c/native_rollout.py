@@ -15,9 +15,9 @@ from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
     """Whether the rows of ``Batch.rollout`` hold what a call of ``Batch.step`` for each step would show.
 
-    A row is written as ``mj_step`` leaves things. The state is then the new one, but what was computed from positions
-    and velocities belongs to the state before the last substep: it is found in the next row. RK4 is the exception,
-    where it belongs to an intermediate stage. Sensor data of both kinds can't be told apart.
+    A row is written as ``mj_step`` leaves MjData. The state is then the new one, but fields computed from positions and
+    velocities belong to the state before the last substep: the next row holds those of the new state. Under RK4 they
+    belong to an intermediate stage instead. Sensor data mixes both kinds and cannot be separated.
     """
     current = [field for field in fields if field.refresh > Stage.NONE]
     if any(field.snapshot for field in current):

@@ -35,7 +35,7 @@ class Scratch(Reserve):
         """The most bytes that were handed out at once."""
 
     def open(self) -> None:
-        """Begin again at the start: earlier launches are over when later ones run."""
+        """Reuse the memory from its start: earlier launches are over when later ones run."""
         self._block, self._used, self._now = 0, 0, 0
 
     @contextlib.contextmanager

@@ -107,7 +107,7 @@ class Arena(Reserve):
         self._serving = False
 
     def open(self) -> None:
-        """Begin again at the start of the reserve."""
+        """Reuse the reserve from its start."""
         self._used = 0
 
     @contextlib.contextmanager

@@ -52,7 +52,7 @@ class WarpEngine(Engine):
         device: A CUDA device, or the CPU (single-threaded: for tests).
         fields: The fields to keep.
         nconmax: Contacts that each world has room for, on average. None probes the model, and gives all worlds
-            together additional room for a single one in an absurd state.
+            together additional room for a single one in which everything touches.
         njmax: Constraints that each world has room for; None probes the model.
         unroll: Whether graphs hold all iterations of the solver, instead of a loop that ends with the last world's.
             Iterations that a world does not need leave it unchanged.
