@@ -1,8 +1,8 @@
 """Learning in several processes: each steps its share of the worlds, and all make the same update.
 
 A sum over all worlds is a sum over each process's own worlds, then over the processes. Every process draws the random
-numbers of all worlds from the same stream and takes those of its own worlds. The number of processes therefore changes only
-the rounding of sums.
+numbers of all worlds from the same stream and takes those of its own worlds. The number of processes therefore changes
+only the rounding of sums.
 """
 
 import contextlib
