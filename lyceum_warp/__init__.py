@@ -27,6 +27,7 @@ from lyceum_warp.env import Env, make
 from lyceum_warp.fields import vec10
 from lyceum_warp.kernels.random import normal, uniform
 from lyceum_warp.openloop import OpenLoop
+from lyceum_warp.options import EnvOptions, PhysicsOptions
 from lyceum_warp.runs import load, load_value
 from lyceum_warp.task import Planning, Row, Task, body, dof, geom, mocap, qpos, sensor, site
 
@@ -40,12 +41,14 @@ __all__ = [
     "Controller",
     "Done",
     "Env",
+    "EnvOptions",
     "Episodes",
     "GaussianPolicy",
     "Iteration",
     "MPPIConfig",
     "NPGConfig",
     "OpenLoop",
+    "PhysicsOptions",
     "Planning",
     "PlanningController",
     "Rollout",

@@ -68,14 +68,14 @@ class Worlds:
         # the fields of the state that a step leads to, live, and copies of those of the state before
         self.memory = wp.zeros((n, task.memory), dtype=float)
         self.after, self.before = kernels.Batch(), kernels.Batch()
-        self.pairs: list[tuple[wp.array, wp.array]] = []
+        self._pairs: list[tuple[wp.array, wp.array]] = []
         for name in self.task.types:
             live = self.memory if name == "memory" else self.engine.arrays[name]
             self.task.check_field(name, live)
             copy = wp.zeros_like(live)
             setattr(self.after, name, live)
             setattr(self.before, name, copy)
-            self.pairs.append((copy, live))
+            self._pairs.append((copy, live))
         self._no_memory = wp.zeros((n, task.memory), dtype=float)
         self.params = self.task.parameters.array(self.device)
 
@@ -132,7 +132,7 @@ class Worlds:
     def step_phases(self) -> list[Phase]:
         """One step, in order."""
         phases = [
-            Phase("act", self._act),
+            Phase("act", self.act),
             Phase("physics", partial(self.engine.step, self.task.frame_skip), engine=True),
             Phase("judge", self._judge_step),
             Phase("restart", partial(self._restart, self.restarting, randomly=True)),
@@ -172,10 +172,14 @@ class Worlds:
         for phase in self.restore_phases():
             phase.run()
 
-    def _act(self) -> None:
-        """Keep the state that the step starts from, and turn actions into controls."""
-        for copy, live in self.pairs:
+    def keep_before(self) -> None:
+        """Keep the current state as the one that a transition starts from."""
+        for copy, live in self._pairs:
             wp.copy(copy, live)
+
+    def act(self) -> None:
+        """Keep the state that the step starts from, and turn actions into controls."""
+        self.keep_before()
         wp.launch(self.task.kernels.act, self.nworld, [
             self.after, self.params, self.action, self.ranges, self.scale, self.steps, self.safe_action,
             self._action_fault, self.engine.ctrl,
@@ -242,26 +246,17 @@ class Worlds:
     def _memory_columns(self) -> wp.array:
         return self.state[:, self.engine.state_size + len(COUNTERS) :]
 
-    # what environments, open-loop roll-outs and checks do besides
+    # parts of phases, and preparations, for environments and open-loop roll-outs
 
     def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
         """Set the masked worlds' counters from columns of states."""
         counters = [mask, columns, self.steps, self.key, self.episode, self.outcome.done_reason]
         wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)
 
-    def act(self) -> None:
-        """The first phase of a step alone."""
-        self._act()
-
     def judge_transition(self, action: torch.Tensor) -> None:
-        """Judge the transition from ``before`` to the current state under some actions, as if without faults."""
+        """Judge the transition from ``before`` to the current state under some actions, without looking for faults."""
         torch_view(self.safe_action).copy_(action)
         self._judge(self.everyone, self._no_fault, self._no_fault, transition=True)
-
-    def keep_before(self) -> None:
-        """Keep the current state as the one that a transition starts from."""
-        for copy, live in self.pairs:
-            wp.copy(copy, live)
 
     def seed_streams(self, seed: int) -> None:
         """Start the random streams of the masked worlds anew."""
