@@ -10,16 +10,20 @@ import subprocess
 import sys
 import types
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import pytest
+import torch
 import warp as wp
 
 import lyceum_warp as lw
+from lyceum_warp.engines import memory
 from lyceum_warp.engines.deterministic import order_kernels as order
 from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
+from lyceum_warp.engines.deterministic.deterministic_engine import DeterministicEngine
 from lyceum_warp.engines.deterministic.scratch import LARGEST_BUFFER, Scratch, ScratchSizes
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import describe
@@ -65,6 +69,51 @@ def test_no_other_room_mentions_the_deterministic_room() -> None:
     for path in package.rglob("*.py"):
         inside = path.parent.name == "deterministic" or path.name == "placement.py"
         assert inside or "engines.deterministic" not in path.read_text(), path
+
+
+@pytest.fixture
+def without_allocators(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Warp has allocators of one's own on CUDA devices only; on the CPU the engine runs without."""
+    monkeypatch.setattr(wp, "ScopedAllocator", lambda *args: contextlib.nullcontext())
+
+
+@pytest.mark.usefixtures("without_allocators")
+def test_the_deterministic_engine_steps_as_the_warp_engine_does() -> None:
+    """On the CPU, where only the order of sums differs."""
+    envs = [lw.make("humanoid", engine=engine, nworld=3, horizon=3) for engine in (DeterministicEngine, WarpEngine)]
+    ordered, plain = envs
+    for _ in range(4):
+        for env in envs:
+            env.step(torch.full_like(env.action, 0.3))
+        torch.testing.assert_close(ordered.get_state(), plain.get_state(), rtol=1e-3, atol=1e-3)
+    engine: Any = ordered.engine
+    assert engine.name == "warp" and engine.m.opt.deterministic == mjw.DeterminismType.ALL
+    model, _ = engine.bare()
+    assert model.callback.contactfilter is not None and model.opt.deterministic == mjw.DeterminismType.ALL
+    assert ordered.bytes_per_world > 3 * plain.bytes_per_world
+
+
+@pytest.mark.usefixtures("without_allocators")
+def test_scratch_is_reserved_before_graphs_are_captured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For 256 worlds and more, if it fits into memory and into Warp's buffers."""
+    engine: Any = lw.make("hopper", engine=DeterministicEngine, nworld=2).engine
+    assert not engine._scratch.blocks
+    engine.nworld = 1000
+    plain = WarpEngine.bytes_per_world(engine.model, engine.fields.values())
+    for sizes, message in [
+        (ScratchSizes(fixed=10, each=100, most=999), "1000 worlds need buffers of more than .* use nworld=999 at most"),
+        (ScratchSizes(fixed=10, each=100, most=1000), ""),
+        (ScratchSizes(fixed=0, each=10 * plain, most=1000), r"^1000 worlds need about .* at most, or leave determ"),
+    ]:
+        monkeypatch.setattr(ScratchSizes, "probe", lambda capture, sizes=sizes: sizes)
+        monkeypatch.setattr(memory, "free_memory", lambda device: 2 * plain * 1000)
+        if message:
+            with pytest.raises(ValueError, match=message):
+                engine.prepare_capture()
+        else:
+            engine.prepare_capture()
+    (block,) = engine._scratch.blocks
+    assert 100_010 <= block.size < 100_010 + 512
 
 
 # the order that MuJoCo Warp leaves to chance on a GPU is shuffled here by hand, and restored

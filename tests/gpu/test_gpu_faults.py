@@ -10,7 +10,7 @@ NWORLD, STEPS = 16384, 10_000
 
 @pytest.mark.gpu
 @pytest.mark.slow
-def test_broken_worlds_recover_are_counted_and_do_not_spread() -> None:
+def test_worlds_with_faults_restart_and_leave_others_unchanged() -> None:
     env = lw.make("half_cheetah", nworld=NWORLD, device="cuda", seed=0)
     generator = torch.Generator("cuda").manual_seed(0)
     broken = torch.randperm(NWORLD, generator=generator, device="cuda")[: NWORLD // 100]
