@@ -73,7 +73,7 @@ def test_no_other_room_mentions_the_deterministic_room() -> None:
 
 @pytest.fixture
 def without_allocators(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Warp has allocators of one's own on CUDA devices only; on the CPU the engine runs without."""
+    """Custom allocators exist only on CUDA devices; on the CPU the engine runs without them."""
     monkeypatch.setattr(wp, "ScopedAllocator", lambda *args: contextlib.nullcontext())
 
 

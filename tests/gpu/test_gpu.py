@@ -207,7 +207,7 @@ def test_restarting_worlds_get_the_fields_of_a_full_forward_pass(deterministic: 
 
 
 def test_a_fault_among_few_humanoids_leaves_the_others_unchanged() -> None:
-    """The pool of contacts has room for an absurd world even where there are only a few worlds."""
+    """The pool of contacts has room for a world beyond 1e10, also where there are only a few worlds."""
     from lyceum_warp.testing import CHECKS
 
     checks = [check for check in CHECKS if check.__name__ in ("check_bad_state", "check_bad_action")]

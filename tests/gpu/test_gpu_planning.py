@@ -3,7 +3,7 @@
 import pytest
 import torch
 import warp as wp
-from test_gpu import CUDA, no_word_to_the_host
+from test_gpu import CUDA, nothing_waits
 
 import lyceum_warp as lw
 from lyceum_warp import Row
@@ -62,7 +62,7 @@ def test_plans_allocate_nothing_and_do_not_wait_for_the_device(kind: str) -> Non
     for _ in range(3):
         plan(state)
     memory = torch.cuda.memory_allocated(), wp.get_mempool_used_mem_current(CUDA)
-    with no_word_to_the_host():
+    with nothing_waits():
         for _ in range(50):
             plan(state)
     assert (torch.cuda.memory_allocated(), wp.get_mempool_used_mem_current(CUDA)) == memory
