@@ -10,9 +10,9 @@ from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_config import MPPIConfig
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig
+from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.rollout_buffer import Rollout
-from lyceum_warp.algos.statistics import Iteration
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.binding.models import gymnasium_model, gymnasium_robotics_model
 from lyceum_warp.binding.registry import register, task_names

@@ -8,7 +8,7 @@ import warp as wp
 from lyceum_warp.arrays import launch_rows, torch_view
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
-from lyceum_warp.graphs.sequence import Phase
+from lyceum_warp.graphs.capture import Phase
 from lyceum_warp.kernels import planning, state
 from lyceum_warp.spaces import COUNTERS
 from lyceum_warp.validate import whole_number

@@ -14,7 +14,7 @@ from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.fields import Stage
-from lyceum_warp.graphs.sequence import Calls, Graphs, Phase
+from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.kernels import random, state, steps
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.spaces import COUNTERS, Space, action_space, control_map, state_space

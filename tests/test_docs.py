@@ -55,7 +55,6 @@ def test_links_of_a_document_lead_to_files_and_headings(document: Path) -> None:
         assert not anchor or anchor in anchors(target), f"{document.name} links to {link}"
 
 
-@pytest.mark.xfail(strict=True, reason="the rooms are being moved: remove this mark when they are all in place")
 @pytest.mark.parametrize("document", [ROOT / "docs" / "architecture.md"], ids=name_of)
 def test_files_that_a_document_names_exist(document: Path) -> None:
     named = set(re.findall(r"`([\w./-]+(?:\.py|\.md|/))`", document.read_text())) - {"path/to/file.py"}

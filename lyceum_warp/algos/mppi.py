@@ -30,7 +30,7 @@ from lyceum_warp.arrays import torch_view
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
-from lyceum_warp.graphs.sequence import Calls, Phase
+from lyceum_warp.graphs.capture import Calls, Phase
 from lyceum_warp.kernels import planning
 from lyceum_warp.openloop import OpenLoop
 from lyceum_warp.task import Task

@@ -18,9 +18,7 @@ from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
 from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, flatten
 from lyceum_warp.algos.networks import Normalizer
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
-from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.algos.rollout_buffer import Rollout
-from lyceum_warp.algos.statistics import (
+from lyceum_warp.algos.npg_statistics import (
     Iteration,
     ProcessNumbers,
     UpdateNumbers,
@@ -29,6 +27,8 @@ from lyceum_warp.algos.statistics import (
     prediction_sums,
     summary,
 )
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.timing import Clock, one_thread
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.algos.value_fit import ValueFit

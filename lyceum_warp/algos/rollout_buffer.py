@@ -8,7 +8,7 @@ from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.arrays import torch_view
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
-from lyceum_warp.graphs.sequence import Graphs, Phase
+from lyceum_warp.graphs.capture import Graphs, Phase
 from lyceum_warp.kernels import collect
 
 

@@ -16,7 +16,7 @@ import torch
 
 from lyceum_warp.env import Env
 from lyceum_warp.viz import EXTRA
-from lyceum_warp.viz._render import CANNOT_DRAW
+from lyceum_warp.viz.render import CANNOT_DRAW
 
 _MAX_RATE = 60  # frames per second; screens rarely show more
 _POSES = ("qpos", "mocap_pos", "mocap_quat")
@@ -115,14 +115,14 @@ def _libraries() -> list[str]:
 
 
 def _draw(arguments: list[str]) -> None:
-    """Run ``_render.py`` with each graphics library until one works."""
+    """Run ``render.py`` with each graphics library until one works."""
     failures = []
     for library in _libraries():
         environment = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
         if library:
             environment["MUJOCO_GL"] = library
-        # -P keeps the folder of _render.py off the path, where its other modules could shadow packages
-        command = [sys.executable, "-P", str(Path(__file__).with_name("_render.py")), *arguments]
+        # -P keeps the folder of render.py off the path, where its other modules could shadow packages
+        command = [sys.executable, "-P", str(Path(__file__).with_name("render.py")), *arguments]
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
         if done.returncode == 0:
             return

@@ -9,7 +9,7 @@ import torch
 import lyceum_warp as lw
 from lyceum_warp.cli import main
 
-OLD = Path(__file__).parent.parent / "data" / "run_before_rooms"
+OLD = Path(__file__).parent.parent / "data" / "old_run"
 
 
 @pytest.fixture

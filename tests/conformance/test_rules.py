@@ -11,7 +11,7 @@ import pytest
 import lyceum_warp as lw
 import lyceum_warp.env
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
-from lyceum_warp.graphs.sequence import Calls, Graphs, Phase
+from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.testing import CHECKS, Report, check_task
 from lyceum_warp.worlds import Worlds
 

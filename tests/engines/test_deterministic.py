@@ -24,7 +24,7 @@ from lyceum_warp.engines import memory
 from lyceum_warp.engines.deterministic import order_kernels as order
 from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
 from lyceum_warp.engines.deterministic.deterministic_engine import DeterministicEngine
-from lyceum_warp.engines.deterministic.scratch import LARGEST_BUFFER, Scratch, ScratchSizes
+from lyceum_warp.engines.deterministic.sort_memory import LARGEST_BUFFER, Scratch, ScratchSizes
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import describe
 

@@ -11,7 +11,7 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp.engines.deterministic.deterministic_engine import DeterministicEngine
-from lyceum_warp.engines.deterministic.scratch import ScratchSizes
+from lyceum_warp.engines.deterministic.sort_memory import ScratchSizes
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.testing import check_task
 

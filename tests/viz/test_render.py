@@ -4,7 +4,7 @@ import mujoco
 import pytest
 
 import lyceum_warp as lw
-from lyceum_warp.viz._render import camera
+from lyceum_warp.viz.render import camera
 
 
 @pytest.mark.parametrize("task, expected", [("half_cheetah", 0), ("hopper", 0), ("reach", 0), ("point_mass", 0)])

@@ -11,8 +11,8 @@ from mujoco.batch import Batch
 
 from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines.c.batch_faults import errors_as_warnings
 from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
-from lyceum_warp.engines.c.world_errors import errors_as_warnings
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_rows64, fill_rows64, narrow, widen

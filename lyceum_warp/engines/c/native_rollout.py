@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from mujoco.batch import Batch
 
-from lyceum_warp.engines.c.world_errors import errors_as_warnings
+from lyceum_warp.engines.c.batch_faults import errors_as_warnings
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
 
 

@@ -9,7 +9,7 @@ import mujoco_warp as mjw
 import warp as wp
 
 from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
-from lyceum_warp.engines.deterministic.scratch import LARGEST_BUFFER, Scratch, ScratchSizes
+from lyceum_warp.engines.deterministic.sort_memory import LARGEST_BUFFER, Scratch, ScratchSizes
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import Field

@@ -12,8 +12,8 @@ import warp as wp
 from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.warp import overflow
-from lyceum_warp.engines.warp.partial import PartialForward, group_size
-from lyceum_warp.engines.warp.sizes import probe_sizes
+from lyceum_warp.engines.warp.contact_sizes import probe_sizes
+from lyceum_warp.engines.warp.partial_forward import PartialForward, group_size
 from lyceum_warp.fields import Field, Stage
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_rows, narrow, widen

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.algos.statistics import (
+from lyceum_warp.algos.npg_statistics import (
     EpisodeSums,
     Moments,
     ProcessNumbers,

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from lyceum_warp.graphs.sequence import Graphs, Phase
+from lyceum_warp.graphs.capture import Graphs, Phase
 
 
 @wp.kernel(enable_backward=False)

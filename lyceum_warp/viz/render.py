@@ -1,4 +1,4 @@
-"""A program that draws states into a video: ``python _render.py job.npz model.mjb out.mp4``.
+"""A program that draws states into a video: ``python render.py job.npz model.mjb out.mp4``.
 
 MuJoCo chooses its graphics library once, when it is imported, and a driver that fails may end the process. Therefore
 ``video.py`` runs this file in a process for each library that it tries. The file imports nothing of the package. Exit

@@ -8,9 +8,9 @@ import mujoco_warp as mjw
 import warp as wp
 
 from lyceum_warp.arrays import flat
-from lyceum_warp.engines.warp import group_kernels as kernels
+from lyceum_warp.engines.warp import partial_kernels as kernels
+from lyceum_warp.engines.warp.memory_reserve import Reserve, aligned
 from lyceum_warp.engines.warp.overflow import report_pool_overflow
-from lyceum_warp.engines.warp.reserve import Reserve, aligned
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
