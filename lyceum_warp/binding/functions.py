@@ -59,7 +59,8 @@ class TaskSource:
             raise ValueError(f"{name} of the task {self.name!r} must be a @wp.func, not {function!r}")
         types = list(function.input_types.values())
         structs = [kind for kind in types if hasattr(kind, "vars") and hasattr(kind, "cls")]
-        if structs and self.world not in structs and self.params not in structs:
+        foreign = structs and self.world not in structs and self.params not in structs
+        if foreign and function.func.__module__ == self.task.__module__:
             return None  # another task's, left over in a notebook
         annotations = function.func.__annotations__
         if any(isinstance(annotation, str) for annotation in annotations.values()):

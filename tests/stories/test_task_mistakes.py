@@ -119,6 +119,10 @@ MISTAKES: dict[str, tuple[tuple[str, str], str]] = {
         r"reward of the task 'tiny' takes the Params of .*other_rewards\.py, but the task has the Params of .*tiny\.py"
         ": import both structs from one module, or write reward for the task's own",
     ),
+    "a function of another file with its own structs": (
+        ("class Tiny", "from other_rewards import reward\n\nclass Tiny"),
+        r"reward of the task 'tiny' takes the World of .*other_rewards\.py, but the task has the World of .*tiny\.py",
+    ),
     # the class
     "no obs": (("    obs = {", "    parts = {"), "the task 'tiny' has no obs: add the parts of its observation"),
     "a misspelt attribute": (line("frameskip = 5"), "the task 'tiny' has 'frameskip' in its class: did you mean frame"),
