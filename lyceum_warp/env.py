@@ -17,7 +17,7 @@ from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.placement import bytes_per_world, few_worlds, find_device, open_engine
-from lyceum_warp.fields import elements
+from lyceum_warp.fields import describe, elements
 from lyceum_warp.graphs.compile_ahead import compile_ahead
 from lyceum_warp.kernels import steps
 from lyceum_warp.options import OPTION_DOCS, EnvOptions, signature_of_options
@@ -368,6 +368,7 @@ class Env:
             ValueError: The environment does not keep this field, or the model has no such element.
         """
         if name not in self._fields:
+            describe(self.model, name)  # a misspelt name has an error of its own
             kept = ", ".join(sorted(self._fields))
             raise ValueError(
                 f"this environment of {self.task.name!r} does not keep the field {name!r}: make it with "

@@ -71,6 +71,8 @@ def test_a_field_that_is_not_kept_is_refused_with_the_way_to_get_it() -> None:
     with pytest.raises(ValueError, match=r"does not keep the field 'site_xpos': make it with fields=\['site_xpos'\]"):
         env.field("site_xpos")
     assert env.state_space.size == size
+    with pytest.raises(ValueError, match="there is no field 'site_xpoz': did you mean site_xpos"):
+        env.field("site_xpoz")
     assert lw.make("reach", fields=["xpos"]).field("xpos").shape[2] == 3
 
 
