@@ -144,7 +144,7 @@ def test_faults_print_nothing_over_300_steps(
             state[BAD, start + i % 6] = (np.nan, np.inf, 1e200, -1e15)[i % 4]
             env.set_state(state, only, check=False)
             assert torch.isfinite(env.obs).all() and env.done_reason[BAD] == int(Done.NAN)
-            assert Done.NAN in step_both(env, clean, 5)  # and what else an engine makes of such a state
+            assert Done.NAN in step_both(env, clean, 5)  # beside other faults of such a state
     assert env.fault_counts["nan"] == 60
     assert sum(clean.fault_counts.values()) == 0
     printed = capfd.readouterr()

@@ -98,7 +98,7 @@ class Engine(abc.ABC):
         return 8 * _integration_size(model) + 4 * sum(field.size for field in fields) + 8
 
     def prepare_capture(self) -> None:  # noqa: B027
-        """Allocate what graphs need; called when every kernel is compiled, before the first capture.
+        """Allocate the memory that graphs need; called when every kernel is compiled, before the first capture.
 
         Raises:
             ValueError: The memory is too small for this many worlds.

@@ -1,4 +1,4 @@
-"""Where worlds run: devices by name, what "auto" means, and the engine that is made for it."""
+"""Where worlds run: devices by name, the meaning of "auto", and the engine for both."""
 
 import importlib
 import inspect

@@ -33,14 +33,14 @@ class Built:
     """Seconds that compiling took, all modules together."""
 
 
-def compile_ahead(function: Callable[[], None], device: wp.Device, what: str) -> Built:
+def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str) -> Built:
     """Compile every kernel that a function would launch and that is not in the cache, and report it on stderr.
 
     Args:
         function: Made of launches. It is called without launching anything, and may overwrite its arrays with
             meaningless numbers.
         device: Where the kernels will run.
-        what: Their purpose, for the report, as "hopper".
+        purpose: The kernels' purpose, for the report, as "hopper".
     """
     with rehearse() as rehearsal:
         function()
@@ -49,7 +49,7 @@ def compile_ahead(function: Callable[[], None], device: wp.Device, what: str) ->
     if not missing:
         return Built(known=len(wanted))
     start = time.perf_counter()
-    with _Report(len(missing), what, device) as report:
+    with _Report(len(missing), purpose, device) as report:
         pool = concurrent.futures.ThreadPoolExecutor(min(cpu_cores(), len(missing)))
         try:
             futures = [pool.submit(_load, module, block, device) for module, block in missing]
@@ -96,8 +96,8 @@ def cached() -> dict[Path, int]:
 class _Report:
     """A progress bar on a terminal, and a line for each module elsewhere."""
 
-    def __init__(self, total: int, what: str, device: wp.Device) -> None:
-        self._text = f"compiling kernels of {what} for {device.alias}"
+    def __init__(self, total: int, purpose: str, device: wp.Device) -> None:
+        self._text = f"compiling kernels of {purpose} for {device.alias}"
         self._total, self._done = total, 0
         console = Console(stderr=True)
         self._progress = Progress(

@@ -1,4 +1,4 @@
-"""A forward pass of restarting worlds alone gives what a forward pass of all worlds gives."""
+"""A forward pass of restarting worlds alone gives the same numbers as a forward pass of all worlds."""
 
 from pathlib import Path
 
@@ -130,8 +130,8 @@ def full_forward(env: lw.Env, world: int) -> mujoco.MjData:
 def test_sensor_histories_belong_to_their_worlds_after_a_reset(file: Path, engine: str) -> None:
     """A sensor with an interval reads its history, which must be that of its own world."""
     env = lw.make(file, engine=engine, nworld=3)
-    everyone, middle = torch.ones(3, dtype=torch.bool), torch.tensor([False, True, False])
-    for mask in (everyone, middle):
+    all_worlds, middle = torch.ones(3, dtype=torch.bool), torch.tensor([False, True, False])
+    for mask in (all_worlds, middle):
         before = env.obs.clone(), env.get_state()
         env.rand_reset(mask=mask)
         assert len(env.obs[:, 0].unique()) == 3

@@ -159,7 +159,7 @@ def test_memory_of_the_deterministic_mode_is_as_measured_in_advance() -> None:
         return torch.cuda.mem_get_info(CUDA)[0]
 
     few = lw.make("hopper", nworld=256, device=CUDA, deterministic=True)
-    few.step()  # allocates what any number of worlds needs
+    few.step()  # allocates the memory that any number of worlds needs
     engine = few.engine
     assert isinstance(engine, DeterministicEngine)
     sizes = ScratchSizes.probe(engine._captured_step)

@@ -191,5 +191,5 @@ class MujocoEngine(Engine):
 
 
 def _is_persistent(fields: Iterable[Field]) -> bool:
-    """Whether the batch keeps an MjData for each world, from which the next step continues what a refresh computed."""
+    """Whether the batch keeps an MjData for each world, so that a step reuses the stages computed after the last."""
     return any(field.refresh > Stage.NONE for field in fields)

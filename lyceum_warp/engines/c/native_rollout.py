@@ -13,11 +13,11 @@ from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
 
 
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
-    """Whether the rows of ``Batch.rollout`` hold what a call of ``Batch.step`` for each step would show.
+    """Whether the rows of ``Batch.rollout`` hold the values that a call of ``Batch.step`` for each step would show.
 
-    A row is written as ``mj_step`` leaves MjData. The state is then the new one, but fields computed from positions and
-    velocities belong to the state before the last substep: the next row holds those of the new state. Under RK4 they
-    belong to an intermediate stage instead. Sensor data mixes both kinds and cannot be separated.
+    A row holds values as ``mj_step`` leaves them. Its state is the new one, but quantities of the position and velocity
+    stages belong to the state before the last substep: those of the new state are in the next row. With RK4 they belong
+    to an intermediate stage instead. Sensor data mix the stages, so they are not exact either.
     """
     current = [field for field in fields if field.refresh > Stage.NONE]
     if any(field.snapshot for field in current):
@@ -78,7 +78,7 @@ class NativeRollout:
         self.run(*self._views)
 
     def run(self, state: np.ndarray, controls: np.ndarray, buffers: Mapping[str, np.ndarray]) -> None:
-        """Roll out, and copy the fields. ``batch.state`` and ``batch.warning`` then hold the end and what went wrong.
+        """Roll out, and copy the fields; ``batch.state`` and ``batch.warning`` then hold the end and all warnings.
 
         Args:
             state: States at the start, (nworld, at least state_size) float64.

@@ -15,8 +15,8 @@ from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import Field
 
 _TIMES_THE_MEMORY = 5
-"""A world's memory by the estimate for the plain Warp engine: 4.9 on humanoid, 6.1 on half_cheetah, 6.3 on hopper,
-measured on an H100. ``prepare_capture`` measures it for the model at hand."""
+"""A world's memory relative to the estimate for the plain Warp engine: measured as 4.9 on humanoid, 6.1 on half_cheetah
+and 6.3 on hopper. ``prepare_capture`` measures it for the model at hand."""
 
 _FEW = 256
 """Up to so many worlds fit into any memory: their scratch is not measured, and allocated when it is needed."""

@@ -17,7 +17,7 @@ class Reserve:
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self.below = device.get_allocator()
-        """The allocator that the blocks, and everything that is not reserved, come from."""
+        """The device's allocator, for the blocks and for all memory that is not reserved."""
         self.blocks: list[wp.array] = []
 
     def add_block(self, size: int) -> None:
@@ -33,5 +33,5 @@ class Reserve:
 
 
 def aligned(size: int) -> int:
-    """A number of bytes, rounded up to a multiple of what addresses are aligned to."""
+    """A number of bytes, rounded up to a multiple of the alignment of addresses."""
     return -(-size // _ALIGNED) * _ALIGNED

@@ -92,7 +92,7 @@ class PartialForward:
 
 
 class Arena(Reserve):
-    """An allocator for code that may not allocate: it counts what a run outside a graph allocates, and reserves that.
+    """An allocator for graphs, which may not allocate: it counts the bytes of a run outside a graph and reserves them.
 
     While it counts, memory comes from the device. Graphs are served from the reserve; they never run at the same time,
     so all of them may use the same memory.
@@ -112,7 +112,7 @@ class Arena(Reserve):
 
     @contextlib.contextmanager
     def counting(self) -> Iterator[None]:
-        """Count what is allocated between one ``open`` and the next, and reserve the most at the end."""
+        """Count the bytes that are allocated between one ``open`` and the next, and reserve the most at the end."""
         self._serving = False
         with wp.ScopedAllocator(self.device, self):
             yield

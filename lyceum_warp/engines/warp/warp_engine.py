@@ -1,7 +1,6 @@
 """The Warp engine: MuJoCo Warp, float32, on a CUDA device or on the CPU."""
 
 import contextlib
-import dataclasses
 from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Any
 
@@ -13,6 +12,7 @@ from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.warp import overflow
 from lyceum_warp.engines.warp.contact_sizes import probe_sizes
+from lyceum_warp.engines.warp.data_memory import data_bytes
 from lyceum_warp.engines.warp.partial_forward import PartialForward, group_size
 from lyceum_warp.fields import Field, Stage
 from lyceum_warp.kernels import faults
@@ -30,17 +30,6 @@ _PARTS = (
 
 _MOST_UNROLLED = 20
 """The most iterations of the solver that are unrolled; more would take minutes to capture and gain nothing."""
-
-_TEMPORARIES = 1.25
-"""A world's memory by that of MuJoCo Warp's data. The temporary arrays of a step were measured at 1 to 9 % of it; the
-rest is for graphs and for the group of a partial forward pass."""
-
-_TEMPORARIES_CONVEX = 3.5
-"""The same with convex collisions or the noslip solver: on adroit_pen temporary arrays take 1.5 to 2.4 times the data.
-"""
-
-_CONVEX = {mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_MESH,
-           mujoco.mjtGeom.mjGEOM_HFIELD}  # fmt: skip
 
 
 class WarpEngine(Engine):
@@ -100,7 +89,7 @@ class WarpEngine(Engine):
         self._reset = [field.name for field in self.fields.values() if field.reset > Stage.NONE]
         self._partial = self._partial_forward()
 
-    # what a subclass may change
+    # hooks for subclasses
 
     def _put_model(self) -> mjw.Model:
         """MuJoCo Warp's model with the engine's options."""
@@ -128,14 +117,10 @@ class WarpEngine(Engine):
 
     @classmethod
     def bytes_per_world(cls, model: mujoco.MjModel, fields: Iterable[Field], **options: Any) -> int:
-        nconmax, njmax = _sizes(model, options.get("nconmax"), options.get("njmax"))
-        sizes = []
-        for nworld in (1, 2):
-            with _refusals(), wp.ScopedDevice("cpu"):
-                data = mjw.make_data(model, nworld=nworld, naconmax=nworld * nconmax, njmax=njmax)
-            sizes.append(_bytes_of(data))
-        own = 4 * mujoco.mj_stateSize(model, _SPEC) + 4 * sum(field.size for field in fields if field.snapshot)
-        return int(_margin(model) * (sizes[1] - sizes[0])) + own
+        sizes = _sizes(model, options.get("nconmax"), options.get("njmax"))
+        with _refusals():
+            data = data_bytes(model, *sizes)
+        return data + 4 * mujoco.mj_stateSize(model, _SPEC) + 4 * sum(field.size for field in fields if field.snapshot)
 
     # fields
 
@@ -205,7 +190,7 @@ class WarpEngine(Engine):
             overflow.report_pool_overflow(self.d, mask)
 
     def _partial_forward(self) -> PartialForward | None:
-        """A forward pass of restarting worlds alone, or None where it is not worth it, or not possible."""
+        """A forward pass of restarting worlds alone, or None where it gains nothing or is not possible."""
         # sorting pairs of geoms, as for large models, takes memory that can't be reserved
         sorts = self.m.opt.broadphase != mjw.BroadphaseType.NXN
         if not self.partial_refresh or sorts or _parts(self._reset) is not None:
@@ -281,23 +266,3 @@ def _contacts_of_one_world(model: mjw.Model) -> int:
     """Room for a world in which everything touches everything, which is about to be reset."""
     pairs = len(model.nxn_geom_pair_filtered)
     return int(min(max(256, 4 * pairs), 4096))
-
-
-def _bytes_of(data: Any) -> int:
-    """Bytes of all arrays in a data class and in those within it."""
-    total = 0
-    for field in dataclasses.fields(data):
-        value = getattr(data, field.name)
-        if isinstance(value, wp.array):
-            total += value.size * wp.types.type_size_in_bytes(value.dtype)
-        elif dataclasses.is_dataclass(value):
-            total += _bytes_of(value)
-    return total
-
-
-def _margin(model: mujoco.MjModel) -> float:
-    """A world's memory by that of its data: more where collisions or the solver need large temporary arrays."""
-    collides = (model.geom_contype | model.geom_conaffinity) != 0
-    kinds = [int(kind) for kind in model.geom_type[collides]]
-    convex = not _CONVEX.isdisjoint(kinds) or kinds.count(int(mujoco.mjtGeom.mjGEOM_BOX)) > 1
-    return _TEMPORARIES_CONVEX if convex or model.opt.noslip_iterations > 0 else _TEMPORARIES
