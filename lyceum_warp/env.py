@@ -3,6 +3,7 @@
 import inspect
 import os
 import weakref
+from collections.abc import Iterable
 from typing import Any
 
 import mujoco
@@ -16,43 +17,50 @@ from lyceum_warp.binding.registry import find_task
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.engines.placement import bytes_per_world, few_worlds, find_device, open_engine
+from lyceum_warp.engines.placement import bytes_per_world, find_device, open_engine, options_for_few_worlds
 from lyceum_warp.fields import describe, elements
 from lyceum_warp.graphs.compile_ahead import compile_ahead
 from lyceum_warp.kernels import steps
 from lyceum_warp.options import OPTION_DOCS, EnvOptions, signature_of_options
 from lyceum_warp.spaces import Space
 from lyceum_warp.task import Task
-from lyceum_warp.validate import check_tensor, whole_number
+from lyceum_warp.validate import check_kind, check_tensor, whole_number
 from lyceum_warp.worlds import Worlds, own_bytes_per_world
 
 _BUFFERS = (*steps.OUTCOMES, "action")
 
 
-def _document_options(function: Any) -> Any:
-    """Decorator: put the options into the docstring and the signature, where ``help`` shows them."""
-    function.__doc__ = inspect.cleandoc(function.__doc__).replace("    {options}", OPTION_DOCS)
+_ARGUMENTS = """Args:
+    task: Name of a task, a file with one (path/to/file.py, or path/to/file.py:Class), or its class.
+    options: Options in one piece; those given by name replace single ones.
+{options}
+    **params: Every other keyword is a parameter of the task, a field of its ``Params``; a scalar may also be given
+        as one value a world, (nworld,).
+
+Raises:
+    ValueError: An argument is unknown or does not fit; the message names the argument and says how to fix it.
+    FileNotFoundError: A model file or a task file is missing.
+"""
+
+
+def _document_arguments(function: Any) -> Any:
+    """Decorator: put the arguments into the docstring and the signature, where ``help`` shows them."""
+    arguments = _ARGUMENTS.replace("{options}", OPTION_DOCS)
+    function.__doc__ = inspect.cleandoc(function.__doc__).replace("{arguments}", arguments)
+    function.__signature__ = signature_of_options(function)
     return function
 
 
-@_document_options
-def make(task: str | type[Task], **options: Any) -> "Env":  # noqa: D417
+@_document_arguments
+def make(task: str | type[Task], options: EnvOptions | None = None, **words: Any) -> "Env":
     """Make an environment, as in ``make("hopper", nworld=64, ctrl_cost_weight=1e-2)``.
 
-    Args:
-        task: Name of a task, a file with one (path/to/file.py, or path/to/file.py:Class), or its class.
-        {options}
-        params: Every other keyword is a parameter of the task, a field of its ``Params``; a scalar may also be given
-            as one value a world, (nworld,).
-
-    Raises:
-        ValueError: An argument is unknown or does not fit; the message names it and how to fix it.
-        FileNotFoundError: A model file or a task file is missing.
+    {arguments}
     """
-    return Env(task, **options)
+    return Env(task, options, **words)
 
 
-@_document_options
+@_document_arguments
 @document_attributes
 class Env:
     """One task in many worlds, with every array allocated once and shared with torch.
@@ -68,16 +76,7 @@ class Env:
     On a GPU, torch's work on these tensors belongs on torch's default stream, which is synchronised with Warp's. Work
     on other streams must be synchronised by the caller.
 
-    Args:
-        task: Name of a task, a file with one (path/to/file.py, or path/to/file.py:Class), or its class.
-        options: Options in one piece; those given by name replace single ones.
-        {options}
-        params: Every other keyword is a parameter of the task, a field of its ``Params``; a scalar may also be given
-            as one value a world, (nworld,).
-
-    Raises:
-        ValueError: An argument is unknown or does not fit; the message names it and how to fix it.
-        FileNotFoundError: A model file or a task file is missing.
+    {arguments}
     """
 
     obs: torch.Tensor
@@ -111,8 +110,7 @@ class Env:
     device: wp.Device
     """The Warp device; ``obs.device`` is torch's name of it."""
     model: mujoco.MjModel
-    """The compiled model that both engines were made of. Changes here reach neither: give an edited MjSpec as
-    ``model=`` instead."""
+    """The compiled model. Editing it has no effect: pass an edited MjSpec as ``model=``."""
     options: EnvOptions
     """The options that the environment was made with."""
     task: BoundTask
@@ -133,8 +131,9 @@ class Env:
     """A scalar."""
 
     def __init__(self, task: str | type[Task], options: EnvOptions | None = None, **words: Any) -> None:
-        known, params = EnvOptions.split(words, options)
-        self.options = options = known
+        check_kind("options", options, EnvOptions | None, "as lw.EnvOptions(nworld=64)")
+        self.options, params = EnvOptions.split(words, options)
+        options = self.options
         self.nworld = options.nworld
         self.device = find_device(options.device)
         self.task = BoundTask(
@@ -145,7 +144,7 @@ class Env:
         if options.nvtx and not torch.backends.cuda.is_built():
             raise ValueError("nvtx=True marks phases through torch, whose build here is without CUDA: leave it out")
         physics = options.engine, self.model, self.nworld, self.device, self.task.fields
-        self.engine = open_engine(*physics, beside=own_bytes_per_world(self.task), **options.for_engine())
+        self.engine = open_engine(*physics, reserved=own_bytes_per_world(self.task), **options.for_engine())
         self._given_params = params
         self._scratch: Env | None = None
         try:
@@ -164,7 +163,9 @@ class Env:
             self.rand_reset(options.seed)
             self.task.check_observation(worlds.after, worlds.params)
         except Exception as error:
-            raise self.task.explained(error) from None
+            if (explained := self.task.explained(error)) is error:
+                raise
+            raise explained from None
         _live.add(self)
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -252,12 +253,17 @@ class Env:
         Args:
             out: Where to write the states.
             mask: Which worlds' rows of ``out`` to write, (nworld,) bool; all by default.
+
+        Raises:
+            ValueError: An argument has another shape or type, or a mask comes without ``out``.
         """
         worlds = self.worlds
         for call in worlds.programs.read_state:
             call()
-        if mask is None or out is None:
-            return _given(worlds.state_view, out)
+        if mask is None:
+            return _copied(worlds.state_view, out)
+        if out is None:
+            raise ValueError("a mask selects the rows of out that get_state writes: give out as well")
         check_tensor(out, "out", worlds.state_view)
         worlds.set_mask(mask)
         return torch.where(worlds.mask_view[:, None], worlds.state_view, out, out=out)
@@ -292,15 +298,15 @@ class Env:
 
     def get_obs(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
         """Observations of the current states, or of given ones, (nworld, nobs)."""
-        return _given(self.obs if state is None else self._scratch_at(state).obs, out)
+        return _copied(self.obs if state is None else self._scratch_at(state).obs, out)
 
     def get_eval(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
         """The evaluation metric after the last step, or of given states, (nworld,)."""
-        return _given(self.eval if state is None else self._scratch_at(state).eval, out)
+        return _copied(self.eval if state is None else self._scratch_at(state).eval, out)
 
     def get_terminated(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
         """Whether the last step, or given states, end the episode, (nworld,) bool."""
-        return _given(self.terminated if state is None else self._scratch_at(state).terminated, out)
+        return _copied(self.terminated if state is None else self._scratch_at(state).terminated, out)
 
     def get_reward(
         self,
@@ -323,7 +329,7 @@ class Env:
             ValueError: Only a part of a transition is given, or it has the wrong shape or type.
         """
         if before is None and action is None and after is None:
-            return _given(self.reward, out)
+            return _copied(self.reward, out)
         if before is None or action is None or after is None:
             raise ValueError("a reward belongs to a transition: give before, action and after, or none of them")
         check_tensor(action, "action", self.action)
@@ -333,14 +339,14 @@ class Env:
         scratch.worlds.keep_before()
         scratch.set_state(after)
         scratch.worlds.judge_transition(action)
-        return _given(scratch.reward, out)
+        return _copied(scratch.reward, out)
 
     def get_action(self, out: torch.Tensor | None = None) -> torch.Tensor:
         """The actions of the next step, (nworld, nu)."""
-        return _given(self.action, out)
+        return _copied(self.action, out)
 
     def set_action(self, action: torch.Tensor) -> None:
-        """Set the actions of the next step, with every check; ``env.action.copy_`` does it without.
+        """Check and set the actions of the next step. ``env.action.copy_(...)`` skips the checks.
 
         Raises:
             ValueError: The action has another shape or type, or is not finite.
@@ -392,20 +398,28 @@ class Env:
         self.task.change_params(params)
         self._given_params = self._given_params | params
         self.worlds.update_params()
-        self._scratch = None
+        if self._scratch is not None:
+            self._scratch.follow(self)
 
     def follow(self, other: "Env") -> None:
-        """Take over the parameters of another environment of the same task, as ``replicate`` does."""
-        self.set_params(**other._params_for(self.nworld))
+        """Take over the parameters of another environment of the same task, as ``replicate`` does.
+
+        Raises:
+            ValueError: The other is not an environment, or has other parameters.
+        """
+        check_kind("other", other, Env, "an environment of the same task")
+        self.set_params(**other._params_for(self.nworld, {**self._given_params, **other._given_params}))
 
     def replicate(self, *, nworld: int | None = None, **changes: Any) -> "Env":
         """Another environment of the same task with the same options and parameters, except for the given changes.
 
-        Where a parameter has one value a world and the number of worlds differs, its values are repeated.
+        Its ``seed`` and ``first_world`` are 0 unless they are given. Where a parameter has one value a world and the
+        number of worlds differs, its values are repeated.
         """
         nworld = self.nworld if nworld is None else nworld
         known, params = EnvOptions.split(changes, self._own_options())
-        return Env(self.task.task, known.changed({"nworld": nworld}), **(self._params_for(nworld) | params))
+        given = self._params_for(nworld, self._given_params)
+        return Env(self.task.task, known.changed({"nworld": nworld}), **(given | params))
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
         """``replicate`` for a few worlds, such as an evaluation's.
@@ -413,18 +427,22 @@ class Env:
         On a GPU a step of a few worlds takes nearly as long as one of thousands. Where engine="auto" leaves the
         choice, they step on CPU cores through the C engine, in double precision.
         """
-        return self.replicate(nworld=nworld, **(few_worlds(self.options.engine, self.device) | changes))
+        return self.replicate(nworld=nworld, **(options_for_few_worlds(self.options.engine, self.device) | changes))
 
     def _own_options(self) -> EnvOptions:
         current = {"horizon": self.horizon, "autoreset": self.autoreset, "seed": 0, "first_world": 0}
         return self.options.changed(current)
 
-    def _params_for(self, nworld: int) -> dict[str, Any]:
-        params = {}
-        for name, given in self._given_params.items():
-            value = self.task.params[name]
-            params[name] = value[np.arange(nworld) % self.nworld] if isinstance(value, np.ndarray) else given
-        return params
+    def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
+        """The values of some parameters, for a number of worlds."""
+        params, worlds = self.task.params, np.arange(nworld) % self.nworld
+        return {
+            name: params[name][worlds]
+            if isinstance(params[name], np.ndarray)
+            # as it was given: a name of the model, not its index
+            else self._given_params.get(name, params[name])
+            for name in names
+        }
 
     def _scratch_at(self, given: torch.Tensor) -> "Env":
         """Worlds of the same task in given states; made when first needed."""
@@ -434,6 +452,10 @@ class Env:
         return self._scratch
 
     # diagnostics
+
+    def check_process(self) -> None:
+        """Raise RuntimeError if this process was forked after the environment was made."""
+        _ = self.worlds.programs
 
     @property
     def bytes_per_world(self) -> float:
@@ -448,10 +470,7 @@ class Env:
         return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
 
 
-make.__signature__ = signature_of_options(make)
-
-
-def _given(values: torch.Tensor, out: torch.Tensor | None) -> torch.Tensor:
+def _copied(values: torch.Tensor, out: torch.Tensor | None) -> torch.Tensor:
     if out is None:
         return values.clone()
     check_tensor(out, "out", values)
@@ -465,7 +484,7 @@ _lost: list[object] = []
 
 
 class _LostWorlds:
-    """Stands in for the worlds of an environment in a forked child."""
+    """Stands in for the worlds and the engine of an environment in a forked child."""
 
     def __getattr__(self, name: str) -> Any:
         raise RuntimeError(
@@ -478,7 +497,7 @@ def _after_fork() -> None:
     for env in _live:
         _lost.append(env.worlds)  # never destroyed here: its engine would wait for its threads
         _lost.append(env.engine)
-        env.worlds = _LostWorlds()  # type: ignore[assignment]
+        env.worlds = env.engine = _LostWorlds()  # type: ignore[assignment]
 
 
 if hasattr(os, "register_at_fork"):

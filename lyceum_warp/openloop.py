@@ -1,5 +1,6 @@
-"""Open-loop roll-outs: a horizon of given actions in every world, judged by the task."""
+"""Open-loop rollouts: a horizon of given actions in every world, judged by the task."""
 
+from collections.abc import Iterable
 from functools import partial
 
 import torch
@@ -7,8 +8,9 @@ import warp as wp
 
 from lyceum_warp.arrays import launch_rows, torch_view
 from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
-from lyceum_warp.graphs.capture import Phase
+from lyceum_warp.graphs.capture import Calls, Phase
 from lyceum_warp.kernels import planning, state
 from lyceum_warp.spaces import COUNTERS
 from lyceum_warp.validate import whole_number
@@ -24,11 +26,11 @@ class OpenLoop:
     engine as launches that become one graph.
 
     Args:
-        env: Worlds to roll out in; they belong to the roll-outs from then on.
+        env: Worlds to roll out in; they belong to the rollouts from then on.
         horizon: Steps.
 
     Raises:
-        ValueError: The environment resets its worlds automatically.
+        ValueError: The environment resets its worlds automatically, or the buffers do not fit into memory.
     """
 
     state: torch.Tensor
@@ -42,17 +44,18 @@ class OpenLoop:
     final_obs: torch.Tensor
     """Observations after the last step, (nworld, nobs)."""
     fault: torch.Tensor
-    """Bits of ``Done`` for the faults of a world, (nworld,) int32: with any, its rewards mean nothing."""
+    """Bits of ``Done`` for the faults of a world, (nworld,) int32; if a bit is set, ignore that world's rewards."""
     phases: tuple[Phase, ...]
     """What ``run`` does, in order, for a caller that puts more into the same graph."""
 
     def __init__(self, env: Env, horizon: int) -> None:
         if env.autoreset:
-            raise ValueError("open-loop roll-outs need worlds that do not reset: make(..., autoreset=False)")
+            raise ValueError("open-loop rollouts need worlds that do not reset: make(..., autoreset=False)")
         self.env, self.worlds = env, env.worlds
         self.horizon = whole_number("horizon", horizon, low=1)
         n, nu, task = env.nworld, env.action_space.size, env.task
         rows = self.horizon * n
+        check_fit(self._bytes_per_world(env, self.horizon), n, env.device)
         with wp.ScopedDevice(env.device):
             self._state = wp.zeros(env.state_space.size, dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nu), dtype=float)
@@ -76,12 +79,24 @@ class OpenLoop:
         self.terminated = torch_view(self._terminated).view(self.horizon, n)
         self.fault, self.final_obs = torch_view(self._fault), torch_view(self._obs)
         self.phases = self._whole_horizon() if task.functions["control"] is None else self._step_by_step()
-        self._calls = self.worlds.programs.graphs.sequence(self.phases)
+        self._calls = self.sequence(self.phases)
 
     def run(self) -> None:
         """Roll out."""
+        self.env.check_process()
         for call in self._calls:
             call()
+
+    def sequence(self, phases: Iterable[Phase]) -> Calls:
+        """The calls that run some phases, those of the rollout among them, in as few graphs as the engine allows."""
+        return self.worlds.programs.graphs.sequence(phases)
+
+    @staticmethod
+    def _bytes_per_world(env: Env, horizon: int) -> int:
+        """An estimate of the buffers' memory for each world."""
+        fields = [field for field in env.task.fields if field.name in env.task.types]
+        own = 4 * (sum(field.size for field in fields) + env.task.task.memory + env.model.nu + env.action_space.size)
+        return horizon * (own + 8) + env.engine.rollout_bytes_per_world(horizon, env.task.frame_skip, fields)
 
     def _whole_horizon(self) -> tuple[Phase, ...]:
         physics = partial(

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import mujoco
 
 from lyceum_warp.docstrings import attribute_docs, document_attributes, listed
-from lyceum_warp.validate import whole_number
+from lyceum_warp.validate import check_kind, whole_number
 
 ModelSource: TypeAlias = str | Path | mujoco.MjSpec
 """Where a model comes from: a file, or an MjSpec."""
@@ -84,9 +84,9 @@ class PhysicsOptions:
     """Limits of the constraint solver: any of iterations, ls_iterations (of its line search) and noslip_iterations
     (0 turns the noslip solver off)."""
     nconmax: int | None = _for_engine(None)
-    """Contacts that the Warp engine has room for in each world, on average; by default twice the peak of a probe."""
+    """Contact capacity per world, on average (Warp engine); by default twice the peak of a probe."""
     njmax: int | None = _for_engine(None)
-    """Constraints that the Warp engine has room for in each world; by default twice the peak of a probe."""
+    """Constraint capacity of each world (Warp engine); by default twice the peak of a probe."""
     deterministic: bool = _for_engine(False)
     """Make two runs on a CUDA device equal to the bit. Costs 5 to 18 times the time and 5 to 7 times the memory on
     hopper, half_cheetah and humanoid. Runs on the CPU are always equal to the bit."""
@@ -131,8 +131,8 @@ class EnvOptions:
     seed: int = 0
     """Seed of the worlds' random streams."""
     first_world: int = 0
-    """Number of the first world, where several processes share a batch: worlds draw the random streams of their
-    numbers."""
+    """Number of the first world, where several processes share a batch: a world's random stream depends on its number
+    in the whole batch."""
     autoreset: bool = True
     """Whether a world whose episode ended begins a new one within the same step. With False finished worlds keep
     stepping with ``done`` set until they are reset; only a world with a fault restarts at once."""
@@ -147,7 +147,7 @@ class EnvOptions:
     model: ModelSource | None = None
     """Another model than the task's: a file or an MjSpec."""
     fields: Collection[str] = ()
-    """Fields to keep beside those that the task reads, for ``env.field``."""
+    """Additional fields to keep, for ``env.field``."""
     physics: PhysicsOptions = PhysicsOptions()
     """How the worlds are simulated."""
 
@@ -155,6 +155,10 @@ class EnvOptions:
         """Check every value."""
         for name, low in (("nworld", 1), ("nthread", 0), ("seed", 0), ("first_world", 0), ("horizon", 0)):
             _whole(self, name, low)
+        check_kind("device", self.device, str | None, "as 'cpu' or 'cuda:0'")
+        if self.model is not None and not isinstance(self.model, mujoco.MjModel):  # which has an error of its own
+            check_kind("model", self.model, ModelSource, "a file or an MjSpec")
+        check_kind("physics", self.physics, PhysicsOptions, "as lw.PhysicsOptions(cone='elliptic')")
         _flags(self, "autoreset", "graphs", "nvtx")
         names = isinstance(self.fields, Collection) and not isinstance(self.fields, str)
         if not names or not all(isinstance(name, str) for name in self.fields):
@@ -226,7 +230,6 @@ def signature_of_options(function: Callable[..., Any]) -> inspect.Signature:
         inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type)
         for kind in (EnvOptions, PhysicsOptions)
         for field in dataclasses.fields(kind)
-        if field.name != "physics"
     ]
     rest = inspect.Parameter("params", inspect.Parameter.VAR_KEYWORD, annotation=Any)
     signature = inspect.signature(function)

@@ -15,7 +15,7 @@ def whole_number(name: str, value: Any, *, low: int, high: int = 2**31 - 1) -> i
     """
     try:
         number = int(value)
-        fits = number == value and low <= number <= high
+        fits = number == value and low <= number <= high and not isinstance(value, bool)
     except (TypeError, ValueError, OverflowError):
         fits = False
     if not fits:

@@ -165,7 +165,7 @@ class Worlds:
         ]
 
     def rehearsal(self) -> None:
-        """Run every phase once, in an order that means nothing, to find the kernels that they launch."""
+        """Run every phase once, in arbitrary order, to find the kernels that they launch."""
         self.seed_streams(0)
         for phase in (*self.reset_phases(randomly=True), *self.step_phases(), *self.read_phases()):
             phase.run()
@@ -246,7 +246,7 @@ class Worlds:
     def _memory_columns(self) -> wp.array:
         return self.state[:, self.engine.state_size + len(COUNTERS) :]
 
-    # parts of phases, and preparations, for environments and open-loop roll-outs
+    # parts of phases, and preparations, for environments and open-loop rollouts
 
     def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
         """Set the masked worlds' counters from columns of states."""

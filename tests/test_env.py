@@ -100,28 +100,69 @@ def test_an_environment_is_not_pickled_or_copied(spoil: Any) -> None:
         spoil(lw.make("hopper"))
 
 
-def _use(env: lw.Env, connection: Connection) -> None:
-    told = []
-    for call in (env.step, env.reset, env.get_state):
+def _use(env: lw.Env, plan: lw.MPPI, loop: lw.OpenLoop, state: torch.Tensor, connection: Connection) -> None:
+    """Send the message of each call that raises RuntimeError."""
+    messages = []
+    for call in (env.step, env.reset, env.get_state, lambda: env.engine.step(1), loop.run, lambda: plan(state)):
         try:
             call()
         except RuntimeError as error:
-            told.append(str(error))
-    connection.send(told)
+            messages.append(str(error))
+    connection.send(messages)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no fork")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_an_environment_in_a_forked_child_says_that_it_belongs_to_the_parent() -> None:
-    env = lw.make("hopper", nworld=2)
+    env = lw.make("hopper", nworld=64)
     env.step()
+    plan, loop = lw.MPPI("hopper", samples=64, horizon=4), lw.OpenLoop(lw.make("hopper", nworld=64, autoreset=False), 4)
+    plan(env.get_state()[0])
+    loop.run()
     here, there = multiprocessing.Pipe()
-    child = multiprocessing.get_context("fork").Process(target=_use, args=(env, there))
+    arguments = (env, plan, loop, env.get_state()[0], there)
+    child = multiprocessing.get_context("fork").Process(target=_use, args=arguments)
     child.start()
-    assert here.poll(60), "the child hangs"
-    told = here.recv()
+    hangs = not here.poll(60)
+    if hangs:
+        child.kill()
+    messages = [] if hangs else here.recv()
     child.join(60)
-    assert child.exitcode == 0
-    assert len(told) == 3
-    assert all("made before the process was forked" in text and "'spawn'" in text for text in told)
+    assert not hangs and child.exitcode == 0
+    assert len(messages) == 6
+    assert all("made before the process was forked" in text and "'spawn'" in text for text in messages)
     env.step()  # the parent's goes on
+
+
+# parameters and replicas
+
+
+def test_follow_takes_over_every_parameter_that_either_was_given() -> None:
+    first = lw.make("hopper", nworld=2, healthy_reward=3.0)
+    second = first.replicate(nworld=4, ctrl_cost_weight=0.5)
+    second.follow(first)
+    assert second.task.params == first.task.params
+    with pytest.raises(ValueError, match="other must be of type Env, an environment of the same task, not int 3"):
+        second.follow(3)  # type: ignore[arg-type]
+
+
+def test_scratch_worlds_follow_changed_parameters() -> None:
+    env = lw.make("hopper", nworld=2)
+    before = env.get_state()
+    env.step(torch.ones_like(env.action))
+    after = env.get_state()
+    judged = env.get_reward(before, torch.ones_like(env.action), after)
+    env.set_params(ctrl_cost_weight=1.0)
+    changed = env.get_reward(before, torch.ones_like(env.action), after)
+    assert torch.allclose(judged - changed, torch.full((2,), 3 * (1.0 - 1e-3)))
+
+
+def test_an_option_given_as_a_parameter_is_named_as_one() -> None:
+    with pytest.raises(ValueError, match=r"'nworld' is an option, not a parameter .* env.replicate\(nworld=...\)"):
+        lw.make("hopper").set_params(nworld=3)
+
+
+def test_a_mask_without_out_is_refused_by_get_state() -> None:
+    env = lw.make("hopper", nworld=2)
+    with pytest.raises(ValueError, match="give out as well"):
+        env.get_state(mask=torch.tensor([True, False]))

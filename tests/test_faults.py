@@ -192,7 +192,7 @@ def test_a_bad_action_is_applied_as_zero(engine: str) -> None:
     clean.action[BAD] = 0
     # the controls as a step sees them, before it resets the world
     for each in (env, clean):
-        each._begin()
+        each.worlds.act()
     assert torch.equal(wp.to_torch(env.engine.ctrl), wp.to_torch(clean.engine.ctrl))
 
 

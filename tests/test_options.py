@@ -28,6 +28,10 @@ from lyceum_warp.options import OPTION_DOCS, OPTIONS, EnvOptions, PhysicsOptions
         ({"solver": {"itrations": 4}}, "solver has no limit 'itrations': it takes 'iterations', 'ls_iterations'"),
         ({"solver": {"iterations": 0}}, "solver's iterations must be a whole number from 1 .*, not 0"),
         ({"deterministic": None}, "deterministic must be True or False, not None"),
+        ({"nworld": True}, "nworld must be a whole number .*, not True"),
+        ({"device": 0}, "device must be .* as 'cpu' or 'cuda:0', not int 0"),
+        ({"model": 3}, "model must be .* a file or an MjSpec, not int 3"),
+        ({"physics": 3}, "physics must be of type PhysicsOptions, as lw.PhysicsOptions.*, not int 3"),
     ],
 )  # fmt: skip
 def test_an_option_out_of_range_is_refused_with_its_value(options: dict[str, object], message: str) -> None:
@@ -48,6 +52,12 @@ def test_changed_keeps_all_other_options() -> None:
     options = EnvOptions(nworld=4, horizon=7, physics=PhysicsOptions(cone="elliptic", njmax=24))
     changed = options.changed({"nworld": 2, "njmax": 48})
     assert changed.given() == {"nworld": 2, "horizon": 7, "cone": "elliptic", "njmax": 48}
+
+
+def test_options_of_another_type_are_refused() -> None:
+    for make in (lw.make, lw.Env):
+        with pytest.raises(ValueError, match=r"options must be .* as lw.EnvOptions\(nworld=64\), not dict"):
+            make("hopper", {"nworld": 3})
 
 
 def test_options_in_one_piece_and_by_name_make_the_same_environment() -> None:
@@ -84,6 +94,7 @@ def test_every_option_is_in_the_help_and_the_signature_of_make() -> None:
     assert list(OPTIONS) == names
     for name in names:
         assert f"    {name}: " in OPTION_DOCS
-        assert name == "physics" or name in inspect.signature(lw.make).parameters
+        assert name in inspect.signature(lw.make).parameters
+        assert name in inspect.signature(lw.Env).parameters
     assert OPTION_DOCS in str(lw.make.__doc__)
     assert OPTION_DOCS in str(lw.Env.__doc__)

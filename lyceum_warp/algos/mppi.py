@@ -1,4 +1,4 @@
-"""Model predictive path integral control (MPPI): planning by weighted averages of random roll-outs.
+"""Model predictive path integral control (MPPI): planning by weighted averages of random rollouts.
 
 Each call improves a plan, a sequence of actions u_t, from the state that it is given:
 
@@ -10,7 +10,7 @@ Each call improves a plan, a sequence of actions u_t, from the state that it is 
 
 The formulation is that of Williams et al. (2017, "Information theoretic MPC for model-based reinforcement learning")
 without a cost on the controls, as in Lyceum (Summers et al. 2020) and in trajopt, which also is the source of the
-smoothing. A temperature here is a true one: the 5 of Summers et al. for their arm is an inverse temperature, here 0.2.
+smoothing. Returns are divided by the temperature: the 5 of Summers et al. for their arm, an inverse, is 0.2 here.
 """
 
 from collections.abc import Callable, Mapping
@@ -37,6 +37,7 @@ from lyceum_warp.task import Task
 from lyceum_warp.validate import described, whole_number
 
 _BLOCK = 256
+_BUFFERS = ("actions", "nominal", "standard_noise", "sampled", "returns", "weights")
 
 Value: TypeAlias = ValueFunction | wp.Function | Callable[[torch.Tensor], torch.Tensor]
 
@@ -59,7 +60,7 @@ class MPPI:
         value: Adds the value of the state where a sample ends to its return: a ``ValueFunction``, or a function from
             (nsample, nobs) observations to (nsample,) values, or a Warp function of one observation,
             ``value(obs: Row[float]) -> float``, which becomes part of the graph on the Warp engine. With a value the
-            parameters in ``planning`` do not apply, because values are of the rewards of the task itself.
+            parameters in ``planning`` do not apply, because the value function was fitted to the task's own rewards.
         seed: Seed of the noise.
         params: Parameters of the task, for names that are also settings.
         words: Single settings, by the names of ``lw.MPPIConfig`` (None leaves one as it is); options of the planner's
@@ -129,8 +130,13 @@ class MPPI:
         self._made = True
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in (*SETTINGS, "config", "value", "seed") and "_made" in self.__dict__:
-            raise AttributeError(f"{name} is part of the planner's graphs: make another MPPI with {name}={value!r}")
+        if "_made" in self.__dict__:
+            if name in (*SETTINGS, "config", "value", "seed"):
+                raise AttributeError(f"{name} is part of the planner's graphs: make another MPPI with {name}={value!r}")
+            if name in _BUFFERS:
+                raise AttributeError(
+                    f"plan.{name} is a buffer of fixed address: write into it, as plan.{name}.copy_(...)"
+                )
         super().__setattr__(name, value)
 
     def _allocate(self) -> None:
@@ -172,6 +178,7 @@ class MPPI:
         Raises:
             ValueError: The state has another shape or type, or is not finite.
         """
+        self.env.check_process()
         self._loop.state.copy_(checked_state(self.env, state, self._loop.state))
         self._shift_view.fill_(whole_number("shift", shift, low=0))
         for call in self._calls:
@@ -180,12 +187,12 @@ class MPPI:
 
     def _program(self, *, first: bool) -> Calls:
         """The calls of one improvement, of which ``first`` moves the plan forward in time."""
-        graphs = self.env.worlds.programs.graphs
+        sequence = self._loop.sequence
         sample = [Phase("perturb", partial(self._perturb, first)), *self._loop.phases]
         update = [Phase("weigh", self._weigh), Phase("average", self._average)]
         if self._value_in_torch:  # torch computes between two graphs
-            return (*graphs.sequence(sample), self._evaluate, *graphs.sequence(update))
-        return graphs.sequence([*sample, *update])
+            return (*sequence(sample), self._evaluate, *sequence(update))
+        return sequence([*sample, *update])
 
     def _perturb(self, first: bool) -> None:
         """The plan to start from, and the samples around it."""
@@ -245,15 +252,16 @@ class MPPI:
             ValueError: The seed is not a whole number from 0.
         """
         if seed is not None:
-            self._seed.fill_(whole_number("seed", seed, low=0))
+            self.__dict__["seed"] = whole_number("seed", seed, low=0)
+            self._seed.fill_(self.seed)
         self._count.zero_()
         self.actions.copy_(torch_view(self._fill).expand_as(self.actions))
 
     def state_of(self, **parts: Any) -> torch.Tensor:
         """A state from its parts, as a robot knows them; the rest is as the task's fixed reset leaves it.
 
-        The rest includes fields that a task reads as the last substep left them: they matter only for the transition
-        in which a plan's first step began. A ``time`` sets the step counter, too, unless ``step`` is given.
+        The rest includes fields that a task reads as the last substep left them: they affect only the first transition
+        of a plan. A ``time`` sets the step counter, too, unless ``step`` is given.
 
         Args:
             parts: Values for parts of ``env.state_space``: qpos, qvel, time, mocap_pos, ...

@@ -117,6 +117,7 @@ _OWN_OPTIONS = {
     "autoreset": "its worlds never reset",
     "horizon": "episodes of its worlds have no limit, and the horizon of a plan is a setting",
     "seed": "every sample starts from the state to plan from",
+    "first_world": "its worlds are all the samples that there are",
 }
 """Options that the planner sets in its worlds, each with the reason."""
 

@@ -152,7 +152,7 @@ class BoundTask:
             return ValueError(
                 f"{name} of the task {self.name!r} returns {kind}: it must be written as {FUNCTIONS[name].signature}"
             )
-        lines = [line.strip() for line in text.splitlines() if line.strip()]
+        lines = [line.strip(" ;") for line in text.splitlines() if line.strip(" ;")]
         hint = ": a function returns one number, not a tuple" if "tuple_t" in text else ""
         return ValueError(f"Warp can't compile the functions of the task {self.name!r}: {' '.join(lines[-3:])}{hint}")
 

@@ -39,7 +39,7 @@ class Parameters:
     ) -> None:
         self._struct, self._task_name, self._model, self._nworld = struct, task_name, model, nworld
         self._sizes: dict[str, int] = {}
-        if taken := [name for name in struct.vars if name in OPTIONS]:
+        if taken := [name for name in struct.vars if name in (*OPTIONS, "task", "options")]:
             raise ValueError(
                 f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), so that no "
                 "value would reach it: rename it in Params"
@@ -63,6 +63,11 @@ class Parameters:
         for name in given:
             if name not in known or name == "dt":
                 names = sorted(set(known) - {"dt"})
+                if name in OPTIONS:
+                    raise ValueError(
+                        f"{name!r} is an option, not a parameter of the task {self._task_name!r}: make another "
+                        f"environment, as env.replicate({name}=...)"
+                    )
                 hint = suggestion(name, names) or f"it has {', '.join(names) or 'none'}"
                 raise ValueError(f"the task {self._task_name!r} has no parameter {name!r}: {hint}")
         if missing := [name for name in known if name not in self.values and name not in given]:

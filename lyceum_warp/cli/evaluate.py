@@ -11,7 +11,7 @@ from rich.table import Table
 from lyceum_warp.algos.evaluation import Episodes, evaluate
 from lyceum_warp.cli.arguments import Physics
 from lyceum_warp.cli.display import make_console, policy_video
-from lyceum_warp.engines.placement import few_worlds
+from lyceum_warp.engines.placement import options_for_few_worlds
 from lyceum_warp.env import Env
 from lyceum_warp.runs import Run, load
 from lyceum_warp.viz.video import check_video
@@ -53,7 +53,7 @@ def evaluate_run(options: Eval) -> int:
     engine, device = options.engine or config["engine"], options.device or config["device"]
     where = {"engine": engine, "device": device} | Physics.of(config).options().given() | config["params"]
     if options.device is None:
-        where |= few_worlds(engine, device)
+        where |= options_for_few_worlds(engine, device)
     env = Env(config["task"], nworld=nworld, **where)
     policy = load(run, device=env.obs.device)
     sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)

@@ -156,6 +156,16 @@ class Engine(abc.ABC):
             self.step(nstep)
             self._copy_fields(buffers, t + 1)
 
+    def rollout_bytes_per_world(self, steps: int, nstep: int, fields: Iterable[Field]) -> int:
+        """An estimate of the memory that ``rollout`` takes for each world beside its arguments, in bytes.
+
+        Args:
+            steps: Steps of the horizon.
+            nstep: Substeps in a step.
+            fields: Fields that are copied into buffers.
+        """
+        return 0
+
     def _copy_fields(self, buffers: Mapping[str, wp.array], t: int) -> None:
         for name, buffer in buffers.items():
             wp.copy(buffer[t], self.arrays[name])

@@ -13,6 +13,7 @@ from lyceum_warp.engines.base import Engine, EngineFactory
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.fields import Field
 from lyceum_warp.machine import cpu_cores
+from lyceum_warp.options import EnvOptions
 
 _ENGINES = {
     "mujoco": ("lyceum_warp.engines.c.mujoco_engine", "MujocoEngine"),
@@ -20,9 +21,6 @@ _ENGINES = {
 }
 _DETERMINISTIC = "lyceum_warp.engines.deterministic"
 """The room of the engine that takes the place of "warp" with deterministic=True on a CUDA device."""
-
-_ON_CPU_CORES = {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None}
-"""The options that move an environment from a GPU to the C engine, which takes no sizes of contacts and constraints."""
 
 _SAMPLES_PER_CORE = 40
 """With fewer samples for each CPU core, the C engine plans faster than an H100. Measured with 16 cores, where the two
@@ -83,7 +81,7 @@ def open_engine(
     device: wp.Device,
     fields: Iterable[Field],
     *,
-    beside: int = 0,
+    reserved: int = 0,
     **options: Any,
 ) -> Engine:
     """Make an engine by name, or by a class or factory of your own.
@@ -94,9 +92,9 @@ def open_engine(
         nworld: Number of worlds.
         device: Where they run.
         fields: The fields to keep, from ``fields.describe``.
-        beside: Bytes for each world that the caller itself is going to allocate.
+        reserved: Bytes for each world that the caller allocates.
         options: The engine's options, the keyword-only arguments of its constructor. None leaves an engine its default.
-            An engine that does not take an option that is True or False ignores it.
+            An engine ignores a flag (True or False) that it does not take.
 
     Raises:
         ValueError: There is no such engine, the worlds do not fit into memory, or the engine refuses the model, the
@@ -106,7 +104,7 @@ def open_engine(
     factory, given = _resolved(engine, device, options)
     needed = _bytes_per_world(factory, model, fields, given)
     if needed is not None:
-        check_fit(needed + beside, nworld, device, model=_model_name(model))
+        check_fit(needed + reserved, nworld, device, model=_model_name(model))
     return factory(model, nworld, device, fields, **given)
 
 
@@ -118,13 +116,13 @@ def bytes_per_world(
     return _bytes_per_world(factory, model, list(fields), given) or 0
 
 
-def few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
+def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
     """The options to change for an environment of a few worlds, such as an evaluation's.
 
     On a GPU a step of a few worlds takes nearly as long as one of thousands. With engine="auto" a few worlds therefore
     step on CPU cores, through the C engine, in double precision.
     """
-    return dict(_ON_CPU_CORES) if engine == "auto" and engine_name(engine, device) == "warp" else {}
+    return _on_cpu_cores() if engine == "auto" and engine_name(engine, device) == "warp" else {}
 
 
 def place_samples(
@@ -152,7 +150,15 @@ def place_samples(
     enough = _SAMPLES_PER_CORE * min(_MOST_CORES, nthread or cpu_cores())
     if samples >= enough and (samples >= _NOSLIP * enough or not has_noslip()):
         return {"engine": "warp", "nthread": None}
-    return dict(_ON_CPU_CORES)
+    return _on_cpu_cores()
+
+
+def _on_cpu_cores() -> dict[str, Any]:
+    """The options that move an environment from a GPU to the C engine, without those that it does not take."""
+    known = _options_of(_engine_class("mujoco", wp.get_device("cpu"), False)) or []
+    defaults = EnvOptions().for_engine()
+    others = {name: None for name, default in defaults.items() if default is None and name not in known}
+    return {"engine": "mujoco", "device": "cpu", **others}
 
 
 def _resolved(

@@ -455,6 +455,21 @@ def test_settings_cannot_be_assigned(name: str) -> None:
         setattr(plan, name, 2.0)
 
 
+@pytest.mark.parametrize("name", ["actions", "nominal", "standard_noise", "sampled", "returns", "weights"])
+def test_buffers_cannot_be_replaced(name: str) -> None:
+    plan = MPPI("point_mass", horizon=3, samples=2)
+    with pytest.raises(
+        AttributeError, match=rf"plan.{name} is a buffer of fixed address: write into it, as plan.{name}"
+    ):
+        setattr(plan, name, torch.zeros(3))
+
+
+def test_reset_with_a_seed_changes_the_seed() -> None:
+    plan = MPPI("point_mass", horizon=3, samples=2)
+    plan.reset(7)
+    assert plan.seed == 7
+
+
 @pytest.mark.parametrize("seed", [-1, 0.5, "a"])
 def test_a_seed_that_is_not_a_whole_number_is_refused(seed: Any) -> None:
     with pytest.raises(ValueError, match="seed must be a whole number from 0"):

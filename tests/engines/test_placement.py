@@ -13,7 +13,7 @@ import lyceum_warp as lw
 from lyceum_warp.engines import memory, placement
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
-from lyceum_warp.engines.placement import engine_name, few_worlds, find_device, open_engine, place_samples
+from lyceum_warp.engines.placement import engine_name, find_device, open_engine, options_for_few_worlds, place_samples
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 
 ON_CPU = {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None}
@@ -98,17 +98,17 @@ def test_worlds_that_do_not_fit_are_refused_before_the_engine_is_made(
     assert each > 8 * mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION.value)
     monkeypatch.setattr(memory, "free_memory", lambda device: int(10.5 * each / 0.9))
     open_engine(engine, model, 10, cpu, [])
-    open_engine(engine, model, 5, cpu, [], beside=each)
+    open_engine(engine, model, 5, cpu, [], reserved=each)
     with pytest.raises(ValueError, match=r"11 worlds of hopper need about .* use nworld=10 at most"):
         open_engine(engine, model, 11, cpu, [])
     with pytest.raises(ValueError, match=r"6 worlds of hopper need about .* use nworld=5 at most"):
-        open_engine(engine, model, 6, cpu, [], beside=each)
+        open_engine(engine, model, 6, cpu, [], reserved=each)
 
 
 def test_few_worlds_move_from_a_gpu_to_cpu_cores_with_auto_only() -> None:
-    assert few_worlds("auto", "cuda:0") == ON_CPU
+    assert options_for_few_worlds("auto", "cuda:0") == ON_CPU
     for engine, device in (("auto", "cpu"), ("auto", None), ("warp", "cuda:0"), ("mujoco", "cpu"), (ToyEngine, "cuda")):
-        assert few_worlds(engine, device) == {}
+        assert options_for_few_worlds(engine, device) == {}
 
 
 def test_place_samples_chooses_by_the_number_of_samples(gpu: Any) -> None:

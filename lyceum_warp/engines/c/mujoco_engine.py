@@ -144,6 +144,12 @@ class MujocoEngine(Engine):
         self.batch.warning += native.batch.warning
         self._copy(self._state_fields)
 
+    def rollout_bytes_per_world(self, steps: int, nstep: int, fields: Iterable[Field]) -> int:
+        fields = list(fields)
+        if not is_exact(self.model, fields):
+            return 0
+        return 8 * steps * nstep * (self.model.nu + sum(field.size for field in fields)) + 8 * self.integration_size
+
     def _native_rollout(self, steps: int, nstep: int, fields: list[Field]) -> NativeRollout | None:
         if not is_exact(self.model, fields):
             return None
