@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.algos.evaluation import moved
+from lyceum_warp.algos.networks import moved
 
 
 def test_evaluate_leaves_no_gradients() -> None:
