@@ -1,4 +1,4 @@
-"""Task: what a user writes, and the one table of its functions."""
+"""Task, the base class of every task, and the one table of a task's functions."""
 
 import dataclasses
 import inspect
@@ -34,9 +34,9 @@ class TaskFunction:
     arguments: str
     """The arguments as they are written in a task's file."""
     result: type | None
-    """What it returns: float, bool, or None for a function that writes into its arguments."""
+    """The type of its result: float, bool, or None for a function that writes into its arguments."""
     about: str
-    """What it is for, and its default, for the documentation."""
+    """Its purpose and its default, for the documentation."""
     default: str | None = None
     """The body of the function that stands in for it; None where it is required."""
 
@@ -98,7 +98,7 @@ class Element(int):
     name: str
 
     def __new__(cls, field: str, name: str) -> "Element":
-        """An integer that says which element it stands for; its own value is never used."""
+        """An integer that holds the element's name; its own value is never used."""
         element = super().__new__(cls, -1)
         element.field, element.name = field, name
         return element
@@ -185,8 +185,8 @@ class Task:
     stream: pass it to ``lw.uniform`` and ``lw.normal``.
 
     ``initialize`` and ``randomize`` may write qpos, qvel, act, mocap_pos, mocap_quat, userdata and memory where
-    ``World`` lists them. They must not read derived fields (``xpos``, ``site_xpos``, ``sensordata``), which are computed
-    afterwards.
+    ``World`` lists them. They must not read derived fields (``xpos``, ``site_xpos``, ``sensordata``): these are
+    computed afterwards.
 
     Quaternions in fields are in MuJoCo's order w, x, y, z; Warp's own quaternion functions expect x, y, z, w.
     """

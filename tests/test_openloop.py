@@ -223,7 +223,7 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", PACKAGE)
-def test_a_roll_out_gives_the_numbers_of_stepping(task: str, engine: str) -> None:
+def test_a_rollout_gives_the_numbers_of_stepping(task: str, engine: str) -> None:
     steps = 3 if task in ("humanoid", "adroit_pen") else 5
     # on the CPU every substep of the Warp engine is hundreds of launches, so two of them must do
     options = {"frame_skip": min(2, find_task(task).frame_skip)} if engine == "warp" else {}
@@ -288,7 +288,7 @@ def test_every_kind_of_task_gives_the_numbers_of_stepping(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_parameters_may_change_between_roll_outs(engine: str) -> None:
+def test_parameters_may_change_between_rollouts(engine: str) -> None:
     """Also from one number to one a world, after graphs were captured."""
     loop, env = rollouts(Forgetful, 3, engine=engine), lw.make(Forgetful, engine=engine, nworld=4, autoreset=False)
     check_against_stepping(loop, env)
@@ -470,7 +470,7 @@ def test_worlds_that_reset_and_bad_horizons_are_refused(shared_env: SharedEnv) -
             OpenLoop(env, horizon)  # type: ignore[arg-type]
 
 
-def test_a_roll_out_is_a_list_of_phases() -> None:
+def test_a_rollout_is_a_list_of_phases() -> None:
     """One entry for the whole horizon of a task whose actions are controls, else three for each step."""
     names = [[phase.name for phase in rollouts(task, 2, engine="mujoco").phases] for task in (Forgetful, Servo)]
     assert names[0] == ["start", "physics", "judge"]

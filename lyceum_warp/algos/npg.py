@@ -231,8 +231,8 @@ class NPG:
     def advantages(self) -> tuple[torch.Tensor, torch.Tensor, ValueSums]:
         """Generalised advantages and discounted returns of the rollout.
 
-        Where a time limit or the end of the rollout cuts an episode off, the value function's prediction stands for
-        the rest. A state in which the episode terminated is worth 0 (mjrl; Lyceum bootstraps there, too).
+        At a time limit and at the end of the rollout, the value function's prediction stands for the rest of the
+        episode. A state in which the episode terminated is worth 0 (mjrl; Lyceum bootstraps there, too).
 
         Returns:
             Advantages, (steps, nworld); returns, (steps, nworld); and how well the value function predicted them.
@@ -281,7 +281,7 @@ class NPG:
         return finite, (log_std - old_log_std + 0.5 * square * torch.exp(-2 * log_std) - 0.5).sum(-1).mean()
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the next iteration depends on, the worlds of all processes included.
+        """The state on which the next iteration depends, with the worlds of all processes.
 
         All processes must call it. Any number of processes can continue from it.
         """
