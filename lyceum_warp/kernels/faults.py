@@ -62,7 +62,10 @@ def pool_overflow(
     bits: int,
     overflow_inout: wp.array[int],
 ):
-    """Set the bits of an overflow of the pool of pairs and contacts, as ``mujoco_warp.step`` does; over (nworld,)."""
+    """Set the bits of an overflow of the pool of pairs and contacts; launched over (nworld,).
+
+    ``mujoco_warp.step`` sets them in the same way.
+    """
     w = wp.tid()
     if mask_in[w] and (npair_in[0] > nmax or ncontact_in[0] > nmax):
         overflow_inout[w] = overflow_inout[w] | bits

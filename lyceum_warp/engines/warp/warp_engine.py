@@ -263,6 +263,6 @@ def _parts(names: Collection[str]) -> list[Callable[[mjw.Model, mjw.Data], None]
 
 
 def _contacts_of_one_world(model: mjw.Model) -> int:
-    """Contacts of a single world in which all bodies touch; its step is a fault, so it restarts."""
+    """Contacts of a single world in which all bodies touch; such a world is about to be reset."""
     pairs = len(model.nxn_geom_pair_filtered)
     return int(min(max(256, 4 * pairs), 4096))
