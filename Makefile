@@ -1,4 +1,4 @@
-# make demo: install, train Hopper and show what came of it    make test: install and run every test
+# make demo: install, train Hopper and show the result         make test: install and run every test
 # make lint: ruff and mypy                                     make clean: remove what these made
 #
 # Another Python: make demo PYTHON=python3.12
@@ -24,7 +24,7 @@ lint: $(VENV)/installed-dev
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache
 
-# The install is editable: only another list of dependencies asks for another one. constraints.txt pins torch
+# The install is editable: it is repeated only when the list of dependencies changes. constraints.txt pins torch
 # so that pip takes a local build of the tested version, where there is one, rather than the newest.
 $(VENV)/installed-%: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(INSTALL) -e '.[$*]'

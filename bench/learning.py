@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 import lyceum_warp as lw
-from lyceum_warp.algos.evaluation import moved
+from lyceum_warp.algos.networks import moved
 
 
 @dataclasses.dataclass(frozen=True)

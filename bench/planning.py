@@ -1,4 +1,4 @@
-"""The cost of a plan beside the bare engine on the same roll-outs, and beside MPPI over single Python environments.
+"""The cost of a plan beside the bare engine on the same rollouts, and beside MPPI over single Python environments.
 
     python bench/planning.py --tasks reach adroit_pen
 

@@ -179,7 +179,7 @@ def _sensed(model: mujoco.MjModel, name: str) -> bool:
 
 
 def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
-    """Where a named element of the model lies in a field, along the axis after the worlds.
+    """The place of a named element of the model in a field, along the axis after the worlds.
 
     A joint has its coordinates in ``qpos`` and its degrees of freedom in ``qvel``, ``qacc`` and other fields of that
     size, a sensor its numbers in ``sensordata``, a mocap body its row in ``mocap_pos``. In every other field each

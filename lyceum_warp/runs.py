@@ -29,7 +29,7 @@ class Run:
     ``config.json``     the task, its parameters, the engine, its physics, the seed and all hyperparameters
     ``versions.json``   versions of the packages and of Python, the machine, the commit
     ``metrics.csv``     one row per iteration
-    ``checkpoint.pt``   the policy, and everything that is needed to continue exactly
+    ``checkpoint.pt``   the policy, and the state from which a run continues exactly
     =================== ======================================================================================
 
     Args:

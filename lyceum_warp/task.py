@@ -1,4 +1,4 @@
-"""Task: what a user writes, and the one table of its functions."""
+"""Task, the base class of every task, and the one table of a task's functions."""
 
 import dataclasses
 import inspect
@@ -28,15 +28,15 @@ else:
 
 @dataclasses.dataclass(frozen=True)
 class TaskFunction:
-    """One of a task's functions: how it is written and what happens without it."""
+    """One of a task's functions: its signature, its purpose and its default."""
 
     name: str
     arguments: str
     """The arguments as they are written in a task's file."""
     result: type | None
-    """What it returns: float, bool, or None for a function that writes into its arguments."""
+    """The type of its result: float, bool, or None for a function that writes into its arguments."""
     about: str
-    """What it is for, and its default, for the documentation."""
+    """Its purpose and its default, for the documentation."""
     default: str | None = None
     """The body of the function that stands in for it; None where it is required."""
 
@@ -92,30 +92,30 @@ def _document_functions(cls: type["Task"]) -> type["Task"]:
 
 
 class Element(int):
-    """The place of a named element of the model, found when the model is known. See ``site`` and its like."""
+    """The place of a named element of the model, found when the model is known. Functions such as ``site`` make it."""
 
     field: str
     name: str
 
     def __new__(cls, field: str, name: str) -> "Element":
-        """An integer that says which element it stands for; its own value is never used."""
+        """An integer that holds the element's name; its own value is never used."""
         element = super().__new__(cls, -1)
         element.field, element.name = field, name
         return element
 
 
 def site(name: str) -> int:
-    """As a default in Params: the index of a site, in ``site_xpos`` and its like."""
+    """As a default in Params: the index of a site, in ``site_xpos`` and the other ``site_`` fields."""
     return Element("site_xpos", name)
 
 
 def body(name: str) -> int:
-    """As a default in Params: the index of a body, in ``xpos`` and its like."""
+    """As a default in Params: the index of a body, in ``xpos`` and the other fields of bodies."""
     return Element("xpos", name)
 
 
 def geom(name: str) -> int:
-    """As a default in Params: the index of a geom, in ``geom_xpos`` and its like."""
+    """As a default in Params: the index of a geom, in ``geom_xpos`` and the other ``geom_`` fields."""
     return Element("geom_xpos", name)
 
 
@@ -125,7 +125,7 @@ def qpos(joint: str) -> int:
 
 
 def dof(joint: str) -> int:
-    """As a default in Params: where a joint's degrees of freedom begin in ``qvel`` and its like."""
+    """As a default in Params: where a joint's degrees of freedom begin in ``qvel`` and fields of its size."""
     return Element("qvel", joint)
 
 
@@ -142,7 +142,7 @@ def mocap(body: str) -> int:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Planning:
-    """What suits a task when MPPI plans for it.
+    """A task's settings for MPPI: those of the planner, and options and parameters of its worlds.
 
     Raises:
         ValueError: A part is not a dict.
@@ -173,17 +173,20 @@ class Task:
     defaults; ``dt``, the seconds in a step, is filled in), and the functions, each a ``wp.func``. Each of these may
     also be an attribute of the class.
 
+    A default in ``Params`` may name an element of the model, as ``tip: int = lw.site("tip")``: the functions then get
+    its index. ``lw.body``, ``lw.geom``, ``lw.qpos``, ``lw.dof``, ``lw.sensor`` and ``lw.mocap`` work likewise.
+
     Functions:
     {functions}
 
-    ``s``, ``s0`` and ``s1`` are one world's fields: now, before the step, and after it. Positions, velocities and
-    their like belong to that state; quantities of the acceleration stage (forces, accelerations) are those of the
-    last substep. Controls are clipped to the model's ranges; costs see the action as given. ``rng`` is the world's
-    random stream: pass it to ``lw.uniform`` and ``lw.normal``.
+    ``s``, ``s0`` and ``s1`` are one world's fields: now, before the step, and after it. Fields of the position and
+    velocity stages belong to that state; fields of the acceleration stage (forces, accelerations) are those of the last
+    substep. Controls are clipped to the model's ranges; costs see the action as given. ``rng`` is the world's random
+    stream: pass it to ``lw.uniform`` and ``lw.normal``.
 
     ``initialize`` and ``randomize`` may write qpos, qvel, act, mocap_pos, mocap_quat, userdata and memory where
-    ``World`` lists them. They must not read positions and their like (``xpos``, ``site_xpos``, ``sensordata``), which
-    are computed afterwards.
+    ``World`` lists them. They must not read derived fields (``xpos``, ``site_xpos``, ``sensordata``): these are
+    computed afterwards.
 
     Quaternions in fields are in MuJoCo's order w, x, y, z; Warp's own quaternion functions expect x, y, z, w.
     """
@@ -201,16 +204,17 @@ class Task:
     lagged: ClassVar[tuple[str, ...]] = ()
     """Fields to read as ``mj_step`` leaves them, one substep behind the state, as some Gymnasium tasks do."""
     memory: ClassVar[int] = 0
-    """Number of floats in the field ``memory``, which the task writes in ``advance`` and which belongs to the state."""
+    """Number of floats in the field ``memory``, which the task writes in ``advance`` and which belongs to the state.
+    ``World`` must list it as ``memory: Row[float]``."""
     action_range: ClassVar[tuple[float, float] | None] = None
     """The range of an action that the default ``control`` scales to the model's control ranges; None: actions are
     controls."""
     planning: ClassVar[Planning] = Planning()
-    """What suits this task when MPPI plans for it: settings of the planner, and options and parameters of its worlds,
-    as ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
+    """The task's settings for MPPI: those of the planner, and options and parameters of its worlds, as
+    ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
 
-    # World, Params and functions of the class's module when the class was made
-    scope: ClassVar[dict[str, Any]] = {}
+    # World, Params and functions of the class's module when the class was made; each subclass has its own
+    scope: ClassVar[dict[str, Any]]
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)

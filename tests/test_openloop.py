@@ -1,4 +1,4 @@
-"""Open-loop roll-outs give the numbers of stepping an environment, to the bit, on both engines."""
+"""Open-loop rollouts give the numbers of stepping an environment, to the bit, on both engines."""
 
 from typing import Any
 
@@ -200,7 +200,7 @@ def run(loop: OpenLoop, state: torch.Tensor, actions: torch.Tensor) -> dict[str,
 
 
 def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None:
-    """Compare several roll-outs, from other states and under other actions each time; the later ones replay graphs."""
+    """Compare several rollouts, from other states and under other actions each time; the later ones replay graphs."""
     for seed in range(rounds):
         state, actions = some_state(env, seed), random_actions(env, loop.horizon, 10 + seed)
         low, high = env.action_space.low, env.action_space.high
@@ -223,7 +223,7 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", PACKAGE)
-def test_a_roll_out_gives_the_numbers_of_stepping(task: str, engine: str) -> None:
+def test_a_rollout_gives_the_numbers_of_stepping(task: str, engine: str) -> None:
     steps = 3 if task in ("humanoid", "adroit_pen") else 5
     # on the CPU every substep of the Warp engine is hundreds of launches, so two of them must do
     options = {"frame_skip": min(2, find_task(task).frame_skip)} if engine == "warp" else {}
@@ -233,7 +233,7 @@ def test_a_roll_out_gives_the_numbers_of_stepping(task: str, engine: str) -> Non
 
 @pytest.fixture
 def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Holds one entry for every roll-out of a whole horizon in one native call."""
+    """Holds one entry for every rollout of a whole horizon in one native call."""
     calls, original = [], NativeRollout.run
 
     def counting(self: NativeRollout, *args: Any) -> None:
@@ -288,7 +288,7 @@ def test_every_kind_of_task_gives_the_numbers_of_stepping(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_parameters_may_change_between_roll_outs(engine: str) -> None:
+def test_parameters_may_change_between_rollouts(engine: str) -> None:
     """Also from one number to one a world, after graphs were captured."""
     loop, env = rollouts(Forgetful, 3, engine=engine), lw.make(Forgetful, engine=engine, nworld=4, autoreset=False)
     check_against_stepping(loop, env)
@@ -338,7 +338,7 @@ BAD = 1
 @pytest.mark.parametrize("task", [Forgetful, Servo])
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_an_action_that_is_not_finite_is_a_fault_of_its_world(task: type[lw.Task], engine: str, number: float) -> None:
-    """The action counts as zero; other worlds keep their numbers, and the next roll-out has no fault."""
+    """The action counts as zero; other worlds keep their numbers, and the next rollout has no fault."""
     loop = rollouts(task, 5, engine=engine)
     state, actions = some_state(loop.env, 0), random_actions(loop.env, 5, 0)
     zeroed, wrong = actions.clone(), actions.clone()
@@ -418,7 +418,7 @@ class PushedRunaway(Runaway):
 @pytest.mark.parametrize("how", ["native", "rk4", "control"])
 @pytest.mark.parametrize("size, step", [(1e9, 1), (1e9, 5), (1e13, 1)])  # MuJoCo leaves out controls beyond 1e10
 def test_a_world_that_diverges_has_a_fault_and_changes_no_other(size: float, how: str, step: int, engine: str) -> None:
-    """The next roll-outs have no fault either.
+    """The next rollouts have no fault either.
 
     On the C engine such a world stops and keeps its last finite numbers, so only the fault shows that they are
     meaningless.
@@ -443,7 +443,7 @@ def test_a_world_that_diverges_has_a_fault_and_changes_no_other(size: float, how
         assert torch.equal(found["final_obs"][[0, 2]], clean["final_obs"][[0, 2]])
         again = run(loop, state, actions)
         for name, value in clean.items():
-            assert torch.equal(again[name], value), f"{name} of a roll-out after one that diverged"
+            assert torch.equal(again[name], value), f"{name} of a rollout after one that diverged"
 
 
 @pytest.mark.parametrize("task", [Runaway, PushedRunaway])
@@ -470,7 +470,7 @@ def test_worlds_that_reset_and_bad_horizons_are_refused(shared_env: SharedEnv) -
             OpenLoop(env, horizon)  # type: ignore[arg-type]
 
 
-def test_a_roll_out_is_a_list_of_phases() -> None:
+def test_a_rollout_is_a_list_of_phases() -> None:
     """One entry for the whole horizon of a task whose actions are controls, else three for each step."""
     names = [[phase.name for phase in rollouts(task, 2, engine="mujoco").phases] for task in (Forgetful, Servo)]
     assert names[0] == ["start", "physics", "judge"]

@@ -1,7 +1,7 @@
 """One word for one thing: words and phrases that were settled against, with their replacements.
 
-The search covers code, comments, messages and names (an underscore counts as a space), and the documents. A phrase may
-span two lines.
+The search covers code, comments, messages and names (an underscore counts as a space), the documents, and the files
+that build and test the package. A phrase may span two lines.
 """
 
 import bisect
@@ -23,6 +23,7 @@ SETTLED: dict[str, str] = {
     r"\babsurd(ly)?\b(?! \(beyond)": "beyond 1e10",
     r"\bbeg[aiu]n(s|ning)? again\b": "restart",
     r"\bgoodbye\b": "the end of the program",
+    r"\broll-outs?\b|\broll outs\b|\b(an?|the|each|every|bare|native) roll out\b": "rollout (verb: roll out)",
     # rules
     r"\b(has|have|had) to be\b": "must be",
     r"\b(has|have) to (?!be\b|do with\b)": "must",
@@ -64,6 +65,8 @@ SETTLED: dict[str, str] = {
     r"\bafresh\b": "again",
     r"\bon that account\b": "therefore",
     r"\bwhat (came|comes) of (it|them|this)\b": "the result",
+    r"\banew\b": "again",
+    r"\band (its|their) like\b": "name them, or their kind",
     r"\bslips? of the pen\b": "misspelt",
     r"\b(leaves?|left) no trace\b": "changes nothing",
     r"\bwithout a word\b": "silently",
@@ -92,14 +95,16 @@ QUOTING = {
 """Parts of documents that quote what was settled against."""
 
 DOCUMENTS = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "bench/README.md")
+OTHERS = ("Makefile", "pyproject.toml", ".ci/run", "CITATION.cff", "constraints.txt")
 FILES = [
     *(
         path
         for folder in ("lyceum_warp", "tests", "bench", "examples")
         for path in sorted((ROOT / folder).rglob("*.py"))
     ),
-    *(ROOT / name for name in DOCUMENTS),
+    *(ROOT / name for name in (*DOCUMENTS, *OTHERS)),
     *sorted((ROOT / "docs").glob("*.md")),
+    *sorted(path for path in (ROOT / ".github").rglob("*") if path.is_file()),
 ]
 NAMES = [str(path.relative_to(ROOT)) for path in FILES if path.exists() and path != Path(__file__)]
 
@@ -137,6 +142,8 @@ def test_no_word_is_used_that_was_settled_against(name: str) -> None:
         "Whoever calls it",
         "The kernel launches by itself.",
         "as if the step had never been",
+        "The roll-out is one call.",
+        "the roll out of a plan",
     ],
 )
 def test_a_phrase_is_found_in_code_names_and_over_two_lines(text: str) -> None:
@@ -151,6 +158,7 @@ def test_a_phrase_is_found_in_code_names_and_over_two_lines(text: str) -> None:
         "beyond what an absurd (beyond 1e10) state needs",
         "It has nothing to do with it.",
         "The fault ends the episode.",
+        "A planner rolls out its samples; worlds to roll out in; one rollout.",
     ],
 )
 def test_a_plain_sentence_has_no_such_phrase(text: str) -> None:

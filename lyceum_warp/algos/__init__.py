@@ -1,10 +1,13 @@
 """Algorithms that learn and plan, and the parts that they are made of.
 
-``npg.py`` and ``mppi.py`` each hold one algorithm, in the order of its mathematics. Both reach the worlds only through
-the public interface of the environment and of its open-loop roll-outs.
+``npg.py`` and ``mppi.py`` each hold one algorithm, in the order of its mathematics. Neither touches the arrays behind
+an environment: NPG uses ``Env``, and MPPI also uses ``OpenLoop``, to whose phases it adds its own.
 
 NPG's parts: ``npg_config`` (hyperparameters), ``rollout_buffer`` (samples), ``natural_gradient`` (Fisher information
 and conjugate gradient), ``policy``, ``value`` and ``networks`` (the functions that are learned), ``value_fit``
-(regression on returns), ``evaluation`` (the mean policy in whole episodes), ``statistics`` (the numbers of an
-iteration), ``distributed`` (several processes) and ``timing``.
+(regression on returns), ``evaluation`` (the mean policy in whole episodes), ``npg_statistics`` (the numbers of an
+iteration), ``distributed`` (several processes) and ``timing`` (seconds of its phases).
+
+MPPI's parts: ``mppi_config`` (settings), ``mppi_arguments`` (the arguments of ``lw.MPPI``, sorted into settings,
+options and parameters) and ``planner_state`` (the state to plan from).
 """

@@ -32,7 +32,7 @@ class Team:
 
     @property
     def leads(self) -> bool:
-        """Whether this is the process that writes files and messages."""
+        """Whether this process writes the files and messages."""
         return self.rank == 0
 
     @property
@@ -91,7 +91,7 @@ class Team:
         return int(numbers)
 
     def gather(self, part: torch.Tensor) -> torch.Tensor:
-        """The parts of all processes one after another, (size * n, ...) from (n, ...), in every process."""
+        """Concatenate the parts of all processes, (size * n, ...) from (n, ...), in every process."""
         if self.size == 1:
             return part
         whole = part.new_empty(self.size * part.shape[0], *part.shape[1:])
@@ -102,8 +102,8 @@ class Team:
     def copy_leader(self, tensors: Iterable[torch.Tensor]) -> None:
         """Overwrite tensors with those of the leading process.
 
-        Where all processes have the same hardware, parameters that each updated for itself are equal already.
-        Elsewhere this keeps rounding from driving them apart.
+        On equal hardware, parameters that each process updates are equal already.
+        On different hardware this prevents rounding errors from adding up.
         """
         if self.size > 1:
             tensors = list(tensors)

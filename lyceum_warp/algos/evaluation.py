@@ -1,16 +1,13 @@
 """Evaluation of policies: whole episodes under the mean action."""
 
-import copy
 import dataclasses
-from typing import TypeVar
 
 import torch
 
 from lyceum_warp.algos.distributed import Team
+from lyceum_warp.algos.networks import moved
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
-
-Module = TypeVar("Module", bound=torch.nn.Module)
 
 MEAN_SEED = 2**31 - 1
 """Seed of the initial states from which NPG evaluates the mean policy."""
@@ -82,7 +79,7 @@ class MeanPolicyEvaluation:
     evaluations. The leading process evaluates; all processes get its numbers.
 
     Args:
-        env: The environment of the training; its parameters at each evaluation are those of the evaluation.
+        env: The environment of the training; each evaluation uses its current parameters.
         episodes: Number of episodes.
         team: The processes.
     """
@@ -107,11 +104,3 @@ class MeanPolicyEvaluation:
 
 MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")
 """The attributes of ``Iteration`` that an evaluation of the mean policy sets."""
-
-
-def moved(module: Module, env: Env) -> Module:
-    """The module itself if its parameters are on the device of an environment's observations, else a copy there."""
-    device = env.obs.device
-    if all(parameter.device == device for parameter in module.parameters()):
-        return module
-    return copy.deepcopy(module).to(device)

@@ -21,9 +21,9 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.algos.evaluation import moved
 from lyceum_warp.algos.mppi_arguments import plain, planner_arguments
 from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig
+from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.planner_state import checked_state, state_from_parts
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.arrays import torch_view

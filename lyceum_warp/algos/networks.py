@@ -1,12 +1,17 @@
 """Networks that policies and value functions are made of."""
 
+import copy
 import itertools
 from collections.abc import Sequence
+from typing import TypeVar
 
 import torch
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
+from lyceum_warp.env import Env
+
+Module = TypeVar("Module", bound=nn.Module)
 
 
 def mlp(sizes: Sequence[int], *, last_scale: float = 1.0, generator: torch.Generator | None = None) -> nn.Sequential:
@@ -76,3 +81,11 @@ class Normalizer(nn.Module):
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Normalised observations, (..., size)."""
         return ((obs - self.shift) * self.scale).clamp(-self.limit, self.limit)
+
+
+def moved(module: Module, env: Env) -> Module:
+    """The module itself if its parameters are on the device of an environment's observations, else a copy there."""
+    device = env.obs.device
+    if all(parameter.device == device for parameter in module.parameters()):
+        return module
+    return copy.deepcopy(module).to(device)

@@ -29,7 +29,7 @@ from lyceum_warp.algos.npg_statistics import (
 )
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.rollout_buffer import Rollout
-from lyceum_warp.algos.timing import Clock, one_thread
+from lyceum_warp.algos.timing import PhaseTimer, one_thread
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.docstrings import document_attributes
@@ -153,13 +153,13 @@ class NPG:
 
     def __next__(self) -> Iteration:
         config, rollout, team = self.config, self.rollout, self.team
-        clock = Clock(self.env.obs.device)
+        timer = PhaseTimer(self.env.obs.device)
 
         # 1. Samples of the current policy.
         if not self.segments:
             rollout.restart()
         self.sample()
-        clock.mark()
+        timer.mark()
 
         # 2. Advantages, from the value function that was not yet fitted to these samples.
         advantage, target, prediction = self.advantages()
@@ -169,7 +169,7 @@ class NPG:
         parameters = [p for p in self.policy.parameters() if p.requires_grad]
         objective = (self.policy.log_prob(obs, action) * advantage.flatten()).sum() / self.count
         gradient = team.sum(flatten(torch.autograd.grad(objective, parameters)))
-        clock.mark()
+        timer.mark()
 
         # 4. Natural gradient x = F^-1 g, and the step x sqrt(delta / (g.x)), so that step.F.step = delta.
         fisher_obs = obs if self._fisher_count == self.count else obs[self._fisher_places]
@@ -177,7 +177,7 @@ class NPG:
         direction = conjugate_gradient(fisher, gradient, config.cg_iterations)
         step = direction * torch.sqrt(config.delta / (gradient @ direction + 1e-20))
         finite, kl = self.move(step, obs)
-        clock.mark()
+        timer.mark()
 
         # One copy brings the numbers of all processes to the host.
         update = UpdateNumbers(
@@ -197,7 +197,7 @@ class NPG:
         for module in (self.policy, self.value):
             if isinstance(module.normalizer, Normalizer):
                 module.normalizer.update(obs, team)
-        clock.mark()
+        timer.mark()
 
         # 6. Every few iterations, the mean policy in whole episodes.
         self.iteration += 1
@@ -205,9 +205,9 @@ class NPG:
         mean: dict[str, Any] = dict.fromkeys(MEAN_STATISTICS)
         if config.mean_every and self.iteration % config.mean_every == 0:
             mean = self._evaluate_mean(self.policy)
-        clock.mark()
+        timer.mark()
 
-        time_sample, time_gradient, time_solve, time_value, time_mean = clock.seconds()
+        time_sample, time_gradient, time_solve, time_value, time_mean = timer.seconds()
         return Iteration(
             iteration=self.iteration,
             samples=self.samples,
@@ -231,8 +231,8 @@ class NPG:
     def advantages(self) -> tuple[torch.Tensor, torch.Tensor, ValueSums]:
         """Generalised advantages and discounted returns of the rollout.
 
-        Where a time limit or the end of the rollout cuts an episode off, the value function's prediction stands for
-        the rest. A state in which the episode terminated is worth 0 (mjrl; Lyceum bootstraps there, too).
+        At a time limit and at the end of the rollout, the value function's prediction stands for the rest of the
+        episode. A state in which the episode terminated is worth 0 (mjrl; Lyceum bootstraps there, too).
 
         Returns:
             Advantages, (steps, nworld); returns, (steps, nworld); and how well the value function predicted them.
@@ -281,7 +281,7 @@ class NPG:
         return finite, (log_std - old_log_std + 0.5 * square * torch.exp(-2 * log_std) - 0.5).sum(-1).mean()
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the next iteration depends on, the worlds of all processes included.
+        """The state on which the next iteration depends, with the worlds of all processes.
 
         All processes must call it. Any number of processes can continue from it.
         """

@@ -135,7 +135,7 @@ class EpisodeSums(NamedTuple):
 
 
 class ProcessNumbers(NamedTuple):
-    """What one process contributes to the statistics of an iteration."""
+    """The contribution of one process to the statistics of an iteration."""
 
     update: UpdateNumbers
     values: ValueSums

@@ -119,7 +119,7 @@ class Rollout:
         self.running_return.masked_fill_(first > 0, torch.nan)
 
     def explain_not_finite(self) -> str:
-        """A sentence about the rewards or observations that are not finite; waits for the device."""
+        """A sentence that names the rewards or observations that are not finite; waits for the device."""
         for name, values in (("reward", self.reward), ("observation", self.obs), ("observation", self.final_obs)):
             bad = ~values.isfinite()
             if not bad.any():

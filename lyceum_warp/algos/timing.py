@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import torch
 
 
-class Clock:
-    """Measures the seconds between calls of ``mark``; making the clock is the first mark.
+class PhaseTimer:
+    """Measures the seconds between calls of ``mark``; making the timer is the first mark.
 
     On a GPU a mark is an event in the device's stream: only ``seconds`` waits for the device.
     """

@@ -101,7 +101,7 @@ class CapturedStep:
 
     Args:
         fit: The fit.
-        features: The network's inputs, (samples, features); only their shape and device count here.
+        features: The network's inputs, (samples, features); only their shape and device are used here.
         target: Scaled returns, (samples, 1); likewise.
     """
 
@@ -149,7 +149,7 @@ class CapturedStep:
     def _capture(self, times: int) -> None:
         """Run some steps directly, on another stream than the default one, then capture the graph.
 
-        The direct steps make everything that is made once, such as Adam's moments.
+        The direct steps allocate lasting memory, such as Adam's moments.
         """
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())

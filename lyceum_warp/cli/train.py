@@ -13,7 +13,8 @@ import tyro
 from rich.console import Console
 
 from lyceum_warp.algos.distributed import Team, join
-from lyceum_warp.algos.evaluation import Episodes, evaluate, moved
+from lyceum_warp.algos.evaluation import Episodes, evaluate
+from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
 from lyceum_warp.binding.registry import find_task, task_name, task_names

@@ -91,7 +91,7 @@ class CheckedController:
             found |= settings
         if isinstance(env := getattr(controller, "env", None), Env):
             found |= {"engine": env.engine.name, "device": env.device.alias}
-        # through JSON, so that it equals what a file gives back; a value that JSON cannot hold becomes text
+        # through JSON, so that it equals the content of a saved file; a value that JSON cannot hold becomes text
         return dict(json.loads(json.dumps(found, default=str)))
 
     def _checked(self, value: Any, ndim: int, step: int) -> torch.Tensor:

@@ -174,7 +174,7 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
         rate: Required plans per second, which set the deadline; by default one plan in each of the plant's periods.
 
     Raises:
-        ValueError: There is no trajectory, the trajectories differ in what must be the same, or the rate is not
+        ValueError: There is no trajectory, the trajectories are of different kinds, or the rate is not
             positive.
     """
     episodes = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)

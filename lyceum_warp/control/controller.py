@@ -1,4 +1,4 @@
-"""The protocols of a controller: what ``lw.control`` and ``lw.control_async`` call, and what else they use."""
+"""The protocols of a controller: the members that ``lw.control`` and ``lw.control_async`` use."""
 
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable

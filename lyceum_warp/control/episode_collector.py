@@ -1,4 +1,4 @@
-"""What both loops share: the limits of an episode, its progress, and the collection of its steps and plans."""
+"""The common part of both loops: the limits of an episode, its progress, and the collection of its steps and plans."""
 
 import dataclasses
 import time
@@ -29,7 +29,7 @@ class ControlProgress:
     success: bool
     """Whether the task's goal is met in that state."""
     plan_time: float
-    """Seconds that the plan took from which the action was applied."""
+    """Planning time of the plan that the action came from, seconds."""
     age: float
     """Age of the action when it was applied, seconds; see ``Trajectory.ages``."""
     plans: int

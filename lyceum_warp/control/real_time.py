@@ -1,4 +1,4 @@
-"""The loop against the clock: the plant keeps its rate while a thread plans."""
+"""The loop in real time: the plant keeps its rate while a thread plans."""
 
 import atexit
 import contextlib

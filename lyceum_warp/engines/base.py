@@ -126,7 +126,7 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def commit(self, mask: wp.array) -> None:
-        """Take the values in the masked worlds' state fields over into the engine. Made of Warp launches."""
+        """Copy the masked worlds' state fields into the engine. Made of Warp launches."""
 
     @abc.abstractmethod
     def refresh(self, mask: wp.array) -> None:
@@ -135,7 +135,7 @@ class Engine(abc.ABC):
         Worlds outside the mask keep their values.
         """
 
-    # roll-outs
+    # rollouts
 
     def rollout(self, state: wp.array, controls: wp.array, nstep: int, buffers: Mapping[str, wp.array]) -> None:
         """Step every world from a given state under given controls, and copy fields into buffers along the way.
@@ -148,7 +148,7 @@ class Engine(abc.ABC):
             nstep: Substeps in a step.
             buffers: Where fields go, by their names, (steps + 1, nworld, ...): the first row is the start.
         """
-        self.reset(self._everyone)  # clears warnings and warm starts of the last roll-out
+        self.reset(self._everyone)  # clears warnings and warm starts of the last rollout
         self.set_state(state, self._everyone)
         self._copy_fields(buffers, 0)
         for t in range(len(controls)):

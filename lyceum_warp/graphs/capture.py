@@ -1,4 +1,4 @@
-"""Phases: what a step, a reset or a plan is made of, and how their launches become graphs.
+"""Phases, the parts of a step, a reset or a plan, and graphs of their launches.
 
 Code with launches lists them as phases, in order. ``Graphs.sequence`` turns the list into calls: phases that
 follow one another and are made of Warp launches become one graph, captured once and replayed. On an engine whose own
@@ -13,7 +13,7 @@ import torch
 import warp as wp
 
 Calls = tuple[Callable[[], None], ...]
-"""What ``Graphs.sequence`` returns: call them in order."""
+"""The result of ``Graphs.sequence``: functions to call in order."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,11 +25,11 @@ class Phase:
     """
 
     name: str
-    """What a profiler's range is called."""
+    """Name of the phase's range in a profiler."""
     run: Callable[[], object]
     """Takes no arguments."""
     engine: bool = False
-    """Whether this is a call into the engine that only some engines make of launches."""
+    """True for an engine call, which consists of Warp launches on some engines only."""
 
 
 class Graphs:

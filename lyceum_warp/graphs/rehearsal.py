@@ -1,4 +1,4 @@
-"""Find out which kernels a function would launch, without launching anything."""
+"""Find the kernels that a function launches, without launching anything."""
 
 import contextlib
 import threading

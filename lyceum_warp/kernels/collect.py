@@ -55,7 +55,7 @@ def store_outputs(
     fault_inout: wp.array[int],
     out: RolloutArrays,
 ):
-    """Store the results of a step and the return of the episode so far, and count faults; over (nworld, nobs)."""
+    """Store the results of a step and the episode's return so far, and count faults; launched over (nworld, nobs)."""
     w, i = wp.tid()
     t = index_in[0]
     out.final_obs[t, w, i] = final_obs_in[w, i]
@@ -79,4 +79,5 @@ def store_outputs(
 
 @wp.kernel(enable_backward=False)
 def advance_index(index_inout: wp.array[int]):
+    """Advance the index by one step; launched over (1,)."""
     index_inout[0] = index_inout[0] + 1

@@ -1,4 +1,4 @@
-"""Faults: kernels that find in each world, as bits of ``Done``, why it can't go on."""
+"""Kernels that find each world's faults, as bits of ``Done``."""
 
 import warp as wp
 
@@ -25,7 +25,9 @@ def faults_of_rows(
     warning_inout: wp.array3d[int],
     fault_out: wp.array[int],
 ):
-    """Find faults of the C engine: time, qpos, qvel and act lead its rows, warnings are (nworld, kind, 2) counters.
+    """Find faults of the C engine in the masked worlds; launched over (nworld,).
+
+    Time, qpos, qvel and act lead the rows of ``state``; ``warning`` holds counters, (nworld, kind, 2).
 
     The kinds are mjtWarning's: 0 inertia, 1 contacts full, 2 constraints full, 3 to 5 bad qpos, qvel, qacc,
     6 bad control. A counter is cleared when it is read.
@@ -60,7 +62,10 @@ def pool_overflow(
     bits: int,
     overflow_inout: wp.array[int],
 ):
-    """Set the bits of an overflow of the pool of pairs and contacts, as ``mujoco_warp.step`` does."""
+    """Set the bits of an overflow of the pool of pairs and contacts; launched over (nworld,).
+
+    ``mujoco_warp.step`` sets them in the same way.
+    """
     w = wp.tid()
     if mask_in[w] and (npair_in[0] > nmax or ncontact_in[0] > nmax):
         overflow_inout[w] = overflow_inout[w] | bits
@@ -78,7 +83,10 @@ def faults_of_fields(
     ignored_bits: int,
     fault_out: wp.array[int],
 ):
-    """Find faults of the Warp engine: in its state fields, and in its own overflow bits."""
+    """Find faults of the Warp engine in the masked worlds; launched over (nworld,).
+
+    They are found in the state fields and in the engine's own overflow bits.
+    """
     w = wp.tid()
     if not mask_in[w]:
         return

@@ -1,4 +1,4 @@
-"""Planning by sampling: controls of open-loop roll-outs, noise around a plan, weights, and the weighted mean.
+"""Planning by sampling: controls of open-loop rollouts, noise around a plan, weights, and the weighted mean.
 
 Actions of samples are (horizon, nsample, nu), plans (horizon, nu).
 """
@@ -48,7 +48,7 @@ def controls(
 
 @wp.kernel(enable_backward=False)
 def merge_faults(fault_in: wp.array[int], fault_inout: wp.array[int]):
-    """Add the bits of one array of faults to another; launched over nworld."""
+    """Add the bits of one array of faults to another; launched over (nworld,)."""
     w = wp.tid()
     fault_inout[w] = fault_inout[w] | fault_in[w]
 
@@ -118,7 +118,7 @@ def add_up(
     stop: bool,
     return_out: wp.array[float],
 ):
-    """Add up the samples' discounted rewards and terminal values; launched over nsample.
+    """Add up the samples' discounted rewards and terminal values; launched over (nsample,).
 
     With ``stop`` a sample earns nothing after the end of its episode, also no terminal value. The return of a sample
     with a fault, or of one that is not finite, is minus infinity.
@@ -201,7 +201,7 @@ def average(
 
 @wp.kernel(enable_backward=False)
 def count_up(count_inout: wp.array[int]):
-    """Count one improvement of a plan; launched over 1."""
+    """Count one improvement of a plan; launched over (1,)."""
     count_inout[0] = count_inout[0] + 1
 
 
@@ -217,6 +217,7 @@ def value_kernel(value: wp.Function) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False)
     def values(obs_in: wp.array2d[float], value_out: wp.array[float]):
+        """Evaluate the samples' last observations; launched over (nsample,)."""
         k = wp.tid()
         value_out[k] = value(obs_in[k])
 

@@ -49,7 +49,10 @@ def seed_worlds(
     key_out: wp.array[wp.uint32],
     episode_out: wp.array[int],
 ):
-    """Start the masked worlds' streams from a seed, at their first episode; world 0 has the number ``first``."""
+    """Start the masked worlds' streams from a seed, before their first episode; launched over (nworld,).
+
+    World 0 has the number ``first``.
+    """
     w = wp.tid()
     if mask_in[w]:
         key_out[w] = world_key(seed_in[0], first + int(w))

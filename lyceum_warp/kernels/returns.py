@@ -15,7 +15,10 @@ def advantages(
     advantage_out: wp.array2d[float],
     return_out: wp.array2d[float],
 ):
-    """Generalised advantage estimates (Schulman et al. 2016, eq. 16) and discounted returns, (steps, nworld).
+    """Compute advantages and discounted returns, (steps, nworld); launched over (nworld,).
+
+    Advantages are generalised advantage estimates (Schulman et al. 2016, "High-dimensional continuous control using
+    generalized advantage estimation", eq. 16).
 
     ``next_value`` is the value of the state that a step led to, before any reset. It stands for the rest of an
     episode that a time limit or the end of the rollout cut off, and counts as 0 where the episode terminated.

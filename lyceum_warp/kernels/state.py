@@ -10,6 +10,7 @@ import warp as wp
 
 @wp.kernel(enable_backward=False)
 def widen(mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[wp.float64], lanes: int):
+    """Copy the masked rows of float32 into float64; launched over (nworld, lanes)."""
     w, lane = wp.tid()
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):
@@ -18,6 +19,7 @@ def widen(mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.
 
 @wp.kernel(enable_backward=False)
 def narrow(mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[float], lanes: int):
+    """Round the masked rows of float64 to float32; launched over (nworld, lanes)."""
     w, lane = wp.tid()
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):
@@ -26,6 +28,7 @@ def narrow(mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_ou
 
 @wp.kernel(enable_backward=False)
 def copy_rows(mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[float], lanes: int):
+    """Copy the masked rows of float32; launched over (nworld, lanes)."""
     w, lane = wp.tid()
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):
@@ -36,6 +39,7 @@ def copy_rows(mask_in: wp.array[bool], source_in: wp.array2d[float], target_out:
 def copy_rows64(
     mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[wp.float64], lanes: int
 ):
+    """Copy the masked rows of float64; launched over (nworld, lanes)."""
     w, lane = wp.tid()
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):
@@ -46,6 +50,7 @@ def copy_rows64(
 def fill_rows64(
     mask_in: wp.array[bool], source_in: wp.array[wp.float64], target_out: wp.array2d[wp.float64], lanes: int
 ):
+    """Copy one row of float64 into the masked rows; launched over (nworld, lanes)."""
     w, lane = wp.tid()
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):
@@ -60,7 +65,10 @@ def pack_counters(
     done_reason_in: wp.array[int],
     state_out: wp.array2d[wp.float64],
 ):
-    """Write step, stream key, episode and done reason into four columns; float64 holds 32-bit integers exactly."""
+    """Write step, stream key, episode and done reason into four columns; launched over (nworld,).
+
+    float64 holds 32-bit integers exactly.
+    """
     w = wp.tid()
     state_out[w, 0] = wp.float64(step_in[w])
     state_out[w, 1] = wp.float64(key_in[w])
@@ -77,6 +85,7 @@ def unpack_counters(
     episode_out: wp.array[int],
     done_reason_out: wp.array[int],
 ):
+    """Read the four columns that ``pack_counters`` writes, in the masked worlds; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
         step_out[w] = int(state_in[w, 0])

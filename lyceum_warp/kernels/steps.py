@@ -45,7 +45,7 @@ OUTCOMES = {
 
 @wp.kernel(enable_backward=False)
 def count_faults(fault_in: wp.array[int], count_out: wp.array[int]):
-    """Count each kind of fault, at the place of its bit in Done."""
+    """Count each kind of fault, at the place of its bit in Done; launched over (nworld,)."""
     w = wp.tid()
     fault = fault_in[w]
     if fault != 0:
@@ -91,7 +91,10 @@ def make_kernels(
         fault_out: wp.array[int],
         ctrl_out: wp.array2d[float],
     ):
-        """Map actions to controls, clipped to their ranges; an action that is not finite counts as zero."""
+        """Map actions to controls, clipped to their ranges; launched over (nworld,).
+
+        An action that is not finite counts as zero.
+        """
         w = wp.tid()
         fault = int(0)
         for i in range(action_in.shape[1]):
@@ -120,7 +123,7 @@ def make_kernels(
         episode_in: wp.array[int],
         rng_inout: wp.array2d[wp.uint32],
     ):
-        """Advance the task's memory by one step."""
+        """Advance the task's memory by one step; launched over (nworld,)."""
         w = wp.tid()
         rng_inout[w, 0] = stream(key_in[w], episode_in[w], step_in[w])
         p = params[w % params.shape[0]]
@@ -142,7 +145,9 @@ def make_kernels(
         out: Outcome,
         restart_out: wp.array[bool],
     ):
-        """Reward, evaluation, termination and observation of a transition, or of a state alone.
+        """Judge a transition, or a state alone, in the masked worlds; launched over (nworld,).
+
+        Writes the reward, the evaluation, termination, success and the observation.
 
         A transition with a fault has reward 0, the evaluation of the state before it, and the last good observation.
         It counts as terminated, so that no learner bootstraps from it.
@@ -205,7 +210,10 @@ def make_kernels(
         step_out: wp.array[int],
         episode_inout: wp.array[int],
     ):
-        """Begin an episode in masked worlds, which the engine has put into the model's initial state."""
+        """Begin an episode in the masked worlds; launched over (nworld,).
+
+        The engine has already put them into the model's initial state.
+        """
         w = wp.tid()
         if not mask_in[w]:
             return
@@ -221,12 +229,12 @@ def make_kernels(
 
     @wp.kernel(module=module, enable_backward=False)
     def observe_worlds(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], obs_out: wp.array2d[float]):
-        """Observe the masked worlds."""
+        """Observe the masked worlds; launched over (nworld,)."""
         w = wp.tid()
         if mask_in[w]:
             observe(view(batch, w), params[w % params.shape[0]], obs_out[w])
 
-    # An open-loop roll-out keeps its fields for all steps: row t * nworld + w is world w after t steps. The
+    # An open-loop rollout keeps its fields for all steps: row t * nworld + w is world w after t steps. The
     # transition of that row leads to the one nworld further, so `before` and `after` are the same arrays, shifted.
 
     @wp.kernel(module=module, enable_backward=False)
@@ -238,7 +246,7 @@ def make_kernels(
         reward_out: wp.array[float],
         terminated_out: wp.array[bool],
     ):
-        """Reward and termination of a roll-out's transitions."""
+        """Compute reward and termination of a rollout's transitions; launched over (steps * nworld,)."""
         row = wp.tid()
         p = params[row % params.shape[0]]
         s1 = view(after, row)
@@ -257,7 +265,7 @@ def make_kernels(
         memory_inout: wp.array2d[float],
         rng_inout: wp.array2d[wp.uint32],
     ):
-        """Advance the task's memory along a roll-out; one thread goes through all steps of a world."""
+        """Advance the task's memory along a rollout; launched over (nworld,), one thread for all steps of a world."""
         w = wp.tid()
         n = step_in.shape[0]
         p = params[w % params.shape[0]]

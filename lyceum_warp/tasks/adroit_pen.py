@@ -1,9 +1,9 @@
 """AdroitPen: turn a pen in the hand until it points as the target does (Gymnasium-Robotics' AdroitHandPen-v1).
 
 The hand's model comes with the extra "hand". The target is a mocap body here, so that it belongs to the state, and
-nothing can bump into it; there it is a part of the model, and the pen can. The tips of ring and little finger, which
-the model pairs twice, are paired once. As there, positions are those that ``mj_step`` leaves. An episode is a success
-once the pen was held right for more than 20 steps in all.
+nothing collides with it; in the original, the pen can collide with the target. The tips of ring and little finger,
+which the model pairs twice, are paired once. As in the original, positions are those that ``mj_step`` leaves. An
+episode is a success once the pen was held in the goal orientation for more than 20 steps in all.
 """
 
 import mujoco

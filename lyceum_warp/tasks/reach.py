@@ -1,8 +1,8 @@
 """Reach: move the hand of a 7-joint arm to a target in space (the arm that the Lyceum paper calls Sawyer).
 
-The arm has no gravity to fight. Its target is a mocap body, and so belongs to the state. An episode is a success
+Gravity does not act on the arm. Its target is a mocap body, and so belongs to the state. An episode is a success
 while the distance, averaged over ten steps, is under 5 cm. With ``random_start`` one episode in five begins with the
-palm inside the table, which throws it out.
+palm inside the table, whose contact forces push it out.
 """
 
 import mujoco
@@ -173,7 +173,7 @@ def arm() -> mujoco.MjSpec:
 
 
 def scenery(spec: mujoco.MjSpec) -> None:
-    """What only a video shows."""
+    """Add a sky, a table's material, a light and a camera, which only a video shows."""
     texture, pattern = mujoco.mjtTexture, mujoco.mjtBuiltin
     spec.add_texture(
         name="sky", type=texture.mjTEXTURE_SKYBOX, builtin=pattern.mjBUILTIN_GRADIENT,

@@ -53,7 +53,7 @@ CHECKS: tuple[Callable[[Context], None], ...] = (
 @document_attributes
 @dataclasses.dataclass
 class Report:
-    """The rules that a task kept on an engine."""
+    """The result of ``check_task``: a task keeps every rule on an engine."""
 
     task: str
     """The task's name."""

@@ -23,7 +23,7 @@ def check_round_trip(ctx: Context) -> None:
 
 
 def check_restoring(ctx: Context) -> None:
-    """Steps after ``set_state`` equal those that followed the state before, also in another environment."""
+    """Steps after ``set_state`` repeat those that first followed the state, also in another environment."""
     a, b = ctx.a, ctx.b
     ctx.restart()
     ctx.run(a, ctx.actions(7))

@@ -13,7 +13,7 @@ def new_figure(purpose: str, width: float, height: float) -> Any:
     """Make a figure, without pyplot: it needs no display, and shares no state with a user's own figures.
 
     Args:
-        purpose: What is drawn, for the error message.
+        purpose: Name of the drawing, for the error message.
         width: Width in inches.
         height: Height in inches.
 

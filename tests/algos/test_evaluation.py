@@ -5,7 +5,6 @@ import pytest
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.algos.evaluation import moved
 
 
 def test_evaluate_leaves_no_gradients() -> None:
@@ -53,8 +52,3 @@ def test_parameters_of_each_world_reach_the_worlds_of_the_mean_policy() -> None:
     env.set_params(success_distance=9.0)
     it = next(npg)
     assert it.mean_success == it.success == 1.0
-
-
-def test_a_module_on_the_right_device_is_not_copied() -> None:
-    policy = lw.GaussianPolicy(6, 2)
-    assert moved(policy, lw.make("point_mass")) is policy

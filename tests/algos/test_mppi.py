@@ -180,7 +180,7 @@ def test_an_action_is_a_copy_of_the_plans_first_row() -> None:
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("how", ["reward", "physics", "value"])
 def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
-    """After a reward or value that is not a number, or a roll-out that diverges."""
+    """After a reward or value that is not a number, or a rollout that diverges."""
     settings: dict[str, Any] = dict(horizon=4, samples=40, smoothing=(1, 0, 0), temperature=1.0, engine=engine)
     if how == "physics":
         # motors so strong that only small actions keep MuJoCo's accelerations, and Warp's velocities, under 1e10

@@ -2,7 +2,8 @@
 
 import torch
 
-from lyceum_warp.algos.networks import Normalizer
+import lyceum_warp as lw
+from lyceum_warp.algos.networks import Normalizer, moved
 
 
 def test_normalizer_has_mean_and_variance_of_all_portions_together() -> None:
@@ -14,3 +15,8 @@ def test_normalizer_has_mean_and_variance_of_all_portions_together() -> None:
     normalized = normalizer(obs)
     torch.testing.assert_close(normalized.mean(0), torch.zeros(4), atol=1e-3, rtol=0)
     torch.testing.assert_close(normalized.std(0), torch.ones(4), atol=1e-2, rtol=0)
+
+
+def test_a_module_on_the_right_device_is_not_copied() -> None:
+    policy = lw.GaussianPolicy(6, 2)
+    assert moved(policy, lw.make("point_mass")) is policy

@@ -211,7 +211,7 @@ def test_the_target_has_no_contacts(ours: lw.Env) -> None:
 
 
 def test_model_is_theirs_except_for_the_target_and_a_doubled_pair(shared_env: SharedEnv) -> None:
-    """Their environment sets the actuators' gains anew when it is made."""
+    """Their environment resets the actuators' gains when it is made."""
     ours, theirs = shared_env("adroit_pen").model, AdroitHandPenEnv().model
     assert ours.npair == theirs.npair - 1
     for name in (

@@ -26,7 +26,7 @@ def run_cell(module: types.ModuleType, file: Path) -> None:
 
 
 def test_a_task_keeps_the_functions_of_its_own_cell(notebook: types.ModuleType, tmp_path: Path) -> None:
-    """Each cell defines World, Params and observe anew; only the first one defines evaluate."""
+    """Each cell redefines World, Params and observe; only the first one defines evaluate."""
     evaluate = "def evaluate(s: World, p: Params) -> float:\n    return 1.0"
     first = tiny_task.with_function(evaluate)
     second = tiny_task.changed(("s.qpos[0]", "2.0"), ("class Tiny", "class Other"))

@@ -20,7 +20,7 @@ from lyceum_warp.mujoco_log import quiet
 from lyceum_warp.validate import whole_number
 
 _BATCH_BYTES = 150
-"""What ``Batch`` keeps for each world beside its state: warnings, a status, the message of an error."""
+"""Bytes that ``Batch`` keeps for each world beside its state: warnings, a status, the message of an error."""
 
 _MJDATA_BYTES = 165_000
 """An MjData without its buffer and arena, most of it statistics of the solver (measured with MuJoCo 4.0)."""

@@ -1,4 +1,4 @@
-"""Open-loop roll-outs on the C engine: the whole horizon of every world in one native call."""
+"""Open-loop rollouts on the C engine: the whole horizon of every world in one native call."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -26,7 +26,7 @@ def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
 
 
 class NativeRollout:
-    """Rolls out the worlds of a batch, which are then where the roll-outs ended.
+    """Rolls out the worlds of a batch, and leaves them at the ends of their rollouts.
 
     Args:
         batch: The worlds; no field of it is bound yet.

@@ -1,4 +1,4 @@
-"""The order of contacts and constraint rows, which MuJoCo Warp 4.0 leaves to chance on a GPU; see ``order_kernels``."""
+"""The order of contacts and constraint rows, which MuJoCo Warp 4.0 does not fix on a GPU; see ``order_kernels``."""
 
 import dataclasses
 from collections.abc import Callable

@@ -23,10 +23,10 @@ _FEW = 256
 
 
 class DeterministicEngine(WarpEngine):
-    """A Warp engine that takes the same steps to the bit each time, as every engine does on the CPU.
+    """A Warp engine whose steps on a CUDA device repeat to the bit, as those of every engine do on the CPU.
 
-    It puts contacts and constraint rows in order, has MuJoCo Warp sum in a fixed order, and shares the memory that this
-    takes among all launches. Its arguments are those of ``WarpEngine``.
+    It sorts contacts and constraint rows, makes MuJoCo Warp sum in a fixed order, and shares the memory for this among
+    all launches. Its arguments are those of ``WarpEngine``.
     """
 
     partial_refresh = False

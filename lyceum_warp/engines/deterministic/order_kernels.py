@@ -40,7 +40,10 @@ class Contacts:
 def contact_keys(
     ncontact_in: wp.array[int], contacts: Contacts, nmax: int, key_out: wp.array[wp.int64], place_out: wp.array[int]
 ):
-    """Keys of 24 bits for the world, 14 for each geom, 11 for the place within the pair; unused places come last."""
+    """Compute the contacts' keys for sorting; launched over (naconmax,).
+
+    A key has 24 bits for the world, 14 for each geom, and 11 for the place within the pair. Unused places come last.
+    """
     c = wp.tid()
     place_out[c] = c
     key = _NO_CONTACT
@@ -63,7 +66,7 @@ def _move(source: wp.array2d[int], i: int, target: wp.array2d[int], j: int):
 def gather_contacts(
     ncontact_in: wp.array[int], place_in: wp.array[int], sort: bool, nmax: int, source: Contacts, target: Contacts
 ):
-    """Copy contacts into their new order, or, without ``sort``, back as they are."""
+    """Copy contacts into their new order, or unchanged without ``sort``; launched over (naconmax,)."""
     c = wp.tid()
     if c >= wp.min(ncontact_in[0], nmax):
         return
@@ -128,7 +131,7 @@ def _object(rows: Rows, eq_type: wp.array[int], w: int, r: int) -> int:
 
 @wp.kernel(enable_backward=False)
 def rank_rows(nrow_in: wp.array[int], eq_type_in: wp.array[int], rows: Rows, rank_out: wp.array2d[int]):
-    """The new place of each row."""
+    """Find the new place of each row; launched over (nworld, njmax)."""
     w, r = wp.tid()
     n = int(wp.min(nrow_in[w], rank_out.shape[1]))
     if r >= n:
@@ -157,7 +160,7 @@ def move_rows(
     source: Rows,
     target: Rows,
 ):
-    """Copy rows to their new places, or, without ``sort``, back as they are; each with ``lanes`` threads."""
+    """Copy rows to their new places, or unchanged without ``sort``; launched over (nworld, njmax, lanes)."""
     w, r, lane = wp.tid()
     if r >= int(wp.min(nrow_in[w], rank_in.shape[1])):
         return
@@ -195,7 +198,7 @@ def move_rows(
 
 @wp.kernel(enable_backward=False)
 def move_addresses(ncontact_in: wp.array[int], rank_in: wp.array2d[int], nmax: int, contacts: Contacts):
-    """Write the new places of their rows into contacts."""
+    """Write the new places of their rows into contacts; launched over (naconmax, rows of a contact)."""
     c, i = wp.tid()
     if c < wp.min(ncontact_in[0], nmax):
         row = contacts.efc_address[c, i]

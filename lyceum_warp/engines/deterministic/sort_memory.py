@@ -46,7 +46,7 @@ class Scratch(Reserve):
             yield
 
     def allocate(self, size_in_bytes: int) -> int:
-        """An address with so many bytes behind it, from a new block once the reserve is used up."""
+        """The address of so many free bytes, from a new block once the reserve is used up."""
         # Warp makes these buffers on a stream of their own, outside the capture; everything else belongs to the graph
         if not self.device.is_capturing or self.device.stream.is_capturing:
             return int(self.below.allocate(size_in_bytes))

@@ -1,4 +1,4 @@
-"""How many contacts and constraints a model needs, measured on random roll-outs."""
+"""The number of contacts and constraints that a model needs, measured on random rollouts."""
 
 import contextlib
 import hashlib
@@ -16,7 +16,7 @@ _known: dict[str, tuple[int, int]] = {}
 
 
 def probe_sizes(model: mujoco.MjModel) -> tuple[int, int]:
-    """Contacts and constraints to make room for in each world: twice the peak of random roll-outs.
+    """Contacts and constraints to make room for in each world: twice the peak of random rollouts.
 
     32 worlds start in the model's initial state or a keyframe, half of them with random velocities, and take
     500 substeps on the C engine under random controls held for 20. The result is remembered for each model.

@@ -8,7 +8,7 @@ import mujoco_warp as mjw
 import warp as wp
 
 _TEMPORARIES = 1.25
-"""A world's memory relative to that of MuJoCo Warp's data. The temporary arrays of a step were measured at 1 to 9 % of
+"""Ratio of a world's memory to that of MuJoCo Warp's data. The temporary arrays of a step were measured at 1 to 9 % of
 it; the rest is for graphs and for the group of a partial forward pass. Graphs on the CPU, where this engine is for
 tests, keep all temporary arrays and take up to three times as much."""
 
@@ -43,7 +43,7 @@ def _bytes_of(data: Any) -> int:
 
 
 def _margin(model: mujoco.MjModel) -> float:
-    """A world's memory relative to its data's: more where collisions or the solver need large temporary arrays."""
+    """Ratio of a world's memory to that of its data; larger with convex collisions or the noslip solver."""
     collides = (model.geom_contype | model.geom_conaffinity) != 0
     kinds = [int(kind) for kind in model.geom_type[collides]]
     convex = not _CONVEX.isdisjoint(kinds) or kinds.count(int(mujoco.mjtGeom.mjGEOM_BOX)) > 1

@@ -1,4 +1,4 @@
-"""MuJoCo Warp's overflow bits, sorted into our own faults."""
+"""Faults from MuJoCo Warp's overflow bits."""
 
 import mujoco_warp as mjw
 import warp as wp

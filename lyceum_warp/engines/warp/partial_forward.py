@@ -16,7 +16,7 @@ _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
 def group_size(nworld: int, device: wp.Device) -> int:
-    """Worlds of a group: more than usually restart in one step, few enough to cost little."""
+    """Worlds of a group: more than usually restart in one step, and few enough for a cheap forward pass."""
     return min(nworld, max(1 if device.is_cpu else 64, nworld // 16))
 
 
@@ -130,7 +130,7 @@ class Arena(Reserve):
             self._serving = False
 
     def allocate(self, size_in_bytes: int) -> int:
-        """An address with so many bytes behind it."""
+        """The address of so many free bytes."""
         start = self._used
         self._used += aligned(size_in_bytes)
         if not self._serving:

@@ -8,7 +8,7 @@ import warp as wp
 
 @wp.kernel(enable_backward=False)
 def rank_worlds(mask_in: wp.array[bool], rank_out: wp.array[int], count_inout: wp.array[int]):
-    """Number the masked worlds, in no particular order, from a count of 0 on."""
+    """Number the masked worlds, in no particular order, from a count of 0 on; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
         rank_out[w] = wp.atomic_add(count_inout, 0, 1)
@@ -16,7 +16,7 @@ def rank_worlds(mask_in: wp.array[bool], rank_out: wp.array[int], count_inout: w
 
 @wp.kernel(enable_backward=False)
 def next_group(count_in: wp.array[int], step: int, first_inout: wp.array[int], left_out: wp.array[int]):
-    """Advance by ``step`` worlds, and count how many are left from there on."""
+    """Advance by ``step`` worlds, and count how many are left from there on; launched over (1,)."""
     first = first_inout[0] + step
     first_inout[0] = first
     left_out[0] = wp.max(0, count_in[0] - first)
@@ -24,7 +24,7 @@ def next_group(count_in: wp.array[int], step: int, first_inout: wp.array[int], l
 
 @wp.kernel(enable_backward=False)
 def choose_group(mask_in: wp.array[bool], rank_in: wp.array[int], first_in: wp.array[int], world_out: wp.array[int]):
-    """The world in each place of a group."""
+    """Find the world in each place of a group; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
         place = rank_in[w] - first_in[0]
@@ -36,7 +36,7 @@ def choose_group(mask_in: wp.array[bool], rank_in: wp.array[int], first_in: wp.a
 def take_rows(
     world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array2d[float], target_out: wp.array2d[float]
 ):
-    """Copy rows of the worlds in a group into the group."""
+    """Copy rows of the worlds in a group into the group; launched over (places, width of a row)."""
     place, i = wp.tid()
     if place < left_in[0]:
         target_out[place, i] = source_in[world_in[place], i]
@@ -46,7 +46,7 @@ def take_rows(
 def return_rows(
     world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array2d[float], target_out: wp.array2d[float]
 ):
-    """Copy rows of a group into the worlds that they belong to."""
+    """Copy rows of a group into the worlds that they belong to; launched over (places, width of a row)."""
     place, i = wp.tid()
     if place < left_in[0]:
         target_out[world_in[place], i] = source_in[place, i]
@@ -54,7 +54,7 @@ def return_rows(
 
 @wp.kernel(enable_backward=False)
 def return_bits(world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array[int], target_inout: wp.array[int]):
-    """Add bits of a group to those of the worlds that they belong to."""
+    """Add bits of a group to those of the worlds that they belong to; launched over (places,)."""
     place = wp.tid()
     if place < left_in[0]:
         world = world_in[place]

@@ -54,7 +54,7 @@ class WarpEngine(Engine):
     capturable = True
 
     partial_refresh = True
-    """Whether restarting worlds get a forward pass of their own, where the cheap parts of it are not enough."""
+    """Whether restarting worlds get a separate forward pass if its cheap parts are not enough."""
 
     def __init__(
         self,
@@ -225,7 +225,7 @@ class WarpEngine(Engine):
 
 @contextlib.contextmanager
 def _refusals() -> Iterator[None]:
-    """Say how to go on where MuJoCo Warp refuses a model."""
+    """Add the remedy to the error of a model that MuJoCo Warp refuses."""
     try:
         yield
     except (NotImplementedError, ValueError) as error:
@@ -263,6 +263,6 @@ def _parts(names: Collection[str]) -> list[Callable[[mjw.Model, mjw.Data], None]
 
 
 def _contacts_of_one_world(model: mjw.Model) -> int:
-    """Room for a world in which everything touches everything, which is about to be reset."""
+    """Contacts of a single world in which all bodies touch; such a world is about to be reset."""
     pairs = len(model.nxn_geom_pair_filtered)
     return int(min(max(256, 4 * pairs), 4096))
