@@ -231,7 +231,7 @@ class Env:
         """Put worlds into random initial states, with zero actions.
 
         Args:
-            seed: Starts the worlds' random streams anew; by default each world continues its own.
+            seed: Restarts the worlds' random streams; by default each world continues its own.
             mask: Which worlds, (nworld,) bool; all by default.
         """
         worlds = self.worlds

@@ -259,7 +259,7 @@ class Worlds:
         self._judge(self.everyone, self._no_fault, self._no_fault, transition=True)
 
     def seed_streams(self, seed: int) -> None:
-        """Start the random streams of the masked worlds anew."""
+        """Restart the random streams of the masked worlds."""
         self._seed.fill_(seed)
         args = [self.mask, self._seed, self.first_world, self.key, self.episode]
         wp.launch(random.seed_worlds, self.nworld, args, device=self.device)

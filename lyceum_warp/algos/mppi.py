@@ -44,7 +44,7 @@ Value: TypeAlias = ValueFunction | wp.Function | Callable[[torch.Tensor], torch.
 
 @document_attributes
 class MPPI:
-    """A controller that plans anew at every step: ``action = plan(state)``.
+    """A controller that plans again at every step: ``action = plan(state)``.
 
     The planner simulates in worlds of its own, one for each sample. It controls a plant: an environment, with
     ``plan(env.get_state()[0])``, or a robot, with ``plan(plan.state_of(qpos=..., qvel=..., time=...))``. The plant's

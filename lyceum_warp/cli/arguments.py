@@ -3,42 +3,53 @@
 import ast
 import dataclasses
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
 
 from lyceum_warp.docstrings import attribute_docs
-from lyceum_warp.options import PhysicsOptions
+from lyceum_warp.options import OPTIONS, EnvOptions, PhysicsOptions
 
-Words = tyro.conf.UseAppendAction[tuple[str, ...]]
-"""A flag that may be given several times."""
+Repeated = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")]
+"""A flag that may be given several times, each time with one NAME=VALUE."""
 
 Class = TypeVar("Class")
 
 
 @typing.dataclass_transform(kw_only_default=True, frozen_default=True)
-def optional_flags(options: type, *, default: str = "") -> Callable[[type[Class]], type[Class]]:
-    """Class decorator: add the fields of a dataclass as flags, each None (or False) unless it is given.
+def optional_flags(
+    options: type, *, omit: Collection[str] = (), default: str | None = None
+) -> Callable[[type[Class]], type[Class]]:
+    """Class decorator: add the fields of a dataclass as flags, with their docstrings as help texts.
 
-    Help texts are the docstrings of the fields. The class declares those fields itself that a shell writes in another
-    way, and those of more than one type. Values are checked when the dataclass is made of them, not before.
+    The class itself declares the fields that need another type or another help text in a shell. It must declare those
+    of more than one type. Values are checked when the dataclass is made of them, not before: the parser would print an
+    error as several lines in a box.
 
     Args:
         options: The dataclass.
-        default: How the help text describes the default of a flag.
+        omit: Fields that get no flag.
+        default: The default of a flag as its help text describes it. Flags that are not given then are None, but bools
+            keep their defaults. Without this text all flags have the defaults of the dataclass.
     """
 
     def decorated(cls: type[Class]) -> type[Class]:
         own = dict(vars(cls).get("__annotations__", {}))
         hints, docs = typing.get_type_hints(options), attribute_docs(options) | attribute_docs(cls)
+        inherited = getattr(cls, "__dataclass_fields__", {})
         flags: dict[str, Any] = {}
         for field in dataclasses.fields(options):
+            if field.name in omit or (field.name in inherited and field.name not in own):
+                continue
             if field.name not in vars(cls):
-                setattr(cls, field.name, False if field.default is False else None)
-            flag = own.pop(field.name, None) or _optional(hints[field.name])
-            hint = default if getattr(cls, field.name) is None else None
+                unset = default is not None and not isinstance(field.default, bool)
+                setattr(cls, field.name, None if unset else field.default)
+            value = getattr(cls, field.name)
+            flag = own.pop(field.name, None) or (_optional(hints[field.name]) if value is None else hints[field.name])
+            # a docstring says what None stands for
+            hint = default or "" if value is None else None
             text = " ".join(docs.get(field.name, "").split())
             flags[field.name] = Annotated[flag, tyro.conf.arg(help=text, help_behavior_hint=hint)]
         cls.__annotations__ = flags | own
@@ -49,26 +60,55 @@ def optional_flags(options: type, *, default: str = "") -> Callable[[type[Class]
 
 def _optional(hint: Any) -> Any:
     """The annotation of a flag that may be left out, for a field of one type, or of one type and None."""
-    if hint is bool:
-        return bool
     (kind,) = [kind for kind in typing.get_args(hint) if kind is not type(None)] or [hint]
     return Annotated[kind | None, tyro.conf.arg(metavar=kind.__name__.upper())]
+
+
+def given(flags: Any) -> dict[str, Any]:
+    """The flags that differ from their defaults, by name."""
+    values = {field.name: (getattr(flags, field.name), field.default) for field in dataclasses.fields(flags)}
+    return {name: value for name, (value, default) in values.items() if value != default}
+
+
+NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "nvtx", "model", "fields", "physics")
+"""Options of an environment that do not become flags automatically: commands define nworld, seed and the model in their
+own way, Physics has the flags of ``physics``, and the others are for programs in Python."""
+
+
+@optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"))
+class Placement:
+    """Where the worlds run."""
+
+    engine: str = "auto"
+    """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU."""
+    device: str = "cpu"
+    """cpu, or a CUDA device such as cuda:0."""
+
+
+@optional_flags(EnvOptions, omit=NO_FLAGS)
+class EnvFlags(Placement):
+    """Where the worlds run, and how their episodes go."""
+
+    @classmethod
+    def of(cls, options: EnvOptions) -> "EnvFlags":
+        """The flags that stand for options."""
+        return cls(**{field.name: getattr(options, field.name) for field in dataclasses.fields(cls)})
 
 
 @optional_flags(PhysicsOptions)
 class Physics:
     """How the worlds are simulated. Options that are left out are those of the task or of its model."""
 
-    solver: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    solver: Repeated = ()
     """Another limit of the constraint solver than the model's, as iterations=4, ls_iterations=10 or
     noslip_iterations=0; may be given several times."""
 
     @classmethod
-    def of(cls, config: Mapping[str, Any]) -> "Physics":
-        """The flags of a run's config.json; options that it does not name have their defaults."""
-        saved = dict(config.get("physics", {}))
-        solver = saved.pop("solver", None) or {}
-        return cls(solver=tuple(f"{name}={limit}" for name, limit in solver.items()), **saved)
+    def of(cls, options: PhysicsOptions) -> "Physics":
+        """The flags that stand for options."""
+        values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+        limits = values.pop("solver") or {}
+        return cls(solver=tuple(f"{name}={limit}" for name, limit in limits.items()), **values)
 
     def options(self) -> PhysicsOptions:
         """The options that the flags stand for.
@@ -77,6 +117,45 @@ class Physics:
             ValueError: A value is not valid.
         """
         return PhysicsOptions(**vars(self) | {"solver": dict(map(parameter, self.solver))})
+
+
+def run_options(config: Mapping[str, Any]) -> tuple[EnvOptions, dict[str, Any]]:
+    """The options of a run's environment, except nworld and seed, and the task's parameters, from its config.json.
+
+    Earlier releases accepted options as --param and stored them under "params", or had no "physics".
+
+    Raises:
+        ValueError: A value is not valid.
+    """
+    words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
+    return EnvOptions.split(words, EnvOptions(engine=config["engine"], device=config["device"]))
+
+
+def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """The parameters of a task from the texts of a repeated flag, each NAME=VALUE.
+
+    Args:
+        texts: The texts.
+        command: The command's arguments: their flags are named where a text sets an option.
+        instead: The flags of options that the command calls by another name.
+
+    Raises:
+        ValueError: A text is written in another way, or sets an option.
+    """
+    found: dict[str, Any] = {}
+    for text in texts:
+        name = text.partition("=")[0].strip()
+        if name in OPTIONS:
+            flags = {flag: f"--{flag.replace('_', '-')}" for flag in _flag_names(command)} | dict(instead or {})
+            way = f"use {flags[name]}" if name in flags else "this command has no flag for it"
+            raise ValueError(f"{name} is an option, not a parameter of the task: {way}")
+        found.update([parameter(text)])
+    return found
+
+
+def _flag_names(command: Any) -> list[str]:
+    nested = ([name] if not dataclasses.is_dataclass(v) else _flag_names(v) for name, v in vars(command).items())
+    return [name for names in nested for name in names]
 
 
 def portable(task: str) -> str:

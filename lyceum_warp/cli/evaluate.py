@@ -9,12 +9,26 @@ import tyro
 from rich.table import Table
 
 from lyceum_warp.algos.evaluation import Episodes, evaluate
-from lyceum_warp.cli.arguments import Physics
+from lyceum_warp.cli.arguments import NO_FLAGS, given, optional_flags, run_options
 from lyceum_warp.cli.display import make_console, policy_video
 from lyceum_warp.engines.placement import options_for_few_worlds
 from lyceum_warp.env import Env
+from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs import Run, load
 from lyceum_warp.viz.video import check_video
+
+
+@optional_flags(EnvOptions, omit=NO_FLAGS, default="(default: the run's)")
+class OtherEnv:
+    """Other options than the run's."""
+
+    engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
+    """mujoco (the C engine, on CPU cores), warp, or auto."""
+    device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
+    """cpu, or a CUDA device such as cuda:0. Without this flag a run whose engine is auto is evaluated on the CPU: a few
+    worlds step fastest there."""
+    horizon: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Steps after which an episode is truncated, 0 for never."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,13 +46,9 @@ class Eval:
     """Seed of the initial states."""
     nworld: int = 32
     """Largest number of worlds; never more than episodes."""
-    engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """Another engine than the run's: mujoco, warp or auto."""
-    device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """Another device than the run's. By default the run's, or the CPU if the run's engine is auto: a few worlds step
-    fastest there."""
     video: bool = False
     """Whether to write a video of one episode, eval.mp4 in the run's folder."""
+    env: tyro.conf.OmitArgPrefixes[OtherEnv] = dataclasses.field(default_factory=OtherEnv)
 
 
 def evaluate_run(options: Eval) -> int:
@@ -50,11 +60,11 @@ def evaluate_run(options: Eval) -> int:
     run = Run.open(options.run)
     config = run.config
     nworld = min(options.nworld, options.episodes)
-    engine, device = options.engine or config["engine"], options.device or config["device"]
-    where = {"engine": engine, "device": device} | Physics.of(config).options().given() | config["params"]
-    if options.device is None:
-        where |= options_for_few_worlds(engine, device)
-    env = Env(config["task"], nworld=nworld, **where)
+    known, params = run_options(config)
+    known = known.changed({"nworld": nworld} | given(options.env))
+    if options.env.device is None:
+        known = known.changed(options_for_few_worlds(known.engine, known.device))
+    env = Env(config["task"], known, **params)
     policy = load(run, device=env.obs.device)
     sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
     if sizes != wanted:

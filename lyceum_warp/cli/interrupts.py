@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as an exception, at once or at a time of the program's choice."""
+"""Ctrl-C and SIGTERM as an exception, at once or postponed until the caller handles it."""
 
 import contextlib
 import signal

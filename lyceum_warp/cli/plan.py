@@ -13,7 +13,7 @@ from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.mppi_config import MPPIConfig
 from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.cli.arguments import Physics, Words, optional_flags, parameter, portable
+from lyceum_warp.cli.arguments import Physics, Placement, Repeated, given, optional_flags, parameters, portable
 from lyceum_warp.cli.display import PlanDisplay, make_console, plotted_control, report_table, states_video
 from lyceum_warp.cli.interrupts import Interrupted
 from lyceum_warp.control.control_report import control_report
@@ -21,7 +21,6 @@ from lyceum_warp.control.loop import control
 from lyceum_warp.control.real_time import control_async
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
-from lyceum_warp.options import OPTIONS
 from lyceum_warp.runs import Run, load_value
 from lyceum_warp.validate import whole_number
 
@@ -35,7 +34,6 @@ class Settings:
     covariance only in Python)."""
     smoothing: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="B0 B1 B2")] = None
     fill: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="WORD|FLOAT ...")] = None
-    """What fills the end of a plan that moves forward: zero, repeat, or an action, one number or one for each."""
     termination: Annotated[str | None, tyro.conf.arg(metavar="stop|ignore")] = None
 
     def on_top_of(self, config: MPPIConfig) -> MPPIConfig:
@@ -44,12 +42,12 @@ class Settings:
         Raises:
             ValueError: A setting is not valid.
         """
-        given = {name: value for name, value in vars(self).items() if value is not None}
+        settings = given(self)
         if self.fill is not None:
-            given["fill"] = _fill(self.fill)
+            settings["fill"] = _fill(self.fill)
         if self.noise is not None and len(self.noise) == 1:
-            given["noise"] = self.noise[0]
-        return dataclasses.replace(config, **given)
+            settings["noise"] = self.noise[0]
+        return dataclasses.replace(config, **settings)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,15 +84,9 @@ class Plan:
     """The folder, new or empty; runs/plan-TASK-DATE by default."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
     """NPG run whose value function gives the value of the state where a plan ends."""
-    engine: str = "auto"
-    """Engine of the planner: mujoco (C, on CPU cores), warp, or auto. The controlled world runs on mujoco."""
-    device: str = "cpu"
-    """Device of the planner: cpu, or a CUDA device such as cuda:0."""
-    nthread: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Threads of the planner's mujoco engine; all cores by default."""
-    param: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    param: Repeated = ()
     """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf; may be given several times."""
-    planner_param: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    planner_param: Repeated = ()
     """Another value of a parameter, only for the planner."""
     planner_model: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Another model, only for the planner."""
@@ -102,6 +94,8 @@ class Plan:
     """Whether to make a video of the first episode."""
     plot: bool = True
     """Whether to draw rewards, planning times and ages."""
+    planner: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
+    """Where the planner's worlds run. The controlled world runs on one thread of the mujoco engine."""
     mppi: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
     planner_physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
@@ -119,36 +113,40 @@ def plan(options: Plan) -> int:
     Run.check_free(out, resumable=False)
     # every wrong option is found before the folder is made
     torch.set_num_threads(1)
-    plant, planner = _worlds(options)
+    params, planner_params = _parameters(options)
+    plant, planner = _worlds(options, params, planner_params)
     config = {
-        "algorithm": "mppi", "task": portable(options.task), "params": dict(map(parameter, options.param)),
-        "planner": planner.settings, "planner_params": dict(map(parameter, options.planner_param)),
+        "algorithm": "mppi", "task": portable(options.task), "params": params,
+        "planner": planner.settings, "planner_params": planner_params,
         "planner_model": options.planner_model and str(_model(options.planner_model)),
-        "value": options.value and str(options.value.resolve()), "engine": planner.env.engine.name,
-        "device": options.device, "nthread": options.nthread, "episodes": options.episodes, "steps": options.steps,
+        "value": options.value and str(options.value.resolve()), **vars(options.planner),
+        "engine": planner.env.engine.name, "episodes": options.episodes, "steps": options.steps,
         "seed": options.seed, "real_time": options.real_time, "rate": options.rate,
     }  # fmt: skip
-    return _run(Run.create(out, config, device=options.device), plant, planner, options)
+    return _run(Run.create(out, config, device=options.planner.device), plant, planner, options)
 
 
-def _worlds(options: Plan) -> tuple[Env, MPPI]:
+def _parameters(options: Plan) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The parameters of the task, and those of them that are different for the planner."""
+    both = {"model": "--planner-model"}
+    return (
+        parameters(options.param, options, instead=both | {"horizon": "--steps"}),
+        parameters(options.planner_param, options, instead=both | {"nworld": "--samples"}),
+    )
+
+
+def _worlds(options: Plan, params: dict[str, Any], planner_params: dict[str, Any]) -> tuple[Env, MPPI]:
     """The world to control, and its planner."""
-    params = dict(map(parameter, options.param))
     steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
     if plant.horizon == 0:
         raise ValueError(f"episodes of {plant.task.name!r} never end without a horizon: give --steps")
     value = None if options.value is None else load_value(options.value)
     config = options.mppi.on_top_of(task_config(plant.task.task, value))
-    words: dict[str, Any] = {"engine": options.engine, "device": options.device}
-    words |= options.planner_physics.options().given()
-    if options.nthread is not None:
-        words["nthread"] = options.nthread
+    words = vars(options.planner) | options.planner_physics.options().given()
     if options.planner_model is not None:
         words["model"] = _model(options.planner_model)
-    params |= map(parameter, options.planner_param)
-    words |= {name: params.pop(name) for name in [*params] if name in OPTIONS}
-    return plant, MPPI(plant.task.task, config, value=value, params=params, **words)
+    return plant, MPPI(plant.task.task, config, value=value, params=params | planner_params, **words)
 
 
 def _fill(words: tuple[str, ...]) -> Any:

@@ -18,7 +18,17 @@ from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
 from lyceum_warp.binding.registry import find_task, task_name, task_names
-from lyceum_warp.cli.arguments import Physics, Words, parameter, portable, spelled
+from lyceum_warp.cli.arguments import (
+    EnvFlags,
+    Physics,
+    Repeated,
+    given,
+    optional_flags,
+    parameters,
+    portable,
+    run_options,
+    spelled,
+)
 from lyceum_warp.cli.display import Display, curve_table, make_console, plotted, policy_video
 from lyceum_warp.cli.interrupts import Interrupted, postponed
 from lyceum_warp.engines.placement import engine_name
@@ -30,11 +40,9 @@ from lyceum_warp.versions import versions
 _FINAL_EPISODES = 32
 
 
-class NPGOptions(NPGConfig):
+@optional_flags(NPGConfig)
+class NPGOptions:
     """Hyperparameters of the natural policy gradient."""
-
-    def __post_init__(self) -> None:
-        """Check nothing yet: the parser would print an error as several lines in a box."""
 
     def checked(self) -> NPGConfig:
         """The hyperparameters.
@@ -42,7 +50,7 @@ class NPGOptions(NPGConfig):
         Raises:
             ValueError: A value is of the wrong type, out of range or not finite.
         """
-        return NPGConfig(**dataclasses.asdict(self))
+        return NPGConfig(**vars(self))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,7 +67,8 @@ class Train:
     $ lyceum-warp train --resume runs/mine --iterations 200
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
-    Processes that torchrun starts share the worlds, also on several machines. Their number changes only the rounding
+    Processes that torchrun starts share the worlds, also on several machines. With --device cuda each process takes the
+    GPU of its number. Their number changes only the rounding
     of the results, and a run may continue with another number. The first process writes files and messages. After
     Ctrl-C or SIGTERM, to torchrun or to any process, all processes finish the iteration and end together; torchrun
     waits for them for 30 s, or for its --shutdown-timeout.
@@ -75,18 +84,14 @@ class Train:
     """The run's folder, new or empty; runs/TASK-DATE by default."""
     resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Continue the run in this folder, exactly and with all its settings, up to --iterations."""
-    engine: str = "auto"
-    """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU."""
-    device: str = "cpu"
-    """cpu, or a CUDA device such as cuda:0. Under torchrun each process takes the GPU of its number."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Worlds of all processes together; by default 64, or 4096 for each GPU. Each makes samples / nworld steps in an
     iteration: whole episodes where those fit (as in the paper: 10 worlds for 10,000 samples and episodes of 1,000
     steps), otherwise segments of episodes."""
     threads: int = 1
     """Threads of torch on the CPU. Small networks gain little from more. Runs are equal to the bit only with the same
-    number. The mujoco engine uses all cores in any case."""
-    param: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    number. They are not the threads of the mujoco engine, which are --nthread."""
+    param: Repeated = ()
     """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf; may be given several times."""
     video: bool = True
     """Whether to write a video of one episode of the trained policy at the end."""
@@ -94,20 +99,21 @@ class Train:
     """Whether to draw the learning curve at the end."""
     require_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Exit with code 1 unless the trained mean policy's return exceeds this."""
+    env: tyro.conf.OmitArgPrefixes[EnvFlags] = dataclasses.field(default_factory=EnvFlags)
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
     npg: tyro.conf.OmitArgPrefixes[NPGOptions] = dataclasses.field(default_factory=NPGOptions)
 
 
 def train(options: Train) -> int:
     """Run the command; returns the exit code."""
-    with join(options.device) as team:
+    with join(options.env.device) as team:
         with team.together():
             # every mistake in the options is found before the folder is made
             config, out = _config(options, team), _folder(options)
             if team.leads:
                 Run.check_free(out)
             npg = _algorithm(config, team)
-            run = Run.create(out, config, device=options.device) if team.leads else None
+            run = Run.create(out, config, device=options.env.device) if team.leads else None
         return _learn(run, npg, options)
 
 
@@ -118,14 +124,16 @@ def _config(options: Train, team: Team) -> dict[str, Any]:
     find_task(options.task)
     npg, nworld = options.npg.checked(), options.nworld
     if nworld is None:
-        nworld = 4096 * team.size if options.device.startswith("cuda") else 64
+        nworld = 4096 * team.size if options.env.device.startswith("cuda") else 64
+    others = {name: value for name, value in given(options.env).items() if name not in ("engine", "device")}
     return {
         "algorithm": "npg",
         "task": portable(options.task),
-        "params": dict(parameter(text) for text in options.param),
+        "params": parameters(options.param, options),
         "physics": options.physics.options().given(),
-        "engine": options.engine,
-        "device": options.device,
+        "engine": options.env.engine,
+        "device": options.env.device,
+        "options": others,
         "nworld": nworld,
         "threads": options.threads,
         "seed": options.seed,
@@ -148,16 +156,16 @@ def saved_options(folder: Path) -> Train:
     """
     config = Run.open(folder).config
     try:
-        npg = NPGOptions(**dataclasses.asdict(_hyperparameters(config)))
+        npg = NPGOptions(**vars(_hyperparameters(config)))
+        known, params = run_options(config)
         for name in ("iterations", "seed", "nworld", "threads"):
             if not isinstance(config[name], int):
                 raise TypeError(f"{name} is {config[name]!r}")
         return Train(
             task=config["task"], iterations=config["iterations"], seed=config["seed"], resume=folder,
-            engine=config["engine"], device=config["device"], nworld=config["nworld"],
-            threads=config["threads"],
-            param=tuple(f"{name}={spelled(value)}" for name, value in config["params"].items()),
-            physics=Physics.of(config), npg=npg,
+            nworld=config["nworld"], threads=config["threads"],
+            param=tuple(f"{name}={spelled(value)}" for name, value in params.items()),
+            env=EnvFlags.of(known), physics=Physics.of(known.physics), npg=npg,
         )  # fmt: skip
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{folder / 'config.json'} is not the configuration of an NPG run ({error})") from error
@@ -170,7 +178,7 @@ def resume(options: Train, folder: Path) -> int:
         options: The run's options, overridden by those on the command line.
         folder: The run's folder.
     """
-    with join(options.device) as team:
+    with join(options.env.device) as team:
         with team.together():
             run, npg = _reopened(options, folder, team)
         if team.leads:
@@ -208,11 +216,11 @@ def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, NPG]:
 
 def _settings(options: Train) -> dict[str, Any]:
     """The settings that a resumed run must keep."""
-    free = ("iterations", "out", "resume", "video", "plot", "require_return", "npg", "param", "physics")
+    free = ("iterations", "out", "resume", "video", "plot", "require_return", "npg", "param", "env", "physics")
     settings = {f.name: getattr(options, f.name) for f in dataclasses.fields(options) if f.name not in free}
     settings["task"] = portable(options.task or "")
-    settings["param"] = dict(parameter(text) for text in options.param)
-    return settings | dataclasses.asdict(options.physics.options()) | dataclasses.asdict(options.npg)
+    settings["param"] = parameters(options.param, options)
+    return settings | vars(options.env) | vars(options.physics.options()) | vars(options.npg)
 
 
 def _hyperparameters(config: dict[str, Any]) -> NPGConfig:
@@ -223,14 +231,12 @@ def _algorithm(config: dict[str, Any], team: Team) -> NPG:
     if config["threads"] < 1:
         raise ValueError(f"threads must be at least 1, not {config['threads']}")
     torch.set_num_threads(config["threads"])
-    options = Physics.of(config).options().given() | config["params"]
-    if team.neighbours > 1 and _engine(config) == "mujoco":
-        options["nthread"] = max(1, cpu_cores() // team.neighbours)
+    options, params = run_options(config)
+    if options.nthread is None and team.neighbours > 1 and _engine(config) == "mujoco":
+        options = options.changed({"nthread": max(1, cpu_cores() // team.neighbours)})
     nworld = team.share(config["nworld"])
-    env = Env(
-        config["task"], nworld=nworld, first_world=team.rank * nworld, engine=config["engine"],
-        device=team.device or config["device"], seed=config["seed"], **options,
-    )  # fmt: skip
+    own = {"nworld": nworld, "first_world": team.rank * nworld, "device": team.device or config["device"]}
+    env = Env(config["task"], options.changed(own | {"seed": config["seed"]}), **params)
     return NPG(env, config=_hyperparameters(config), seed=config["seed"], team=team)
 
 
@@ -283,7 +289,7 @@ def _headline(run: Run, npg: NPG, options: Train) -> str:
     processes = f" each in {npg.team.size} processes" if npg.team.size > 1 else ""
     return (
         f"[bold]{env.task.name}[/]: {env.obs_space.size} observations, {env.action_space.size} actions; "
-        f"{env.nworld} worlds{processes}, {_engine(run.config)} engine on {options.device}, "
+        f"{env.nworld} worlds{processes}, {_engine(run.config)} engine on {options.env.device}, "
         f"{'segments' if npg.segments else 'episodes'} of {npg.rollout.steps} steps; run in {run.folder}"
     )
 

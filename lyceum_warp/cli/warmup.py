@@ -9,7 +9,7 @@ import tyro
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig
-from lyceum_warp.cli.arguments import Physics, Words, parameter
+from lyceum_warp.cli.arguments import Physics, Placement, Repeated, parameters
 from lyceum_warp.cli.display import make_console
 from lyceum_warp.engines.memory import most_worlds
 from lyceum_warp.env import Env
@@ -31,34 +31,32 @@ class Warmup:
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
     """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
-    engine: str = "auto"
-    """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU."""
-    device: str = "cpu"
-    """cpu, or a CUDA device such as cuda:0."""
     nworld: int = 64
     """Number of worlds."""
     plan: bool = False
     """Whether to compile MPPI's kernels, too."""
     npg: bool = False
     """Whether to compile NPG's kernels, too."""
-    param: Annotated[Words, tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    param: Repeated = ()
     """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf; may be given several times."""
+    env: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
 
 def warm_up(options: Warmup) -> int:
     """Run the command; returns the exit code."""
-    more = options.physics.options().given() | dict(parameter(text) for text in options.param)
+    more = options.physics.options().given() | parameters(options.param, options)
     start, before = time.perf_counter(), cached()
-    env = Env(options.task, nworld=options.nworld, engine=options.engine, device=options.device, **more)
+    env = Env(options.task, nworld=options.nworld, **vars(options.env), **more)
     for _ in range(3):  # run directly, captured as graphs, replayed
         env.step()
     if options.npg:
         next(NPG(env, config=NPGConfig(samples=2 * env.nworld, mean_every=0)))
         env.replicate_few(1).step()  # evaluations of the mean policy
     if options.plan:
-        engine = env.engine.name  # auto would depend on the number of samples, which is not known here
-        plan = MPPI(options.task, engine=engine, device=options.device, **more)
+        # auto would depend on the number of samples, which is not known here
+        placement = vars(options.env) | {"engine": env.engine.name}
+        plan = MPPI(options.task, **placement, **more)
         for _ in range(3):
             plan(plan.state_of())
     new = cached().keys() - before.keys()

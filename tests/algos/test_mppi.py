@@ -458,9 +458,7 @@ def test_settings_cannot_be_assigned(name: str) -> None:
 @pytest.mark.parametrize("name", ["actions", "nominal", "standard_noise", "sampled", "returns", "weights"])
 def test_buffers_cannot_be_replaced(name: str) -> None:
     plan = MPPI("point_mass", horizon=3, samples=2)
-    with pytest.raises(
-        AttributeError, match=rf"plan.{name} is a buffer of fixed address: write into it, as plan.{name}"
-    ):
+    with pytest.raises(AttributeError, match=rf"plan.{name} is a buffer of fixed address: write into it"):
         setattr(plan, name, torch.zeros(3))
 
 

@@ -7,8 +7,23 @@ from typing import Annotated
 import pytest
 import tyro
 
-from lyceum_warp.cli.arguments import Physics, Words, optional_flags, parameter, portable, spelled
-from lyceum_warp.options import PhysicsOptions
+from lyceum_warp.cli.arguments import (
+    NO_FLAGS,
+    EnvFlags,
+    Physics,
+    Placement,
+    Repeated,
+    given,
+    optional_flags,
+    parameter,
+    parameters,
+    portable,
+    run_options,
+    spelled,
+)
+from lyceum_warp.cli.evaluate import OtherEnv
+from lyceum_warp.cli.train import Train
+from lyceum_warp.options import OPTIONS, EnvOptions, PhysicsOptions
 
 
 @pytest.mark.parametrize("text, value", [
@@ -50,22 +65,46 @@ class Options:
     in metres."""
     name: str | None = None
     fast: bool = False
+    safe: bool = True
     limits: tuple[float, ...] = (1.0,)
     """Limits."""
 
 
 @optional_flags(Options, default="(default: the best)")
 class Flags:
-    limits: Annotated[Words, tyro.conf.arg(metavar="NUMBER")] = ()
+    limits: Annotated[Repeated, tyro.conf.arg(metavar="NUMBER")] = ()
     extra: int = 4
 
 
 def test_flags_are_the_fields_of_the_options_and_none_unless_given() -> None:
-    assert [field.name for field in dataclasses.fields(Flags)] == ["size", "name", "fast", "limits", "extra"]
-    assert vars(tyro.cli(Flags, args=[])) == {"size": None, "name": None, "fast": False, "limits": (), "extra": 4}
-    argv = ["--size", "5", "--name", "a", "--fast", "--limits", "1", "--limits", "2"]
-    given = vars(tyro.cli(Flags, args=argv))
-    assert given == {"size": 5, "name": "a", "fast": True, "limits": ("1", "2"), "extra": 4}
+    assert [field.name for field in dataclasses.fields(Flags)] == ["size", "name", "fast", "safe", "limits", "extra"]
+    unset = {"size": None, "name": None, "fast": False, "safe": True, "limits": (), "extra": 4}
+    assert vars(tyro.cli(Flags, args=[])) == unset and given(Flags()) == {}
+    argv = ["--size", "5", "--name", "a", "--fast", "--no-safe", "--limits", "1", "--limits", "2"]
+    found = tyro.cli(Flags, args=argv)
+    assert given(found) == {"size": 5, "name": "a", "fast": True, "safe": False, "limits": ("1", "2")}
+
+
+@optional_flags(Options, omit=["limits"])
+class FlagsWithDefaults:
+    pass
+
+
+@optional_flags(Options)
+class MoreFlags(FlagsWithDefaults):
+    pass
+
+
+def test_flags_without_a_text_for_their_default_have_those_of_the_options(capsys: pytest.CaptureFixture[str]) -> None:
+    assert vars(FlagsWithDefaults()) == {"size": 3, "name": None, "fast": False, "safe": True}
+    assert tyro.cli(FlagsWithDefaults, args=["--size", "4", "--name", "a"]) == dataclasses.replace(
+        FlagsWithDefaults(), size=4, name="a"  # type: ignore[call-arg]
+    )  # fmt: skip
+    with pytest.raises(SystemExit):
+        tyro.cli(FlagsWithDefaults, args=["--help"])
+    out = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "--size INT Size of it, in metres. (default: 3)" in out and "(default: None)" not in out
+    assert vars(MoreFlags()) == vars(FlagsWithDefaults()) | {"limits": (1.0,)}
 
 
 def test_help_texts_of_flags_are_the_docstrings_of_the_options(capsys: pytest.CaptureFixture[str]) -> None:
@@ -80,6 +119,28 @@ def test_every_option_of_the_physics_has_a_flag() -> None:
     names = [field.name for field in dataclasses.fields(Physics)]
     assert names == [field.name for field in dataclasses.fields(PhysicsOptions)]
     assert Physics().options() == PhysicsOptions()
+
+
+def test_every_option_of_an_environment_is_a_flag_or_left_to_the_commands() -> None:
+    names = {field.name for field in dataclasses.fields(EnvOptions)}
+    for flags, others in ((EnvFlags, set()), (OtherEnv, set()), (Placement, {"horizon"})):
+        assert {field.name for field in dataclasses.fields(flags)} == names - {*NO_FLAGS} - others
+    assert vars(EnvFlags()) == {"engine": "auto", "device": "cpu", "nthread": None, "horizon": None}
+    assert given(OtherEnv()) == {}
+
+
+@pytest.mark.parametrize("name", [*OPTIONS])
+def test_an_option_among_the_parameters_is_refused(name: str) -> None:
+    flags = {*dir(Train), *dir(EnvFlags), *dir(Physics)} - {"physics"}
+    way = f"use --{name.replace('_', '-')}" if name in flags else "this command has no flag for it"
+    with pytest.raises(ValueError, match=f"^{name} is an option, not a parameter of the task: {way}$"):
+        parameters(["mass=1", f"{name}=any"], Train())
+
+
+def test_parameters_are_read_in_order_and_name_the_flag_that_stands_for_an_option() -> None:
+    assert parameters(["mass=1", "size=1,2", "mass=3"], Train()) == {"mass": 3, "size": [1, 2]}
+    with pytest.raises(ValueError, match="horizon is an option, not a parameter of the task: use --steps"):
+        parameters(["horizon=9"], Train(), instead={"horizon": "--steps"})
 
 
 def test_physics_flags_become_checked_options() -> None:
@@ -106,6 +167,18 @@ def test_physics_flags_become_checked_options() -> None:
     ],
 )
 def test_physics_of_a_run_are_read_from_its_configuration(saved: dict[str, object], options: PhysicsOptions) -> None:
-    config = {} if saved is None else {"physics": saved}
-    assert Physics.of(config).options() == options
-    assert Physics.of({"physics": options.given()}).options() == options
+    config = {"engine": "auto", "device": "cpu", "params": {"mass": 2}}
+    for physics in (saved, options.given()):
+        found, params = run_options(config if physics is None else config | {"physics": physics})
+        assert found == EnvOptions(device="cpu", physics=options) and params == {"mass": 2}
+        assert Physics.of(found.physics).options() == options
+
+
+def test_options_among_the_parameters_of_an_earlier_run_are_options() -> None:
+    params = {"mass": 2, "horizon": 9, "nthread": 2, "frame_skip": 3, "graphs": False}
+    found, params = run_options({"engine": "warp", "device": "cuda:0", "params": params, "options": {"horizon": 5}})
+    assert params == {"mass": 2}
+    assert found.given() == {
+        "engine": "warp", "device": "cuda:0", "horizon": 9, "nthread": 2, "graphs": False, "frame_skip": 3,
+    }  # fmt: skip
+    assert EnvFlags.of(found) == EnvFlags(engine="warp", device="cuda:0", nthread=2, horizon=9)  # type: ignore[call-arg]

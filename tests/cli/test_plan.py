@@ -141,6 +141,12 @@ def test_options_of_the_physics_change_the_planner_alone(
     (["--rate", "0"], ["rate", "0"]),
     (["--param", "mass=2"], ["mass"]),
     (["--planner-param", "mass=2"], ["mass"]),
+    (["--param", "horizon=9"], ["horizon is an option", "use --steps"]),
+    (["--param", "nthread=2"], ["nthread is an option", "use --nthread"]),
+    (["--param", "frame_skip=3"], ["frame_skip is an option", "use --frame-skip"]),
+    (["--planner-param", "horizon=9"], ["horizon is an option", "use --horizon"]),
+    (["--planner-param", "nworld=9"], ["nworld is an option", "use --samples"]),
+    (["--nthread", "-1"], ["nthread", "-1"]),
     (["--planner-model", "nowhere.xml"], ["there is no file", str(Path("nowhere.xml").resolve())]),
     (["--fill", "1", "2", "3"], ["fill", "2 of them"]),
     (["--fill", "1", "zero"], ["fill", "1 zero"]),
@@ -250,9 +256,11 @@ def test_a_parameter_with_the_name_of_a_setting_is_given_by_param(task_file: Tas
     assert Trajectory.load(tmp_path / "run" / "episode-000.npz").params["temperature"] == 0.5
 
 
-def test_an_option_among_the_params_is_that_of_world_and_planner(tmp_path: Path, made_envs: list[lw.Env]) -> None:
-    assert plan(tmp_path / "run", *QUIET, "--steps", "1", "--param", "frame_skip=3") == 0
-    assert [env.task.frame_skip for env in made_envs] == [3, 3]
+def test_nthread_is_that_of_the_planner(tmp_path: Path, made_envs: list[lw.Env]) -> None:
+    assert plan(tmp_path / "run", *QUIET, "--steps", "1", "--nthread", "2", "--engine", "mujoco") == 0
+    assert [env.options.nthread for env in made_envs] == [1, 2]
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (config["engine"], config["device"], config["nthread"]) == ("mujoco", "cpu", 2)
 
 
 def test_the_live_display_shows_steps_reward_and_rate(capsys: pytest.CaptureFixture[str]) -> None:

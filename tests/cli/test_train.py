@@ -22,7 +22,8 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.binding.registry import find_task
-from lyceum_warp.cli.train import Train, _config
+from lyceum_warp.cli.arguments import EnvFlags
+from lyceum_warp.cli.train import NPGOptions, Train, _config
 from lyceum_warp.runs import Run
 
 
@@ -145,6 +146,45 @@ def test_a_run_without_saved_physics_has_that_of_the_model(
     assert {physics(env) for env in made_envs} == {physics(lw.make("point_mass"))}
 
 
+def test_a_run_keeps_the_options_of_its_environment(
+    tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert train(out, "--iterations", "1", "--horizon", "32", "--nthread", "2") == 0
+    config = Run.open(out).config
+    assert (config["options"], config["params"]) == ({"horizon": 32, "nthread": 2}, {})
+    resume = ["train", "--resume", str(out), *QUIET, "--iterations"]
+    assert cli.main([*resume, "2"]) == 0
+    assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
+    assert {(env.horizon, env.options.nthread) for env in made_envs} == {(32, 2)}
+    made_envs.clear()
+    assert cli.main(["eval", str(out), "--episodes", "2", "--horizon", "16", "--nthread", "1"]) == 0
+    assert {(env.horizon, env.options.nthread) for env in made_envs} == {(16, 1)}
+    capsys.readouterr()
+    assert cli.main([*resume, "3", "--horizon", "16"]) == 2
+    refused(capsys, "has horizon 32, not 16")
+
+
+def test_a_run_with_options_among_its_parameters_resumes_and_is_evaluated(
+    trained: Path, tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Earlier releases accepted them as --param."""
+    saved = {"frame_skip": 5, "horizon": 256, "nthread": 1, "graphs": False}
+    resume = changed_config(trained, tmp_path / "run", lambda config: config["params"].update(saved))
+    assert cli.main([*resume, "--horizon", "9"]) == 2
+    refused(capsys, "has horizon 256, not 9")
+    assert cli.main(resume) == 0
+    assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2"]) == 0
+    assert made_envs
+    for env in made_envs:
+        assert (env.horizon, env.options.nthread, env.options.graphs) == (256, 1, False)
+        assert env.options.physics.frame_skip == 5
+
+
+def test_every_hyperparameter_has_a_flag_with_its_default() -> None:
+    assert vars(NPGOptions()) == vars(lw.NPGConfig()) and NPGOptions().checked() == lw.NPGConfig()
+
+
 @pytest.mark.parametrize("change, words", [
     (lambda config: config["npg"].update(fisher_fraction=0.0), "fisher_fraction must be greater than 0"),
     (lambda config: config["npg"].update(momentum=0.9), "momentum"),
@@ -201,6 +241,11 @@ def test_train_refuses_to_overwrite_a_run(trained: Path, capsys: pytest.CaptureF
         ("point_mass", ["--log-std", "nan"], ["log_std must be", "not nan"]),
         ("point_mass", ["--hidden", "8", "0"], ["hidden must be", "not (8, 0)"]),
         ("point_mass", ["--param", "distance=1"], ["no parameter 'distance'"]),
+        ("point_mass", ["--param", "nworld=2"], ["nworld is an option", "use --nworld"]),
+        ("point_mass", ["--param", "horizon=5"], ["horizon is an option", "use --horizon"]),
+        ("point_mass", ["--param", "autoreset=false"], ["autoreset is an option", "no flag"]),
+        ("point_mass", ["--horizon", "-1"], ["horizon", "-1"]),
+        ("point_mass", ["--nthread", "-1"], ["nthread", "-1"]),
         ("point_mass", ["--param", "success_distance"], ["NAME=VALUE", "'success_distance'"]),
         ("point_mass", ["--param", "success_distance="], ["NAME=VALUE"]),
         ("point_mass", ["--param", "success_distance=near"], ["'success_distance=near'", "number"]),
@@ -234,7 +279,7 @@ def test_the_default_number_of_worlds_depends_on_the_device() -> None:
     options = Train(task="hopper")
     found = []
     for device, size, given in (("cpu", 2, None), ("cuda:0", 1, None), ("cuda", 2, None), ("cuda", 2, 96)):
-        config = _config(dataclasses.replace(options, device=device, nworld=given), Team(0, size))
+        config = _config(dataclasses.replace(options, env=EnvFlags(device=device), nworld=given), Team(0, size))
         found.append((config["nworld"], config["npg"]["samples"]))
     assert found == [(64, 10_000), (4096, 65_536), (8192, 131_072), (96, 10_000)]
 
