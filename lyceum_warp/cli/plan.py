@@ -52,7 +52,7 @@ class Settings:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Plan:
-    """Control a task with MPPI: plan anew at every step, and report rewards, success and planning times.
+    """Control a task with MPPI: plan again at every step, and report rewards, success and planning times.
 
     The folder then holds config.json, versions.json, a file for each episode (episode-000.npz: states, actions,
     rewards, evaluations, times; numpy reads it), report.json, plan.png and video.mp4 of the first episode. Settings of
