@@ -27,6 +27,8 @@ class OtherEnv:
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """cpu, or a CUDA device such as cuda:0. Without this flag a run whose engine is auto is evaluated on the CPU: a few
     worlds step fastest there."""
+    nthread: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Threads of the C engine."""
     horizon: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Steps after which an episode is truncated, 0 for never."""
 

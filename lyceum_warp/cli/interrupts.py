@@ -63,7 +63,7 @@ def _handled_by(handler: Callable[[int, Any], None]) -> dict[int, Any]:
     previous: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # only the main thread may set handlers
         for number in (int(signal.SIGINT), int(signal.SIGTERM)):
-            # a shell that starts a program in the background has it ignore SIGINT on purpose
+            # a shell that starts a program in the background makes it ignore SIGINT on purpose
             if signal.getsignal(number) is not signal.SIG_IGN:
                 previous[number] = signal.signal(number, handler)
     return previous

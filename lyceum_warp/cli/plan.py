@@ -79,7 +79,7 @@ class Plan:
     real_time: bool = False
     """Let the world run at its own rate while the planner plans, instead of waiting for each plan."""
     rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
-    """Plans a second that the report requires, as the deadline of each; by default one a step."""
+    """Plans per second, which sets the deadline of each plan in the report; by default one per step."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """The folder, new or empty; runs/plan-TASK-DATE by default."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
@@ -101,12 +101,12 @@ class Plan:
 
 
 def plan(options: Plan) -> int:
-    """The command."""
+    """Run the command; returns the exit code."""
     whole_number("episodes", options.episodes, low=1)
     whole_number("seed", options.seed, low=0)
     whole_number("seed of the last episode", options.seed + options.episodes - 1, low=0)
     if options.rate is not None and not 0 < options.rate < float("inf"):
-        raise ValueError(f"rate must be a positive number of plans a second, not {options.rate}")
+        raise ValueError(f"rate must be a positive number of plans per second, not {options.rate}")
     out = options.out or Path(
         "runs", f"plan-{task_name(find_task(options.task))}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
     )

@@ -335,7 +335,10 @@ def _warn_of_versions(run: Run) -> None:
     changed = run.changed(versions(run.config["device"]))
     if changed:
         text = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
-        print(f"lyceum-warp: versions have changed, so the run may not continue to the bit: {text}", file=sys.stderr)
+        print(
+            f"lyceum-warp: versions have changed, so numbers may differ from an uninterrupted run's: {text}",
+            file=sys.stderr,
+        )
 
 
 def _check_iterations(iterations: int) -> None:

@@ -1,4 +1,4 @@
-"""Runs of earlier releases go on: a folder that was written before the rooms were divided."""
+"""Runs of earlier releases load, are evaluated and resume."""
 
 import shutil
 from pathlib import Path
