@@ -1,8 +1,6 @@
 """Env: one task in many worlds, the public face of the package."""
 
 import inspect
-import os
-import weakref
 from collections.abc import Iterable
 from typing import Any
 
@@ -19,6 +17,7 @@ from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.placement import bytes_per_world, find_device, open_engine, options_for_few_worlds
 from lyceum_warp.fields import describe, elements
+from lyceum_warp.forks import leave_in_parent
 from lyceum_warp.graphs.compile_ahead import compile_ahead
 from lyceum_warp.kernels import steps
 from lyceum_warp.options import OPTION_DOCS, EnvOptions, signature_of_options
@@ -166,7 +165,7 @@ class Env:
             if (explained := self.task.explained(error)) is error:
                 raise
             raise explained from None
-        _live.add(self)
+        leave_in_parent(self, "worlds", "engine")
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name in self.__dict__ and name in _BUFFERS:
@@ -475,30 +474,3 @@ def _copied(values: torch.Tensor, out: torch.Tensor | None) -> torch.Tensor:
         return values.clone()
     check_tensor(out, "out", values)
     return out.copy_(values)
-
-
-# A forked child has none of the threads that the engines run on, and would wait for them without end.
-
-_live: "weakref.WeakSet[Env]" = weakref.WeakSet()
-_lost: list[object] = []
-
-
-class _LostWorlds:
-    """Stands in for the worlds and the engine of an environment in a forked child."""
-
-    def __getattr__(self, name: str) -> Any:
-        raise RuntimeError(
-            "this environment was made before the process was forked, and its engine's threads stayed in the parent: "
-            "make it in the child, or start children with multiprocessing.get_context('spawn')"
-        )
-
-
-def _after_fork() -> None:
-    for env in _live:
-        _lost.append(env.worlds)  # never destroyed here: its engine would wait for its threads
-        _lost.append(env.engine)
-        env.worlds = env.engine = _LostWorlds()  # type: ignore[assignment]
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)

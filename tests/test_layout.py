@@ -13,7 +13,8 @@ ROOT = Path(lw.__file__).parent
 TESTS = Path(__file__).parent
 
 LEVELS = {
-    "docstrings": -1, "arrays": 0, "done": 0, "files": 0, "machine": 0, "mujoco_log": 0, "validate": 0, "versions": 0,
+    "docstrings": -1, "arrays": 0, "done": 0, "files": 0, "forks": 0, "machine": 0, "mujoco_log": 0, "validate": 0,
+    "versions": 0,
     "fields": 1, "kernels": 1, "options": 1, "task": 1,
     "graphs": 2, "spaces": 2,
     "binding": 3, "engines": 3,
@@ -27,7 +28,7 @@ LEVELS = {
 }  # fmt: skip
 """The floor of every room: a room imports from lower floors, or from itself."""
 
-TESTED_BY = {"done": "test_faults.py", "testing": "conformance", "versions": "test_runs.py"}
+TESTED_BY = {"done": "test_faults.py", "forks": "test_env.py", "testing": "conformance", "versions": "test_runs.py"}
 """Tests of rooms that have none of their own name."""
 
 NAMEDTUPLE = {"_fields", "_asdict", "_replace", "_make"}

@@ -31,9 +31,10 @@ def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: 
         ValueError: The batch does not fit; the message names the largest number of worlds that does.
     """
     free = free_memory(device)
-    if free is not None and device.is_cuda and nworld > _most(bytes_per_world, free + held):
-        gc.collect()  # frees environments that are no longer used, and then the memory that torch keeps for later
-        torch.cuda.empty_cache()
+    if free is not None and nworld > _most(bytes_per_world, free + held):
+        gc.collect()  # frees environments that are no longer used
+        if device.is_cuda:
+            torch.cuda.empty_cache()  # frees the memory that torch keeps for later
         free = free_memory(device)
     if free is None or nworld <= (most := _most(bytes_per_world, free + held)):
         return

@@ -1,6 +1,7 @@
 """The Warp engine with steps that are equal to the bit on a CUDA device."""
 
 import contextlib
+import inspect
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -29,21 +30,15 @@ class DeterministicEngine(WarpEngine):
     all launches. Its arguments are those of ``WarpEngine``.
     """
 
+    __signature__ = inspect.signature(WarpEngine)  # from which placement reads the options that an engine takes
+
     partial_refresh = False
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        nworld: int,
-        device: wp.Device,
-        fields: Iterable[Field],
-        *,
-        nconmax: int | None = None,
-        njmax: int | None = None,
-        unroll: bool = False,
+        self, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: Iterable[Field], **options: Any
     ) -> None:
         self._scratch = Scratch(device)
-        super().__init__(model, nworld, device, fields, nconmax=nconmax, njmax=njmax, unroll=unroll)
+        super().__init__(model, nworld, device, fields, **options)
         with wp.ScopedDevice(device):
             self._order = CanonicalOrder(self.m, self.d, self._scratch.open)
 

@@ -1,0 +1,34 @@
+"""Forked children: what they cannot use raises an error, instead of waiting for threads that stayed in the parent."""
+
+import os
+import weakref
+from typing import Any
+
+_watched: "weakref.WeakKeyDictionary[Any, tuple[str, ...]]" = weakref.WeakKeyDictionary()
+_kept: list[object] = []
+
+
+class LeftInParent:
+    """Stands in for an attribute that a forked child cannot use."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise RuntimeError(
+            "this environment was made before the process was forked, and its engine's threads stayed in the parent: "
+            "make it in the child, or start children with multiprocessing.get_context('spawn')"
+        )
+
+
+def leave_in_parent(thing: Any, *attributes: str) -> None:
+    """Replace attributes of an object in every child that is forked from now on, where they raise RuntimeError."""
+    _watched[thing] = attributes
+
+
+def _after_fork() -> None:
+    for thing, attributes in _watched.items():
+        for name in attributes:
+            _kept.append(getattr(thing, name))  # an engine that is destroyed here would wait for its threads, too
+            setattr(thing, name, LeftInParent())
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
