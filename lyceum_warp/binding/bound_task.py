@@ -146,11 +146,14 @@ class BoundTask:
         text = str(error)
         if "while parsing function" not in text and not type(error).__module__.startswith("warp"):
             return error
-        result = re.search(r"= (\w+)\(.*value argument type \((\w+)\) must be of the same type", " ".join(text.split()))
-        if result and result.group(1) in FUNCTIONS:
-            name, kind = result.groups()
+        # which kernel is compiled first, and so which of its lines is in the message, differs from run to run
+        flat = " ".join(text.split())
+        call = re.search(r"\b(reward|evaluate|terminated|success)\((?:s0|s1|view)\b", flat)
+        kind = re.search(r"value argument type \((.+?)\) must be|with different type \(<class '[\w.]*?(\w+)'>\)", flat)
+        if call and kind:
+            signature, returned = FUNCTIONS[call.group(1)].signature, kind.group(1) or kind.group(2)
             return ValueError(
-                f"{name} of the task {self.name!r} returns {kind}: it must be written as {FUNCTIONS[name].signature}"
+                f"{call.group(1)} of the task {self.name!r} returns {returned}: it must be written as {signature}"
             )
         lines = [line.strip(" ;") for line in text.splitlines() if line.strip(" ;")]
         hint = ": a function returns one number, not a tuple" if "tuple_t" in text else ""

@@ -94,7 +94,10 @@ NOT_COMPILED = {
         f"{REWARD}:\n    return 1",
         r"reward of the task 'tiny' returns int32: it must be written as reward\(s0: World, .* -> float",
     ),
-    "tuple": (f"{REWARD}:\n    r = (1.0, 2.0)\n    return r", ": a function returns one number, not a tuple"),
+    "tuple": (
+        f"{REWARD}:\n    r = (1.0, 2.0)\n    return r",
+        r"returns tuple\w*(\(.*\))?: it must be written as reward|: a function returns one number, not a tuple",
+    ),
     "declared tuple": (
         f"{REWARD} -> float:\n    r = (1.0, 2.0)\n    return r", ": a function returns one number, not a tuple"
     ),

@@ -63,7 +63,7 @@ def keep_warm_start(engine: MujocoEngine) -> None:
 BREAKS: list[tuple[str, Any, str, Callable[[Function], Function]]] = [
     ("spaces", Worlds, "_allocate", then(lambda worlds: setattr(worlds, "obs_space", worlds.action_space))),
     ("addresses", lw.Env, "step", then(lambda env: env.__dict__.update(obs=env.obs.clone()))),
-    ("getters", lyceum_warp.env, "_given", lambda function: lambda values, out: values),
+    ("getters", lyceum_warp.env, "_copied", lambda function: lambda values, out: values),
     ("time", lw.Env, "__init__", then(lambda env: setattr(env, "timestep", 1.5 * env.timestep))),
     ("round_trip", Worlds, "_restore_counters", nothing),
     ("restoring", MujocoEngine, "_set_integration", nothing),
