@@ -1,4 +1,4 @@
-"""Views of the same memory under another shape or in torch."""
+"""Host code for Warp arrays: views under another shape or in torch, and launches over masked rows."""
 
 from typing import Any
 
