@@ -108,6 +108,8 @@ class Field:
     """Whether the field stays as ``mj_step`` leaves it, one substep behind the state."""
     snapshot: bool
     """Whether the field is not a function of the integration state, so that it is saved and restored with it."""
+    written: bool = False
+    """Whether the task writes the field between resets, so that every step takes it over."""
 
     @property
     def size(self) -> int:
@@ -115,7 +117,7 @@ class Field:
         return int(np.prod(self.shape, dtype=int)) * wp.types.type_size_in_bytes(self.dtype) // 4
 
 
-def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field:
+def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False, written: bool = False) -> Field:
     """Describe a field of a model.
 
     Args:
@@ -123,6 +125,7 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field
         name: MuJoCo's name of the field, an attribute of MjData.
         lagged: Whether to keep the field as ``mj_step`` leaves it, one substep behind the state. Fields of the
             acceleration stage are always kept so; for a field of the integration state it has no effect.
+        written: Whether the task writes the field between resets.
 
     Raises:
         ValueError: There is no such field, or the model has no enabled sensor that makes MuJoCo compute it.
@@ -152,8 +155,8 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field
         raise ValueError(f"there is no field {name!r}: {hint}")
     shape: tuple[int, ...] = np.shape(getattr(mujoco.MjData(model), name))
     if len(shape) == 2:
-        return Field(name, shape[:1], _TYPES[shape[1]], refresh, reset, lagged, snapshot)
-    return Field(name, shape, wp.float32, refresh, reset, lagged, snapshot)
+        return Field(name, shape[:1], _TYPES[shape[1]], refresh, reset, lagged, snapshot, written)
+    return Field(name, shape, wp.float32, refresh, reset, lagged, snapshot, written)
 
 
 def state_columns(model: mujoco.MjModel, name: str) -> slice:

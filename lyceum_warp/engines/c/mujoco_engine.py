@@ -176,7 +176,7 @@ class MujocoEngine(Engine):
     def refresh(self, mask: wp.array) -> None:
         self._forward(mask, self.reset_stage, self._derived)
 
-    def _refresh_current(self, mask: wp.array) -> None:
+    def refresh_current(self, mask: wp.array) -> None:
         self._forward(mask, self.stage, [field for field in self._derived if not field.snapshot])
         self._read_state_fields(mask)
 
