@@ -35,6 +35,12 @@ STATE_FIELDS = {
 }
 """Fields that are part of the integration state, with their mjtState component."""
 
+INPUTS = ("xfrc_applied", "qfrc_applied", "mocap_pos", "mocap_quat", "userdata")
+"""Fields beside ``ctrl`` that drive the simulation and that a step leaves as they are."""
+
+INITIAL = ("qpos", "qvel", "act", "ctrl", *INPUTS)
+"""Fields that make up an initial state."""
+
 _POSITION = (
     "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat cam_xpos cam_xmat "
     "light_xpos light_xdir subtree_com cdof cinert ten_length actuator_length crb"

@@ -51,6 +51,12 @@ class TaskFunction:
         return f"{self.name}({self.arguments})" + (f" -> {self.result.__name__}" if self.result else "")
 
     @property
+    def argument_names(self) -> tuple[str, ...]:
+        """The names of its arguments, in order, with those that may be left out."""
+        arguments = ", ".join(filter(None, (self.arguments, self.optional)))
+        return tuple(argument.partition(": ")[0] for argument in arguments.split(", "))
+
+    @property
     def kinds(self) -> tuple[str, ...]:
         """The annotations of its arguments, in order."""
         return _kinds(self.arguments)
@@ -59,10 +65,6 @@ class TaskFunction:
     def all_kinds(self) -> tuple[str, ...]:
         """The same with the arguments that may be left out."""
         return self.kinds + _kinds(self.optional)
-
-    def named(self, name: str) -> "TaskFunction":
-        """The same function under another name."""
-        return dataclasses.replace(self, name=name)
 
 
 def _kinds(arguments: str) -> tuple[str, ...]:
@@ -119,11 +121,19 @@ FUNCTIONS = {
 """The functions of a task, by name. Checks, kernels, error messages and ``help(lw.Task)`` are made from this table."""
 
 
+RESULTS = ("obs", "ctrl", "metrics", "rng")
+"""Rows among the arguments of functions that a function may write."""
+
 MEMORIES = ("memory", "lasting_memory")
 """Fields of World that the task itself declares, by the names of its attributes with their sizes."""
 
 GROUP_PREFIX = "observe_"
 """``observe_critic`` writes the group ``critic`` of the observations."""
+
+
+def observer_name(group: str) -> str:
+    """The name of the function that writes a group of observations."""
+    return "observe" if group == "policy" else f"{GROUP_PREFIX}{group}"
 
 
 def _document_functions(cls: type["Task"]) -> type["Task"]:

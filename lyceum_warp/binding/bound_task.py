@@ -15,11 +15,11 @@ from lyceum_warp.binding.codegen import kernels_of
 from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
-from lyceum_warp.binding.writes import written_fields
-from lyceum_warp.fields import Field, describe, vec10
+from lyceum_warp.binding.writes import Rights, check_writes, written_fields
+from lyceum_warp.fields import INITIAL, INPUTS, Field, describe, vec10
 from lyceum_warp.model_fields import describe_model_field, is_model_field
 from lyceum_warp.options import ModelSource, PhysicsOptions
-from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, MEMORIES, Task
+from lyceum_warp.task import FUNCTIONS, MEMORIES, RESULTS, Task, TaskFunction, observer_name
 from lyceum_warp.validate import whole_number
 
 _SPELLED = {
@@ -74,10 +74,10 @@ class BoundTask:
         self.source = TaskSource(task, self.name)
         self.functions = self.source.functions
         self.types = {name: variable.type for name, variable in self.source.world.vars.items()}
-        self.writes = {name: written_fields(function) for name, function in self.functions.items() if function}
-        """The fields of World that each function writes."""
         self._check_class(model)
         named = [name for name in dict.fromkeys([*self.types, *fields]) if name not in MEMORIES]
+        self.writes = self._checked_writes()
+        """The fields of World that each function writes, by the functions' names."""
         own = [name for name in named if not is_model_field(name)]
         spec = task_spec(task, model)
         self.model = models.compile_model(spec, own, physics)
@@ -95,13 +95,14 @@ class BoundTask:
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
         """The integration state at which a reset starts, (integration_size,) float64; None for the model's own."""
         self.parameters = Parameters(
-            self.source.params, self.name, self.model, nworld=nworld, timestep=self.timestep,
-            substep=self.model.opt.timestep, given=params or {},
-        )  # fmt: skip
+            self.source.params, self.name, self.model, nworld=nworld, timestep=self.timestep, given=params or {}
+        )
         self.obs_layouts = self._layouts()
         """The parts of each group of observations and their sizes."""
         self.observers = self.source.group_functions(self.obs_layouts)
         """The functions that write the groups of observations, by the groups' names."""
+        named = {observer_name(group): function for group, function in self.observers.items()}
+        check_writes(self.name, named, dict.fromkeys(named, self._rights(FUNCTIONS["observe"])))
         self.kernels = kernels_of(self.source, self.observers)
 
     @property
@@ -118,6 +119,20 @@ class BoundTask:
     def obs_layout(self) -> dict[str, int]:
         """The parts of the policy's observation and their sizes."""
         return self.obs_layouts["policy"]
+
+    def _checked_writes(self) -> dict[str, frozenset[str]]:
+        written = {name: function for name, function in self.functions.items() if function is not None}
+        check_writes(self.name, written, {name: self._rights(function) for name, function in FUNCTIONS.items()})
+        return {name: written_fields(function) for name, function in written.items()}
+
+    def _rights(self, function: TaskFunction) -> Rights:
+        """What a function may write, by its arguments."""
+        model = [name for name in self.types if is_model_field(name)]
+        groups = {"inputs": INPUTS, "memory": MEMORIES, "model": model, "start": (*INITIAL, *MEMORIES, *model)}
+        return {
+            name: None if name in RESULTS else groups.get(function.writes.get(name, ""), ())
+            for name in function.argument_names
+        }
 
     def _sort_model_fields(self, named: list[str], dynamics: Collection[str]) -> None:
         """Sort the model fields into those that differ between worlds and those that are the model's own."""
@@ -280,8 +295,7 @@ class BoundTask:
             for group, row in found.items():
                 written[group] |= ~np.isnan(row) if math.isnan(unwritten) else row != np.float32(unwritten)
         for group, size in sizes.items():
-            name = "observe" if group == "policy" else f"{GROUP_PREFIX}{group}"
-            self._check_written(name, written[group], size, np.isnan(found[group][:size]))
+            self._check_written(observer_name(group), written[group], size, np.isnan(found[group][:size]))
 
     def _check_written(self, name: str, written: np.ndarray, size: int, bad: np.ndarray) -> None:
         if written[size:].any():

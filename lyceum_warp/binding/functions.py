@@ -1,6 +1,7 @@
 """A task's structs and functions: found in its class or module, and checked against the table in ``task.FUNCTIONS``."""
 
 import ast
+import dataclasses
 import difflib
 import inspect
 import sys
@@ -10,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, Task, TaskFunction
+from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, Task, TaskFunction, observer_name
 
 
 class TaskSource:
@@ -45,9 +46,7 @@ class TaskSource:
         """
         found = {}
         for group in groups:
-            wanted = FUNCTIONS["observe"]
-            if group != "policy":
-                wanted = wanted.named(f"{GROUP_PREFIX}{group}")
+            wanted = dataclasses.replace(FUNCTIONS["observe"], name=observer_name(group))
             function = self._function(wanted)
             if function is None:
                 raise ValueError(

@@ -24,7 +24,6 @@ class Parameters:
         model: The compiled model, in which named elements are found.
         nworld: Number of worlds.
         timestep: Seconds in a step, the value of ``dt``.
-        substep: Seconds in a substep, the value of ``substep_dt``.
         given: Values that differ from the defaults.
 
     Raises:
@@ -39,7 +38,6 @@ class Parameters:
         *,
         nworld: int,
         timestep: float,
-        substep: float,
         given: Mapping[str, Any],
     ) -> None:
         self._struct, self._task_name, self._model, self._nworld = struct, task_name, model, nworld
@@ -53,7 +51,7 @@ class Parameters:
         for name in struct.vars:
             # Warp's structs ignore defaults: they are read from the class behind the struct
             if name in _FILLED_IN:
-                self.values[name] = timestep if name == "dt" else substep
+                self.values[name] = timestep if name == "dt" else float(model.opt.timestep)
             elif hasattr(struct.cls, name):
                 self.values[name] = getattr(struct.cls, name)
         self.values = self.checked(given)
