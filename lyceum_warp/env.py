@@ -16,7 +16,7 @@ from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.placement import bytes_per_world, find_device, open_engine, options_for_few_worlds
-from lyceum_warp.fields import describe, elements
+from lyceum_warp.fields import describe, elements, has_several_rows
 from lyceum_warp.forks import leave_in_parent
 from lyceum_warp.graphs.compile_ahead import compile_ahead
 from lyceum_warp.kernels import steps
@@ -353,7 +353,7 @@ class Env:
         check_tensor(action, "action", self.action)
         if not torch.isfinite(action).all():
             world, i = (~torch.isfinite(action)).nonzero()[0].tolist()
-            name = list(self.action_space.parts)[i]
+            name = next(name for name, part in self.action_space.parts.items() if part.start <= i < part.stop)
             raise ValueError(f"the action {name!r} of world {world} is {action[world, i].item()}: it must be finite")
         self.action.copy_(action.detach())
 
@@ -383,7 +383,7 @@ class Env:
         if element is None:
             return view
         where = elements(self.model, name, element)
-        one_object = view.ndim > 2 and not name.startswith("cdof")
+        one_object = view.ndim > 2 and not has_several_rows(name)
         return view[:, where.start] if one_object else view[:, where]
 
     # parameters and other environments of the same task
@@ -429,8 +429,9 @@ class Env:
         return self.replicate(nworld=nworld, **(options_for_few_worlds(self.options.engine, self.device) | changes))
 
     def _own_options(self) -> EnvOptions:
-        current = {"horizon": self.horizon, "autoreset": self.autoreset, "seed": 0, "first_world": 0}
-        return self.options.changed(current)
+        # not the model's source, which may have changed since
+        current = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
+        return self.options.changed(current | {"seed": 0, "first_world": 0})
 
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
         """The values of some parameters, for a number of worlds."""

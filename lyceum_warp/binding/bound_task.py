@@ -72,8 +72,9 @@ class BoundTask:
         self.types = {name: variable.type for name, variable in self.source.world.vars.items()}
         self._check_class(model)
         own = [name for name in self.types if name != "memory"]
-        spec = task_spec(task, model)
-        self.model = models.compile_model(spec, [*own, *fields], physics)
+        self.spec = task_spec(task, model)
+        """The model as it was read: other environments of the same task are made from it, not from its source."""
+        self.model = models.compile_model(self.spec.copy(), [*own, *fields], physics)
         if self.model.nu == 0:
             raise ValueError(f"the model of the task {self.name!r} has no actuators, so there is nothing to act on")
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip

@@ -85,8 +85,7 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         raise ValueError("a task's model must be a file or an MjSpec, not a compiled MjModel: give its MjSpec")
     if isinstance(source, mujoco.MjSpec):
         spec = source.copy()
-        if spec.modelfiledir:  # the folder of its meshes
-            spec.modelfiledir = str(Path(spec.modelfiledir).absolute())
+        spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # where its meshes are
         return spec
     if isinstance(source, str) and source.lstrip().startswith("<"):
         raise ValueError(f"the model {_start(source)} is XML, not a file: give mujoco.MjSpec.from_string(...) of it")
@@ -138,7 +137,7 @@ def compile_model(spec: mujoco.MjSpec, fields: Collection[str], physics: Physics
         spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
         log.info("%s asks for the PGS solver, which MuJoCo Warp lacks: both engines use Newton", spec.modelname)
     if spec.option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-        spec.option.enableflags &= ~mujoco.mjtEnableBit.mjENBL_SLEEP
+        spec.option.enableflags &= ~mujoco.mjtEnableBit.mjENBL_SLEEP.value
         log.info("%s asks for sleep, which is not part of MuJoCo's state: no body falls asleep", spec.modelname)
     if "energy" in fields:
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
