@@ -196,6 +196,6 @@ def test_a_relative_model_and_its_meshes_are_found_from_another_folder(
 
 def test_the_text_of_a_model_is_refused_with_the_way_to_give_it() -> None:
     with pytest.raises(
-        ValueError, match=r"^the model '<mujoco><asset><mesh \.\.\.' is XML.* MjSpec.from_string\(\.\.\.\)"
+        ValueError, match=r"^the model '<mujoco><asset><mesh \.\.\.' is XML.*mujoco.MjSpec.from_string\(\.\.\.\)"
     ):
         load_spec(f"\n  {CUBE}")
