@@ -1,5 +1,6 @@
 """Env: one task in many worlds, the public face of the package."""
 
+import functools
 import inspect
 from collections.abc import Iterable
 from typing import Any
@@ -11,6 +12,7 @@ import warp as wp
 
 from lyceum_warp.arrays import torch_view
 from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.read_only_model import read_only
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.done import FAULTS
@@ -108,8 +110,6 @@ class Env:
     """Simulated seconds in a step, all its substeps together."""
     device: wp.Device
     """The Warp device; ``obs.device`` is torch's name of it."""
-    model: mujoco.MjModel
-    """The compiled model. Editing it has no effect: pass an edited MjSpec as ``model=``."""
     options: EnvOptions
     """The options that the environment was made with."""
     task: BoundTask
@@ -139,10 +139,10 @@ class Env:
             find_task(task), options.nworld, model=options.model, fields=options.fields, physics=options.physics,
             params=params,
         )  # fmt: skip
-        self.timestep, self.model = self.task.timestep, self.task.model
+        self.timestep = self.task.timestep
         if options.nvtx and not torch.backends.cuda.is_built():
             raise ValueError("nvtx=True marks phases through torch, whose build here is without CUDA: leave it out")
-        physics = options.engine, self.model, self.nworld, self.device, self.task.fields
+        physics = options.engine, self.task.model, self.nworld, self.device, self.task.fields
         self.engine = open_engine(*physics, reserved=own_bytes_per_world(self.task), **options.for_engine())
         self._given_params = params
         self._scratch: Env | None = None
@@ -177,6 +177,15 @@ class Env:
             "an environment cannot be pickled or copied: make it again from its arguments (env.replicate() does), and "
             "send env.get_state() to another process"
         )
+
+    @functools.cached_property
+    def model(self) -> mujoco.MjModel:
+        """The compiled model, which can be read alone; ``copy.copy(env.model)`` can be edited.
+
+        To change the physics, list model fields in the task's ``World`` and write them in ``startup`` or
+        ``randomize``, or pass an edited MjSpec as ``model=``.
+        """
+        return read_only(self.task.model)
 
     @property
     def horizon(self) -> int:
@@ -373,7 +382,7 @@ class Env:
             ValueError: The environment does not keep this field, or the model has no such element.
         """
         if name not in self._fields:
-            describe(self.model, name)  # a misspelt name has an error of its own
+            describe(self.task.model, name)  # a misspelt name has an error of its own
             kept = ", ".join(sorted(self._fields))
             raise ValueError(
                 f"this environment of {self.task.name!r} does not keep the field {name!r}: make it with "
@@ -382,7 +391,7 @@ class Env:
         view = self._fields[name]
         if element is None:
             return view
-        where = elements(self.model, name, element)
+        where = elements(self.task.model, name, element)
         one_object = view.ndim > 2 and not has_several_rows(name)
         return view[:, where.start] if one_object else view[:, where]
 
@@ -460,7 +469,7 @@ class Env:
     @property
     def bytes_per_world(self) -> float:
         """An estimate of the memory that a world takes, in bytes, without the model, which all worlds share."""
-        physics = self.options.engine, self.model, self.device, self.task.fields
+        physics = self.options.engine, self.task.model, self.device, self.task.fields
         return bytes_per_world(*physics, **self.options.for_engine()) + own_bytes_per_world(self.task)
 
     @property

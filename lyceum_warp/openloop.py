@@ -59,7 +59,7 @@ class OpenLoop:
         with wp.ScopedDevice(env.device):
             self._state = wp.zeros(env.state_space.size, dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nu), dtype=float)
-            self._controls = wp.zeros((self.horizon, n, env.model.nu), dtype=float)
+            self._controls = wp.zeros((self.horizon, n, env.task.model.nu), dtype=float)
             self._reward = wp.zeros(rows, dtype=float)
             self._terminated = wp.zeros(rows, dtype=bool)
             self._fault = wp.zeros(n, dtype=int)
@@ -72,7 +72,9 @@ class OpenLoop:
                 buffer: wp.array = wp.zeros((rows + n, *live.shape[1:]), dtype=live.dtype)
                 self._fields[name] = buffer.reshape((self.horizon + 1, *live.shape))
                 for batch, start in ((self._before, 0), (self._after, n), (self._last, rows)):
-                    setattr(batch, name, buffer[start : min(start + rows, rows + n)])
+                    # of no numbers there is no slice
+                    part = buffer[start : min(start + rows, rows + n)] if buffer.size else buffer
+                    setattr(batch, name, part)
         self._memory = self._fields.pop("memory", None)
         self.state, self.actions = torch_view(self._state), torch_view(self._actions)
         self.reward = torch_view(self._reward).view(self.horizon, n)
@@ -95,7 +97,7 @@ class OpenLoop:
     def _bytes_per_world(env: Env, horizon: int) -> int:
         """An estimate of the buffers' memory for each world."""
         fields = [field for field in env.task.fields if field.name in env.task.types]
-        own = 4 * (sum(field.size for field in fields) + env.task.task.memory + env.model.nu + env.action_space.size)
+        own = 4 * (sum(field.size for field in fields) + env.task.task.memory + env.task.model.nu + env.action_space.size)
         return horizon * (own + 8) + env.engine.rollout_bytes_per_world(horizon, env.task.frame_skip, fields)
 
     def _whole_horizon(self) -> tuple[Phase, ...]:

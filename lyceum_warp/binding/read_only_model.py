@@ -96,13 +96,18 @@ def _shown(value: Any) -> Any:
     return value if isinstance(value, _PLAIN) or callable(value) else _Part(value)
 
 
+_read = mujoco.MjModel.__getattribute__
+
+
 class ReadOnlyModel(mujoco.MjModel):  # type: ignore[misc]
     """A compiled model that refuses edits. ``copy.copy(model)`` is an ordinary ``mujoco.MjModel``, which takes them."""
 
     __slots__ = ()
 
     def __getattribute__(self, name: str) -> Any:
-        value = super().__getattribute__(name)
+        value = _read(self, name)
+        if type(value) is int:  # sizes, which are read the most
+            return value
         if name in _NAMED:
             return lambda *args: _Part(value(*args))
         return value if name.startswith("_") else _shown(value)
