@@ -1,5 +1,6 @@
 """Env: one task in many worlds, the public face of the package."""
 
+import functools
 import inspect
 from collections.abc import Iterable
 from typing import Any
@@ -11,12 +12,13 @@ import warp as wp
 
 from lyceum_warp.arrays import torch_view
 from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.read_only_model import read_only
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.placement import bytes_per_world, find_device, open_engine, options_for_few_worlds
-from lyceum_warp.fields import describe, elements
+from lyceum_warp.fields import describe, elements, has_several_rows
 from lyceum_warp.forks import leave_in_parent
 from lyceum_warp.graphs.compile_ahead import compile_ahead
 from lyceum_warp.kernels import steps
@@ -117,9 +119,6 @@ class Env:
     """Simulated seconds in a step, all its substeps together."""
     device: wp.Device
     """The Warp device; ``obs.device`` is torch's name of it."""
-    model: mujoco.MjModel
-    """The compiled model, read-only: pass an edited MjSpec as ``model=``, or change single worlds by
-    ``set_dynamics``."""
     options: EnvOptions
     """The options that the environment was made with."""
     task: BoundTask
@@ -151,11 +150,11 @@ class Env:
             find_task(task), options.nworld, model=options.model, fields=options.fields, dynamics=options.dynamics,
             physics=options.physics, params=params,
         )  # fmt: skip
-        self.timestep, self.model = self.task.timestep, self.task.model
+        self.timestep = self.task.timestep
         if options.nvtx and not torch.backends.cuda.is_built():
             raise ValueError("nvtx=True marks phases through torch, whose build here is without CUDA: leave it out")
         self.engine = open_engine(
-            options.engine, self.model, self.nworld, self.device, self.task.fields, dynamics=self.task.dynamics,
+            options.engine, self.task.model, self.nworld, self.device, self.task.fields, dynamics=self.task.dynamics,
             initial=self.task.initial, reserved=own_bytes_per_world(self.task), **options.for_engine(),
         )  # fmt: skip
         self._given_params = params
@@ -198,6 +197,15 @@ class Env:
             "an environment cannot be pickled or copied: make it again from its arguments (env.replicate() does), and "
             "send env.get_state() to another process"
         )
+
+    @functools.cached_property
+    def model(self) -> mujoco.MjModel:
+        """The compiled model, which can be read alone; ``copy.copy(env.model)`` can be edited.
+
+        To change the physics, list model fields in the task's ``World`` and write them in ``startup`` or
+        ``randomize``, or pass an edited MjSpec as ``model=``.
+        """
+        return read_only(self.task.model)
 
     @property
     def horizon(self) -> int:
@@ -389,7 +397,7 @@ class Env:
         check_tensor(action, "action", self.action)
         if not torch.isfinite(action).all():
             world, i = (~torch.isfinite(action)).nonzero()[0].tolist()
-            name = list(self.action_space.parts)[i]
+            name = next(name for name, part in self.action_space.parts.items() if part.start <= i < part.stop)
             raise ValueError(f"the action {name!r} of world {world} is {action[world, i].item()}: it must be finite")
         self.action.copy_(action.detach())
 
@@ -409,7 +417,7 @@ class Env:
             ValueError: The environment does not keep this field, or the model has no such element.
         """
         if name not in self._fields:
-            (describe_model_field if is_model_field(name) else describe)(self.model, name)  # a misspelt name has an error of its own
+            (describe_model_field if is_model_field(name) else describe)(self.task.model, name)  # names a misspelt one
             kept = ", ".join(sorted(self._fields))
             raise ValueError(
                 f"this environment of {self.task.name!r} does not keep the field {name!r}: make it with "
@@ -418,8 +426,8 @@ class Env:
         view = self._fields[name]
         if element is None:
             return view
-        where = elements(self.model, name, element)
-        one_object = view.ndim > 2 and not name.startswith("cdof")
+        where = elements(self.task.model, name, element)
+        one_object = view.ndim > 2 and not has_several_rows(name)
         return view[:, where.start] if one_object else view[:, where]
 
     def set_dynamics(self, mask: torch.Tensor | None = None, **fields: Any) -> None:
@@ -441,7 +449,7 @@ class Env:
         varied = {field.name: field for field in self.task.dynamics}
         for name, value in fields.items():
             if name not in varied:
-                describe_model_field(self.model, name)  # a misspelt name has an error of its own
+                describe_model_field(self.task.model, name)  # a misspelt name has an error of its own
                 raise ValueError(
                     f"the model field {name!r} is the same in every world of this environment: make it with "
                     f"dynamics=[{name!r}], or let the task write it"
@@ -464,7 +472,7 @@ class Env:
             if field.name not in names:
                 continue
             rows = state[:, self.state_space.parts[field.name]].cpu().numpy()
-            if (problem := field.problem(self.model, rows)) is not None:
+            if (problem := field.problem(self.task.model, rows)) is not None:
                 raise ValueError(f"{self.task.name!r}: {problem}")
 
     # parameters and other environments of the same task
@@ -510,8 +518,9 @@ class Env:
         return self.replicate(nworld=nworld, **(options_for_few_worlds(self.options.engine, self.device) | changes))
 
     def _own_options(self) -> EnvOptions:
-        current = {"horizon": self.horizon, "autoreset": self.autoreset, "seed": 0, "first_world": 0}
-        return self.options.changed(current)
+        # not the model's source, which may have changed since
+        current = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
+        return self.options.changed(current | {"seed": 0, "first_world": 0})
 
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
         """The values of some parameters, for a number of worlds."""
@@ -540,7 +549,7 @@ class Env:
     @property
     def bytes_per_world(self) -> float:
         """An estimate of the memory that a world takes, in bytes, without the model, which all worlds share."""
-        physics = self.options.engine, self.model, self.device, self.task.fields
+        physics = self.options.engine, self.task.model, self.device, self.task.fields
         return bytes_per_world(*physics, **self.options.for_engine()) + own_bytes_per_world(self.task)
 
     @property

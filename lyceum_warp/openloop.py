@@ -62,7 +62,7 @@ class OpenLoop:
         with wp.ScopedDevice(env.device):
             self._state = wp.zeros(env.state_space.size, dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nu), dtype=float)
-            self._controls = wp.zeros((self.horizon, n, env.model.nu), dtype=float)
+            self._controls = wp.zeros((self.horizon, n, env.task.model.nu), dtype=float)
             self._reward = wp.zeros(rows, dtype=float)
             self._terminated = wp.zeros(rows, dtype=bool)
             self._fault = wp.zeros(n, dtype=int)
@@ -73,7 +73,7 @@ class OpenLoop:
             # each field for all steps: the states before a step, after it, and the last ones are views of one buffer
             self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
-            constant = {f.name: shared_rows(f.nominal(env.model), f.dtype, rows + n, env.device) for f in task.constants}
+            constant = {f.name: shared_rows(f.nominal(task.model), f.dtype, rows + n, env.device) for f in task.constants}
             for name in task.types:
                 live = getattr(self.worlds.after, name)
                 buffer = constant.get(name)
@@ -81,7 +81,9 @@ class OpenLoop:
                     buffer = wp.zeros((rows + n, *live.shape[1:]), dtype=live.dtype)
                     self._fields[name] = buffer.reshape((self.horizon + 1, *live.shape))
                 for batch, start in ((self._before, 0), (self._after, n), (self._last, rows)):
-                    setattr(batch, name, buffer[start : min(start + rows, rows + n)])
+                    # of no numbers there is no slice
+                    part = buffer[start : min(start + rows, rows + n)] if buffer.size else buffer
+                    setattr(batch, name, part)
         self._memories = {name: self._fields.pop(name) for name in MEMORIES if name in self._fields}
         self._dynamics = {f.name: self._fields.pop(f.name) for f in task.dynamics if f.name in self._fields}
         self.state, self.actions = torch_view(self._state), torch_view(self._actions)
@@ -109,7 +111,7 @@ class OpenLoop:
         """An estimate of the buffers' memory for each world."""
         fields = [field for field in env.task.fields if field.name in env.task.types]
         numbers = sum(field.size for field in (*fields, *env.task.dynamics)) + sum(own_parts(env.task).values())
-        own = 4 * (numbers + env.model.nu + env.action_space.size)
+        own = 4 * (numbers + env.task.model.nu + env.action_space.size)
         return horizon * (own + 8) + env.engine.rollout_bytes_per_world(horizon, env.task.frame_skip, fields)
 
     def _whole_horizon(self) -> tuple[Phase, ...]:

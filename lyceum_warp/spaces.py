@@ -57,18 +57,31 @@ COUNTERS = ("step", "key", "episode", "done_reason")
 def action_space(
     model: mujoco.MjModel, action_range: tuple[float, float] | None, actions: Mapping[str, int] | None = None
 ) -> Space:
-    """Actions: one number for each control, by the actuators' names, within ``action_range`` or the control ranges.
+    """Actions: the controls of each actuator, by its name, within ``action_range`` or the control ranges.
 
-    A task's own ``actions`` have bounds only with an ``action_range``.
+    Most actuators have one control, some have several or none. One without a name is called by its number. A task's own
+    ``actions`` have bounds only with an ``action_range``.
     """
     if actions is not None:
         space = Space.of(actions)
         low, high = np.tile(np.array(action_range or (-np.inf, np.inf), dtype=np.float32), (space.size, 1)).T.copy()
         return dataclasses.replace(space, low=low, high=high)
-    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) or f"actuator_{i}" for i in range(model.nu)]
     bounds = control_ranges(model) if action_range is None else np.tile(action_range, (model.nu, 1))
     low, high = np.ascontiguousarray(bounds.T, dtype=np.float32)
-    return Space.of(dict.fromkeys(names, 1), low=low, high=high)
+    return Space.of(_controls(model), low=low, high=high)
+
+
+def _controls(model: mujoco.MjModel) -> dict[str, int]:
+    """The actuators' names and their numbers of controls, in the order of the controls."""
+    given = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nactuator)]
+    sizes: dict[str, int] = {}
+    for i in np.argsort(model.actuator_ctrladr, kind="stable").tolist():
+        name = given[i] or f"actuator_{i}"
+        while not given[i] and name in given:  # another actuator has this name
+            name = f"{name}_"
+        if model.actuator_ctrlnum[i]:
+            sizes[name] = int(model.actuator_ctrlnum[i])
+    return sizes
 
 
 def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | None) -> np.ndarray:

@@ -174,6 +174,41 @@ def geom(name: str) -> int:
     return Element("geom_xpos", name)
 
 
+def camera(name: str) -> int:
+    """As a default in Params: the index of a camera, in ``cam_xpos`` and the other ``cam_`` fields."""
+    return Element("cam_xpos", name)
+
+
+def tendon(name: str) -> int:
+    """As a default in Params: the index of a tendon, in ``ten_length`` and the ``ten_`` and ``tendon_`` fields."""
+    return Element("ten_length", name)
+
+
+def equality(name: str) -> int:
+    """As a default in Params: the index of an equality constraint, in ``eq_active`` and the other ``eq_`` fields."""
+    return Element("eq_active", name)
+
+
+def actuator(name: str) -> int:
+    """As a default in Params: the index of an actuator, in ``actuator_force`` and the other ``actuator_`` fields."""
+    return Element("actuator_force", name)
+
+
+def ctrl(actuator: str) -> int:
+    """As a default in Params: where an actuator's controls begin in ``ctrl``. Most have one."""
+    return Element("ctrl", actuator)
+
+
+def act(actuator: str) -> int:
+    """As a default in Params: where an actuator's activations begin in ``act``."""
+    return Element("act", actuator)
+
+
+def joint(name: str) -> int:
+    """As a default in Params: the index of a joint, in ``xanchor``, ``xaxis`` and the ``jnt_`` fields."""
+    return Element("xanchor", name)
+
+
 def qpos(joint: str) -> int:
     """As a default in Params: where a joint's coordinates begin in ``qpos``."""
     return Element("qpos", joint)
@@ -233,8 +268,9 @@ class Task:
     ``event`` write differ between worlds and belong to the state; all others are the model's own.
 
     A default in ``Params`` may name an element of the model, as ``tip: int = lw.site("tip")``: the functions then get
-    its index. ``lw.body``, ``lw.geom``, ``lw.qpos``, ``lw.dof``, ``lw.sensor`` and ``lw.mocap`` work likewise. A field
-    of type ``wp.array[float]`` or ``wp.array2d[float]`` is a table that all worlds share.
+    its index. ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``, ``lw.actuator``,
+    ``lw.ctrl``, ``lw.act``, ``lw.tendon``, ``lw.equality``, ``lw.sensor`` and ``lw.mocap`` work likewise. A field of
+    type ``wp.array[float]`` or ``wp.array2d[float]`` is a table that all worlds share.
 
     Functions:
     {functions}

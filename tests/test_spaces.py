@@ -54,6 +54,29 @@ def test_actions_have_the_actuators_names_and_ranges() -> None:
     assert space.low.dtype == np.float32
 
 
+MANY = """
+<mujoco>
+  <worldbody>
+    <site name="here"/>
+    <body><joint name="a" type="ball"/><geom size=".1"/><site name="tip"/></body>
+    <body><joint name="b"/><geom size=".1"/></body>
+  </worldbody>
+  <actuator>
+    <motor name="actuator_2" joint="b"/>
+    <orientation name="aim" site="tip" refsite="here" kp="1"/>
+    <motor joint="b"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_an_actuator_has_as_many_actions_as_controls_and_a_name_of_its_own() -> None:
+    space = action_space(mujoco.MjModel.from_xml_string(MANY), None)
+    assert space.parts == {"actuator_2": slice(0, 1), "aim": slice(1, 4), "actuator_2_": slice(4, 5)}
+    assert space.low is not None
+    assert space.low.shape == space.shape == (5,)
+
+
 def test_actions_without_a_range_are_unbounded() -> None:
     space = action_space(model(""), None)
     assert space.low is not None and space.high is not None

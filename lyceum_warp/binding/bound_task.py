@@ -79,8 +79,9 @@ class BoundTask:
         self.writes = self._checked_writes()
         """The fields of World that each function writes, by the functions' names."""
         own = [name for name in named if not is_model_field(name)]
-        spec = task_spec(task, model)
-        self.model = models.compile_model(spec, own, physics)
+        self.spec = task_spec(task, model)
+        """The model as it was read: other environments of the same task are made from it, not from its source."""
+        self.model = models.compile_model(self.spec.copy(), own, physics)
         self._check_actions()
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.frame_skip = whole_number(f"frame_skip of the task {self.name!r}", skip, low=1)

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from lyceum_warp.fields import elements
+from lyceum_warp.fields import elements, rows
 from lyceum_warp.options import OPTIONS, suggestion
 from lyceum_warp.task import Element
 
@@ -122,7 +122,7 @@ class Parameters:
 
     def _check_index(self, given: str, array: np.ndarray, field: str) -> None:
         if field not in self._sizes:
-            self._sizes[field] = len(getattr(mujoco.MjData(self._model), field))
+            self._sizes[field] = rows(self._model, field)
         count = self._sizes[field]
         if ((array < 0) | (array >= count)).any():
             raise ValueError(

@@ -161,6 +161,9 @@ class WarpEngine(Engine):
                 if stage == Stage.VELOCITY:
                     mjw.fwd_velocity(m, d)
                     mjw.sensor_vel(m, d)
+                if "energy" in names:  # of a model whose sensors do not compute it
+                    mjw.energy_pos(m, d)
+                    mjw.energy_vel(m, d)
 
     def refresh_current(self, mask: wp.array | None = None) -> None:
         self._forward(self._current, self.stage)
