@@ -1,6 +1,6 @@
 """Open-loop rollouts: a horizon of given actions in every world, judged by the task."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 
 import torch
@@ -29,9 +29,14 @@ class OpenLoop:
     Args:
         env: Worlds to roll out in; they belong to the rollouts from then on.
         horizon: Steps.
+        keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device, read in every run. By
+            default every world has the key in ``state``, and so draws what ``env.step`` would draw from there.
+        nominal_model: Whether model fields that differ between worlds have their nominal values instead of those in
+            ``state``.
 
     Raises:
-        ValueError: The environment resets its worlds automatically, or the buffers do not fit into memory.
+        ValueError: The environment resets its worlds automatically, ``keys`` has another shape, type or device, or the
+            buffers do not fit into memory.
     """
 
     state: torch.Tensor
@@ -51,12 +56,18 @@ class OpenLoop:
     phases: tuple[Phase, ...]
     """What ``run`` does, in order, for a caller that puts more into the same graph."""
 
-    def __init__(self, env: Env, horizon: int) -> None:
+    def __init__(self, env: Env, horizon: int, *, keys: wp.array | None = None, nominal_model: bool = False) -> None:
         if env.autoreset:
             raise ValueError("open-loop rollouts need worlds that do not reset: make(..., autoreset=False)")
         self.env, self.worlds = env, env.worlds
         self.horizon = whole_number("horizon", horizon, low=1)
         n, nu, task = env.nworld, env.action_space.size, env.task
+        if keys is not None and (keys.shape, keys.dtype, keys.device) != ((n,), wp.uint32, env.device):
+            raise ValueError(
+                f"keys must be a wp.array of shape ({n},) and type uint32 on {env.device}, not of shape {keys.shape} "
+                f"and type {wp.types.type_repr(keys.dtype)} on {keys.device}"
+            )
+        self._keys, self._nominal_model = keys, nominal_model
         rows = self.horizon * n
         check_fit(self._bytes_per_world(env, self.horizon), n, env.device)
         with wp.ScopedDevice(env.device):
@@ -144,8 +155,12 @@ class OpenLoop:
         """Put every world at the start, and map the actions of all steps to controls."""
         worlds, device = self.worlds, self.env.device
         wp.launch(planning.broadcast, worlds.state.shape, [self._state, worlds.state], device=device)
+        if self._nominal_model:
+            self._overwrite_model()
         rest = worlds.state[:, self.env.engine.state_size :]
         worlds.restore_counters(worlds.everyone, rest)
+        if self._keys is not None:
+            wp.copy(worlds.counters.key, self._keys)
         for name, buffer in self._memories.items():
             columns = worlds.state[:, self.env.state_space.parts[name]]
             launch_rows(state.narrow, worlds.everyone, columns, getattr(worlds, name))
@@ -157,6 +172,15 @@ class OpenLoop:
         self._fault.zero_()
         args = [self._actions, worlds.ranges, worlds.scale, self._fault, self._controls]
         wp.launch(planning.controls, self._actions.shape[:2], args, device=device)
+
+    def _overwrite_model(self) -> None:
+        """Give the model fields in every world's state their nominal values."""
+        columns, states = self.env.state_space.parts, self.worlds.state
+        nominal: Mapping[str, wp.array] = getattr(self.env.engine, "nominal", {})
+        for name, row in nominal.items():
+            row = flat(row)
+            args = [row, columns[name].start, states]
+            wp.launch(planning.overwrite, (states.shape[0], row.shape[1]), args, device=self.env.device)
 
     def _judge_rows(self) -> None:
         """Judge the transitions of the whole horizon."""
