@@ -558,4 +558,4 @@ def test_resets_of_the_planners_worlds_do_not_change_plans() -> None:
         first, second = (plan(state) for plan in plans)
         assert torch.equal(first, second)
         env.step(first[None])
-    assert plans[0].env.episode_step.tolist() == [2, 2, 2, 2]
+    assert plans[0].env.episode_step.tolist() == [5, 5, 5, 5]  # at the ends of the rollouts
