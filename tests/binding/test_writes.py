@@ -256,7 +256,7 @@ def test_a_write_of_any_form_is_found(function: Any) -> None:
     assert rows(function) == set()
 
 
-def test_reading_and_changing_a_copy_is_no_write() -> None:
+def test_reading_and_changing_a_copy_writes_nothing() -> None:
     assert fields(reads_only) == set()
     assert rows(reads_only) == {"obs"}
 
