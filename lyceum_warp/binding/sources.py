@@ -1,6 +1,7 @@
 """The source of a Warp function: its syntax tree, its lines in the file, and what its names stand for."""
 
 import ast
+import builtins
 import types
 from pathlib import Path
 from typing import Any
@@ -93,8 +94,8 @@ def name_of(function: wp.Function) -> str:
 
 
 def builtin(name: str) -> Any:
-    """Warp's builtin of a name, which may not be an attribute of the module; None if there is none."""
-    return getattr(wp, name, None) or _BUILTINS.get(name)
+    """Warp's builtin of a name, which may not be an attribute of the module, or Python's; None if there is none."""
+    return _BUILTINS.get(name) or getattr(wp, name, None) or getattr(builtins, name, None)
 
 
 def overloads(function: wp.Function) -> list[wp.Function]:

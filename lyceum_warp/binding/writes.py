@@ -6,6 +6,7 @@ an element that was read from a row is a copy.
 
 import ast
 import dataclasses
+import functools
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
@@ -51,13 +52,13 @@ class Write:
         return self.argument if self.field is None else f"{self.argument}.{self.field}"
 
 
+@functools.cache
 def find_writes(function: wp.Function) -> tuple[Write, ...]:
     """The writes of a function into its arguments, and of the functions that it calls, in the order of its source.
 
     Handing a row to a function without a source, such as a ``wp.func_native``, counts as a write, with ``reader`` set.
     """
-    found = _Analysis(function)
-    return tuple(found.writes)
+    return tuple(_Analysis(function).writes)
 
 
 def written_fields(function: wp.Function) -> frozenset[str]:
@@ -91,10 +92,11 @@ def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mappin
             place = f"{within} ({write.file}, line {write.line})"
             if write.reader is not None:
                 raise ValueError(
-                    f"{name} of the task {task!r} gives {write.target} to {write.reader}{place}, which may write it and "
-                    "has no source that can be read: give it numbers instead"
+                    f"{name} of the task {task!r} gives {write.target} to {write.reader}{place}, which may write it "
+                    "and has no source that can be read: give it numbers instead"
                 )
-            raise ValueError(f"{name} of the task {task!r} writes {write.target}{place}: {_advice(write, name, rights)}")
+            advice = _advice(write, name, rights)
+            raise ValueError(f"{name} of the task {task!r} writes {write.target}{place}: {advice}")
 
 
 def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
@@ -157,28 +159,27 @@ class _Analysis:
             self.visit(function, arguments)
         else:
             for found in arguments:
-                self._record_unread(found, name_of(function), "", name_of(function), 0)
+                self._note_unread(found, name_of(function), "", name_of(function), 0)
 
     def visit(self, function: wp.Function, arguments: list[_Found]) -> _Found:
-        """Record the writes of a function that gets some arguments; returns what its result may be."""
+        """Note the writes of a function that gets some arguments; returns what its result may be."""
         key = (function, *arguments)
         if key not in self._results:
             self._results[key] = _NOTHING  # for a function that calls itself
             self._results[key] = _Visit(self, FunctionSource(function), arguments).result
         return self._results[key]
 
-    def record(self, found: _Found, source: FunctionSource, node: ast.AST) -> None:
-        """Record a write to some places."""
+    def note(self, found: _Found, source: FunctionSource, node: ast.AST, *, replaced: bool = False) -> None:
+        """Note a write to some places."""
         for place in _places(found):
-            replaced = place.field is not None and isinstance(node, ast.Attribute) and not _is_element(place)
             self._add(Write(place.position, self.names[place.position], place.field, source.name, source.file,
                             source.line(node), replaced))  # fmt: skip
 
-    def record_unread(self, found: _Found, reader: str, source: FunctionSource, node: ast.AST) -> None:
-        """Record that a function without a source gets some places."""
-        self._record_unread(found, source.name, source.file, reader, source.line(node))
+    def note_unread(self, found: _Found, reader: str, source: FunctionSource, node: ast.AST) -> None:
+        """Note that a function without a source gets some places."""
+        self._note_unread(found, source.name, source.file, reader, source.line(node))
 
-    def _record_unread(self, found: _Found, function: str, file: str, reader: str, line: int) -> None:
+    def _note_unread(self, found: _Found, function: str, file: str, reader: str, line: int) -> None:
         for place in _places(found):
             fields: Iterable[str | None] = [place.field]
             if place.field is None and _is_struct(place.kind):
@@ -231,23 +232,23 @@ class _Visit:
             found = self.names.get(target.id, _NOTHING)
             for place in _places(found):
                 if place.kind is _REFERENCE:
-                    self.analysis.record(frozenset([place]), self.source, target)
+                    self.analysis.note(frozenset([place]), self.source, target)
             if value is not None:
                 self.names[target.id] = found | self._value(value)
         else:
-            self.analysis.record(self._memory(target), self.source, target)
+            owners = _places(self._memory(target.value)) if isinstance(target, ast.Attribute) else []
+            replaced = any(owner.field is None and _is_struct(owner.kind) for owner in owners)
+            self.analysis.note(self._memory(target), self.source, target, replaced=replaced)
             root = target
             while isinstance(root, ast.Attribute | ast.Subscript):
                 root = root.value
             # a struct of the function's own may get a row
-            if value is not None and isinstance(root, ast.Name) and isinstance(target, ast.Attribute):
+            if value is not None and isinstance(root, ast.Name) and isinstance(target, ast.Attribute) and not owners:
                 self.names[root.id] = self.names.get(root.id, _NOTHING) | self._value(value)
 
     def _value(self, node: ast.expr) -> _Found:
         """What an expression stands for: rows and structs of the arguments, and functions; elements are copies."""
-        return frozenset(
-            found for found in self._memory(node) if isinstance(found, _Calls) or not _is_element(found)
-        )
+        return frozenset(found for found in self._memory(node) if isinstance(found, _Calls) or not _is_element(found))
 
     def _memory(self, node: ast.expr) -> _Found:
         """The memory that an expression names, elements too."""
@@ -275,7 +276,7 @@ class _Visit:
         if isinstance(expression, ast.Call):
             self._call(expression)
         if isinstance(expression, ast.Attribute) and expression.attr == "ptr":
-            self.analysis.record_unread(self._memory(expression.value), "a pointer", self.source, expression)
+            self.analysis.note_unread(self._memory(expression.value), "a pointer", self.source, expression)
         for child in ast.iter_child_nodes(expression):
             if isinstance(child, ast.expr):
                 self._calls(child)
@@ -283,7 +284,7 @@ class _Visit:
                 self._calls(child.value)
 
     def _call(self, node: ast.Call) -> _Found:
-        """Record the writes of a call; returns what its result may be."""
+        """Note the writes of a call; returns what its result may be."""
         given = [*node.args, *(keyword.value for keyword in node.keywords)]
         callees = [found.function for found in self._memory(node.func) if isinstance(found, _Calls)]
         if not callees:
@@ -291,7 +292,8 @@ class _Visit:
                 if isinstance(node.func, ast.Attribute):
                     given.append(node.func.value)  # a method
                 for argument in given:
-                    self.analysis.record_unread(self._memory(argument), ast.unparse(node.func), self.source, node)
+                    found = self._value(argument) if value is None else self._memory(argument)
+                    self.analysis.note_unread(found, ast.unparse(node.func), self.source, node)
             # a struct or another type may hold the rows that it is made from
             return frozenset(found for argument in given for found in self._value(argument))
         result = _NOTHING
@@ -306,7 +308,7 @@ class _Visit:
     def _call_builtin(self, callee: wp.Function, node: ast.Call, given: list[ast.expr]) -> _Found:
         values = frozenset(found for argument in given for found in self._value(argument))
         if callee.key not in _READERS:
-            self.analysis.record(values, self.source, node)
+            self.analysis.note(values, self.source, node)
         return values if callee.key in _PASSING else _NOTHING
 
     def _call_function(self, callee: wp.Function, node: ast.Call) -> _Found:
@@ -325,7 +327,7 @@ class _Visit:
             arguments.append(found)
         if not has_source(callee):
             for found in arguments:
-                self.analysis.record_unread(found, name_of(callee), self.source, node)
+                self.analysis.note_unread(found, name_of(callee), self.source, node)
             return _NOTHING
         return self.analysis.visit(callee, arguments)
 
@@ -382,7 +384,7 @@ def _attribute(place: _Place, name: str) -> list[_Place]:
     if _is_struct(place.kind):
         variable = place.kind.vars.get(name)
         return [_Place(place.position, place.field or name, _kind(variable.type) if variable else None)]
-    if isinstance(place.kind, tuple) and name in _INQUIRIES:
+    if isinstance(place.kind, tuple) and name in _INQUIRIES | {"ptr"}:
         return []
     return [place]  # a component, or a field of a struct that holds the row
 
