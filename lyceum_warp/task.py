@@ -188,7 +188,8 @@ class Task:
     ``World`` lists them. They must not read derived fields (``xpos``, ``site_xpos``, ``sensordata``): these are
     computed afterwards.
 
-    Quaternions in fields are in MuJoCo's order w, x, y, z; Warp's own quaternion functions expect x, y, z, w.
+    Quaternions in fields are in MuJoCo's order w, x, y, z, and typed ``Row[lw.quat]``. Warp's own quaternion functions
+    expect x, y, z, w and refuse them: use ``lw.quat_rotate``, ``lw.quat_mul``, ``lw.quat_from_axis_angle`` and others.
     """
 
     model: ClassVar[Any]
