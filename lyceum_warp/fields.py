@@ -8,6 +8,9 @@ import mujoco
 import numpy as np
 import warp as wp
 
+quat = wp.vec4
+"""A quaternion in MuJoCo's order w, x, y, z. Functions of Warp that expect x, y, z, w do not take it."""
+
 vec10 = wp.types.vector(length=10, dtype=wp.float32)
 
 
@@ -77,7 +80,7 @@ ON_DEMAND = {
 SENSED = {"sensordata", *ON_DEMAND}
 """Fields for which the model's sensors must be enabled."""
 
-_TYPES = {3: wp.vec3, 4: wp.quat, 6: wp.spatial_vector, 9: wp.mat33, 10: vec10}
+_TYPES = {3: wp.vec3, 4: quat, 6: wp.spatial_vector, 9: wp.mat33, 10: vec10}
 
 _Kind = mujoco.mjtObj
 
@@ -152,7 +155,7 @@ class Field:
     shape: tuple[int, ...]
     """Shape of one world's value, without the axis that ``dtype`` holds."""
     dtype: type
-    """Warp type of an element: float, wp.vec3, wp.quat (w, x, y, z as in MuJoCo), ..."""
+    """Warp type of an element: float, wp.vec3, quat (w, x, y, z), ..."""
     refresh: Stage
     """The stage that must be computed after a step for this field to belong to the new state."""
     reset: Stage

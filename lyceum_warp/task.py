@@ -294,7 +294,8 @@ class Task:
     An event belongs to the environment's randomness: the transition that was judged ends before it, the observation
     that follows shows it. It does not run in worlds that restart. Open-loop rollouts and planners leave events out.
 
-    Quaternions in fields are in MuJoCo's order w, x, y, z; Warp's own quaternion functions expect x, y, z, w.
+    Quaternions in fields are in MuJoCo's order w, x, y, z, and typed ``Row[lw.quat]``. Warp's own quaternion functions
+    expect x, y, z, w and refuse them: use ``lw.quat_rotate``, ``lw.quat_mul``, ``lw.quat_from_axis_angle`` and others.
     """
 
     model: ClassVar[Any]

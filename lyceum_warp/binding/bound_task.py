@@ -23,7 +23,7 @@ from lyceum_warp.task import FUNCTIONS, MEMORIES, RESULTS, Task, TaskFunction, o
 from lyceum_warp.validate import whole_number
 
 _SPELLED = {
-    "float32": "float", "int32": "int", "vec3f": "wp.vec3", "quatf": "wp.quat", "mat33f": "wp.mat33",
+    "float32": "float", "int32": "int", "vec3f": "wp.vec3", "vec4f": "lw.quat", "mat33f": "wp.mat33",
     "spatial_vectorf": "wp.spatial_vector",
 }  # fmt: skip
 
@@ -262,6 +262,10 @@ class BoundTask:
             )
         lines = [line.strip(" ;") for line in text.splitlines() if line.strip(" ;")]
         hint = ": a function returns one number, not a tuple" if "tuple_t" in text else ""
+        if re.search(r"overload for '(quat\w*|mul)' .*\bvec4f\b", flat):
+            hint = (
+                ": quaternions are w, x, y, z here: use lw.quat_rotate, lw.quat_mul, ... in place of Warp's functions"
+            )
         return ValueError(f"Warp can't compile the functions of the task {self.name!r}: {' '.join(lines[-3:])}{hint}")
 
     def check_field(self, name: str, array: wp.array) -> None:
