@@ -176,6 +176,11 @@ class Field:
 def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False, written: bool = False) -> Field:
     """Describe a field of a model.
 
+    Positions, velocities and functions of them belong to the current state: after a step, after a restart and after
+    an event that changed a world. Fields of the acceleration stage, such as ``qacc``, ``cfrc_ext`` or the forces of
+    actuators, are what the last substep left, and belong to the state that it started from; in a world that begins an
+    episode, to its first state. ``sensordata`` may hold both: each sensor follows the stage that it belongs to.
+
     Args:
         model: The compiled model.
         name: MuJoCo's name of the field, an attribute of MjData.
@@ -214,6 +219,13 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False, written:
         return Field(name, shape[:1], _TYPES[shape[1]], refresh, reset, lagged, snapshot, written)
     dtype = wp.bool if name == "eq_active" else wp.float32
     return Field(name, shape, dtype, refresh, reset, lagged, snapshot, written)
+
+
+def early_sensor_columns(model: mujoco.MjModel) -> np.ndarray:
+    """The columns of ``sensordata`` that hold sensors of the position and velocity stages, (n,) int."""
+    early = np.flatnonzero(model.sensor_needstage < Stage.ACCELERATION)
+    ranges = [np.arange(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i]) for i in early]
+    return np.concatenate([np.zeros(0, int), *ranges])
 
 
 def state_columns(model: mujoco.MjModel, name: str) -> slice:

@@ -84,7 +84,9 @@ class OpenLoop:
             # each field for all steps: the states before a step, after it, and the last ones are views of one buffer
             self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
-            constant = {f.name: shared_rows(f.nominal(task.model), f.dtype, rows + n, env.device) for f in task.constants}
+            constant = {
+                f.name: shared_rows(f.nominal(task.model), f.dtype, rows + n, env.device) for f in task.constants
+            }
             for name in task.types:
                 live = getattr(self.worlds.after, name)
                 buffer = constant.get(name)

@@ -145,7 +145,8 @@ class BoundTask:
                 f"the model field {both[0]!r} of the task {self.name!r} is drawn by startup and at resets: draw it in "
                 "one of them"
             )
-        varied = [name for name in dict.fromkeys([*named, *dynamics]) if any(name in f for f in (*drawn.values(), dynamics))]
+        written = frozenset().union(dynamics, *drawn.values())
+        varied = [name for name in dict.fromkeys([*named, *dynamics]) if name in written]
         self.dynamics = [describe_model_field(self.model, name) for name in varied]
         """The model fields that differ between worlds."""
         self.constants = [describe_model_field(self.model, name) for name in named if name not in varied]
@@ -170,7 +171,8 @@ class BoundTask:
     def _check_class(self, model: ModelSource | None) -> None:
         task = self.task
         for name in MEMORIES:
-            if (name in self.types) != (whole_number(f"{name} of the task {self.name!r}", getattr(task, name), low=0) > 0):
+            size = whole_number(f"{name} of the task {self.name!r}", getattr(task, name), low=0)
+            if (name in self.types) != (size > 0):
                 raise ValueError(f"the task {self.name!r} needs both, {name} = ... in the class and {name} in World")
         whole_number(f"draws of the task {self.name!r}", task.draws, low=1)
         whole_number(f"settle of the task {self.name!r}", task.settle, low=0)
@@ -196,13 +198,14 @@ class BoundTask:
     def _check_metrics(self) -> None:
         metrics = self.task.metrics
         if isinstance(metrics, str) or not all(isinstance(name, str) and name for name in metrics):
-            raise ValueError(f"metrics of the task {self.name!r} must be names, as ('forward', 'cost'), not {metrics!r}")
+            raise ValueError(
+                f"metrics of the task {self.name!r} must be names, as ('forward', 'cost'), not {metrics!r}"
+            )
         if twice := [name for name in metrics if list(metrics).count(name) > 1]:
             raise ValueError(f"the task {self.name!r} names the metric {twice[0]!r} twice: give each one name")
         if bool(metrics) != (self.functions["measure"] is not None):
             raise ValueError(
-                f"the task {self.name!r} needs both, metrics = (...) in the class and "
-                f"{FUNCTIONS['measure'].signature}"
+                f"the task {self.name!r} needs both, metrics = (...) in the class and {FUNCTIONS['measure'].signature}"
             )
 
     def _check_actions(self) -> None:
