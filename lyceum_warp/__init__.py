@@ -43,7 +43,25 @@ from lyceum_warp.kernels.rotations import (
 from lyceum_warp.openloop import OpenLoop
 from lyceum_warp.options import EnvOptions, PhysicsOptions
 from lyceum_warp.runs import load, load_value
-from lyceum_warp.task import Planning, Row, Task, body, dof, geom, mocap, qpos, sensor, site
+from lyceum_warp.task import (
+    Planning,
+    Row,
+    Task,
+    act,
+    actuator,
+    body,
+    camera,
+    ctrl,
+    dof,
+    equality,
+    geom,
+    joint,
+    mocap,
+    qpos,
+    sensor,
+    site,
+    tendon,
+)
 
 __version__ = "0.1.0"
 
@@ -70,15 +88,21 @@ __all__ = [
     "Task",
     "Trajectory",
     "ValueFunction",
+    "act",
+    "actuator",
     "body",
+    "camera",
     "control",
     "control_async",
     "control_report",
+    "ctrl",
     "dof",
+    "equality",
     "evaluate",
     "geom",
     "gymnasium_model",
     "gymnasium_robotics_model",
+    "joint",
     "load",
     "load_value",
     "make",
@@ -102,6 +126,7 @@ __all__ = [
     "sensor",
     "site",
     "task_names",
+    "tendon",
     "uniform",
     "vec10",
 ]

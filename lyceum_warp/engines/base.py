@@ -189,7 +189,7 @@ class Engine(abc.ABC):
     def set_state(self, state: wp.array, mask: wp.array) -> None:
         """Put the masked worlds into the given states, exactly; afterwards every field belongs to them."""
         self._set_integration(state[:, : self.integration_size], mask)
-        self._refresh_current(mask)
+        self.refresh_current(mask)
         start = self.integration_size
         for field in self.snapshots:
             target = flat(self.arrays[field.name])
@@ -204,7 +204,7 @@ class Engine(abc.ABC):
     def _set_integration(self, state: wp.array, mask: wp.array) -> None: ...
 
     @abc.abstractmethod
-    def _refresh_current(self, mask: wp.array) -> None: ...
+    def refresh_current(self, mask: wp.array) -> None: ...
 
 
 EngineFactory = Callable[..., Engine]

@@ -56,6 +56,20 @@ def controls(
 
 
 @wp.kernel(enable_backward=False)
+def repeat_columns(columns_in: wp.array2d[wp.float64], rows_out: wp.array3d[float]):
+    """Copy columns of states into the rows of every step; launched over (steps, nworld, columns)."""
+    t, w, i = wp.tid()
+    rows_out[t, w, i] = float(columns_in[w, i])
+
+
+@wp.kernel(enable_backward=False)
+def add_steps(count: int, step_inout: wp.array[int]):
+    """Advance the step counters; launched over (nworld,)."""
+    w = wp.tid()
+    step_inout[w] = step_inout[w] + count
+
+
+@wp.kernel(enable_backward=False)
 def merge_faults(fault_in: wp.array[int], fault_inout: wp.array[int]):
     """Add the bits of one array of faults to another; launched over (nworld,)."""
     w = wp.tid()

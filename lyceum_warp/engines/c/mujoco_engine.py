@@ -13,9 +13,9 @@ from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.batch_faults import errors_as_warnings
 from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
-from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
+from lyceum_warp.fields import READ_ONLY, STATE_FIELDS, Field, Stage, state_columns
 from lyceum_warp.kernels import faults
-from lyceum_warp.kernels.state import copy_rows64, fill_rows64, narrow, widen
+from lyceum_warp.kernels.state import copy_rows64, fill_rows64, narrow, narrow_bool, widen, widen_bool
 from lyceum_warp.mujoco_log import quiet
 from lyceum_warp.validate import whole_number
 
@@ -80,6 +80,8 @@ class MujocoEngine(Engine):
         """The model's initial state as float32 fields show it, whichever of them are kept."""
         initial = self.batch.state[0].copy()
         for name in STATE_FIELDS:
+            if name in READ_ONLY:
+                continue  # rounded, the times of delayed samples would differ from the engine's own
             columns = state_columns(self.model, name)
             initial[columns] = initial[columns].astype(np.float32)
         return wp.array(initial, dtype=wp.float64, device=self.device)
@@ -167,16 +169,24 @@ class MujocoEngine(Engine):
 
     def _read_state_fields(self, mask: wp.array) -> None:
         for name, column in self._columns.items():
-            launch_rows(narrow, mask, column, flat(self.arrays[name]))
+            array = self.arrays[name]
+            if array.dtype is wp.bool:
+                launch_rows(narrow_bool, mask, column, array)
+            else:
+                launch_rows(narrow, mask, column, flat(array))
 
     def commit(self, mask: wp.array) -> None:
         for name, column in self._columns.items():
-            launch_rows(widen, mask, flat(self.arrays[name]), column)
+            array = self.arrays[name]
+            if array.dtype is wp.bool:
+                launch_rows(widen_bool, mask, array, column)
+            elif name not in READ_ONLY:
+                launch_rows(widen, mask, flat(array), column)
 
     def refresh(self, mask: wp.array) -> None:
         self._forward(mask, self.reset_stage, self._derived)
 
-    def _refresh_current(self, mask: wp.array) -> None:
+    def refresh_current(self, mask: wp.array) -> None:
         self._forward(mask, self.stage, [field for field in self._derived if not field.snapshot])
         self._read_state_fields(mask)
 

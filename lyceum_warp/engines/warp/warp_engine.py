@@ -143,7 +143,7 @@ class WarpEngine(Engine):
             for _ in range(nstep):
                 mjw.step(self.m, self.d)
         self._copy_snapshots(self._everyone, lagged=True)
-        self._refresh_current()
+        self.refresh_current()
         self._copy_snapshots(self._everyone, lagged=False)
 
     def _forward(self, names: Collection[str], stage: Stage, data: mjw.Data | None = None) -> None:
@@ -161,8 +161,11 @@ class WarpEngine(Engine):
                 if stage == Stage.VELOCITY:
                     mjw.fwd_velocity(m, d)
                     mjw.sensor_vel(m, d)
+                if "energy" in names:  # of a model whose sensors do not compute it
+                    mjw.energy_pos(m, d)
+                    mjw.energy_vel(m, d)
 
-    def _refresh_current(self, mask: wp.array | None = None) -> None:
+    def refresh_current(self, mask: wp.array | None = None) -> None:
         self._forward(self._current, self.stage)
 
     def find_faults(self, mask: wp.array) -> None:
