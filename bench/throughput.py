@@ -209,7 +209,7 @@ def refresh_seconds(env: lw.Env) -> float:
     if engine.stage == engine.reset_stage == Stage.NONE:
         return 0.0
     with wp.ScopedDevice(env.device), wp.ScopedCapture() as capture:
-        engine._refresh_current()
+        engine.refresh_current()
         engine.refresh(env.worlds.restarting)
     times = [seconds(env, lambda: wp.capture_launch(capture.graph)) for _ in range(30)]
     return statistics.median(times)

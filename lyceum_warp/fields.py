@@ -35,6 +35,9 @@ STATE_FIELDS = {
 }
 """Fields that are part of the integration state, with their mjtState component."""
 
+INPUTS = ("ctrl", "xfrc_applied", "qfrc_applied", "mocap_pos", "mocap_quat", "userdata")
+"""State fields that physics reads and does not change: a task may write them before a step."""
+
 _POSITION = (
     "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat cam_xpos cam_xmat "
     "light_xpos light_xdir subtree_com cdof cinert ten_length actuator_length crb"
@@ -108,6 +111,8 @@ class Field:
     """Whether the field stays as ``mj_step`` leaves it, one substep behind the state."""
     snapshot: bool
     """Whether the field is not a function of the integration state, so that it is saved and restored with it."""
+    written: bool = False
+    """Whether the task writes the field before a step, which then takes it over: one of ``INPUTS``."""
 
     @property
     def size(self) -> int:
@@ -115,7 +120,7 @@ class Field:
         return int(np.prod(self.shape, dtype=int)) * wp.types.type_size_in_bytes(self.dtype) // 4
 
 
-def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field:
+def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False, written: bool = False) -> Field:
     """Describe a field of a model.
 
     Args:
@@ -123,10 +128,15 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field
         name: MuJoCo's name of the field, an attribute of MjData.
         lagged: Whether to keep the field as ``mj_step`` leaves it, one substep behind the state. Fields of the
             acceleration stage are always kept so; for a field of the integration state it has no effect.
+        written: Whether the task writes the field before a step. Controls are always written.
 
     Raises:
-        ValueError: There is no such field, or the model has no enabled sensor that makes MuJoCo compute it.
+        ValueError: There is no such field, the model has no enabled sensor that makes MuJoCo compute it, or it is
+            written and not one of ``INPUTS``.
     """
+    if written and name not in INPUTS:
+        raise ValueError(f"the field {name!r} cannot be written before a step: the inputs are {', '.join(INPUTS)}")
+    written = written or name == "ctrl"
     if name in SENSED and not _sensed(model, name):
         raise ValueError(
             f"MuJoCo computes the field {name!r} only for a sensor, and this model has no enabled sensor that needs "
@@ -152,8 +162,8 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field
         raise ValueError(f"there is no field {name!r}: {hint}")
     shape: tuple[int, ...] = np.shape(getattr(mujoco.MjData(model), name))
     if len(shape) == 2:
-        return Field(name, shape[:1], _TYPES[shape[1]], refresh, reset, lagged, snapshot)
-    return Field(name, shape, wp.float32, refresh, reset, lagged, snapshot)
+        return Field(name, shape[:1], _TYPES[shape[1]], refresh, reset, lagged, snapshot, written)
+    return Field(name, shape, wp.float32, refresh, reset, lagged, snapshot, written)
 
 
 def state_columns(model: mujoco.MjModel, name: str) -> slice:

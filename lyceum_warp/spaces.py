@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from lyceum_warp.fields import STATE_FIELDS, Field
+from lyceum_warp.model_fields import ModelField
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,8 +87,10 @@ def control_ranges(model: mujoco.MjModel) -> np.ndarray:
     return np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf))
 
 
-def state_space(model: mujoco.MjModel, snapshots: Iterable[Field], memory: int) -> Space:
-    """States: the integration state in MuJoCo's order, the fields saved with it, counters, and task memory."""
+def state_space(
+    model: mujoco.MjModel, snapshots: Iterable[Field], memory: int, *, dynamics: Iterable[ModelField] = ()
+) -> Space:
+    """States: the integration state in MuJoCo's order, the fields and model fields saved with it, counters, memory."""
     sizes = {}
     names = {component.value: name for name, component in STATE_FIELDS.items()}
     components = mujoco.mjtState.mjSTATE_INTEGRATION.value
@@ -95,5 +98,6 @@ def state_space(model: mujoco.MjModel, snapshots: Iterable[Field], memory: int) 
         if components & component and (size := mujoco.mj_stateSize(model, component)):
             fallback = mujoco.mjtState(component).name.removeprefix("mjSTATE_").lower()
             sizes[names.get(component, fallback)] = size
-    sizes |= {field.name: field.size for field in snapshots} | dict.fromkeys(COUNTERS, 1)
+    sizes |= {field.name: field.size for field in snapshots} | {field.name: field.size for field in dynamics}
+    sizes |= dict.fromkeys(COUNTERS, 1)
     return Space.of(sizes | ({"memory": memory} if memory else {}), dtype=torch.float64)

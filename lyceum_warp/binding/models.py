@@ -12,6 +12,7 @@ from pathlib import Path
 import mujoco
 
 from lyceum_warp.fields import ON_DEMAND, SENSED
+from lyceum_warp.model_fields import MOVED_INERTIA
 from lyceum_warp.mujoco_log import quiet
 from lyceum_warp.options import CONES, INTEGRATORS, ModelSource, PhysicsOptions
 
@@ -103,7 +104,9 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         raise ValueError(f"MuJoCo can't read the model {path}: {error}") from error
 
 
-def compile_model(spec: mujoco.MjSpec, fields: Collection[str], physics: PhysicsOptions) -> mujoco.MjModel:
+def compile_model(
+    spec: mujoco.MjSpec, fields: Collection[str], physics: PhysicsOptions, *, varied: Collection[str] = ()
+) -> mujoco.MjModel:
     """Compile a model for either engine.
 
     MuJoCo Warp has no PGS solver, so a model that asks for it gets Newton on both engines, which converges to
@@ -114,6 +117,7 @@ def compile_model(spec: mujoco.MjSpec, fields: Collection[str], physics: Physics
         spec: The model; changed in place.
         fields: Names of the fields that will be read.
         physics: Cone, integrator and solver limits that replace the model's own.
+        varied: Names of the model fields that will differ between worlds.
 
     Raises:
         ValueError: MuJoCo refuses the model.
@@ -135,6 +139,9 @@ def compile_model(spec: mujoco.MjSpec, fields: Collection[str], physics: Physics
         spec.add_sensor(name=name, type=sensor, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=body.name)
     if SENSED.isdisjoint(fields):
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
+    if not MOVED_INERTIA.isdisjoint(varied):
+        for body in spec.bodies[1:]:
+            body.simple = 0
     quiet()
     try:
         with warnings.catch_warnings(record=True) as caught:
