@@ -84,9 +84,7 @@ class OpenLoop:
             # each field for all steps: the states before a step, after it, and the last ones are views of one buffer
             self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
-            constant = {
-                f.name: shared_rows(f.nominal(task.model), f.dtype, rows + n, env.device) for f in task.constants
-            }
+            constant = {f.name: shared_rows(f.value(task.model), f.dtype, rows + n, env.device) for f in task.constants}
             for name in task.types:
                 live = getattr(self.worlds.after, name)
                 buffer = constant.get(name)
@@ -178,7 +176,7 @@ class OpenLoop:
     def _overwrite_model(self) -> None:
         """Give the model fields in every world's state their nominal values."""
         columns, states = self.env.state_space.parts, self.worlds.state
-        nominal: Mapping[str, wp.array] = getattr(self.env.engine, "nominal", {})
+        nominal: Mapping[str, wp.array] = self.env.engine.nominal
         for name, row in nominal.items():
             row = flat(row)
             args = [row, columns[name].start, states]

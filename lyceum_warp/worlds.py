@@ -85,7 +85,7 @@ class Worlds:
         # the fields of the state that a step leads to, live, and copies of those of the state before
         self.after, self.before = kernels.Batch(), kernels.Batch()
         self._copies: dict[str, wp.array] = {}
-        constant = {f.name: shared_rows(f.nominal(model), f.dtype, n, self.device) for f in self.task.constants}
+        constant = {f.name: shared_rows(f.value(model), f.dtype, n, self.device) for f in self.task.constants}
         varied = [field.name for field in self.task.dynamics]
         for name in self.task.types:
             live = getattr(self, name) if name in MEMORIES else constant.get(name, self.engine.arrays.get(name))
