@@ -81,8 +81,8 @@ _POSITIVE = {"body_mass", "body_inertia", "geom_size"}
 """Fields whose numbers must stay positive where the nominal value is."""
 
 _NOT_NEGATIVE = _POSITIVE | set(
-    "geom_friction pair_friction jnt_stiffness dof_damping dof_armature dof_frictionloss tendon_stiffness tendon_damping "
-    "tendon_armature tendon_frictionloss actuator_damping actuator_armature density viscosity".split()
+    "geom_friction pair_friction jnt_stiffness dof_damping dof_armature dof_frictionloss tendon_stiffness "
+    "tendon_damping tendon_armature tendon_frictionloss actuator_damping actuator_armature density viscosity".split()
 )
 """Fields whose numbers are never negative."""
 

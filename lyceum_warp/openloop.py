@@ -121,7 +121,8 @@ class OpenLoop:
     def _bytes_per_world(env: Env, horizon: int) -> int:
         """An estimate of the buffers' memory for each world."""
         fields = [field for field in env.task.fields if field.name in env.task.types]
-        numbers = sum(field.size for field in (*fields, *env.task.dynamics)) + sum(own_parts(env.task).values())
+        numbers = sum(field.size for field in fields) + sum(field.size for field in env.task.dynamics)
+        numbers += sum(own_parts(env.task).values())
         own = 4 * (numbers + env.task.model.nu + env.action_space.size)
         return horizon * (own + 8) + env.engine.rollout_bytes_per_world(horizon, env.task.frame_skip, fields)
 

@@ -103,8 +103,8 @@ class BoundTask:
         """The parts of each group of observations and their sizes."""
         self.observers = self.source.group_functions(self.obs_layouts)
         """The functions that write the groups of observations, by the groups' names."""
-        named = {observer_name(group): function for group, function in self.observers.items()}
-        check_writes(self.name, named, dict.fromkeys(named, self._rights(FUNCTIONS["observe"])))
+        observers = {observer_name(group): function for group, function in self.observers.items()}
+        check_writes(self.name, observers, dict.fromkeys(observers, self._rights(FUNCTIONS["observe"])))
         self.kernels = kernels_of(self.source, self.observers)
 
     @property
@@ -197,7 +197,7 @@ class BoundTask:
                 )
 
     def _check_metrics(self) -> None:
-        metrics = self.task.metrics
+        metrics: Any = self.task.metrics
         if isinstance(metrics, str) or not all(isinstance(name, str) and name for name in metrics):
             raise ValueError(
                 f"metrics of the task {self.name!r} must be names, as ('forward', 'cost'), not {metrics!r}"
