@@ -19,7 +19,7 @@ _RESET = ("startup", "initialize", "randomize")
 _MEMORIES = ("memory", "lasting_memory")
 """Fields that ``advance`` finds as the step before left them."""
 
-_MOST_LISTED = 5
+_MOST_LISTED = 8
 """Problems that the message of a failure lists."""
 
 
@@ -139,7 +139,9 @@ class _Run:
         with wp.ScopedDevice(self.env.device):
             made: wp.array = wp.zeros([max(size, 1) for size in shape], dtype=dtype)
             self.keep.append(made)
-            return made if made.shape == shape else wp.array(ptr=made.ptr, shape=shape, strides=made.strides, dtype=dtype)
+            return (
+                made if made.shape == shape else wp.array(ptr=made.ptr, shape=shape, strides=made.strides, dtype=dtype)
+            )
 
     def _copy(self, source: Any, target: Any) -> None:
         for name in self.env.task.types:
