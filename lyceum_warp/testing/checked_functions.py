@@ -17,9 +17,7 @@ import numpy as np
 import warp as wp
 
 from lyceum_warp.binding.sources import FunctionSource, has_source, name_of, overloads
-
-MOST_ROUNDS = wp.constant(1_000_000)
-"""Rounds after which a ``while`` loop is reported as endless."""
+from lyceum_warp.kernels import bounds
 
 _SHAPES = ("shape", "strides")
 """Attributes of an array that are tuples."""
@@ -40,58 +38,19 @@ class Place:
     def problem(self, index: int, size: int) -> str:
         """What went wrong, in one line."""
         if self.verb == "loops":
-            return f"{self.function} is still in its loop {self.text!r} after {MOST_ROUNDS} rounds ({self.where})"
+            rounds = int(bounds.MOST_ROUNDS)
+            return f"{self.function} is still in its loop {self.text!r} after {rounds} rounds ({self.where})"
+        there = f"{size} elements, 0 to {size - 1}" if size else "no elements"
         return (
-            f"{self.function} {self.verb} {self.text} out of range ({self.where}): the index is {index}, and there "
-            f"are {size} elements, 0 to {size - 1}"
-            if size
-            else f"{self.function} {self.verb} {self.text} out of range ({self.where}): the index is {index}, and there "
-            "are no elements"
+            f"{self.function} {self.verb} {self.text} out of range ({self.where}): the index is {index}, and there are "
+            f"{there}"
         )
 
 
-@wp.func(inline=False)
-def note(report: wp.array2d[int], place: int, index: int, size: int):
-    """Keep the first index that is out of range at a place."""
-    if wp.atomic_add(report, place, 0, 1) == 0:
-        report[place, 1] = index
-        report[place, 2] = size
-
-
-@wp.func(inline=False)
-def at(report: wp.array2d[int], place: int, index: Any, size: int) -> int:
-    """An index within a size; 0 for one that is out of range, also a negative one."""
-    i = int(index)
-    if i < 0 or i >= size:
-        note(report, place, i, size)
-        return 0
-    return i
-
-
-@wp.func(inline=False)
-def from_end(report: wp.array2d[int], place: int, index: int, size: int) -> int:
-    """The same for a negative constant, which counts from the end as in Python."""
-    if index < -size:
-        note(report, place, index, size)
-        return 0
-    return index + size
-
-
-@wp.func
-def element(report: wp.array2d[int], place: int, values: Any, index: Any):
-    """An element of the result of a call, which is evaluated once."""
-    return values[at(report, place, index, len(values))]
-
-
-@wp.func
-def is_endless(report: wp.array2d[int], place: int, rounds: int) -> bool:
-    """Whether a loop has run too often, here or before."""
-    if rounds > MOST_ROUNDS:
-        note(report, place, rounds, 0)
-    return report[place, 0] > 0
-
-
-_HELPERS = {"bounds_at": at, "bounds_from_end": from_end, "bounds_element": element, "bounds_is_endless": is_endless}
+_HELPERS = {
+    "bounds_at": bounds.at, "bounds_from_end": bounds.from_end, "bounds_element": bounds.element,
+    "bounds_is_endless": bounds.is_endless,
+}  # fmt: skip
 """The names that the copies use, chosen so that no task has them."""
 
 
@@ -167,7 +126,7 @@ class CheckedFunctions:
         return len(self.places) - 1
 
     def number(self, function: wp.Function) -> int:
-        """The number of the copy of a function, which is made if it is not there yet."""
+        """The number of a function's copy, which is made if it is not there yet."""
         if function not in self._numbers:
             number = self._numbers[function] = len(self._numbers)
             for overload in overloads(function):
@@ -187,7 +146,9 @@ class CheckedFunctions:
         for argument, name in zip(tree.args.args, types, strict=True):
             argument.annotation = ast.Name(name, ast.Load())
         tree.args.args.insert(0, ast.arg("bounds_report", ast.Name("bounds_report_type", ast.Load())))
-        defaults = {f"bounds_default_{i}": value for i, value in enumerate(function.func.__defaults__ or ())}
+        defaults = {
+            f"bounds_default_{i}": value for i, value in enumerate(getattr(function.func, "__defaults__", None) or ())
+        }
         tree.args.defaults = [ast.Name(name, ast.Load()) for name in defaults]
         returned = function.adj.arg_types.get("return")
         tree.returns = None if returned is None else ast.Name("bounds_result_type", ast.Load())

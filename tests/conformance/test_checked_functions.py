@@ -95,7 +95,7 @@ def right(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):
     pair = both(s)
     obs[4] = pair[1] + lw.uniform(rng, 0.0, 1.0)
     wp.atomic_add(obs, 4, 1.0)
-    rounds = int(0)
+    rounds = int(0)  # noqa: RUF046
     while rounds < 5:
         rounds += 1
         obs[5] += float(rounds)
@@ -165,8 +165,9 @@ WRONG = {
     )
 }  # fmt: skip
 FINDINGS = {
-    "reads_beyond": [r"reads_beyond reads s\.qpos\[4\] out of range \(.*\.py, line \d+\): the index is 4, and there are "
-                     "4 elements, 0 to 3"],
+    "reads_beyond": [
+        r"reads_beyond reads s\.qpos\[4\] out of range \(.*\.py, line \d+\): the index is 4, and there are 4 el"
+    ],
     "reads_before": [r"reads s\.qpos\[p\.where - 1\] .* the index is -1,", r"reads s\.qpos\[-5\] .* the index is -5,"],
     "component": [
         r"reads s\.site_xpos\[0\]\[i\] .* the index is 3, and there are 3 elements",
