@@ -97,7 +97,9 @@ class OpenLoop:
     def _bytes_per_world(env: Env, horizon: int) -> int:
         """An estimate of the buffers' memory for each world."""
         fields = [field for field in env.task.fields if field.name in env.task.types]
-        own = 4 * (sum(field.size for field in fields) + env.task.task.memory + env.task.model.nu + env.action_space.size)
+        own = 4 * (
+            sum(field.size for field in fields) + env.task.task.memory + env.task.model.nu + env.action_space.size
+        )
         return horizon * (own + 8) + env.engine.rollout_bytes_per_world(horizon, env.task.frame_skip, fields)
 
     def _whole_horizon(self) -> tuple[Phase, ...]:

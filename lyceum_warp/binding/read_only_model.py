@@ -83,8 +83,8 @@ class _Part:
 
 _PLAIN = (int, float, bytes, str, tuple, type(None), enum.Enum, np.generic)
 _NAMED = frozenset(
-    "actuator bind body cam camera eq equality exclude geom hfield jnt joint key keyframe light mat material mesh numeric "
-    "pair sensor site skin tendon tex texture tuple".split()
+    "actuator bind body cam camera eq equality exclude geom hfield jnt joint key keyframe light mat material mesh "
+    "numeric pair sensor site skin tendon tex texture tuple".split()
 )
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
+from mujoco_warp._src import collision_sdf
 
 from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
@@ -237,11 +238,19 @@ def _refusals() -> Iterator[None]:
 
 def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None) -> tuple[int, int]:
     """Contacts and constraints that each world has room for: those given, and probed ones for those that are not."""
+    with _refusals():
+        _check_sdf_plugins(model)  # now: probing such a model takes long
     given = {"nconmax": nconmax, "njmax": njmax}
     sizes = [size if size is None else whole_number(name, size, low=1) for name, size in given.items()]
     probed = probe_sizes(model) if None in sizes else (0, 0)
     contacts, constraints = (other if size is None else size for size, other in zip(sizes, probed, strict=True))
     return contacts, constraints
+
+
+def _check_sdf_plugins(model: mujoco.MjModel) -> None:
+    """Refuse plugins whose distance function MuJoCo Warp leaves to its user, who has not written it."""
+    if (model.geom_plugin >= 0).any() and collision_sdf.user_sdf.func.__module__ == collision_sdf.__name__:
+        raise NotImplementedError("it has no functions of SDF plugins")
 
 
 def _check_unrolled(model: mujoco.MjModel) -> None:
