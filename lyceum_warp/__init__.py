@@ -24,8 +24,22 @@ from lyceum_warp.control.real_time import control_async
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.done import Done
 from lyceum_warp.env import Env, make
-from lyceum_warp.fields import vec10
+from lyceum_warp.fields import quat, vec10
 from lyceum_warp.kernels.random import normal, uniform
+from lyceum_warp.kernels.rotations import (
+    quat_angle,
+    quat_difference,
+    quat_from_axis_angle,
+    quat_from_mat,
+    quat_from_rotvec,
+    quat_inverse,
+    quat_mul,
+    quat_random,
+    quat_rotate,
+    quat_rotate_inverse,
+    quat_to_mat,
+    quat_to_rotvec,
+)
 from lyceum_warp.openloop import OpenLoop
 from lyceum_warp.options import EnvOptions, PhysicsOptions
 from lyceum_warp.runs import load, load_value
@@ -95,6 +109,19 @@ __all__ = [
     "mocap",
     "normal",
     "qpos",
+    "quat",
+    "quat_angle",
+    "quat_difference",
+    "quat_from_axis_angle",
+    "quat_from_mat",
+    "quat_from_rotvec",
+    "quat_inverse",
+    "quat_mul",
+    "quat_random",
+    "quat_rotate",
+    "quat_rotate_inverse",
+    "quat_to_mat",
+    "quat_to_rotvec",
     "register",
     "sensor",
     "site",

@@ -8,6 +8,9 @@ import mujoco
 import numpy as np
 import warp as wp
 
+quat = wp.vec4
+"""A quaternion in MuJoCo's order w, x, y, z. Functions of Warp that expect x, y, z, w do not take it."""
+
 vec10 = wp.types.vector(length=10, dtype=wp.float32)
 
 
@@ -37,6 +40,12 @@ STATE_FIELDS = {
     "userdata": mujoco.mjtState.mjSTATE_USERDATA,
 }
 """Fields that are part of the integration state, with their mjtState component."""
+
+INPUTS = ("xfrc_applied", "qfrc_applied", "mocap_pos", "mocap_quat", "userdata")
+"""Fields beside ``ctrl`` that drive the simulation and that a step leaves as they are."""
+
+INITIAL = ("qpos", "qvel", "act", "ctrl", "eq_active", *INPUTS)
+"""Fields that make up an initial state."""
 
 READ_ONLY = ("history", "plastic")
 """Fields of the integration state that the physics alone writes: delayed samples and deformations."""
@@ -71,7 +80,7 @@ ON_DEMAND = {
 SENSED = {"sensordata", *ON_DEMAND}
 """Fields for which the model's sensors must be enabled."""
 
-_TYPES = {3: wp.vec3, 4: wp.quat, 6: wp.spatial_vector, 9: wp.mat33, 10: vec10}
+_TYPES = {3: wp.vec3, 4: quat, 6: wp.spatial_vector, 9: wp.mat33, 10: vec10}
 
 _Kind = mujoco.mjtObj
 
@@ -146,7 +155,7 @@ class Field:
     shape: tuple[int, ...]
     """Shape of one world's value, without the axis that ``dtype`` holds."""
     dtype: type
-    """Warp type of an element: float, wp.vec3, wp.quat (w, x, y, z as in MuJoCo), ..."""
+    """Warp type of an element: float, wp.vec3, quat (w, x, y, z), ..."""
     refresh: Stage
     """The stage that must be computed after a step for this field to belong to the new state."""
     reset: Stage
@@ -155,6 +164,8 @@ class Field:
     """Whether the field stays as ``mj_step`` leaves it, one substep behind the state."""
     snapshot: bool
     """Whether the field is not a function of the integration state, so that it is saved and restored with it."""
+    written: bool = False
+    """Whether the task writes the field between resets, so that every step takes it over."""
 
     @property
     def size(self) -> int:
@@ -162,14 +173,20 @@ class Field:
         return int(np.prod(self.shape, dtype=int)) * max(1, wp.types.type_size_in_bytes(self.dtype) // 4)
 
 
-def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field:
+def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False, written: bool = False) -> Field:
     """Describe a field of a model.
+
+    Positions, velocities and functions of them belong to the current state: after a step, after a restart and after
+    an event that changed a world. Fields of the acceleration stage, such as ``qacc``, ``cfrc_ext`` or the forces of
+    actuators, are what the last substep left, and belong to the state that it started from; in a world that begins an
+    episode, to its first state. ``sensordata`` may hold both: each sensor follows the stage that it belongs to.
 
     Args:
         model: The compiled model.
         name: MuJoCo's name of the field, an attribute of MjData.
         lagged: Whether to keep the field as ``mj_step`` leaves it, one substep behind the state. Fields of the
             acceleration stage are always kept so; for a field of the integration state it has no effect.
+        written: Whether the task writes the field between resets.
 
     Raises:
         ValueError: There is no such field, or the model has no enabled sensor that makes MuJoCo compute it.
@@ -199,9 +216,16 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False) -> Field
         raise ValueError(f"there is no field {name!r}: {hint}")
     shape: tuple[int, ...] = np.shape(getattr(mujoco.MjData(model), name))
     if len(shape) == 2:
-        return Field(name, shape[:1], _TYPES[shape[1]], refresh, reset, lagged, snapshot)
+        return Field(name, shape[:1], _TYPES[shape[1]], refresh, reset, lagged, snapshot, written)
     dtype = wp.bool if name == "eq_active" else wp.float32
-    return Field(name, shape, dtype, refresh, reset, lagged, snapshot)
+    return Field(name, shape, dtype, refresh, reset, lagged, snapshot, written)
+
+
+def early_sensor_columns(model: mujoco.MjModel) -> np.ndarray:
+    """The columns of ``sensordata`` that hold sensors of the position and velocity stages, (n,) int."""
+    early = np.flatnonzero(model.sensor_needstage < Stage.ACCELERATION)
+    ranges = [np.arange(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i]) for i in early]
+    return np.concatenate([np.zeros(0, int), *ranges])
 
 
 def state_columns(model: mujoco.MjModel, name: str) -> slice:

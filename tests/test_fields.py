@@ -38,7 +38,7 @@ def model() -> mujoco.MjModel:
         ("time", (), wp.float32),
         ("qpos", (8,), wp.float32),
         ("site_xpos", (2,), wp.vec3),
-        ("xquat", (4,), wp.quat),
+        ("xquat", (4,), lw.quat),
         ("xmat", (4,), wp.mat33),
         ("cvel", (4,), wp.spatial_vector),
         ("cinert", (4,), vec10),

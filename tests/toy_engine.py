@@ -100,7 +100,7 @@ class ToyEngine(Engine):
     def refresh(self, mask: wp.array) -> None:
         self._forward(mask, self.reset_stage, list(self.fields.values()))
 
-    def _refresh_current(self, mask: wp.array) -> None:
+    def refresh_current(self, mask: wp.array) -> None:
         self._forward(mask, self.stage, [field for field in self.fields.values() if not field.snapshot])
         self._read_state_fields(mask)
 

@@ -10,6 +10,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from lyceum_warp.fields import ON_DEMAND, SENSED
 from lyceum_warp.mujoco_log import quiet
@@ -114,6 +115,26 @@ def _start(text: str) -> str:
     """The beginning of a text, for a message of one line."""
     flat = " ".join(text.split())
     return repr(flat if len(flat) <= 24 else f"{flat[:20]} ...")
+
+
+def keyframe_state(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """The integration state of one of the model's keyframes at time 0, (integration_size,) float64.
+
+    Raises:
+        ValueError: The model has no such keyframe.
+    """
+    key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name)
+    if key < 0:
+        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) for i in range(model.nkey)]
+        known = ", ".join(repr(n) for n in names if n) or "none that is named"
+        raise ValueError(f"the model has no keyframe {name!r}; it has {known}")
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, key)
+    data.time = 0.0
+    spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
+    state = np.zeros(mujoco.mj_stateSize(model, spec))
+    mujoco.mj_getState(model, data, state, spec)
+    return state
 
 
 def compile_model(spec: mujoco.MjSpec, fields: Collection[str], physics: PhysicsOptions) -> mujoco.MjModel:

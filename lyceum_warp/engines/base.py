@@ -135,6 +135,14 @@ class Engine(abc.ABC):
         Worlds outside the mask keep their values.
         """
 
+    @abc.abstractmethod
+    def refresh_current(self, mask: wp.array) -> None:
+        """Compute the masked worlds' fields that belong to the current state, and their sensors.
+
+        Fields and sensors of the acceleration stage stay as the last substep left them. Other worlds, and all
+        sensors' histories, stay as they are.
+        """
+
     # rollouts
 
     def rollout(self, state: wp.array, controls: wp.array, nstep: int, buffers: Mapping[str, wp.array]) -> None:
@@ -189,7 +197,7 @@ class Engine(abc.ABC):
     def set_state(self, state: wp.array, mask: wp.array) -> None:
         """Put the masked worlds into the given states, exactly; afterwards every field belongs to them."""
         self._set_integration(state[:, : self.integration_size], mask)
-        self._refresh_current(mask)
+        self.refresh_current(mask)
         start = self.integration_size
         for field in self.snapshots:
             target = flat(self.arrays[field.name])
@@ -202,9 +210,6 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def _set_integration(self, state: wp.array, mask: wp.array) -> None: ...
-
-    @abc.abstractmethod
-    def _refresh_current(self, mask: wp.array) -> None: ...
 
 
 EngineFactory = Callable[..., Engine]

@@ -82,6 +82,8 @@ def open_engine(
     fields: Iterable[Field],
     *,
     reserved: int = 0,
+    dynamics: Any = (),
+    initial: Any = None,
     **options: Any,
 ) -> Engine:
     """Make an engine by name, or by a class or factory of your own.

@@ -76,8 +76,6 @@ class PartialForward:
         forward(group)
         report_pool_overflow(group, self._everyone)
         results = {name: (getattr(group, name), target) for name, target in targets.items()}
-        if self._model.nhistory:  # a forward pass adds its sensors' samples to it
-            results["history"] = group.history, data.history
         for source, target in results.values():
             rows = flat(source)
             wp.launch(kernels.return_rows, rows.shape, [*worlds, rows, flat(target)])
@@ -89,6 +87,39 @@ class PartialForward:
         if self._arena is None:
             return contextlib.nullcontext()
         return self._arena.serving() if self._device.is_capturing else self._arena.counting()
+
+
+class Conditional:
+    """Runs launches if a mask holds a world, and costs next to nothing in a graph if it holds none.
+
+    Outside a graph it always runs them, without a look at the mask, which may still be in the making.
+
+    Args:
+        device: Where the launches run.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        self._device = device
+        self._any = wp.zeros(1, dtype=int, device=device)
+        self._arena = None if device.is_cpu else Arena(device)
+
+    def __call__(self, mask: wp.array, run: Callable[[], None]) -> None:
+        """Run launches for the masked worlds, (nworld,) bool, which may not matter to any other world."""
+        if not self._device.is_capturing:
+            with contextlib.nullcontext() if self._arena is None else self._arena.counting():
+                self._open()
+                run()
+            return
+        with wp.ScopedDevice(self._device):
+            self._any.zero_()
+            wp.launch(kernels.find_any, len(mask), [mask, self._any])
+            self._open()
+            with contextlib.nullcontext() if self._arena is None else self._arena.serving():
+                wp.capture_if(self._any, on_true=run)
+
+    def _open(self) -> None:
+        if self._arena is not None:
+            self._arena.open()
 
 
 class Arena(Reserve):

@@ -1,7 +1,7 @@
 """The Warp engine: MuJoCo Warp, float32, on a CUDA device or on the CPU."""
 
 import contextlib
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 import mujoco
@@ -14,20 +14,14 @@ from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.warp import overflow
 from lyceum_warp.engines.warp.contact_sizes import probe_sizes
 from lyceum_warp.engines.warp.data_memory import data_bytes
-from lyceum_warp.engines.warp.partial_forward import PartialForward, group_size
-from lyceum_warp.fields import Field, Stage
+from lyceum_warp.engines.warp.forward_parts import Part, forward_parts, step_after, takes_over
+from lyceum_warp.engines.warp.partial_forward import Conditional, PartialForward, group_size
+from lyceum_warp.fields import Field, Stage, early_sensor_columns
 from lyceum_warp.kernels import faults
-from lyceum_warp.kernels.state import copy_rows, narrow, widen
+from lyceum_warp.kernels.state import copy_columns, copy_rows, narrow, widen, zero_columns
 from lyceum_warp.validate import whole_number
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
-
-_PARTS = (
-    (mjw.kinematics, "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat".split()),
-    (mjw.com_pos, "subtree_com cdof cinert".split()),
-    (mjw.com_vel, "cvel cdof_dot".split()),
-)
-"""The cheap parts of a forward pass in their order, and the fields that each computes; each needs those before it."""
 
 _MOST_UNROLLED = 20
 """The most iterations of the solver that are unrolled; more would take minutes to capture and gain nothing."""
@@ -55,7 +49,8 @@ class WarpEngine(Engine):
     capturable = True
 
     partial_refresh = True
-    """Whether restarting worlds get a separate forward pass if its cheap parts are not enough."""
+    """Whether restarting worlds get a separate forward pass if its cheap parts are not enough, and no pass at all if
+    there are none."""
 
     def __init__(
         self,
@@ -86,8 +81,16 @@ class WarpEngine(Engine):
             self._own[field.name] = self._alias(field)
             self.arrays[field.name] = wp.clone(self._own[field.name]) if field.snapshot else self._own[field.name]
         self.ctrl = self.arrays["ctrl"]
-        self._current = [field.name for field in self.fields.values() if field.refresh > Stage.NONE]
         self._reset = [field.name for field in self.fields.values() if field.reset > Stage.NONE]
+        self._current_parts = forward_parts(model, [f.name for f in self.fields.values() if f.refresh > Stage.NONE])
+        self._reset_parts = None
+        if self.reset_stage < Stage.ACCELERATION:
+            self._reset_parts = forward_parts(model, self._reset)
+        self._columns: wp.array = wp.array(early_sensor_columns(model), dtype=int, device=device)
+        # a step goes on from the parts that were computed for its state, whether a world stepped there or restarted
+        moved = any(getattr(self.fields.get(name), "written", False) for name in ("mocap_pos", "mocap_quat"))
+        self._shared = () if moved else takes_over(model, self._current_parts or ())
+        self._conditional = Conditional(device)
         self._partial = self._partial_forward()
 
     # hooks for subclasses
@@ -132,42 +135,52 @@ class WarpEngine(Engine):
         own.owner = source  # a view of this memory may outlive the engine
         return own
 
-    def _copy_snapshots(self, mask: wp.array, *, lagged: bool | None = None) -> None:
+    def _copy_snapshots(self, mask: wp.array) -> None:
         for field in self.snapshots:
-            if lagged is None or field.lagged == lagged:
-                launch_rows(copy_rows, mask, flat(self._own[field.name]), flat(self.arrays[field.name]))
+            launch_rows(copy_rows, mask, flat(self._own[field.name]), flat(self.arrays[field.name]))
 
     # physics
 
     def step(self, nstep: int) -> None:
         with self._on_device():
-            for _ in range(nstep):
-                mjw.step(self.m, self.d)
-        self._copy_snapshots(self._everyone, lagged=True)
-        self._refresh_current()
-        self._copy_snapshots(self._everyone, lagged=False)
+            for i in range(nstep):
+                if i == 0 and self._shared:
+                    step_after(self._shared, self.m, self.d)
+                else:
+                    mjw.step(self.m, self.d)
+        self._copy_snapshots(self._everyone)
+        self.refresh_current(self._everyone)
 
-    def _forward(self, names: Collection[str], stage: Stage, data: mjw.Data | None = None) -> None:
-        """Run the part of a forward pass that the named fields need, in every world of a data."""
+    def _forward(self, parts: Collection[Part] | None, stage: Stage, data: mjw.Data | None = None) -> None:
+        """Run parts of a forward pass in every world of a data; None for all parts up to a stage."""
         m, d = self.m, self.d if data is None else data
         with self._on_device():
-            if (parts := _parts(names)) is not None:
+            if parts is not None:
                 for part in parts:
                     part(m, d)
             elif stage == Stage.ACCELERATION:
                 mjw.forward(m, d)
             else:
-                mjw.fwd_position(m, d)
+                # sensors of limits and contacts are written only where there is one; the others stay as they are
+                wp.launch(zero_columns, (d.nworld, len(self._columns)), [self._columns, d.sensordata])
+                mjw.fwd_position(m, d, factorize=False)
                 mjw.sensor_pos(m, d)
                 if stage == Stage.VELOCITY:
                     mjw.fwd_velocity(m, d)
                     mjw.sensor_vel(m, d)
-                if "energy" in names:  # of a model whose sensors do not compute it
+                if "energy" in self.fields:  # of a model whose sensors do not compute it
                     mjw.energy_pos(m, d)
                     mjw.energy_vel(m, d)
 
-    def _refresh_current(self, mask: wp.array | None = None) -> None:
-        self._forward(self._current, self.stage)
+    def refresh_current(self, mask: wp.array) -> None:
+        if self.stage == Stage.NONE:
+            return
+        with self._histories_kept():
+            self._forward(self._current_parts, self.stage)
+        if (mixed := self.fields.get("sensordata")) and mixed.snapshot and not mixed.lagged:
+            own, kept = self._own["sensordata"], self.arrays["sensordata"]
+            size = self.nworld, len(self._columns)
+            wp.launch(copy_columns, size, [mask, self._columns, own, kept], device=self.device)
 
     def find_faults(self, mask: wp.array) -> None:
         d = self.d
@@ -184,35 +197,41 @@ class WarpEngine(Engine):
 
     def refresh(self, mask: wp.array) -> None:
         if self._partial is not None and self.partial_refresh:
-            targets = {name: self.arrays[name] for name in self._reset}
-            self._partial(mask, lambda data: self._forward(self._reset, self.reset_stage, data), targets)
-            return
-        with self._histories_of_others_kept(mask):
-            self._forward(self._reset, self.reset_stage)
+            self._partial(mask, self._forward_group, {name: self.arrays[name] for name in self._reset})
+        elif self.partial_refresh:
+            self._conditional(mask, lambda: self._refresh(mask))
+        else:
+            self._refresh(mask)
+
+    def _forward_group(self, group: mjw.Data) -> None:
+        self._forward(None, self.reset_stage, group)
+        self._forward(self._shared, self.reset_stage)  # from which the next step goes on
+
+    def _refresh(self, mask: wp.array) -> None:
+        """A forward pass of all worlds; those outside the mask stay as they are."""
+        with self._histories_kept():
+            self._forward(self._reset_parts, self.reset_stage)
         self._copy_snapshots(mask)
-        if _parts(self._reset) is None:
+        if self._reset_parts is None:
             overflow.report_pool_overflow(self.d, mask)
 
     def _partial_forward(self) -> PartialForward | None:
         """A forward pass of restarting worlds alone, or None where it gains nothing or is not possible."""
         # sorting pairs of geoms, as for large models, takes memory that can't be reserved
         sorts = self.m.opt.broadphase != mjw.BroadphaseType.NXN
-        if not self.partial_refresh or sorts or _parts(self._reset) is not None:
+        if not self.partial_refresh or sorts or self._reset_parts is not None:
             return None
         group = self._make_data(group_size(self.nworld, self.device))
         return PartialForward(self.m, self.d, group, self._state)
 
     @contextlib.contextmanager
-    def _histories_of_others_kept(self, mask: wp.array) -> Iterator[None]:
-        """A forward pass adds samples to the sensors' histories, here only in the masked worlds."""
-        history = self.d.history
-        if not history.size:
-            yield
-            return
-        wp.copy(self._history, history)
+    def _histories_kept(self) -> Iterator[None]:
+        """A forward pass adds samples to the sensors' histories; the step that follows adds the same ones."""
+        if self.d.history.size:
+            wp.copy(self._history, self.d.history)
         yield
-        launch_rows(copy_rows, mask, history, self._history)
-        wp.copy(history, self._history)
+        if self.d.history.size:
+            wp.copy(self.d.history, self._history)
 
     # state
 
@@ -261,17 +280,6 @@ def _check_unrolled(model: mujoco.MjModel) -> None:
         )
     if model.nflex:
         raise ValueError("unroll=True would unroll the collisions of the model's flexes, too: leave it out")
-
-
-def _parts(names: Collection[str]) -> list[Callable[[mjw.Model, mjw.Data], None]] | None:
-    """The parts of a forward pass that compute the named fields, or None if collisions and constraints are needed."""
-    last = -1
-    for name in names:
-        place = next((i for i, (_, fields) in enumerate(_PARTS) if name in fields), None)
-        if place is None:
-            return None
-        last = max(last, place)
-    return [part for part, _ in _PARTS[: last + 1]]
 
 
 def _contacts_of_one_world(model: mjw.Model) -> int:
