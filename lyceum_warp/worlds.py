@@ -108,8 +108,8 @@ class Worlds:
         for name, dtype in steps.OUTCOMES.items():
             setattr(self.outcome, name, wp.zeros(n, dtype=dtype))
             self.buffers[name] = torch_view(getattr(self.outcome, name))
-        self.metrics, self.episode_metrics = (wp.zeros((n, len(task.metrics)), dtype=float) for _ in range(2))
-        self.outcome.metrics, self.outcome.episode_metrics = self.metrics, self.episode_metrics
+        self.outcome.metrics = wp.zeros((n, len(task.metrics)), dtype=float)  # type: ignore[assignment]
+        self.outcome.episode_metrics = wp.zeros((n, len(task.metrics)), dtype=float)  # type: ignore[assignment]
         self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
         self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
         self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
@@ -125,7 +125,7 @@ class Worlds:
         self.counters = steps.Counters()
         self.counters.step, self.counters.episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
         self.counters.key = wp.zeros(n, dtype=wp.uint32)
-        self.counters.rng = wp.zeros((n, 1), dtype=wp.uint32)
+        self.counters.rng = wp.zeros((n, 1), dtype=wp.uint32)  # type: ignore[assignment]
         self._seed = wp.zeros(1, dtype=int)
         self._action_fault, self._no_fault = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
         self.fault_count = wp.zeros(int(FAULTS).bit_length(), dtype=int)

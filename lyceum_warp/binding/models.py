@@ -173,11 +173,10 @@ def compile_model(
     for name, limit in (physics.solver or {}).items():
         setattr(spec.option, name, limit)
     for sensor in sorted({ON_DEMAND[name] for name in fields if name in ON_DEMAND}, key=int):
-        body = spec.bodies[1]
+        body = spec.bodies[min(1, len(spec.bodies) - 1)]
         if not body.name:
             body.name = "lyceum_first_body"
-        name = f"lyceum_{sensor.name.removeprefix('mjSENS_').lower()}"
-        spec.add_sensor(name=name, type=sensor, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=body.name)
+        spec.add_sensor(type=sensor, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=body.name)
     if SENSED.isdisjoint(fields):
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
     if not MOVED_INERTIA.isdisjoint(varied):

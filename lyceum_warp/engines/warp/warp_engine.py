@@ -9,6 +9,7 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
+from mujoco_warp._src import collision_sdf
 
 from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
@@ -342,6 +343,8 @@ def _refusals() -> Iterator[None]:
 
 def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied: Collection[str]) -> tuple[int, int]:
     """Contacts and constraints that each world has room for: those given, and probed ones for those that are not."""
+    with _refusals():
+        _check_sdf_plugins(model)  # now: probing such a model takes long
     given = {"nconmax": nconmax, "njmax": njmax}
     sizes = [size if size is None else whole_number(name, size, low=1) for name, size in given.items()]
     probed = probe_sizes(_with_friction_losses(model, varied)) if None in sizes else (0, 0)
@@ -358,6 +361,12 @@ def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> muj
             losses = getattr(model, name)
             losses[losses == 0] = 1e-6
     return model
+
+
+def _check_sdf_plugins(model: mujoco.MjModel) -> None:
+    """Refuse plugins whose distance function MuJoCo Warp leaves to its user, who has not written it."""
+    if (model.geom_plugin >= 0).any() and collision_sdf.user_sdf.func.__module__ == collision_sdf.__name__:
+        raise NotImplementedError("it has no functions of SDF plugins")
 
 
 def _check_unrolled(model: mujoco.MjModel) -> None:
