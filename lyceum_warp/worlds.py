@@ -128,7 +128,7 @@ class Worlds:
         self.counters.key = wp.zeros(n, dtype=wp.uint32)
         self.counters.rng = wp.zeros((n, 1), dtype=wp.uint32)  # type: ignore[assignment]
         self._seed = wp.zeros(1, dtype=int)
-        self._action_fault, self._no_fault = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
+        self._action_fault, self._no_fault, self._judged = (wp.zeros(n, dtype=int) for _ in range(3))
         self.fault_count = wp.zeros(int(FAULTS).bit_length(), dtype=int)
         self.everyone, self.mask = wp.full(n, True, dtype=bool), wp.zeros(n, dtype=bool)
         self.restarting, self._drawing = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
@@ -382,7 +382,8 @@ class Worlds:
     def judge_transition(self, action: torch.Tensor) -> None:
         """Judge the transition from ``before`` to the current state under some actions, without looking for faults."""
         torch_view(self.safe_action).copy_(action)
-        self._judge(self.everyone, self._no_fault, self._no_fault, transition=True)
+        self._judged.zero_()  # gets the faults of this transition
+        self._judge(self.everyone, self._judged, self._no_fault, transition=True)
 
     def seed_streams(self, seed: int) -> None:
         """Restart the random streams of the masked worlds, and draw what is drawn once for each stream."""
