@@ -223,5 +223,5 @@ class OpenLoop:
         worlds, n, device = self.worlds, self.env.nworld, self.env.device
         self.env.engine.find_faults(worlds.everyone)
         wp.launch(planning.merge_faults, n, [self.env.engine.fault, self._fault], device=device)
-        args = [worlds.everyone, batch, worlds.params, worlds.counters, self._obs]
+        args = [worlds.everyone, batch, worlds.params, worlds.counters, self._obs, self._obs]
         wp.launch(self.env.task.kernels.observe_worlds, n, args, device=device)

@@ -339,7 +339,7 @@ class Worlds:
         for mask in (
             (self.restarting, self._changed) if self.task.kernels.run_events is not None else (self.restarting,)
         ):
-            args = [mask, self.after, self.params, self.counters, self.obs]
+            args = [mask, self.after, self.params, self.counters, self.final_obs, self.obs]
             wp.launch(self.task.kernels.observe_worlds, self.nworld, args, device=self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:

@@ -306,7 +306,7 @@ class BoundTask:
             rows = self.kernels.Observations()
             for group, size in sizes.items():
                 setattr(rows, group, wp.full((1, size + 64), unwritten, dtype=float, device=device))
-            wp.launch(self.kernels.observe_worlds, 1, [mask, batch, params, counters, rows], device=device)
+            wp.launch(self.kernels.observe_worlds, 1, [mask, batch, params, counters, rows, rows], device=device)
             found = {group: getattr(rows, group).numpy()[0] for group in sizes}
             for group, row in found.items():
                 written[group] |= ~np.isnan(row) if math.isnan(unwritten) else row != np.float32(unwritten)
