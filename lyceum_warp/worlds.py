@@ -78,6 +78,7 @@ class Worlds:
         n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
         self.memory = wp.zeros((n, task.memory), dtype=float)
         self.lasting_memory = wp.zeros((n, task.lasting_memory), dtype=float)
+        self._lasting_before = wp.zeros((n, task.lasting_memory), dtype=float)
         self.metric_sums = wp.zeros((n, len(task.metrics)), dtype=float)
         """Sums of the metrics over the episode so far."""
         self._zeros = {name: wp.zeros_like(getattr(self, name)) for name in ("memory", "lasting_memory", "metric_sums")}
@@ -284,6 +285,9 @@ class Worlds:
         """Put the masked worlds into an initial state of the task."""
         self.engine.reset(mask)
         self._clear(mask, "memory", *([] if again else ["metric_sums"]))
+        if self.task.kernels.reject_worlds is not None:  # a rejected draw leaves no trace
+            kept, live = self._lasting_before, self.lasting_memory
+            launch_rows(state.copy_rows, mask, *((kept, live) if again else (live, kept)))
         self._make_nominal(mask, self.task.reset_dynamics)
         args = [mask, randomly, again, self.after, self.params, self.counters]
         wp.launch(self.task.kernels.restart, self.nworld, args, device=self.device)
