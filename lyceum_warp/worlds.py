@@ -133,7 +133,9 @@ class Worlds:
         self.fault_count = wp.zeros(int(FAULTS).bit_length(), dtype=int)
         self.everyone, self.mask = wp.full(n, True, dtype=bool), wp.zeros(n, dtype=bool)
         self.restarting, self._drawing = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
-        self._going_on, self._changed = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
+        self._going_on, self.changed = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
+        self.changed_view = torch_view(self.changed)
+        """The worlds that the events of the last step changed, (nworld,) bool."""
         self.state = wp.zeros((n, self.state_space.size), dtype=wp.float64)
         self.mask_view, self.state_view = torch_view(self.mask), torch_view(self.state)
 
@@ -209,9 +211,9 @@ class Worlds:
             return []
         phases = [Phase("event", self._event)]
         if any(field.name in self.task.writes["event"] for field in self.task.dynamics):
-            phases.append(Phase("dynamics", partial(self.engine.apply_model, self._changed), engine=True))
+            phases.append(Phase("event dynamics", partial(self.engine.apply_model, self.changed), engine=True))
         if self.engine.stage > Stage.NONE:
-            phases.append(Phase("refresh", partial(self.engine.refresh_current, self._changed), engine=True))
+            phases.append(Phase("event refresh", partial(self.engine.refresh_current, self.changed), engine=True))
         return phases
 
     def _refresh_phases(self, mask: wp.array) -> list[Phase]:
@@ -326,22 +328,22 @@ class Worlds:
         for name in varied:
             wp.copy(self._model_copies[name], self.engine.arrays[name])
         wp.launch(self.task.kernels.run_events, self.nworld, [
-            self.restarting, self.after, self.params, self.counters, self._going_on, self._changed,
+            self.restarting, self.after, self.params, self.counters, self._going_on, self.changed,
         ], device=self.device)  # fmt: skip
         for name in written:
             self._mark_changes(self._copies[name], live[name])
         for name in varied:
             self._mark_changes(self._model_copies[name], self.engine.arrays[name])
-        self.engine.commit(self._changed)
+        self.engine.commit(self.changed)
 
     def _mark_changes(self, before: wp.array, after: wp.array) -> None:
-        args = [self._going_on, flat(before), flat(after), self._changed]
+        args = [self._going_on, flat(before), flat(after), self.changed]
         wp.launch(steps.mark_changes, self.nworld, args, device=self.device)
 
     def _observe_restarted(self) -> None:
         """Observe the worlds that restarted or that an event changed; the others were observed when judged."""
         for mask in (
-            (self.restarting, self._changed) if self.task.kernels.run_events is not None else (self.restarting,)
+            (self.restarting, self.changed) if self.task.kernels.run_events is not None else (self.restarting,)
         ):
             args = [mask, self.after, self.params, self.counters, self.final_obs, self.obs]
             wp.launch(self.task.kernels.observe_worlds, self.nworld, args, device=self.device)
