@@ -3,7 +3,9 @@
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import pytest
+import torch
 import warp as wp
 
 import lyceum_warp as lw
@@ -203,6 +205,11 @@ SENSING = {
         MOTOR + '<sensor><framequat objtype="site" objname="end"/><accelerometer site="end"/><force site="tip"/>'
         '<touch site="end"/><actuatorfrc actuator="push"/><contact geom1="floor" num="1" data="found force"/></sensor>',
     ),
+    "welds and sensors": text(
+        ARM + BALL.format(z=1.5) + '<body name="target" mocap="true" pos=".3 0 .6"/>',
+        '<equality><weld body1="hand" body2="target" solref=".1 1"/></equality>'
+        '<sensor><gyro site="end"/><framepos objtype="site" objname="end"/></sensor>' + MOTOR,
+    ),
     "delayed sensors": text(
         ARM,
         MOTOR + '<sensor><jointpos joint="hinge" nsample="4" delay=".012"/><jointvel joint="hinge" nsample="4" '
@@ -291,3 +298,57 @@ def test_names_that_are_used_twice_are_refused_in_a_line(tmp_path: Path) -> None
     file.write_text(text(ARM, actuated('<motor name="twice" joint="hinge"/>', '<motor name="twice" joint="wrist"/>')))
     with pytest.raises(ValueError, match="^MuJoCo can't read the model .*: Error: repeated name 'twice' in actuator"):
         lw.make(moving(text(ARM)), model=file)
+
+
+# fields that only some models have
+
+RICH = text(
+    ARM
+    + '<flexcomp name="cloth" type="grid" dim="2" count="3 3 1" spacing=".1 .1 .1" pos="2 0 3" radius=".02" mass=".1">'
+    '<contact selfcollide="none"/><edge equality="true"/></flexcomp>',
+    '<equality><connect name="hung" active="false" body1="hand" body2="world" anchor="0 0 0"/></equality>'
+    + actuated('<motor name="push" joint="hinge" nsample="4" delay=".01"/>'),
+)
+FIELDS = ("eq_active", "history", "plastic", "energy", "flexvert_xpos", "flexedge_length", "flexedge_velocity")
+
+
+def test_fields_of_some_models_are_the_same_on_both_engines_and_in_mujoco() -> None:
+    seen = []
+    for engine in ("mujoco", "warp"):
+        env = lw.make(moving(RICH), engine=engine, nworld=2, fields=FIELDS, seed=1)
+        for _ in range(3):
+            env.action.fill_(0.3)
+            env.step()
+        data = mujoco.MjData(env.model)
+        state = env.get_state()[1, : env.engine.integration_size].numpy()
+        mujoco.mj_setState(env.model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION.value)
+        mujoco.mj_forward(env.model, data)
+        for name in ("eq_active", "energy", "flexvert_xpos", "flexedge_length", "flexedge_velocity"):
+            found = env.field(name)[1].numpy().reshape(np.shape(getattr(data, name)))
+            np.testing.assert_allclose(found, getattr(data, name), rtol=1e-4, atol=1e-4, err_msg=f"{engine} {name}")
+        assert env.field("flexvert_xpos", "cloth").shape == (2, 9, 3)
+        assert env.field("eq_active", "hung").dtype == torch.bool
+        seen.append({name: env.field(name).float() for name in FIELDS})
+    for name in FIELDS:
+        torch.testing.assert_close(*(fields[name] for fields in seen), rtol=1e-3, atol=1e-3, msg=name)
+
+
+def test_an_equality_constraint_is_switched_on_at_a_reset_alike_on_both_engines() -> None:
+    """The engine takes over truth values as it does numbers."""
+    ends = []
+    for engine in ("mujoco", "warp"):
+        env = lw.make(moving(RICH), engine=engine, nworld=2, fields=["eq_active"])
+        env.reset()
+        env.field("eq_active")[1, 0] = True
+        env.engine.commit(wp.full(2, True, dtype=bool))
+        for _ in range(10):
+            env.step(torch.ones_like(env.action))
+        assert env.field("eq_active", "hung").tolist() == [[False], [True]]
+        ends.append(env.obs[:, :2].clone())
+        state = env.get_state()
+        env.reset()
+        assert not env.field("eq_active", "hung").any()
+        env.set_state(state)
+        assert env.field("eq_active", "hung").tolist() == [[False], [True]]
+    assert (ends[0][0] - ends[0][1]).abs().max() > 1e-3
+    torch.testing.assert_close(*ends, rtol=1e-3, atol=1e-4)
