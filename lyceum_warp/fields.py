@@ -41,10 +41,10 @@ STATE_FIELDS = {
 }
 """Fields that are part of the integration state, with their mjtState component."""
 
-INPUTS = ("xfrc_applied", "qfrc_applied", "mocap_pos", "mocap_quat", "userdata")
-"""Fields beside ``ctrl`` that drive the simulation and that a step leaves as they are."""
+INPUTS = ("ctrl", "xfrc_applied", "qfrc_applied", "mocap_pos", "mocap_quat", "userdata")
+"""State fields that physics reads and does not change: a task may write them before a step."""
 
-INITIAL = ("qpos", "qvel", "act", "ctrl", "eq_active", *INPUTS)
+INITIAL = ("qpos", "qvel", "act", "eq_active", *INPUTS)
 """Fields that make up an initial state."""
 
 READ_ONLY = ("history", "plastic")
@@ -165,12 +165,17 @@ class Field:
     snapshot: bool
     """Whether the field is not a function of the integration state, so that it is saved and restored with it."""
     written: bool = False
-    """Whether the task writes the field between resets, so that every step takes it over."""
+    """Whether the task writes the field before a step, which then takes it over: one of ``INPUTS``."""
 
     @property
     def size(self) -> int:
         """Numbers in one world's value."""
         return int(np.prod(self.shape, dtype=int)) * max(1, wp.types.type_size_in_bytes(self.dtype) // 4)
+
+
+def is_data_field(name: str) -> bool:
+    """Whether a name is that of a field of MjData that can be kept."""
+    return name in STATE_FIELDS or name in DERIVED_FIELDS or name in SENSED
 
 
 def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False, written: bool = False) -> Field:
@@ -186,11 +191,15 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False, written:
         name: MuJoCo's name of the field, an attribute of MjData.
         lagged: Whether to keep the field as ``mj_step`` leaves it, one substep behind the state. Fields of the
             acceleration stage are always kept so; for a field of the integration state it has no effect.
-        written: Whether the task writes the field between resets.
+        written: Whether the task writes the field before a step. Controls are always written.
 
     Raises:
-        ValueError: There is no such field, or the model has no enabled sensor that makes MuJoCo compute it.
+        ValueError: There is no such field, the model has no enabled sensor that makes MuJoCo compute it, or it is
+            written and not one of ``INPUTS``.
     """
+    if written and name not in INPUTS:
+        raise ValueError(f"the field {name!r} cannot be written before a step: the inputs are {', '.join(INPUTS)}")
+    written = written or name == "ctrl"
     if name in SENSED and not _sensed(model, name):
         raise ValueError(
             f"MuJoCo computes the field {name!r} only for a sensor, and this model has no enabled sensor that needs "

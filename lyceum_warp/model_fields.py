@@ -1,27 +1,199 @@
-"""TEMPORARY"""
+"""Fields of the model that can differ between worlds: their Warp types, and the constants that follow from each."""
 
 import dataclasses
-import mujoco, numpy as np, warp as wp
+import difflib
+import enum
+
+import mujoco
+import numpy as np
+import warp as wp
+
+
+class Constants(enum.IntFlag):
+    """Groups of a model's constants that MuJoCo computes from other fields (mj_setConst)."""
+
+    NONE = 0
+    FIXED = 1
+    """Masses of subtrees, and bounds of geoms."""
+    KINEMATIC = 2
+    """Lengths of tendons, anchors of equality constraints and poses of cameras in ``qpos0``."""
+    INERTIAL = 4
+    """Inverse weights and unit accelerations in ``qpos0``."""
+    PRIVATE = 8
+    """What the C engine alone keeps: which frames coincide, bounding volumes of bodies, indices and flags."""
+
+
+_ALL = Constants.FIXED | Constants.KINEMATIC | Constants.INERTIAL | Constants.PRIVATE
+_POSES = Constants.KINEMATIC | Constants.INERTIAL | Constants.PRIVATE
+_WRAPPED = {"geom_pos", "geom_quat", "geom_size"}
+"""Fields of geoms around which tendons may be wrapped."""
+
+_WRAPS = [int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER)]
+
+_FIELDS = (
+    dict.fromkeys(
+        # contacts
+        "geom_friction geom_solmix geom_solref geom_solimp "
+        "pair_friction pair_solref pair_solreffriction pair_solimp pair_margin pair_gap "
+        # joints, degrees of freedom
+        "jnt_solref jnt_solimp jnt_stiffness jnt_range jnt_actfrcrange jnt_margin "
+        "dof_solref dof_solimp dof_frictionloss dof_damping "
+        # equality constraints and tendons
+        "eq_solref eq_solimp "
+        "tendon_solref_lim tendon_solimp_lim tendon_solref_fri tendon_solimp_fri tendon_range tendon_actfrcrange "
+        "tendon_margin tendon_frictionloss tendon_lengthspring "
+        # actuators and options
+        "actuator_dynprm actuator_gainprm actuator_biasprm actuator_actrange actuator_forcerange actuator_ctrlrange "
+        "gravity magnetic".split(),
+        Constants.NONE,
+    )
+    | dict.fromkeys(
+        "body_gravcomp geom_pos geom_quat geom_margin geom_gap qpos_spring tendon_stiffness tendon_damping "
+        "actuator_damping wind density viscosity".split(),
+        Constants.PRIVATE,
+    )
+    | dict.fromkeys(
+        "qpos0 body_pos body_quat body_ipos body_iquat body_inertia jnt_pos jnt_axis site_pos site_quat dof_armature "
+        "tendon_armature actuator_armature actuator_gear actuator_cranklength".split(),
+        _POSES,
+    )
+    | dict.fromkeys(("cam_pos", "cam_quat"), Constants.KINEMATIC | Constants.PRIVATE)
+    | {"body_mass": _ALL, "geom_size": Constants.FIXED | Constants.PRIVATE}
+)
+"""The fields that can differ between worlds on every engine, and the constants that follow from each."""
+
+_OPTIONS = {"gravity", "magnetic", "wind", "density", "viscosity"}
+"""Those of the fields that are options of the model, attributes of MjModel.opt."""
+
+_REASONS = (
+    dict.fromkeys(
+        "body_subtreemass body_invweight0 dof_invweight0 dof_M0 tendon_invweight0 tendon_length0 actuator_acc0 "
+        "actuator_length0 geom_rbound geom_aabb cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0 light_dir0 "
+        "eq_data".split(),
+        "MuJoCo computes it from other fields; write those instead",
+    )
+    | {"timestep": "all worlds share the parameter dt", "impratio": "MuJoCo Warp keeps another number instead of it"}
+    | dict.fromkeys(("geom_surfacevel", "geom_adhesion", "pair_adhesion"),
+                    "MuJoCo Warp decides on the host whether any geom has it")
+)  # fmt: skip
+
+_POSITIVE = {"body_mass", "body_inertia", "geom_size"}
+"""Fields whose numbers must stay positive where the nominal value is."""
+
+_NOT_NEGATIVE = _POSITIVE | set(
+    "geom_friction pair_friction jnt_stiffness dof_damping dof_armature dof_frictionloss tendon_stiffness "
+    "tendon_damping tendon_armature tendon_frictionloss actuator_damping actuator_armature density viscosity".split()
+)
+"""Fields whose numbers are never negative."""
+
+_TYPES = {
+    2: wp.vec2, 3: wp.vec3, 4: wp.vec4, 5: wp.types.vector(length=5, dtype=wp.float32), 6: wp.spatial_vector,
+    10: wp.types.vector(length=10, dtype=wp.float32),
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
 class ModelField:
+    """One field of one model that can differ between worlds."""
+
     name: str
-    shape: tuple
+    shape: tuple[int, ...]
+    """Shape of one world's value, without the axis that ``dtype`` holds."""
     dtype: type
+    """Warp type of an element: float, wp.vec3, wp.vec4 for quaternions (w, x, y, z), ..."""
+    constants: Constants
+    """The constants that follow from the field."""
 
     @property
-    def size(self):
+    def size(self) -> int:
+        """Floats in one world's value."""
         return int(np.prod(self.shape, dtype=int)) * wp.types.type_size_in_bytes(self.dtype) // 4
 
-    def nominal(self, model):
-        return getattr(model, self.name).astype(np.float32)
+    @property
+    def option(self) -> bool:
+        """Whether the field is an attribute of MjModel.opt."""
+        return self.name in _OPTIONS
+
+    def problem(self, model: mujoco.MjModel, rows: np.ndarray) -> str | None:
+        """What is wrong with the values of some worlds, in one line; None if MuJoCo can simulate them.
+
+        Args:
+            model: The compiled model.
+            rows: A row for each world, (nworld, size).
+        """
+        nominal = self.value(model).ravel()
+        bad = ~np.isfinite(rows)
+        if self.name in _NOT_NEGATIVE:
+            bad |= (rows < 0) | ((rows == 0) & (nominal > 0) & (self.name in _POSITIVE))
+        if not bad.any():
+            return None
+        world, column = np.argwhere(bad)[0].tolist()
+        place = np.unravel_index(column, self.value(model).shape) if nominal.size > 1 else ()
+        index = "".join(f"[{int(i)}]" for i in place)
+        wanted = "positive" if self.name in _POSITIVE else "0 or more" if self.name in _NOT_NEGATIVE else "finite"
+        return (
+            f"{self.name}{index} of world {world} is {rows[world, column]:g} and must be {wanted} "
+            f"(its nominal value is {nominal[column]:g})"
+        )
+
+    def value(self, model: mujoco.MjModel) -> np.ndarray:
+        """The field in a model, float64; for an array the model's own memory."""
+        return np.asarray(getattr(model.opt if self.option else model, self.name))
 
 
-def is_model_field(name):
-    return name in ("body_mass", "geom_friction")
+def is_model_field(name: str) -> bool:
+    """Whether a name is that of a field of MjModel, or of one of its options that can differ between worlds."""
+    return name in _FIELDS or hasattr(mujoco.MjModel, name)
 
 
-def describe_model_field(model, name):
-    a = getattr(model, name)
-    return ModelField(name, a.shape[:1], wp.float32 if a.ndim == 1 else wp.vec3)
+def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = True) -> ModelField:
+    """Describe a field of a model.
+
+    Args:
+        model: The compiled model.
+        name: MuJoCo's name of the field, an attribute of MjModel or, as "gravity", of MjModel.opt.
+        varies: Whether the field must be one that can differ between worlds.
+
+    Raises:
+        ValueError: There is no such field, it does not hold real numbers, or all worlds share it.
+    """
+    value = getattr(model, name, None)
+    if not varies and name not in _FIELDS and isinstance(value, np.ndarray):
+        if value.dtype != np.float64 or value.ndim > 2 or (value.ndim == 2 and value.shape[1] not in _TYPES):
+            raise ValueError(f"the model field {name!r} cannot be read in World: it has no rows of real numbers")
+        return _described(name, value.shape, Constants.NONE)
+    if name not in _FIELDS:
+        if not isinstance(getattr(model, name, getattr(model.opt, name, None)), np.ndarray | float | int):
+            close = difflib.get_close_matches(name, _FIELDS, 3)
+            hint = f"did you mean {' or '.join(close)}?" if close else f"those are {', '.join(sorted(_FIELDS))}"
+            raise ValueError(f"there is no model field {name!r} that can differ between worlds: {hint}")
+        reason = _REASONS.get(name, "the engines share it between all worlds")
+        raise ValueError(f"the model field {name!r} cannot differ between worlds: {reason}")
+    constants = _FIELDS[name]
+    if name in _WRAPPED and np.isin(model.wrap_type, _WRAPS).any():
+        constants |= _POSES
+    shape: tuple[int, ...] = np.shape(getattr(model.opt if name in _OPTIONS else model, name))
+    return _described(name, shape, constants)
+
+
+def _described(name: str, shape: tuple[int, ...], constants: Constants) -> ModelField:
+    if len(shape) == 2:
+        return ModelField(name, shape[:1], _TYPES[shape[1]], constants)
+    return ModelField(name, shape, wp.float32, constants)
+
+
+MOVED_INERTIA = {"body_ipos", "body_iquat"}
+"""Fields that a body must not be compiled as "simple" for: MuJoCo assumes that its inertial frame is the body's."""
+
+
+def check_simple(model: mujoco.MjModel, name: str) -> None:
+    """Refuse a field that moves the inertial frame of a body that is compiled as simple.
+
+    Raises:
+        ValueError: The model has such a body.
+    """
+    if name in MOVED_INERTIA and (simple := np.flatnonzero(model.body_simple[1:]) + 1).size:
+        raise ValueError(
+            f"{name} can't differ between worlds while bodies are compiled as simple (the bodies {simple.tolist()}): "
+            'set simple="false" on them'
+        )

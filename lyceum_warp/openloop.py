@@ -84,9 +84,7 @@ class OpenLoop:
             # each field for all steps: the states before a step, after it, and the last ones are views of one buffer
             self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
-            constant = {
-                f.name: shared_rows(f.nominal(task.model), f.dtype, rows + n, env.device) for f in task.constants
-            }
+            constant = {f.name: shared_rows(f.value(task.model), f.dtype, rows + n, env.device) for f in task.constants}
             for name in task.types:
                 live = getattr(self.worlds.after, name)
                 buffer = constant.get(name)
@@ -123,7 +121,8 @@ class OpenLoop:
     def _bytes_per_world(env: Env, horizon: int) -> int:
         """An estimate of the buffers' memory for each world."""
         fields = [field for field in env.task.fields if field.name in env.task.types]
-        numbers = sum(field.size for field in (*fields, *env.task.dynamics)) + sum(own_parts(env.task).values())
+        numbers = sum(field.size for field in fields) + sum(field.size for field in env.task.dynamics)
+        numbers += sum(own_parts(env.task).values())
         own = 4 * (numbers + env.task.model.nu + env.action_space.size)
         return horizon * (own + 8) + env.engine.rollout_bytes_per_world(horizon, env.task.frame_skip, fields)
 
@@ -178,7 +177,7 @@ class OpenLoop:
     def _overwrite_model(self) -> None:
         """Give the model fields in every world's state their nominal values."""
         columns, states = self.env.state_space.parts, self.worlds.state
-        nominal: Mapping[str, wp.array] = getattr(self.env.engine, "nominal", {})
+        nominal: Mapping[str, wp.array] = self.env.engine.nominal
         for name, row in nominal.items():
             row = flat(row)
             args = [row, columns[name].start, states]

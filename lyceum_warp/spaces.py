@@ -127,5 +127,5 @@ def state_space(
         if components & component and (size := mujoco.mj_stateSize(model, component)):
             fallback = mujoco.mjtState(component).name.removeprefix("mjSTATE_").lower()
             sizes[names.get(component, fallback)] = size
-    sizes |= {field.name: field.size for field in (*snapshots, *dynamics)} | dict.fromkeys(COUNTERS, 1)
-    return Space.of(sizes | own, dtype=torch.float64)
+    sizes |= {field.name: field.size for field in snapshots} | {field.name: field.size for field in dynamics}
+    return Space.of({**sizes, **dict.fromkeys(COUNTERS, 1), **own}, dtype=torch.float64)

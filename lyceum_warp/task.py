@@ -79,8 +79,8 @@ FUNCTIONS = {
     function.name: function
     for function in (
         TaskFunction("observe", "s: World, p: Params, obs: Row[float]", None,
-                     "Writes the observation. The only function that is required. With ``rng`` as a last argument it may "
-                     "draw noise.", optional=_RNG),
+                     "Writes the observation. The only function that is required. With ``rng`` as a last argument it "
+                     "may draw noise.", optional=_RNG),
         TaskFunction("control", "s: World, action: Row[float], p: Params, ctrl: Row[float]", None,
                      "Turns an action into controls, and writes further inputs. Default: copies it, or scales it (see "
                      "``action_range``).", "pass", writes={"s": "inputs"}),

@@ -19,7 +19,6 @@ from lyceum_warp.engines.base import Engine
 from lyceum_warp.fields import Stage
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.kernels import random, state, steps
-from lyceum_warp.model_fields import ModelField
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.spaces import Space, action_space, control_ranges, control_scale, state_space
 from lyceum_warp.task import MEMORIES
@@ -85,10 +84,10 @@ class Worlds:
         # the fields of the state that a step leads to, live, and copies of those of the state before
         self.after, self.before = kernels.Batch(), kernels.Batch()
         self._copies: dict[str, wp.array] = {}
-        constant = {f.name: shared_rows(f.nominal(model), f.dtype, n, self.device) for f in self.task.constants}
+        constant = {f.name: shared_rows(f.value(model), f.dtype, n, self.device) for f in self.task.constants}
         varied = [field.name for field in self.task.dynamics]
         for name in self.task.types:
-            live = getattr(self, name) if name in MEMORIES else constant.get(name, self.engine.arrays.get(name))
+            live: Any = getattr(self, name) if name in MEMORIES else constant.get(name, self.engine.arrays.get(name))
             self.task.check_field(name, live)
             setattr(self.after, name, live)
             if name not in constant and name not in varied:  # no step changes the model
@@ -109,8 +108,8 @@ class Worlds:
         for name, dtype in steps.OUTCOMES.items():
             setattr(self.outcome, name, wp.zeros(n, dtype=dtype))
             self.buffers[name] = torch_view(getattr(self.outcome, name))
-        self.metrics, self.episode_metrics = wp.zeros_like(self.metric_sums), wp.zeros_like(self.metric_sums)
-        self.outcome.metrics, self.outcome.episode_metrics = self.metrics, self.episode_metrics
+        self.outcome.metrics = wp.zeros((n, len(task.metrics)), dtype=float)  # type: ignore[assignment]
+        self.outcome.episode_metrics = wp.zeros((n, len(task.metrics)), dtype=float)  # type: ignore[assignment]
         self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
         self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
         self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
@@ -125,7 +124,8 @@ class Worlds:
 
         self.counters = steps.Counters()
         self.counters.step, self.counters.episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
-        self.counters.key, self.counters.rng = wp.zeros(n, dtype=wp.uint32), wp.zeros((n, 1), dtype=wp.uint32)
+        self.counters.key = wp.zeros(n, dtype=wp.uint32)
+        self.counters.rng = wp.zeros((n, 1), dtype=wp.uint32)  # type: ignore[assignment]
         self._seed = wp.zeros(1, dtype=int)
         self._action_fault, self._no_fault = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
         self.fault_count = wp.zeros(int(FAULTS).bit_length(), dtype=int)
@@ -295,7 +295,7 @@ class Worlds:
     def _make_nominal(self, mask: wp.array, names: Iterable[str]) -> None:
         """Give model fields of the masked worlds their nominal values."""
         for name in names:
-            launch_rows(state.fill_rows, mask, flat(self.engine.nominal[name]), flat(self.engine.arrays[name]))
+            launch_rows(state.fill_rows, mask, flat(self.engine.nominal[name])[0], flat(self.engine.arrays[name]))
 
     def _redraw(self, mask: wp.array) -> None:
         """Draw initial states of the masked worlds again while the task rejects them."""

@@ -1,4 +1,4 @@
-"""A third engine, written against the contract in ``lyceum_warp.engines.base`` alone: an MjData for each world."""
+"""A third engine, written against the contract in ``lyceum_warp.engines.base`` alone: plain MuJoCo, world by world."""
 
 import copy
 from collections.abc import Iterable
@@ -11,12 +11,15 @@ from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
 from lyceum_warp.kernels import faults, state
+from lyceum_warp.model_fields import ModelField
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
 class ToyEngine(Engine):
     """The state lies in float64 rows; a step loads each row into its world's MjData and saves it afterwards.
+
+    Each world has an MjModel of its own, and ``apply_model`` writes its fields into it.
 
     Launches between two calls of the engine are captured, so ``reset``, ``commit``, ``find_faults`` and getting the
     state are Warp launches on those rows.
@@ -25,17 +28,26 @@ class ToyEngine(Engine):
     name = "toy"
     capturable = False
 
-    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: Iterable[Field]) -> None:
-        super().__init__(model, nworld, device, fields)
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        nworld: int,
+        device: wp.Device,
+        fields: Iterable[Field],
+        dynamics: Iterable[ModelField] = (),
+        initial: np.ndarray | None = None,
+    ) -> None:
+        super().__init__(model, nworld, device, fields, dynamics, initial)
         mujoco.set_mju_user_warning(lambda message: None)
-        self._model = copy.copy(model)
-        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self.worlds = [mujoco.MjData(self._model) for _ in range(nworld)]
-        rows = np.empty((nworld, self.integration_size))
-        for data, row in zip(self.worlds, rows, strict=True):
-            mujoco.mj_getState(self._model, data, row, _SPEC)
+        self.models = [copy.copy(model) for _ in range(nworld)]
+        for own in self.models:
+            own.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.worlds = [mujoco.MjData(own) for own in self.models]
+        rows = np.tile(self.initial, (nworld, 1))
         self._rows = wp.array(rows, dtype=wp.float64, device=device)
         self._initial = wp.array(rows[0].astype(np.float32).astype(float), dtype=wp.float64, device=device)
+        for name, varied in self.dynamics.items():
+            self.arrays[name] = self._nominal_rows(varied, nworld)
         self._warning = wp.zeros((nworld, len(self.worlds[0].warning.number), 2), dtype=int, device=device)
         self._columns: dict[str, wp.array] = {}
         for name, field in self.fields.items():
@@ -47,7 +59,7 @@ class ToyEngine(Engine):
     # fields
 
     def _load(self, w: int) -> None:
-        mujoco.mj_setState(self._model, self.worlds[w], self._rows.numpy()[w], _SPEC)
+        mujoco.mj_setState(self.models[w], self.worlds[w], self._rows.numpy()[w], _SPEC)
 
     def _show(self, w: int, fields: list[Field]) -> None:
         for field in fields:
@@ -55,7 +67,7 @@ class ToyEngine(Engine):
             target[...] = np.reshape(getattr(self.worlds[w], field.name), target.shape)
 
     def _compute(self, w: int, stage: Stage) -> None:
-        model, data = self._model, self.worlds[w]
+        model, data = self.models[w], self.worlds[w]
         if stage == Stage.ACCELERATION:
             mujoco.mj_forward(model, data)
         elif stage > Stage.NONE:
@@ -70,16 +82,40 @@ class ToyEngine(Engine):
     def step(self, nstep: int) -> None:
         fields = list(self.fields.values())
         for w, data in enumerate(self.worlds):
-            self._load(w)
-            data.ctrl[:] = self.ctrl.numpy()[w]
-            for _ in range(nstep):
-                mujoco.mj_step(self._model, data)
-            mujoco.mj_getState(self._model, data, self._rows.numpy()[w], _SPEC)
+            for name, field in self.fields.items():
+                if field.written:
+                    row = flat(self.arrays[name]).numpy()[w]
+                    self._rows.numpy()[w, state_columns(self.model, name)] = row
+            self._advance(w, nstep)
             self._show(w, [field for field in fields if field.lagged])
             self._compute(w, self.stage)
             self._show(w, [field for field in fields if not field.lagged])
             self._warning.numpy()[w, :, 1] += data.warning.number
             data.warning.number[:] = 0
+
+    def _advance(self, w: int, nstep: int) -> None:
+        self._load(w)
+        for _ in range(nstep):
+            mujoco.mj_step(self.models[w], self.worlds[w])
+        mujoco.mj_getState(self.models[w], self.worlds[w], self._rows.numpy()[w], _SPEC)
+
+    def apply_model(self, mask: wp.array) -> None:
+        for w in mask.numpy().nonzero()[0]:
+            for name, varied in self.dynamics.items():
+                own, world = varied.value(self.model), varied.value(self.models[w])
+                given = self.arrays[name].numpy()[w].reshape(own.shape)
+                value = np.where(given == own.astype(np.float32), own, given)
+                if world.ndim:
+                    world[...] = value
+                else:
+                    setattr(self.models[w].opt, name, float(value))
+            mujoco.mj_setConst(self.models[w], mujoco.MjData(self.models[w]))
+
+    def settle(self, mask: wp.array, nstep: int) -> None:
+        for w in mask.numpy().nonzero()[0]:
+            self._advance(w, nstep)
+            self._rows.numpy()[w, state_columns(self.model, "time")] = 0.0
+        self._read_state_fields(mask)
 
     def find_faults(self, mask: wp.array) -> None:
         nphysics = 1 + self.model.nq + self.model.nv + self.model.na

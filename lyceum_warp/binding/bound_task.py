@@ -16,7 +16,7 @@ from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
 from lyceum_warp.binding.writes import Rights, check_writes, written_fields
-from lyceum_warp.fields import INITIAL, INPUTS, Field, describe, vec10
+from lyceum_warp.fields import INITIAL, INPUTS, Field, describe, is_data_field, vec10
 from lyceum_warp.model_fields import describe_model_field, is_model_field
 from lyceum_warp.options import ModelSource, PhysicsOptions
 from lyceum_warp.task import FUNCTIONS, MEMORIES, RESULTS, Task, TaskFunction, observer_name
@@ -78,10 +78,11 @@ class BoundTask:
         named = [name for name in dict.fromkeys([*self.types, *fields]) if name not in MEMORIES]
         self.writes = self._checked_writes()
         """The fields of World that each function writes, by the functions' names."""
-        own = [name for name in named if not is_model_field(name)]
+        own = [name for name in named if is_data_field(name) or not is_model_field(name)]
+        of_model = [name for name in named if name not in own]
         self.spec = task_spec(task, model)
         """The model as it was read: other environments of the same task are made from it, not from its source."""
-        self.model = models.compile_model(self.spec.copy(), own, physics)
+        self.model = models.compile_model(self.spec.copy(), own, physics, varied={*of_model, *dynamics})
         self._check_actions()
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.frame_skip = whole_number(f"frame_skip of the task {self.name!r}", skip, low=1)
@@ -92,7 +93,7 @@ class BoundTask:
             for name in dict.fromkeys([*own, "time", "ctrl"])
         ]
         """The fields that the engine keeps: the task's own, further ones, time and controls."""
-        self._sort_model_fields([name for name in named if is_model_field(name)], dynamics)
+        self._sort_model_fields(of_model, dynamics)
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
         """The integration state at which a reset starts, (integration_size,) float64; None for the model's own."""
         self.parameters = Parameters(
@@ -102,8 +103,8 @@ class BoundTask:
         """The parts of each group of observations and their sizes."""
         self.observers = self.source.group_functions(self.obs_layouts)
         """The functions that write the groups of observations, by the groups' names."""
-        named = {observer_name(group): function for group, function in self.observers.items()}
-        check_writes(self.name, named, dict.fromkeys(named, self._rights(FUNCTIONS["observe"])))
+        observers = {observer_name(group): function for group, function in self.observers.items()}
+        check_writes(self.name, observers, dict.fromkeys(observers, self._rights(FUNCTIONS["observe"])))
         self.kernels = kernels_of(self.source, self.observers)
 
     @property
@@ -149,7 +150,7 @@ class BoundTask:
         varied = [name for name in dict.fromkeys([*named, *dynamics]) if name in written]
         self.dynamics = [describe_model_field(self.model, name) for name in varied]
         """The model fields that differ between worlds."""
-        self.constants = [describe_model_field(self.model, name) for name in named if name not in varied]
+        self.constants = [describe_model_field(self.model, name, varies=False) for name in named if name not in varied]
         """The model fields that functions read and that are the same in every world."""
 
     def change_params(self, params: Mapping[str, Any]) -> None:
@@ -196,7 +197,7 @@ class BoundTask:
                 )
 
     def _check_metrics(self) -> None:
-        metrics = self.task.metrics
+        metrics: Any = self.task.metrics
         if isinstance(metrics, str) or not all(isinstance(name, str) and name for name in metrics):
             raise ValueError(
                 f"metrics of the task {self.name!r} must be names, as ('forward', 'cost'), not {metrics!r}"
@@ -213,8 +214,8 @@ class BoundTask:
         if actions is None:
             if self.model.nu == 0:
                 raise ValueError(
-                    f"the model of the task {self.name!r} has no actuators, so there is nothing to act on: add some, or "
-                    "give the task actions = {...} and a control that writes inputs"
+                    f"the model of the task {self.name!r} has no actuators, so there is nothing to act on: add some, "
+                    "or give the task actions = {...} and a control that writes inputs"
                 )
             return
         if not isinstance(actions, Mapping) or not actions:
@@ -239,8 +240,8 @@ class BoundTask:
             given = {"policy": given}
         elif not all(grouped) or "policy" not in given:
             raise ValueError(
-                f"obs of the task {self.name!r} must name parts with sizes, or groups of them, of which one is 'policy', "
-                f"not {given!r}"
+                f"obs of the task {self.name!r} must name parts with sizes, or groups of them, of which one is "
+                f"'policy', not {given!r}"
             )
         return {group: self._layout(layout) for group, layout in given.items()}
 

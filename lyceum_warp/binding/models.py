@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from lyceum_warp.fields import ON_DEMAND, SENSED
+from lyceum_warp.model_fields import MOVED_INERTIA
 from lyceum_warp.mujoco_log import quiet
 from lyceum_warp.options import CONES, INTEGRATORS, ModelSource, PhysicsOptions
 
@@ -137,7 +138,9 @@ def keyframe_state(model: mujoco.MjModel, name: str) -> np.ndarray:
     return state
 
 
-def compile_model(spec: mujoco.MjSpec, fields: Collection[str], physics: PhysicsOptions) -> mujoco.MjModel:
+def compile_model(
+    spec: mujoco.MjSpec, fields: Collection[str], physics: PhysicsOptions, *, varied: Collection[str] = ()
+) -> mujoco.MjModel:
     """Compile a model for either engine.
 
     MuJoCo Warp has no PGS solver, so a model that asks for it gets Newton on both engines, which converges to
@@ -150,6 +153,7 @@ def compile_model(spec: mujoco.MjSpec, fields: Collection[str], physics: Physics
         spec: The model; changed in place.
         fields: Names of the fields that will be read.
         physics: Cone, integrator and solver limits that replace the model's own.
+        varied: Names of the model fields that will differ between worlds.
 
     Raises:
         ValueError: MuJoCo refuses the model.
@@ -175,6 +179,9 @@ def compile_model(spec: mujoco.MjSpec, fields: Collection[str], physics: Physics
         spec.add_sensor(type=sensor, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=body.name)
     if SENSED.isdisjoint(fields):
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
+    if not MOVED_INERTIA.isdisjoint(varied):
+        for body in spec.bodies[1:]:
+            body.simple = 0
     quiet()
     try:
         with warnings.catch_warnings(record=True) as caught:

@@ -103,7 +103,8 @@ def overloads(function: wp.Function) -> list[wp.Function]:
     if not has_source(function):
         return [function]
     found = [*function.user_overloads.values(), *function.user_templates.values()]
-    return found or [function]
+    # without those that Warp made from a generic one
+    return [overload for overload in found if overload.generic_parent is None] or [function]
 
 
 _BUILTINS: dict[str, Any] = wp._src.context.builtin_functions  # wp.tid and others are only here

@@ -5,12 +5,14 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import mujoco
+import numpy as np
 import warp as wp
 
 from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.fields import Field, Stage, describe
 from lyceum_warp.kernels.state import narrow, widen
+from lyceum_warp.model_fields import ModelField, check_simple
 
 
 @document_attributes
@@ -20,18 +22,22 @@ class Engine(abc.ABC):
     An engine knows nothing of tasks. Its fields lie in Warp arrays with a leading ``nworld`` axis, whose addresses
     never change, so that graphs of launches that read them can be captured once.
 
-    The order of calls in a step is: write ``ctrl``, ``step``, ``find_faults``, read fields and ``fault``; for worlds
-    that restart, ``reset``, then write state fields, then ``commit`` and ``refresh``. After construction the arrays
-    hold no state yet: reset all worlds first.
+    The order of calls in a step is: write ``ctrl`` and other inputs, ``step``, ``find_faults``, read fields and
+    ``fault``; for worlds that restart, ``reset``, then write state fields and model fields, then ``commit``,
+    ``apply_model``, perhaps ``settle``, and ``refresh``. After construction the arrays hold no state yet: reset all
+    worlds first. Model fields hold the model's values, and no reset changes them.
 
     Args:
         model: The compiled model; the engine keeps it and does not change it.
         nworld: Number of worlds.
         device: Where the arrays live.
         fields: The fields to keep, from ``fields.describe``. No other field can be read later.
+        dynamics: The model fields that differ between worlds, from ``model_fields.describe_model_field``.
+        initial: The state that ``reset`` puts worlds into, (integration_size,); None for the model's own.
 
     Raises:
-        ValueError: A field is listed twice, once lagged and once current.
+        ValueError: A field is listed twice, once lagged and once current, the initial state has another shape, or a
+            model field cannot differ between worlds of this model.
     """
 
     name: str
@@ -50,8 +56,14 @@ class Engine(abc.ABC):
     """Where the arrays live."""
     fields: dict[str, Field]
     """The fields that are kept, by name; ``ctrl`` is always among them."""
+    dynamics: dict[str, ModelField]
+    """The model fields that differ between worlds, by name."""
+    nominal: dict[str, wp.array]
+    """The model's own values of those model fields, (1, ...), float32."""
+    initial: np.ndarray
+    """The state that ``reset`` puts worlds into, (integration_size,), float64."""
     arrays: dict[str, wp.array]
-    """The live arrays of the fields, (nworld, ...), by name; filled by each engine's constructor."""
+    """The live arrays of the fields and model fields, (nworld, ...), by name; filled by each engine's constructor."""
     ctrl: wp.array
     """Controls of the next step, (nworld, nu), float32: the field of that name, reset and restored with the state."""
     fault: wp.array
@@ -65,9 +77,17 @@ class Engine(abc.ABC):
     integration_size: int
     """Floats in one world's integration state (mjSTATE_INTEGRATION)."""
     state_size: int
-    """Floats in one world's state: the integration state and the snapshots."""
+    """Floats in one world's state: the integration state, the snapshots, and the model fields."""
 
-    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: Iterable[Field]) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        nworld: int,
+        device: wp.Device,
+        fields: Iterable[Field],
+        dynamics: Iterable[ModelField] = (),
+        initial: np.ndarray | None = None,
+    ) -> None:
         self.model = model
         self.nworld = nworld
         self.device = device
@@ -75,17 +95,36 @@ class Engine(abc.ABC):
         for field in (describe(model, "ctrl"), *fields):
             if self.fields.setdefault(field.name, field) != field:
                 raise ValueError(f"the field {field.name!r} is listed both lagged and current: list it once")
+        self.dynamics = {}
+        self.nominal = {}
+        for varied in dynamics:
+            check_simple(model, varied.name)
+            self.dynamics[varied.name] = varied
+            self.nominal[varied.name] = self._nominal_rows(varied, 1)
         self.arrays = {}
         self.fault = wp.zeros(nworld, dtype=int, device=device)
         self.stage = max(field.refresh for field in self.fields.values())
         self.reset_stage = max(field.reset for field in self.fields.values())
         self.snapshots = [field for field in self.fields.values() if field.snapshot]
         self.integration_size = _integration_size(model)
-        self.state_size = self.integration_size + sum(field.size for field in self.snapshots)
+        self.state_size = self.integration_size + sum(field.size for field in self._saved())
+        self.initial = _initial_state(model) if initial is None else np.array(initial, dtype=np.float64)
+        if self.initial.shape != (self.integration_size,):
+            raise ValueError(f"an initial state has the shape ({self.integration_size},), not {self.initial.shape}")
         self._everyone = wp.full(nworld, True, dtype=bool, device=device)
 
+    def _nominal_rows(self, field: ModelField, rows: int) -> wp.array:
+        """An array of a model field with the model's own value in every row."""
+        value = np.tile(field.value(self.model).astype(np.float32).reshape(-1), (rows, 1))
+        array: wp.array = wp.zeros((rows, *field.shape), dtype=field.dtype, device=self.device)
+        if value.size:
+            wp.copy(flat(array), wp.array(value, dtype=wp.float32, device=self.device))
+        return array
+
     @classmethod
-    def bytes_per_world(cls, model: mujoco.MjModel, fields: Iterable[Field], **options: Any) -> int:
+    def bytes_per_world(
+        cls, model: mujoco.MjModel, fields: Iterable[Field], dynamics: Iterable[ModelField] = (), **options: Any
+    ) -> int:
         """An estimate of the memory that the engine takes for each world, in bytes.
 
         The default counts a float64 state and one float32 array for each field.
@@ -93,9 +132,11 @@ class Engine(abc.ABC):
         Args:
             model: The compiled model.
             fields: The fields that the engine will keep.
+            dynamics: The model fields that will differ between worlds.
             options: The engine's options, as for its constructor.
         """
-        return 8 * _integration_size(model) + 4 * sum(field.size for field in fields) + 8
+        floats = sum(field.size for field in fields) + sum(field.size for field in dynamics)
+        return 8 * _integration_size(model) + 4 * floats + 8
 
     def prepare_capture(self) -> None:  # noqa: B027
         """Allocate the memory that graphs need; called when every kernel is compiled, before the first capture.
@@ -108,7 +149,10 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def step(self, nstep: int) -> None:
-        """Advance every world by ``nstep`` substeps under ``ctrl`` and update the fields."""
+        """Advance every world by ``nstep`` substeps under ``ctrl`` and the other inputs, and update the fields.
+
+        The arrays of all fields that are ``written`` are taken over first.
+        """
 
     @abc.abstractmethod
     def find_faults(self, mask: wp.array) -> None:
@@ -127,6 +171,22 @@ class Engine(abc.ABC):
     @abc.abstractmethod
     def commit(self, mask: wp.array) -> None:
         """Copy the masked worlds' state fields into the engine. Made of Warp launches."""
+
+    def apply_model(self, mask: wp.array) -> None:
+        """Take over the masked worlds' model fields, and recompute the constants that follow from them.
+
+        Worlds whose values are those that were applied last cost next to nothing. Fields that follow from the state
+        are not recomputed: see ``refresh`` and ``refresh_current``. An engine that takes ``dynamics`` must have it.
+        """
+        if self.dynamics:
+            raise NotImplementedError(f"the {self.name} engine does not let model fields differ between worlds")
+
+    def settle(self, mask: wp.array, nstep: int) -> None:
+        """Advance the masked worlds alone by ``nstep`` substeps from their committed states, and update state fields.
+
+        Their time is 0 afterwards; derived fields follow with ``refresh``. Other worlds keep every bit.
+        """
+        raise NotImplementedError(f"the {self.name} engine cannot settle single worlds")
 
     @abc.abstractmethod
     def refresh(self, mask: wp.array) -> None:
@@ -154,7 +214,8 @@ class Engine(abc.ABC):
             state: States to start from, whose leading columns are those of ``get_state``; (nworld, ...) float64.
             controls: Controls of each step, (steps, nworld, nu) float32.
             nstep: Substeps in a step.
-            buffers: Where fields go, by their names, (steps + 1, nworld, ...): the first row is the start.
+            buffers: Where fields and model fields go, by their names, (steps + 1, nworld, ...): the first row is the
+                start.
         """
         self.reset(self._everyone)  # clears warnings and warm starts of the last rollout
         self.set_state(state, self._everyone)
@@ -188,7 +249,7 @@ class Engine(abc.ABC):
         mask = self._everyone if mask is None else mask
         self._get_integration(state[:, : self.integration_size], mask)
         start = self.integration_size
-        for field in self.snapshots:
+        for field in self._saved():
             source = flat(self.arrays[field.name])
             target = state[:, start : start + field.size]
             launch_rows(widen, mask, source, target)
@@ -197,13 +258,26 @@ class Engine(abc.ABC):
     def set_state(self, state: wp.array, mask: wp.array) -> None:
         """Put the masked worlds into the given states, exactly; afterwards every field belongs to them."""
         self._set_integration(state[:, : self.integration_size], mask)
+        if self.dynamics:
+            self._read_columns(state, mask, self.dynamics.values(), self.state_size - self._dynamics_size)
+            self.apply_model(mask)
         self.refresh_current(mask)
-        start = self.integration_size
-        for field in self.snapshots:
-            target = flat(self.arrays[field.name])
-            source = state[:, start : start + field.size]
-            launch_rows(narrow, mask, source, target)
+        self._read_columns(state, mask, self.snapshots, self.integration_size)
+
+    def _read_columns(self, state: wp.array, mask: wp.array, fields: Iterable[Field | ModelField], start: int) -> None:
+        """Round the masked worlds' columns of a state from ``start`` on into the arrays of some fields."""
+        for field in fields:
+            launch_rows(narrow, mask, state[:, start : start + field.size], flat(self.arrays[field.name]))
             start += field.size
+
+    def _saved(self) -> list[Field | ModelField]:
+        """What follows the integration state in a state vector, in order."""
+        return [*self.snapshots, *self.dynamics.values()]
+
+    @property
+    def _dynamics_size(self) -> int:
+        """Floats of one world's model fields, the last columns of its state."""
+        return sum(field.size for field in self.dynamics.values())
 
     @abc.abstractmethod
     def _get_integration(self, state: wp.array, mask: wp.array) -> None: ...
@@ -215,9 +289,18 @@ class Engine(abc.ABC):
 EngineFactory = Callable[..., Engine]
 """Called with (model, nworld, device, fields, **options), the options being those that were given; returns an engine.
 
+``dynamics`` and ``initial`` are given to it by name, only where they are used.
+
 A factory with an attribute ``bytes_per_world``, as an engine class has, is asked before it is called.
 """
 
 
 def _integration_size(model: mujoco.MjModel) -> int:
     return mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION.value)
+
+
+def _initial_state(model: mujoco.MjModel) -> np.ndarray:
+    """The integration state of new data of a model."""
+    state = np.empty(_integration_size(model))
+    mujoco.mj_getState(model, mujoco.MjData(model), state, mujoco.mjtState.mjSTATE_INTEGRATION.value)
+    return state

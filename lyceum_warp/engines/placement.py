@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import mujoco
+import numpy as np
 import torch
 import warp as wp
 
@@ -13,6 +14,7 @@ from lyceum_warp.engines.base import Engine, EngineFactory
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.fields import Field
 from lyceum_warp.machine import cpu_cores
+from lyceum_warp.model_fields import ModelField
 from lyceum_warp.options import EnvOptions
 
 _ENGINES = {
@@ -80,10 +82,10 @@ def open_engine(
     nworld: int,
     device: wp.Device,
     fields: Iterable[Field],
+    dynamics: Iterable[ModelField] = (),
+    initial: np.ndarray | None = None,
     *,
     reserved: int = 0,
-    dynamics: Any = (),
-    initial: Any = None,
     **options: Any,
 ) -> Engine:
     """Make an engine by name, or by a class or factory of your own.
@@ -94,28 +96,36 @@ def open_engine(
         nworld: Number of worlds.
         device: Where they run.
         fields: The fields to keep, from ``fields.describe``.
+        dynamics: The model fields that differ between worlds, from ``model_fields.describe_model_field``.
+        initial: The state that a reset puts worlds into; None for the model's own.
         reserved: Bytes for each world that the caller allocates.
         options: The engine's options, the keyword-only arguments of its constructor. None leaves an engine its default.
             An engine ignores a flag (True or False) that it does not take.
 
     Raises:
         ValueError: There is no such engine, the worlds do not fit into memory, or the engine refuses the model, the
-            device or an option.
+            device or an option, or lets no model fields differ between worlds.
     """
     fields = list(fields)
     factory, given = _resolved(engine, device, options)
-    needed = _bytes_per_world(factory, model, fields, given)
+    contract = _contract(factory, engine_name(engine, device.alias), list(dynamics), initial)
+    needed = _bytes_per_world(factory, model, fields, contract.get("dynamics"), given)
     if needed is not None:
         check_fit(needed + reserved, nworld, device, model=_model_name(model))
-    return factory(model, nworld, device, fields, **given)
+    return factory(model, nworld, device, fields, **contract, **given)
 
 
 def bytes_per_world(
-    engine: str | EngineFactory, model: mujoco.MjModel, device: wp.Device, fields: Iterable[Field], **options: Any
+    engine: str | EngineFactory,
+    model: mujoco.MjModel,
+    device: wp.Device,
+    fields: Iterable[Field],
+    dynamics: Iterable[ModelField] = (),
+    **options: Any,
 ) -> int:
     """An estimate of the memory for each world of the engine that ``open_engine`` makes, in bytes; 0 if unknown."""
     factory, given = _resolved(engine, device, options)
-    return _bytes_per_world(factory, model, list(fields), given) or 0
+    return _bytes_per_world(factory, model, list(fields), list(dynamics), given) or 0
 
 
 def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
@@ -204,11 +214,32 @@ def _options_of(factory: EngineFactory) -> list[str] | None:
     return [parameter.name for parameter in parameters if parameter.kind == parameter.KEYWORD_ONLY]
 
 
+def _contract(
+    factory: EngineFactory, name: str, dynamics: list[ModelField], initial: np.ndarray | None
+) -> dict[str, Any]:
+    """Those of the contract's later arguments that are used; engines that know nothing of them do without."""
+    used = {"dynamics": dynamics or None, "initial": initial}
+    contract = {key: value for key, value in used.items() if value is not None}
+    parameters = inspect.signature(factory).parameters.values()
+    takes = {parameter.name for parameter in parameters}
+    takes |= {key for key in contract if any(parameter.kind == parameter.VAR_KEYWORD for parameter in parameters)}
+    uses = {"dynamics": "model fields that differ between worlds", "initial": "an initial state of the task's"}
+    for key in contract.keys() - takes:
+        raise ValueError(f"the {name} engine takes no {uses[key]}: its constructor needs an argument {key!r}")
+    return contract
+
+
 def _bytes_per_world(
-    factory: EngineFactory, model: mujoco.MjModel, fields: list[Field], given: dict[str, Any]
+    factory: EngineFactory,
+    model: mujoco.MjModel,
+    fields: list[Field],
+    dynamics: list[ModelField] | None,
+    given: dict[str, Any],
 ) -> int | None:
     estimate = getattr(factory, "bytes_per_world", None)
-    return None if estimate is None else int(estimate(model, fields, **given))
+    if estimate is None:
+        return None
+    return int(estimate(model, fields, **({"dynamics": dynamics} if dynamics else {}), **given))
 
 
 def _model_name(model: mujoco.MjModel) -> str:

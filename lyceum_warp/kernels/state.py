@@ -83,19 +83,19 @@ def copy_rows64(
 
 
 @wp.kernel(enable_backward=False)
-def fill_rows(mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[float], lanes: int):
-    """Copy one row of float32, (1, n), into the masked rows; launched over (nworld, lanes)."""
-    w, lane = wp.tid()
-    if mask_in[w]:
-        for i in range(lane, target_out.shape[1], lanes):
-            target_out[w, i] = source_in[0, i]
-
-
-@wp.kernel(enable_backward=False)
 def fill_rows64(
     mask_in: wp.array[bool], source_in: wp.array[wp.float64], target_out: wp.array2d[wp.float64], lanes: int
 ):
     """Copy one row of float64 into the masked rows; launched over (nworld, lanes)."""
+    w, lane = wp.tid()
+    if mask_in[w]:
+        for i in range(lane, target_out.shape[1], lanes):
+            target_out[w, i] = source_in[i]
+
+
+@wp.kernel(enable_backward=False)
+def fill_rows(mask_in: wp.array[bool], source_in: wp.array[float], target_out: wp.array2d[float], lanes: int):
+    """Copy one row of float32 into the masked rows; launched over (nworld, lanes)."""
     w, lane = wp.tid()
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):

@@ -67,10 +67,10 @@ OUTCOMES = {
 @wp.func
 def finite_row(row: wp.array[float]) -> bool:
     """Whether every number is finite."""
-    finite = bool(True)
     for i in range(row.shape[0]):
-        finite = finite and wp.isfinite(row[i])
-    return finite
+        if not wp.isfinite(row[i]):
+            return False
+    return True
 
 
 @wp.func
@@ -122,6 +122,7 @@ def make_kernels(
         module: Name of the Warp module that the kernels are compiled into, one for each task.
     """
     Batch, Params, Observations = generated.Batch, generated.Params, generated.Observations  # noqa: N806
+    World = generated.World  # noqa: N806
     view, observe_groups = generated.view, generated.observe_groups
     all_finite, copy_observations = generated.all_finite, generated.copy_observations
     control, reward, measure = functions["control"], functions["reward"], functions["measure"]
@@ -138,7 +139,7 @@ def make_kernels(
         return lambda body: None
 
     @wp.func
-    def observe(s: generated.World, p: Params, out: Observations, w: int, counters: Counters):
+    def observe(s: World, p: Params, out: Observations, w: int, counters: Counters):
         """Write every group of observations; their noise is a function of the counters alone."""
         base = substream(stream(counters.key[w], counters.episode[w], counters.step[w]), OBSERVE)
         observe_groups(s, p, out, w, base, counters.rng[w])

@@ -3,12 +3,10 @@
 from typing import Any
 
 import numpy as np
-import torch
 import warp as wp
 
 from lyceum_warp.arrays import torch_view
 from lyceum_warp.binding.writes import written_fields
-from lyceum_warp.env import Env
 from lyceum_warp.task import FUNCTIONS
 from lyceum_warp.testing.checked_functions import CheckedFunctions, Unchecked, checked_functions
 from lyceum_warp.testing.context import Context
@@ -19,7 +17,7 @@ _RESET = ("startup", "initialize", "randomize")
 _MEMORIES = ("memory", "lasting_memory")
 """Fields that ``advance`` finds as the step before left them."""
 
-_MOST_LISTED = 5
+_MOST_LISTED = 8
 """Problems that the message of a failure lists."""
 
 
@@ -57,7 +55,7 @@ class _Run:
         self.rng = np.random.default_rng(ctx.seed)
         n = self.env.nworld
         sizes = {
-            "action": self.worlds.action_space.size, "obs": self.worlds.obs_space.size, "ctrl": task.model.nu,
+            "action": self.worlds.action_space.size, "obs": self.worlds.obs_spaces["policy"].size, "ctrl": task.model.nu,
             "metrics": len(getattr(task.task, "metrics", ())),
         }  # fmt: skip
         self.rows = {name: self._array((n, size), wp.float32) for name, size in sizes.items()}

@@ -17,12 +17,10 @@ import numpy as np
 import warp as wp
 
 from lyceum_warp.binding.sources import FunctionSource, has_source, name_of, overloads
+from lyceum_warp.kernels import bounds
 
-MOST_ROUNDS = wp.constant(1_000_000)
-"""Rounds after which a ``while`` loop is reported as endless."""
-
-_LEAST_UNROLLED = ("shape", "strides")
-"""Attributes of an array that must be indexed by constants; Warp checks them."""
+_SHAPES = ("shape", "strides")
+"""Attributes of an array that are tuples."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,58 +38,19 @@ class Place:
     def problem(self, index: int, size: int) -> str:
         """What went wrong, in one line."""
         if self.verb == "loops":
-            return f"{self.function} is still in its loop {self.text!r} after {MOST_ROUNDS} rounds ({self.where})"
+            rounds = int(bounds.MOST_ROUNDS)
+            return f"{self.function} is still in its loop {self.text!r} after {rounds} rounds ({self.where})"
+        there = f"{size} elements, 0 to {size - 1}" if size else "no elements"
         return (
-            f"{self.function} {self.verb} {self.text} out of range ({self.where}): the index is {index}, and there "
-            f"are {size} elements, 0 to {size - 1}"
-            if size
-            else f"{self.function} {self.verb} {self.text} out of range ({self.where}): the index is {index}, and there "
-            "are no elements"
+            f"{self.function} {self.verb} {self.text} out of range ({self.where}): the index is {index}, and there are "
+            f"{there}"
         )
 
 
-@wp.func
-def note(report: wp.array2d[int], place: int, index: int, size: int):
-    """Keep the first index that is out of range at a place."""
-    if wp.atomic_add(report, place, 0, 1) == 0:
-        report[place, 1] = index
-        report[place, 2] = size
-
-
-@wp.func
-def at(report: wp.array2d[int], place: int, index: Any, size: int) -> int:
-    """An index within a size; 0 for one that is out of range, also a negative one."""
-    i = int(index)
-    if i < 0 or i >= size:
-        note(report, place, i, size)
-        return 0
-    return i
-
-
-@wp.func
-def from_end(report: wp.array2d[int], place: int, index: int, size: int) -> int:
-    """The same for a negative constant, which counts from the end as in Python."""
-    if index < -size:
-        note(report, place, index, size)
-        return 0
-    return index + size
-
-
-@wp.func
-def element(report: wp.array2d[int], place: int, values: Any, index: Any):
-    """An element of the result of a call, which is evaluated once."""
-    return values[at(report, place, index, len(values))]
-
-
-@wp.func
-def is_endless(report: wp.array2d[int], place: int, rounds: int) -> bool:
-    """Whether a loop has run too often, here or before."""
-    if rounds > MOST_ROUNDS:
-        note(report, place, rounds, 0)
-    return report[place, 0] > 0
-
-
-_HELPERS = {"bounds_at": at, "bounds_from_end": from_end, "bounds_element": element, "bounds_is_endless": is_endless}
+_HELPERS = {
+    "bounds_at": bounds.at, "bounds_from_end": bounds.from_end, "bounds_element": bounds.element,
+    "bounds_is_endless": bounds.is_endless,
+}  # fmt: skip
 """The names that the copies use, chosen so that no task has them."""
 
 
@@ -111,16 +70,25 @@ class CheckedFunctions:
         functions: The functions by name.
         world: The task's World.
         batch: The struct of the task's fields for all worlds.
-        lenient: Leave constant indices of local names alone: a tuple has only these.
+        unrolled: Whether Warp writes short loops out, as it does for the task itself. Without it the copies compile in
+            a fraction of the time, but a loop cannot change a name that was assigned a constant.
 
     Raises:
         Unchecked: A function can't be copied.
     """
 
     def __init__(
-        self, module: str, functions: Mapping[str, wp.Function], world: Any, batch: Any, *, lenient: bool = False
+        self,
+        module: str,
+        functions: Mapping[str, wp.Function],
+        world: Any,
+        batch: Any,
+        *,
+        unrolled: bool = False,
     ) -> None:
-        self._module, self._world, self._batch, self.lenient = module, world, batch, lenient
+        self._module, self._world, self._batch, self.unrolled = module, world, batch, unrolled
+        if not unrolled:
+            wp.get_module(module).options["max_unroll"] = 0
         self.places: list[Place] = []
         self._numbers: dict[wp.Function, int] = {}
         self._copies: dict[int, wp.Function] = {}
@@ -158,7 +126,7 @@ class CheckedFunctions:
         return len(self.places) - 1
 
     def number(self, function: wp.Function) -> int:
-        """The number of the copy of a function, which is made if it is not there yet."""
+        """The number of a function's copy, which is made if it is not there yet."""
         if function not in self._numbers:
             number = self._numbers[function] = len(self._numbers)
             for overload in overloads(function):
@@ -173,20 +141,25 @@ class CheckedFunctions:
         rewriter = _Rewriter(self, source)
         tree = rewriter.visit(copy.deepcopy(source.tree))
         tree.name = f"checked_{number}_{source.name}"
-        tree.decorator_list = []
+        tree.decorator_list = [ast.parse("bounds_wp.func(module=bounds_module)", mode="eval").body]
         types = {f"bounds_type_{i}": kind for i, kind in enumerate(function.input_types.values())}
         for argument, name in zip(tree.args.args, types, strict=True):
             argument.annotation = ast.Name(name, ast.Load())
         tree.args.args.insert(0, ast.arg("bounds_report", ast.Name("bounds_report_type", ast.Load())))
-        defaults = {f"bounds_default_{i}": value for i, value in enumerate(function.func.__defaults__ or ())}
+        defaults = {
+            f"bounds_default_{i}": value for i, value in enumerate(getattr(function.func, "__defaults__", None) or ())
+        }
         tree.args.defaults = [ast.Name(name, ast.Load()) for name in defaults]
         returned = function.adj.arg_types.get("return")
         tree.returns = None if returned is None else ast.Name("bounds_result_type", ast.Load())
         types |= {"bounds_report_type": wp.array2d(dtype=int), "bounds_result_type": returned}
         scope = source.scope | _HELPERS | types | defaults
+        scope |= {"bounds_wp": wp, "bounds_module": wp.get_module(self._module)}
+        if number in self._copies:  # Warp takes the next for an overload of this one
+            scope[tree.name] = self._copies[number]
         self._scopes.append((scope, rewriter.callees))
         self._execute(ast.unparse(ast.fix_missing_locations(tree)), scope, len(self._scopes))
-        copied: wp.Function = wp.func(scope[tree.name], module=wp.get_module(self._module))
+        copied: wp.Function = scope[tree.name]
         return copied
 
     def _execute(self, text: str, scope: dict[str, Any], part: int | str) -> None:
@@ -226,6 +199,8 @@ class _Rewriter(ast.NodeTransformer):
         self.checked, self.source = checked, source
         self.callees: list[int] = []
         self.loops = 0
+        self.writes = False
+        """Whether the expression at hand is written: of ``a[i].x = 1.0`` all parts are."""
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
         """Leave the type of a local name alone."""
@@ -238,7 +213,14 @@ class _Rewriter(ast.NodeTransformer):
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
         self._refused(node)
-        return self.generic_visit(node)
+        node.value = self._visit(node.value, writes=self.writes or not isinstance(node.ctx, ast.Load))
+        return node
+
+    def _visit(self, node: ast.expr, *, writes: bool) -> ast.expr:
+        kept, self.writes = self.writes, writes
+        visited: ast.expr = self.visit(node)
+        self.writes = kept
+        return visited
 
     def _refused(self, node: ast.Name | ast.Attribute) -> ast.AST:
         """Refuse a function that is not called here: the copy that is called elsewhere takes one argument more."""
@@ -286,18 +268,19 @@ class _Rewriter(ast.NodeTransformer):
     def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
         if self._is_left_alone(node):
             return node
-        text, verb = ast.unparse(node), "reads" if isinstance(node.ctx, ast.Load) else "writes"
+        writes = self.writes or not isinstance(node.ctx, ast.Load)
+        text, verb = ast.unparse(node), "writes" if writes else "reads"
         called = any(isinstance(inner, ast.Call) for inner in ast.walk(node.value))
-        base = self.visit(node.value)
+        base = self._visit(node.value, writes=writes)
         indices = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         if called and len(indices) == 1 and not isinstance(indices[0], ast.Slice) and verb == "reads":
             place = ast.Constant(self.checked.place(self.source, node, text, verb))
-            index = self.visit(indices[0])
+            index = self._visit(indices[0], writes=False)
             return _call("bounds_element", _name("bounds_report"), place, base, index)
         checked = [
-            self.visit(index)
+            self._visit(index, writes=False)
             if isinstance(index, ast.Slice)
-            else self._checked(node, text, verb, base, axis, self.visit(index))
+            else self._checked(node, text, verb, base, axis, self._visit(index, writes=False))
             for axis, index in enumerate(indices)
         ]
         node.value = base
@@ -305,13 +288,10 @@ class _Rewriter(ast.NodeTransformer):
         return node
 
     def _is_left_alone(self, node: ast.Subscript) -> bool:
-        """Whether Warp itself checks the index."""
-        if isinstance(node.value, ast.Attribute) and node.value.attr in _LEAST_UNROLLED:
-            return True
-        if self.checked.lenient and isinstance(node.value, ast.Name) and isinstance(node.slice, ast.Constant):
-            return node.value.id in self.source.locals
+        """Whether Warp itself checks the index, which must be a constant."""
         value = self.source.value(node.value)
-        return value is not None and not hasattr(value, "_wp_scalar_type_")  # a type, or Python's own tuple
+        not_ours = value is not None and not hasattr(value, "_wp_scalar_type_")  # a type, or Python's own tuple
+        return not_ours or _is_tuple(self.source, node.value)
 
     def _checked(self, node: ast.AST, text: str, verb: str, base: ast.expr, axis: int, index: ast.expr) -> ast.expr:
         """An index along one axis, with its check."""
@@ -334,6 +314,31 @@ class _Rewriter(ast.NodeTransformer):
         ).body
         node.body = [*count[1:], *node.body]
         return [count[0], node]
+
+
+def _is_tuple(source: FunctionSource, node: ast.expr, seen: frozenset[Any] = frozenset()) -> bool:
+    """Whether an expression is a tuple, or the shape of an array."""
+    if isinstance(node, ast.Attribute):
+        return node.attr in _SHAPES
+    if isinstance(node, ast.Tuple):
+        return True
+    if isinstance(node, ast.Name):
+        key: Any = (source.function, node.id)
+        values = [
+            inner.value
+            for inner in ast.walk(source.tree)
+            if isinstance(inner, ast.Assign)
+            and any(isinstance(target, ast.Name) and target.id == node.id for target in inner.targets)
+        ]
+    elif isinstance(node, ast.Call):
+        key = source.value(node.func)
+        if not isinstance(key, wp.Function) or not has_source(key):
+            return False
+        source = FunctionSource(key)
+        values = [inner.value for inner in ast.walk(source.tree) if isinstance(inner, ast.Return) and inner.value]
+    else:
+        return False
+    return key not in seen and any(_is_tuple(source, value, seen | {key}) for value in values)
 
 
 def _is_row(kind: Any) -> bool:
@@ -380,12 +385,12 @@ def checked_functions(
         _made[key].load(device)
         return _made[key]
     failure: Unchecked | None = None
-    for lenient in (False, True):
-        module = re.sub(r"[^\w.]", "_", f"lyceum_warp.checked.{name}{'.lenient' * lenient}")
+    for unrolled in (False, True):
+        module = re.sub(r"[^\w.]", "_", f"lyceum_warp.checked.{name}{'.unrolled' * unrolled}")
         taken = sum(other == module or other.startswith(f"{module}_again") for other in _module_names)
         module = f"{module}_again{taken}" if taken else module
         _module_names.append(module)
-        checked = CheckedFunctions(module, functions, world, batch, lenient=lenient)
+        checked = CheckedFunctions(module, functions, world, batch, unrolled=unrolled)
         try:
             checked.load(device)
         except Unchecked as error:

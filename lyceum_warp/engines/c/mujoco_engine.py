@@ -13,9 +13,12 @@ from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.batch_faults import errors_as_warnings
 from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
+from lyceum_warp.engines.c.world_models import WorldModels
+from lyceum_warp.engines.c.world_models import bytes_per_world as model_bytes_per_world
 from lyceum_warp.fields import READ_ONLY, STATE_FIELDS, Field, Stage, early_sensor_columns, state_columns
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_rows64, fill_rows64, narrow, narrow_bool, widen, widen_bool
+from lyceum_warp.model_fields import ModelField
 from lyceum_warp.mujoco_log import quiet
 from lyceum_warp.validate import whole_number
 
@@ -34,6 +37,8 @@ class MujocoEngine(Engine):
         nworld: Number of worlds.
         device: Must be the CPU.
         fields: The fields to keep.
+        dynamics: The model fields that differ between worlds.
+        initial: The state that ``reset`` puts worlds into, shown as float32 fields show it; None for the model's own.
         nthread: Threads of the pool; 0 takes all cores.
 
     Raises:
@@ -44,13 +49,21 @@ class MujocoEngine(Engine):
     capturable = False
 
     def __init__(
-        self, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: Iterable[Field], *, nthread: int = 0
+        self,
+        model: mujoco.MjModel,
+        nworld: int,
+        device: wp.Device,
+        fields: Iterable[Field],
+        dynamics: Iterable[ModelField] = (),
+        initial: np.ndarray | None = None,
+        *,
+        nthread: int = 0,
     ) -> None:
         if not device.is_cpu:
             raise ValueError(
                 f"the mujoco engine runs on the CPU, not on {device.alias!r}: use device='cpu' or engine='warp'"
             )
-        super().__init__(model, nworld, device, fields)
+        super().__init__(model, nworld, device, fields, dynamics, initial)
         quiet()
         self.nthread = whole_number("nthread", nthread, low=0)
         self.native_model = copy.copy(model)
@@ -60,7 +73,7 @@ class MujocoEngine(Engine):
         self.batch = Batch(self.native_model, nworld, self.nthread, _is_persistent(self.fields.values()))
         self._rows = self._alias(self.batch.state)
         self._warning: wp.array = wp.array(self.batch.warning, dtype=int, device=device, copy=False)
-        self._initial = self._initial_state()
+        self._initial = self._rounded_initial()
         self._columns: dict[str, wp.array] = {}
         self._copies: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         for field in self.fields.values():
@@ -72,14 +85,21 @@ class MujocoEngine(Engine):
         self._lagged = [field for field in kept if field.lagged]
         self._unlagged = [field for field in kept if not field.lagged and field.name != "ctrl"]
         self._early_columns = np.isin(np.arange(model.nsensordata), early_sensor_columns(model))
+        self._written = [field for field in kept if field.written]
         self._rollouts: dict[Any, NativeRollout | None] = {}
+        self._values: dict[str, np.ndarray] = {}
+        for name, varied in self.dynamics.items():
+            self.arrays[name] = self._nominal_rows(varied, nworld)
+            self._values[name] = flat(self.arrays[name]).numpy()
+        self._models = WorldModels(self.batch, self.dynamics.values())
+        self._models.apply(self._values)
 
     def _alias(self, rows: np.ndarray) -> wp.array:
         return wp.array(rows, dtype=wp.float64, device=self.device, copy=False)
 
-    def _initial_state(self) -> wp.array:
-        """The model's initial state as float32 fields show it, whichever of them are kept."""
-        initial = self.batch.state[0].copy()
+    def _rounded_initial(self) -> wp.array:
+        """The initial state as float32 fields show it, whichever of them are kept."""
+        initial = self.initial.copy()
         for name in STATE_FIELDS:
             if name in READ_ONLY:
                 continue  # rounded, the times of delayed samples would differ from the engine's own
@@ -100,9 +120,13 @@ class MujocoEngine(Engine):
         self._copies[field.name] = target, source.reshape(target.shape)
 
     @classmethod
-    def bytes_per_world(cls, model: mujoco.MjModel, fields: Iterable[Field], **options: Any) -> int:
-        fields = list(fields)
-        total = super().bytes_per_world(model, fields, **options) + _BATCH_BYTES
+    def bytes_per_world(
+        cls, model: mujoco.MjModel, fields: Iterable[Field], dynamics: Iterable[ModelField] = (), **options: Any
+    ) -> int:
+        fields, dynamics = list(fields), list(dynamics)
+        total = super().bytes_per_world(model, fields, dynamics, **options) + _BATCH_BYTES
+        if dynamics:
+            total += model_bytes_per_world(model, dynamics)
         total += 8 * sum(field.size for field in fields if field.name not in STATE_FIELDS)
         if _is_persistent(fields):
             # of an arena only the pages that contacts and constraints touch: about half as much as the buffer
@@ -112,8 +136,9 @@ class MujocoEngine(Engine):
     # physics
 
     def step(self, nstep: int) -> None:
-        ctrl, rows = self._copies["ctrl"]
-        np.copyto(rows, ctrl)
+        for field in self._written:
+            given, rows = self._copies[field.name]
+            np.copyto(rows, given)
         separate = bool(self._lagged) and self.stage > Stage.NONE
         with errors_as_warnings(self.batch):
             self.batch.step(nstep=nstep, stage=Stage.NONE if separate else self.stage)
@@ -145,7 +170,7 @@ class MujocoEngine(Engine):
     def rollout(self, state: wp.array, controls: wp.array, nstep: int, buffers: Mapping[str, wp.array]) -> None:
         key = (len(controls), nstep, *buffers)
         if key not in self._rollouts:
-            fields = [self.fields[name] for name in buffers]
+            fields = [self.fields[name] for name in buffers if name not in self.dynamics]
             self._rollouts[key] = self._native_rollout(len(controls), nstep, fields)
         native = self._rollouts[key]
         if native is None:
@@ -155,6 +180,11 @@ class MujocoEngine(Engine):
         self.batch.state[:] = native.batch.state
         self.batch.warning += native.batch.warning
         self._copy(self._state_fields)
+        if self.dynamics:
+            self._read_columns(state, self._everyone, self.dynamics.values(), self.state_size - self._dynamics_size)
+            self.apply_model(self._everyone)
+            for name in self.dynamics.keys() & buffers.keys():
+                np.copyto(buffers[name].numpy(), self.arrays[name].numpy())
 
     def rollout_bytes_per_world(self, steps: int, nstep: int, fields: Iterable[Field]) -> int:
         fields = list(fields)
@@ -166,7 +196,19 @@ class MujocoEngine(Engine):
         if not is_exact(self.model, fields):
             return None
         batch = Batch(self.native_model, self.nworld, self.nthread)
-        return NativeRollout(batch, steps, nstep, fields, self.snapshots)
+        return NativeRollout(batch, steps, nstep, fields, self.snapshots, self.dynamics.values())
+
+    def apply_model(self, mask: wp.array) -> None:
+        self._models.apply(self._values, mask.numpy())
+
+    def settle(self, mask: wp.array, nstep: int) -> None:
+        chosen = mask.numpy()
+        if nstep == 0 or not chosen.any():
+            return
+        with errors_as_warnings(self.batch):
+            self.batch.step(ids=chosen, nstep=nstep)
+        self.batch.state[chosen, state_columns(self.model, "time")] = 0.0
+        self._copy(self._state_fields, chosen)
 
     def find_faults(self, mask: wp.array) -> None:
         nphysics = 1 + self.model.nq + self.model.nv + self.model.na

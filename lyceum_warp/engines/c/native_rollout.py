@@ -9,7 +9,9 @@ import warp as wp
 from mujoco.batch import Batch
 
 from lyceum_warp.engines.c.batch_faults import errors_as_warnings
+from lyceum_warp.engines.c.world_models import WorldModels
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
+from lyceum_warp.model_fields import ModelField
 
 
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
@@ -34,10 +36,17 @@ class NativeRollout:
         nstep: Substeps in a step.
         fields: The fields to copy into buffers.
         snapshots: The fields that follow the integration state in a state vector, in order.
+        dynamics: The model fields that follow those.
     """
 
     def __init__(
-        self, batch: Batch, steps: int, nstep: int, fields: Iterable[Field], snapshots: Iterable[Field]
+        self,
+        batch: Batch,
+        steps: int,
+        nstep: int,
+        fields: Iterable[Field],
+        snapshots: Iterable[Field],
+        dynamics: Iterable[ModelField] = (),
     ) -> None:
         self.batch, self.nstep = batch, nstep
         model, nworld = batch.model, batch.nsim
@@ -57,6 +66,12 @@ class NativeRollout:
         for field in snapshots:
             self.start[field.name] = slice(column, column + field.size)
             column += field.size
+        self.models = WorldModels(batch, dynamics)
+        self.model_columns: dict[str, slice] = {}
+        """Columns of the state vector that hold the model fields."""
+        for varied in dynamics:
+            self.model_columns[varied.name] = slice(column, column + varied.size)
+            column += varied.size
         for field in self.fields:
             if field.name in STATE_FIELDS:
                 columns = state_columns(model, field.name)
@@ -81,13 +96,14 @@ class NativeRollout:
         """Roll out, and copy the fields; ``batch.state`` and ``batch.warning`` then hold the end and all warnings.
 
         Args:
-            state: States at the start, (nworld, at least state_size) float64.
+            state: States at the start, (nworld, at least state_size) float64; each world runs on its model fields.
             controls: Controls of each step, (steps, nworld, nu).
             buffers: Where each field goes, (steps + 1, nworld, ...) float32.
         """
         batch = self.batch
         batch.state[:] = state[:, : batch.nstate]
         batch.warning[:] = 0
+        self.models.apply({name: state[:, columns].astype(np.float32) for name, columns in self.model_columns.items()})
         np.copyto(self.by_step, controls.transpose(1, 0, 2)[:, :, None])
         rows: dict[str, Any] = {"record": list(self.rows), "out": self.rows}
         # a world that MuJoCo warns of stops there and repeats its last row: only the warning shows it

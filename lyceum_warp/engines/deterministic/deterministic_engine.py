@@ -7,6 +7,7 @@ from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
+import numpy as np
 import warp as wp
 
 from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
@@ -15,6 +16,7 @@ from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.engines.warp import substep
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import Field
+from lyceum_warp.model_fields import ModelField
 
 _TIMES_THE_MEMORY = 5
 """A world's memory relative to the estimate for the plain Warp engine: measured as 4.9 on humanoid, 6.1 on half_cheetah
@@ -36,16 +38,25 @@ class DeterministicEngine(WarpEngine):
     partial_refresh = False
 
     def __init__(
-        self, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: Iterable[Field], **options: Any
+        self,
+        model: mujoco.MjModel,
+        nworld: int,
+        device: wp.Device,
+        fields: Iterable[Field],
+        dynamics: Iterable[ModelField] = (),
+        initial: np.ndarray | None = None,
+        **options: Any,
     ) -> None:
         self._scratch = Scratch(device)
-        super().__init__(model, nworld, device, fields, **options)
+        super().__init__(model, nworld, device, fields, dynamics, initial, **options)
         with wp.ScopedDevice(device):
             self._order = CanonicalOrder(self.m, self.d, self._scratch.open)
 
     @classmethod
-    def bytes_per_world(cls, model: mujoco.MjModel, fields: Iterable[Field], **options: Any) -> int:
-        return _TIMES_THE_MEMORY * super().bytes_per_world(model, fields, **options)
+    def bytes_per_world(
+        cls, model: mujoco.MjModel, fields: Iterable[Field], dynamics: Iterable[ModelField] = (), **options: Any
+    ) -> int:
+        return _TIMES_THE_MEMORY * super().bytes_per_world(model, fields, dynamics, **options)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
         """Another model and data of MuJoCo Warp with the same options and sizes, to measure it alone.
@@ -67,7 +78,8 @@ class DeterministicEngine(WarpEngine):
                 f"{self.nworld} worlds need buffers of more than the {LARGEST_BUFFER / 1e9:.3g} GB in which Warp can "
                 f"sort with deterministic=True: use nworld={sizes.most} at most, or leave it out"
             )
-        plain = super().bytes_per_world(self.model, self.fields.values(), nconmax=self.nconmax, njmax=self.njmax)
+        fields, dynamics = self.fields.values(), self.dynamics.values()
+        plain = super().bytes_per_world(self.model, fields, dynamics, nconmax=self.nconmax, njmax=self.njmax)
         needed = sizes.bytes_of(self.nworld) / self.nworld
         try:
             check_fit(plain + needed, self.nworld, self.device, held=self.nworld * plain)

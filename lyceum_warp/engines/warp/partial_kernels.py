@@ -67,3 +67,17 @@ def return_bits(world_in: wp.array[int], left_in: wp.array[int], source_in: wp.a
     if place < left_in[0]:
         world = world_in[place]
         target_inout[world] = target_inout[world] | source_in[place]
+
+
+@wp.kernel(enable_backward=False)
+def mark_changed(
+    mask_in: wp.array[bool], given_in: wp.array2d[int], applied_inout: wp.array2d[int], changed_inout: wp.array[bool]
+):
+    """Mark the masked worlds whose bits differ from those taken last, and take them; launched over (nworld,)."""
+    w = wp.tid()
+    if mask_in[w]:
+        for i in range(given_in.shape[1]):
+            bits = given_in[w, i]
+            if bits != applied_inout[w, i]:
+                applied_inout[w, i] = bits
+                changed_inout[w] = True

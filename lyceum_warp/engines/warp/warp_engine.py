@@ -1,11 +1,13 @@
 """The Warp engine: MuJoCo Warp, float32, on a CUDA device or on the CPU."""
 
 import contextlib
+import copy
 from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
+import numpy as np
 import warp as wp
 from mujoco_warp._src import collision_sdf
 
@@ -15,10 +17,14 @@ from lyceum_warp.engines.warp import overflow, substep
 from lyceum_warp.engines.warp.contact_sizes import probe_sizes
 from lyceum_warp.engines.warp.data_memory import data_bytes
 from lyceum_warp.engines.warp.forward_parts import Part, forward_parts, step_after, takes_over
-from lyceum_warp.engines.warp.partial_forward import Conditional, PartialForward, group_size
+from lyceum_warp.engines.warp.group_turns import group_size
+from lyceum_warp.engines.warp.model_constants import ModelConstants
+from lyceum_warp.engines.warp.model_rows import ModelRows, constants_of, outputs_of, owner, put_varied_model
+from lyceum_warp.engines.warp.partial_forward import Conditional, PartialForward
 from lyceum_warp.fields import Field, Stage, early_sensor_columns
 from lyceum_warp.kernels import faults
-from lyceum_warp.kernels.state import copy_columns, copy_rows, narrow, widen, zero_columns
+from lyceum_warp.kernels.state import copy_columns, copy_rows, fill_rows, narrow, widen, zero_columns
+from lyceum_warp.model_fields import ModelField
 from lyceum_warp.validate import whole_number
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
@@ -35,6 +41,9 @@ class WarpEngine(Engine):
         nworld: Number of worlds.
         device: A CUDA device, or the CPU (single-threaded: for tests).
         fields: The fields to keep.
+        dynamics: The model fields that differ between worlds; the arrays are MuJoCo Warp's own. With them, room for
+            constraints is probed on the model's own values, except that drawn friction losses add their constraints.
+        initial: The state that ``reset`` puts worlds into, rounded to float32; None for the model's own.
         nconmax: Contacts that each world has room for, on average. None probes the model, and gives all worlds
             together additional room for a single one in which everything touches.
         njmax: Constraints that each world has room for; None probes the model.
@@ -58,16 +67,18 @@ class WarpEngine(Engine):
         nworld: int,
         device: wp.Device,
         fields: Iterable[Field],
+        dynamics: Iterable[ModelField] = (),
+        initial: np.ndarray | None = None,
         *,
         nconmax: int | None = None,
         njmax: int | None = None,
         unroll: bool = False,
     ) -> None:
-        super().__init__(model, nworld, device, fields)
+        super().__init__(model, nworld, device, fields, dynamics, initial)
         if unroll:
             _check_unrolled(model)
         self.unroll = unroll
-        self.nconmax, self.njmax = _sizes(model, nconmax, njmax)
+        self.nconmax, self.njmax = _sizes(model, nconmax, njmax, self.dynamics)
         with _refusals():
             self.m = self._put_model()
             self.spare = _contacts_of_one_world(self.m) if nconmax is None else 0
@@ -81,6 +92,13 @@ class WarpEngine(Engine):
             self._own[field.name] = self._alias(field)
             self.arrays[field.name] = wp.clone(self._own[field.name]) if field.snapshot else self._own[field.name]
         self.ctrl = self.arrays["ctrl"]
+        for varied in self.dynamics.values():
+            self.arrays[varied.name] = self._alias_model(varied)
+        self._constants = self._model_constants()
+        # the model's own initial state follows qpos0 and the poses of mocap bodies, which may differ between worlds
+        self._start: wp.array | None = None
+        if initial is not None or self.dynamics:
+            self._start = wp.array(self.initial, dtype=float, device=device)
         self._reset = [field.name for field in self.fields.values() if field.reset > Stage.NONE]
         self._current_parts = forward_parts(model, [f.name for f in self.fields.values() if f.refresh > Stage.NONE])
         self._reset_parts = None
@@ -92,13 +110,15 @@ class WarpEngine(Engine):
         self._shared = () if moved else takes_over(model, self._current_parts or ())
         self._conditional = Conditional(device)
         self._partial = self._partial_forward()
+        self._settling: PartialForward | None = None
+        self.apply_model(self._everyone)
 
     # hooks for subclasses
 
     def _put_model(self) -> mjw.Model:
         """MuJoCo Warp's model with the engine's options."""
         with wp.ScopedDevice(self.device):
-            model = mjw.put_model(self.model)
+            model = put_varied_model(self.model, list(self.dynamics.values()), self.nworld)
         # overflows are reported per world; printed from a kernel they would fill the disk
         model.opt.warn_overflow = 0
         model.opt.graph_conditional = not self.unroll
@@ -120,13 +140,33 @@ class WarpEngine(Engine):
             return mjw.make_data(self.model, nworld=nworld, naconmax=naconmax, njmax=self.njmax)
 
     @classmethod
-    def bytes_per_world(cls, model: mujoco.MjModel, fields: Iterable[Field], **options: Any) -> int:
-        sizes = _sizes(model, options.get("nconmax"), options.get("njmax"))
+    def bytes_per_world(
+        cls, model: mujoco.MjModel, fields: Iterable[Field], dynamics: Iterable[ModelField] = (), **options: Any
+    ) -> int:
+        dynamics = list(dynamics)
+        sizes = _sizes(model, options.get("nconmax"), options.get("njmax"), [field.name for field in dynamics])
         with _refusals():
             data = data_bytes(model, *sizes)
-        return data + 4 * mujoco.mj_stateSize(model, _SPEC) + 4 * sum(field.size for field in fields if field.snapshot)
+        floats = mujoco.mj_stateSize(model, _SPEC) + sum(field.size for field in fields if field.snapshot)
+        floats += 2 * sum(field.size for field in dynamics)
+        floats += sum(np.size(getattr(model, name)) for name in outputs_of(dynamics))
+        return data + 4 * floats
 
     # fields
+
+    def _alias_model(self, field: ModelField) -> wp.array:
+        """The memory of a model field under the type of ``model_fields``."""
+        source = getattr(owner(self.m, field.name), field.name)
+        if not field.size:
+            return wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
+        own: Any = wp.array(ptr=source.ptr, dtype=field.dtype, shape=(self.nworld, *field.shape), device=self.device)
+        own.owner = source
+        return own
+
+    def _model_constants(self) -> ModelConstants | None:
+        """What keeps constants up to date, or None where none follow from the model fields."""
+        fields = [field for field in self.dynamics.values() if field.size and constants_of([field])]
+        return ModelConstants(self.model, self.m, fields, self.nworld, self.device) if fields else None
 
     def _alias(self, field: Field) -> wp.array:
         """The memory of a field under the types of ``fields``, which differ from MuJoCo Warp's in name alone."""
@@ -151,9 +191,15 @@ class WarpEngine(Engine):
         self._copy_snapshots(self._everyone)
         self.refresh_current(self._everyone)
 
-    def _forward(self, parts: Collection[Part] | None, stage: Stage, data: mjw.Data | None = None) -> None:
+    def _forward(
+        self,
+        parts: Collection[Part] | None,
+        stage: Stage,
+        data: mjw.Data | None = None,
+        model: mjw.Model | None = None,
+    ) -> None:
         """Run parts of a forward pass in every world of a data; None for all parts up to a stage."""
-        m, d = self.m, self.d if data is None else data
+        m, d = self.m if model is None else model, self.d if data is None else data
         with self._on_device():
             if parts is not None:
                 for part in parts:
@@ -182,6 +228,35 @@ class WarpEngine(Engine):
             size = self.nworld, len(self._columns)
             wp.launch(copy_columns, size, [mask, self._columns, own, kept], device=self.device)
 
+    def apply_model(self, mask: wp.array) -> None:
+        if self._constants is not None:
+            with wp.ScopedDevice(self.device):
+                self._constants(mask)
+
+    def settle(self, mask: wp.array, nstep: int) -> None:
+        if nstep == 0:
+            return
+        if self._is_partial():
+            self._settling = self._settling or self._partial or self._group_of_worlds()
+            with self._on_device():
+                self._settling.settle(mask, nstep)
+            return
+        self._settle_among_all(mask, nstep)
+
+    def _settle_among_all(self, mask: wp.array, nstep: int) -> None:
+        """Step all worlds, and put those that are not masked back."""
+        states, bits = wp.empty_like(self._state), wp.clone(self.d.overflow)
+        with self._on_device():
+            mjw.get_state(self.m, self.d, states, _SPEC)
+            for _ in range(nstep):
+                mjw.step(self.m, self.d)
+            mjw.get_state(self.m, self.d, states, _SPEC, mask)
+            launch_rows(copy_rows, mask, wp.zeros((self.nworld, 1), dtype=float, device=self.device), states[:, :1])
+            mjw.set_state(self.m, self.d, states, _SPEC)
+        launch_rows(copy_rows, mask, flat(self.d.overflow), flat(bits))
+        wp.copy(self.d.overflow, bits)
+        self.refresh_current(mask)
+
     def find_faults(self, mask: wp.array) -> None:
         d = self.d
         bits = [overflow.CONTACT_BITS, overflow.CONSTRAINT_BITS, overflow.IGNORED_BITS]
@@ -191,6 +266,9 @@ class WarpEngine(Engine):
     def reset(self, mask: wp.array) -> None:
         with self._on_device():
             mjw.reset_data(self.m, self.d, reset=mask)
+            if self._start is not None:
+                launch_rows(fill_rows, mask, self._start, self._state)
+                mjw.set_state(self.m, self.d, self._state, _SPEC, mask)
 
     def commit(self, mask: wp.array) -> None:
         """Nothing to do: the fields are the engine's own arrays."""
@@ -203,8 +281,8 @@ class WarpEngine(Engine):
         else:
             self._refresh(mask)
 
-    def _forward_group(self, group: mjw.Data) -> None:
-        self._forward(None, self.reset_stage, group)
+    def _forward_group(self, model: mjw.Model, group: mjw.Data) -> None:
+        self._forward(None, self.reset_stage, group, model)
         self._forward(self._shared, self.reset_stage)  # from which the next step goes on
 
     def _refresh(self, mask: wp.array) -> None:
@@ -215,14 +293,22 @@ class WarpEngine(Engine):
         if self._reset_parts is None:
             overflow.report_pool_overflow(self.d, mask)
 
+    def _is_partial(self) -> bool:
+        """Whether a group of worlds can be stepped alone."""
+        # sorting pairs of geoms, as for large models, takes memory that can't be reserved
+        return self.partial_refresh and self.m.opt.broadphase == mjw.BroadphaseType.NXN
+
     def _partial_forward(self) -> PartialForward | None:
         """A forward pass of restarting worlds alone, or None where it gains nothing or is not possible."""
-        # sorting pairs of geoms, as for large models, takes memory that can't be reserved
-        sorts = self.m.opt.broadphase != mjw.BroadphaseType.NXN
-        if not self.partial_refresh or sorts or self._reset_parts is not None:
-            return None
-        group = self._make_data(group_size(self.nworld, self.device))
-        return PartialForward(self.m, self.d, group, self._state)
+        return self._group_of_worlds() if self._is_partial() and self._reset_parts is None else None
+
+    def _group_of_worlds(self) -> PartialForward:
+        size = group_size(self.nworld, self.device)
+        fields = list(self.dynamics.values())
+        names = [field.name for field in fields if field.size] + outputs_of(fields)
+        with wp.ScopedDevice(self.device):
+            rows = ModelRows(self.m, names, size)
+        return PartialForward(rows, self.d, self._make_data(size), self._state)
 
     @contextlib.contextmanager
     def _histories_kept(self) -> Iterator[None]:
@@ -255,15 +341,26 @@ def _refusals() -> Iterator[None]:
         raise ValueError(f"MuJoCo Warp refuses the model: {error}; change the model, or use engine='mujoco'") from error
 
 
-def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None) -> tuple[int, int]:
+def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied: Collection[str]) -> tuple[int, int]:
     """Contacts and constraints that each world has room for: those given, and probed ones for those that are not."""
     with _refusals():
         _check_sdf_plugins(model)  # now: probing such a model takes long
     given = {"nconmax": nconmax, "njmax": njmax}
     sizes = [size if size is None else whole_number(name, size, low=1) for name, size in given.items()]
-    probed = probe_sizes(model) if None in sizes else (0, 0)
+    probed = probe_sizes(_with_friction_losses(model, varied)) if None in sizes else (0, 0)
     contacts, constraints = (other if size is None else size for size, other in zip(sizes, probed, strict=True))
     return contacts, constraints
+
+
+def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> mujoco.MjModel:
+    """The model with a constraint for every friction loss that may become one in a world."""
+    names = {"dof_frictionloss", "tendon_frictionloss"}.intersection(varied)
+    if names:
+        model = copy.copy(model)
+        for name in names:
+            losses = getattr(model, name)
+            losses[losses == 0] = 1e-6
+    return model
 
 
 def _check_sdf_plugins(model: mujoco.MjModel) -> None:

@@ -1,0 +1,79 @@
+"""Model fields that differ between the worlds of a batch."""
+
+from collections.abc import Iterable, Mapping
+
+import mujoco
+import numpy as np
+from mujoco.batch import MODEL_FIELDS, Batch
+
+from lyceum_warp.engines.c.batch_faults import errors_as_warnings
+from lyceum_warp.model_fields import ModelField
+
+
+class WorldModels:
+    """Brings values of model fields into a batch, and the constants that follow from them.
+
+    What a batch holds is a function of the float32 values alone: a value that rounds to the model's own is taken as
+    that, and every other one as it is.
+
+    Args:
+        batch: The worlds.
+        fields: The model fields.
+    """
+
+    def __init__(self, batch: Batch, fields: Iterable[ModelField]) -> None:
+        self.batch = batch
+        self.fields = [field for field in fields if field.size]
+        self._follows = {field.name for field in self.fields if field.constants}
+        self._rows: dict[str, np.ndarray] = {}
+        self._own: dict[str, np.ndarray] = {}
+        self._applied: dict[str, np.ndarray] = {}
+        for field in self.fields:
+            rows = batch.expand(f"opt.{field.name}" if field.option else field.name)
+            self._rows[field.name] = rows.reshape(batch.nsim, field.size)
+            self._own[field.name] = field.value(batch.model).reshape(field.size).copy()
+            self._applied[field.name] = self._rows[field.name].astype(np.float32)
+        # constants that were computed once are computed by the same code for every value, also for the model's own
+        self._stale = np.full(batch.nsim, bool(self._follows))
+
+    def apply(self, values: Mapping[str, np.ndarray], mask: np.ndarray | None = None) -> None:
+        """Take over values, and recompute the constants of the worlds where any of them changed.
+
+        Args:
+            values: By name, (nworld, size) float32.
+            mask: Which worlds; None for all.
+        """
+        derive = self._stale if mask is None else self._stale & mask
+        for name, rows in self._rows.items():
+            given, applied, own = values[name], self._applied[name], self._own[name]
+            different = given.view(np.int32) != applied.view(np.int32)  # bits, so that NaN equals itself
+            if not different.any():
+                continue
+            changed = different.any(axis=1)
+            if mask is not None:
+                changed &= mask
+            new = given[changed]
+            applied[changed] = new
+            rows[changed] = np.where(new == own.astype(np.float32), own, new)
+            if name in self._follows:
+                derive = derive | changed
+        if derive.any():
+            self._set_const(derive)
+
+    def _set_const(self, worlds: np.ndarray) -> None:
+        """Recompute constants; a world where MuJoCo refuses to gets a warning, and is tried again next time."""
+        counted = self.batch.warning[:, :, 1].sum(axis=1)
+        with errors_as_warnings(self.batch):
+            self.batch.set_const(worlds)
+        self._stale[worlds] = (self.batch.warning[:, :, 1].sum(axis=1) > counted)[worlds]
+
+
+def bytes_per_world(model: mujoco.MjModel, fields: Iterable[ModelField]) -> int:
+    """Bytes that a batch and ``WorldModels`` take for each world."""
+    fields = list(fields)
+    batch = Batch(model, 1, 1)
+    models = WorldModels(batch, fields)
+    moved = {field.name: 1.001 * field.value(model).reshape(1, -1).astype(np.float32) for field in models.fields}
+    models.apply(moved)  # constants that differ between worlds take memory, too
+    expanded = [rows for name in MODEL_FIELDS if (rows := batch.expanded(name)) is not None]
+    return sum(rows.nbytes for rows in expanded) + 4 * sum(field.size for field in fields)

@@ -1,0 +1,124 @@
+"""Work on a few worlds of many: the masked ones pass through a small group, in as many turns as it takes."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+
+import warp as wp
+
+from lyceum_warp.arrays import flat
+from lyceum_warp.engines.warp import partial_kernels as kernels
+from lyceum_warp.engines.warp.memory_reserve import Reserve, aligned
+
+
+def group_size(nworld: int, device: wp.Device) -> int:
+    """Worlds of a group: more than usually restart in one step, and few enough for a cheap forward pass."""
+    return min(nworld, max(1 if device.is_cpu else 64, nworld // 16))
+
+
+class Turns:
+    """Takes the masked worlds into a group and back, a group at a time; made of launches.
+
+    No turn is taken where no world is masked.
+
+    Args:
+        nworld: Number of worlds.
+        size: Places in the group.
+        device: Where they live.
+    """
+
+    def __init__(self, nworld: int, size: int, device: wp.Device) -> None:
+        self.nworld, self.size, self.device = nworld, size, device
+        with wp.ScopedDevice(device):
+            self._rank, self._world = wp.zeros(nworld, dtype=int), wp.zeros(size, dtype=int)
+            self._count, self._first, self._left = (wp.zeros(1, dtype=int) for _ in range(3))
+        self._arena = None if device.is_cpu else Arena(device)
+
+    def run(self, mask: wp.array, turn: Callable[[], None]) -> None:
+        """Call ``turn`` for one group after another; it may use ``take`` and ``give``."""
+        with wp.ScopedDevice(self.device):
+            self._count.zero_()
+            self._first.zero_()
+            wp.launch(kernels.rank_worlds, self.nworld, [mask, self._rank, self._count])
+            wp.launch(kernels.next_group, 1, [self._count, 0, self._first, self._left])
+
+            def body() -> None:
+                if self._arena is not None:
+                    self._arena.open()
+                wp.launch(kernels.choose_group, self.nworld, [mask, self._rank, self._first, self._world])
+                turn()
+                wp.launch(kernels.next_group, 1, [self._count, self.size, self._first, self._left])
+
+            with self._reserved():
+                wp.capture_while(self._left, while_body=body)
+
+    def take(self, source: wp.array, target: wp.array) -> None:
+        """Copy the rows of the group's worlds, (nworld, ...), into the group, (size, ...)."""
+        rows = flat(target)
+        if rows.size:
+            wp.launch(kernels.take_rows, rows.shape, [self._world, self._left, flat(source), rows])
+
+    def give(self, source: wp.array, target: wp.array) -> None:
+        """Copy the group's rows, (size, ...), back into those of its worlds, (nworld, ...)."""
+        rows = flat(source)
+        if rows.size:
+            wp.launch(kernels.return_rows, rows.shape, [self._world, self._left, rows, flat(target)])
+
+    def give_bits(self, source: wp.array, target: wp.array) -> None:
+        """Add the group's bits, (size,), to those of its worlds, (nworld,)."""
+        wp.launch(kernels.return_bits, self.size, [self._world, self._left, source, target])
+
+    def _reserved(self) -> contextlib.AbstractContextManager[object]:
+        """Memory for the temporary arrays of a turn: within a loop of a CUDA graph nothing may be allocated."""
+        if self._arena is None:
+            return contextlib.nullcontext()
+        return self._arena.serving() if self.device.is_capturing else self._arena.counting()
+
+
+class Arena(Reserve):
+    """An allocator for graphs, which may not allocate: it counts the bytes of a run outside a graph and reserves them.
+
+    While it counts, memory comes from the device. Graphs are served from the reserve; they never run at the same time,
+    so all of them may use the same memory.
+
+    Args:
+        device: A CUDA device.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        super().__init__(device)
+        self._size, self._used = 0, 0
+        self._serving = False
+
+    def open(self) -> None:
+        """Reuse the reserve from its start."""
+        self._used = 0
+
+    @contextlib.contextmanager
+    def counting(self) -> Iterator[None]:
+        """Count the bytes that are allocated between one ``open`` and the next, and reserve the most at the end."""
+        self._serving = False
+        with wp.ScopedAllocator(self.device, self):
+            yield
+        if not self.blocks or self.blocks[-1].size < self._size:
+            self.add_block(self._size)
+
+    @contextlib.contextmanager
+    def serving(self) -> Iterator[None]:
+        """Hand out the reserve."""
+        self._serving = True
+        try:
+            with wp.ScopedAllocator(self.device, self):
+                yield
+        finally:
+            self._serving = False
+
+    def allocate(self, size_in_bytes: int) -> int:
+        """The address of so many free bytes."""
+        start = self._used
+        self._used += aligned(size_in_bytes)
+        if not self._serving:
+            self._size = max(self._size, self._used)
+            return int(self.below.allocate(size_in_bytes))
+        if not self.blocks or self._used > self.blocks[-1].size:
+            raise RuntimeError("a graph needs more memory than is reserved: call the function once before its capture")
+        return int(self.blocks[-1].ptr) + start

@@ -1,0 +1,64 @@
+"""Constants of a model that follow from fields that differ between worlds."""
+
+from collections.abc import Collection
+
+import mujoco
+import mujoco_warp as mjw
+import warp as wp
+
+from lyceum_warp.arrays import flat
+from lyceum_warp.engines.warp.group_turns import Turns, group_size
+from lyceum_warp.engines.warp.model_rows import OUTPUTS, ModelRows, constants_of, outputs_of, owner
+from lyceum_warp.engines.warp.partial_kernels import mark_changed
+from lyceum_warp.model_fields import Constants, ModelField
+
+_GROUPS = {
+    Constants.FIXED: mjw.SetConstGroup.FIXED,
+    Constants.KINEMATIC: mjw.SetConstGroup.KIN0,
+    Constants.INERTIAL: mjw.SetConstGroup.INERT0,
+}
+
+
+class ModelConstants:
+    """Recomputes constants in the worlds where fields changed since last time.
+
+    The constants are a function of the fields alone. They are computed in a small group of worlds with data of its own,
+    because this overwrites kinematics.
+
+    Args:
+        model: The compiled model.
+        put: MuJoCo Warp's model, with a row for each world in the fields and in the constants that follow.
+        fields: The fields that differ between worlds, with constants that follow.
+        nworld: Number of worlds.
+        device: Where they live.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, put: mjw.Model, fields: Collection[ModelField], nworld: int, device: wp.Device
+    ) -> None:
+        groups = constants_of(fields)
+        self._outputs = outputs_of(fields)
+        self._flags = int(sum(int(flag) for group, flag in _GROUPS.items() if group & groups))
+        written = {name for group, names in OUTPUTS.items() if group & groups for name in names}
+        size = group_size(nworld, device)
+        with wp.ScopedDevice(device):
+            names = [field.name for field in fields]
+            self._rows = ModelRows(put, [*names, *self._outputs], size, written - set(self._outputs))
+            self._scratch = mjw.make_data(model, nworld=size, nconmax=1, njmax=1)
+            self._given = [flat(getattr(owner(put, name), name)).view(wp.int32) for name in names]
+            self._applied = [wp.full_like(given, -1) for given in self._given]  # the bits of no number
+            self._changed = wp.zeros(nworld, dtype=bool)
+        self._turns = Turns(nworld, size, device)
+
+    def __call__(self, mask: wp.array) -> None:
+        """Bring the masked worlds' constants up to date; made of launches."""
+        self._changed.zero_()
+        for given, applied in zip(self._given, self._applied, strict=True):
+            args = [mask, given, applied, self._changed]
+            wp.launch(mark_changed, len(mask), args, device=mask.device)
+        self._turns.run(self._changed, self._turn)
+
+    def _turn(self) -> None:
+        self._rows.take(self._turns)
+        mjw.set_const(self._rows.model, self._scratch, self._flags, restore=False)
+        self._rows.give(self._turns, self._outputs)

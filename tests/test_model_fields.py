@@ -1,0 +1,79 @@
+"""Model fields that can differ between worlds: types, errors, and the constants that follow."""
+
+import mujoco
+import pytest
+import warp as wp
+
+from lyceum_warp.binding.models import gymnasium_model
+from lyceum_warp.fields import vec10
+from lyceum_warp.model_fields import Constants, ModelField, check_simple, describe_model_field
+
+ANT = gymnasium_model("ant.xml").compile()
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "dtype", "size"),
+    [
+        ("body_mass", (ANT.nbody,), wp.float32, ANT.nbody),
+        ("geom_friction", (ANT.ngeom,), wp.vec3, 3 * ANT.ngeom),
+        ("body_quat", (ANT.nbody,), wp.vec4, 4 * ANT.nbody),
+        ("actuator_gainprm", (ANT.nu,), vec10, 10 * ANT.nu),
+        ("gravity", (3,), wp.float32, 3),
+        ("density", (), wp.float32, 1),
+        ("tendon_stiffness", (0,), wp.float32, 0),
+    ],
+)
+def test_a_model_field_has_the_type_of_an_element(name: str, shape: tuple[int, ...], dtype: type, size: int) -> None:
+    field = describe_model_field(ANT, name)
+    assert (field.shape, field.dtype, field.size) == (shape, dtype, size)
+    assert field.value(ANT).size == size
+
+
+def fields_of(model: mujoco.MjModel) -> list[ModelField]:
+    """Every model field that can differ between worlds."""
+    found = []
+    for name in (*dir(model), *dir(model.opt)):
+        try:
+            found.append(describe_model_field(model, name))
+        except ValueError:
+            continue
+    return found
+
+
+def test_constants_follow_where_mujoco_reads_a_field_for_them() -> None:
+    read: frozenset[str] = frozenset(mujoco.MjModel._setconst_inputs)
+    fields = [field for field in fields_of(ANT) if not field.option]
+    assert len(fields) > 50
+    assert {field.name for field in fields if field.constants} == {field.name for field in fields} & read
+
+
+def test_an_unknown_model_field_is_refused_with_close_names() -> None:
+    with pytest.raises(ValueError, match="no model field 'body_mas' .* did you mean body_mass"):
+        describe_model_field(ANT, "body_mas")
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [("timestep", "parameter dt"), ("body_invweight0", "computes it from other fields"), ("geom_type", "share")],
+)
+def test_a_field_that_all_worlds_share_is_refused(name: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=f"{name!r} cannot differ between worlds: .*{reason}"):
+        describe_model_field(ANT, name)
+
+
+def test_geoms_with_wrapped_tendons_have_constants() -> None:
+    xml = """<mujoco><worldbody><geom name="g" size=".1"/><site name="a" pos="-1 0 0"/>
+    <body pos="1 0 0"><joint axis="0 1 0"/><geom size=".1"/><site name="b"/></body></worldbody>
+    <tendon><spatial><site site="a"/><geom geom="g"/><site site="b"/></spatial></tendon></mujoco>"""
+    wrapped = mujoco.MjModel.from_xml_string(xml)
+    assert Constants.INERTIAL in describe_model_field(wrapped, "geom_pos").constants
+    assert Constants.INERTIAL not in describe_model_field(ANT, "geom_pos").constants
+
+
+def test_the_inertia_of_a_simple_body_stays_where_it_is() -> None:
+    ball = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    check_simple(ball, "body_mass")
+    with pytest.raises(ValueError, match=r"body_ipos can't differ .*the bodies \[1\]"):
+        check_simple(ball, "body_ipos")
