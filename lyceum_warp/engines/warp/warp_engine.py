@@ -249,7 +249,7 @@ class WarpEngine(Engine):
         with self._on_device():
             mjw.get_state(self.m, self.d, states, _SPEC)
             for _ in range(nstep):
-                mjw.step(self.m, self.d)
+                substep.step(self.m, self.d)
             mjw.get_state(self.m, self.d, states, _SPEC, mask)
             launch_rows(copy_rows, mask, wp.zeros((self.nworld, 1), dtype=float, device=self.device), states[:, :1])
             mjw.set_state(self.m, self.d, states, _SPEC)
