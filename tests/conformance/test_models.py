@@ -352,3 +352,69 @@ def test_an_equality_constraint_is_switched_on_at_a_reset_alike_on_both_engines(
         assert env.field("eq_active", "hung").tolist() == [[False], [True]]
     assert (ends[0][0] - ends[0][1]).abs().max() > 1e-3
     torch.testing.assert_close(*ends, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_a_field_of_no_numbers_rolls_out(engine: str) -> None:
+    env = lw.make(sensing(SENSING["no sensors"]), engine=engine, nworld=2, autoreset=False, seed=1)
+    rollout = lw.OpenLoop(env, 3)
+    rollout.state.copy_(env.get_state()[0])
+    rollout.actions.zero_()
+    rollout.run()
+    live = lw.make(sensing(SENSING["no sensors"]), engine=engine, nworld=2, autoreset=False)
+    live.set_state(rollout.state.expand(2, -1).contiguous())
+    for t in range(3):
+        live.step(torch.zeros_like(live.action))
+        assert torch.equal(rollout.reward[t], live.reward)
+    assert rollout.reward.abs().min() > 0
+
+
+# models without actuators, in tasks with actions of their own
+
+
+@wp.struct
+class PushedWorld:
+    qpos: Row[float]
+    qvel: Row[float]
+    qfrc_applied: Row[float]
+
+
+@wp.func
+def look(s: PushedWorld, p: Params, obs: Row[float]):
+    obs[0] = s.qpos[0]
+    obs[1] = s.qvel[0]
+
+
+@wp.func
+def push(s: PushedWorld, action: Row[float], p: Params, ctrl: Row[float]):
+    s.qfrc_applied[0] = action[0]
+
+
+@wp.func
+def start_pushed(s: PushedWorld, p: Params, rng: Row[wp.uint32]):
+    s.qvel[0] = lw.uniform(rng, -p.noise, p.noise)
+
+
+@wp.func
+def judge_pushed(s0: PushedWorld, action: Row[float], s1: PushedWorld, p: Params) -> float:
+    return s1.qvel[0]
+
+
+class Pushed(lw.Task):
+    """Pushes a joint of a model without actuators."""
+
+    World, observe, control = PushedWorld, look, push
+    randomize, reward = start_pushed, judge_pushed
+    model = mujoco.MjSpec.from_string(text(ARM, ""))
+    obs = {"position": 1, "velocity": 1}
+    actions = {"push": 1}
+    action_range = (-1.0, 1.0)
+    horizon = 15
+
+
+def test_a_model_without_actuators_keeps_the_rules_on_the_mujoco_engine() -> None:
+    check_task(Pushed, engine="mujoco", nworld=3, steps=20, frame_skip=2)
+
+
+def test_a_model_without_actuators_keeps_the_rules_on_the_warp_engine() -> None:
+    check_task(Pushed, engine="warp", nworld=2, steps=20, horizon=6, frame_skip=1, checks=WARP_CHECKS)
