@@ -167,8 +167,7 @@ class Env:
             self.obs_spaces, self.obs_space = worlds.obs_spaces, worlds.obs_spaces["policy"]
             self.action_space, self.state_space = worlds.action_space, worlds.state_space
             self.metrics, self.episode_metrics = (
-                dict(zip(self.task.task.metrics, torch_view(array).unbind(1), strict=True))
-                for array in (worlds.outcome.metrics, worlds.outcome.episode_metrics)
+                dict(zip(self.task.task.metrics, torch_view(array).unbind(1), strict=True)) for array in worlds.metrics
             )
             self.reward_space = self.eval_space = Space()
             self._fields = {name: torch_view(array) for name, array in worlds.fields.items()}

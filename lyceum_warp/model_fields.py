@@ -65,11 +65,16 @@ _FIELDS = (
 _OPTIONS = {"gravity", "magnetic", "wind", "density", "viscosity"}
 """Those of the fields that are options of the model, attributes of MjModel.opt."""
 
+_COMPUTED = set(
+    "body_subtreemass body_invweight0 dof_invweight0 dof_M0 tendon_invweight0 tendon_length0 actuator_acc0 "
+    "actuator_length0 geom_rbound geom_aabb cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0 light_dir0 "
+    "eq_data".split()
+)
+"""Fields that MuJoCo computes from others."""
+
 _REASONS = (
     dict.fromkeys(
-        "body_subtreemass body_invweight0 dof_invweight0 dof_M0 tendon_invweight0 tendon_length0 actuator_acc0 "
-        "actuator_length0 geom_rbound geom_aabb cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0 light_dir0 "
-        "eq_data".split(),
+        _COMPUTED,
         "MuJoCo computes it from other fields; write those instead",
     )
     | {"timestep": "all worlds share the parameter dt", "impratio": "MuJoCo Warp keeps another number instead of it"}
@@ -114,6 +119,11 @@ class ModelField:
         """Whether the field is an attribute of MjModel.opt."""
         return self.name in _OPTIONS
 
+    @property
+    def follows(self) -> bool:
+        """Whether MuJoCo computes the field from other fields of the model."""
+        return self.name in _COMPUTED
+
     def problem(self, model: mujoco.MjModel, rows: np.ndarray) -> str | None:
         """What is wrong with the values of some worlds, in one line; None if MuJoCo can simulate them.
 
@@ -130,7 +140,13 @@ class ModelField:
         world, column = np.argwhere(bad)[0].tolist()
         place = np.unravel_index(column, self.value(model).shape) if nominal.size > 1 else ()
         index = "".join(f"[{int(i)}]" for i in place)
-        wanted = "positive" if self.name in _POSITIVE else "0 or more" if self.name in _NOT_NEGATIVE else "finite"
+        wanted = (
+            "positive"
+            if self.name in _POSITIVE and nominal[column] > 0
+            else "0 or more"
+            if self.name in _NOT_NEGATIVE
+            else "finite"
+        )
         return (
             f"{self.name}{index} of world {world} is {rows[world, column]:g} and must be {wanted} "
             f"(its nominal value is {nominal[column]:g})"

@@ -108,8 +108,9 @@ class Worlds:
         for name, dtype in steps.OUTCOMES.items():
             setattr(self.outcome, name, wp.zeros(n, dtype=dtype))
             self.buffers[name] = torch_view(getattr(self.outcome, name))
-        self.outcome.metrics = wp.zeros((n, len(task.metrics)), dtype=float)  # type: ignore[assignment]
-        self.outcome.episode_metrics = wp.zeros((n, len(task.metrics)), dtype=float)  # type: ignore[assignment]
+        self.metrics: list[Any] = [wp.zeros((n, len(task.metrics)), dtype=float) for _ in range(2)]
+        """The metrics of the last step, and their sums over its episode."""
+        self.outcome.metrics, self.outcome.episode_metrics = self.metrics
         self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
         self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
         self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}

@@ -152,6 +152,12 @@ class BoundTask:
         """The model fields that differ between worlds."""
         self.constants = [describe_model_field(self.model, name, varies=False) for name in named if name not in varied]
         """The model fields that functions read and that are the same in every world."""
+        drawn_constants = [field.name for field in self.dynamics if field.constants]
+        if drawn_constants and (stale := [field.name for field in self.constants if field.follows]):
+            raise ValueError(
+                f"the task {self.name!r} reads {stale[0]!r}, which follows from {drawn_constants[0]!r} and so differs "
+                "between worlds: read the fields that it follows from instead"
+            )
 
     def change_params(self, params: Mapping[str, Any]) -> None:
         """Change parameters.

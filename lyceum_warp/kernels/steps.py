@@ -67,7 +67,7 @@ OUTCOMES = {
 @wp.func
 def finite_row(row: wp.array[float]) -> bool:
     """Whether every number is finite."""
-    for i in range(row.shape[0]):
+    for i in range(row.shape[0]):  # noqa: SIM110 (Warp has no all())
         if not wp.isfinite(row[i]):
             return False
     return True

@@ -55,7 +55,9 @@ class _Run:
         self.rng = np.random.default_rng(ctx.seed)
         n = self.env.nworld
         sizes = {
-            "action": self.worlds.action_space.size, "obs": self.worlds.obs_spaces["policy"].size, "ctrl": task.model.nu,
+            "action": self.worlds.action_space.size,
+            "obs": self.worlds.obs_spaces["policy"].size,
+            "ctrl": task.model.nu,
             "metrics": len(getattr(task.task, "metrics", ())),
         }  # fmt: skip
         self.rows = {name: self._array((n, size), wp.float32) for name, size in sizes.items()}
