@@ -221,7 +221,8 @@ class Engine(abc.ABC):
         self.set_state(state, self._everyone)
         self._copy_fields(buffers, 0)
         for t in range(len(controls)):
-            wp.copy(self.ctrl, controls[t])
+            if self.ctrl.size:
+                wp.copy(self.ctrl, controls[t])
             self.step(nstep)
             self._copy_fields(buffers, t + 1)
 
@@ -237,7 +238,8 @@ class Engine(abc.ABC):
 
     def _copy_fields(self, buffers: Mapping[str, wp.array], t: int) -> None:
         for name, buffer in buffers.items():
-            wp.copy(buffer[t], self.arrays[name])
+            if buffer.size:
+                wp.copy(buffer[t], self.arrays[name])
 
     # state
 

@@ -6,6 +6,7 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 
+from lyceum_warp.engines.warp.substep import needs_velocities
 from lyceum_warp.fields import Stage
 
 Part = Callable[[mjw.Model, mjw.Data], None]
@@ -30,6 +31,7 @@ _FIELDS: dict[Part, str] = {
     mjw.kinematics: "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat",
     mjw.com_pos: "subtree_com cdof cinert",
     mjw.camlight: "cam_xpos cam_xmat light_xpos light_xdir",
+    mjw.flex: "flexvert_xpos flexedge_length",
     mjw.tendon: "ten_length",
     mjw.crb: "crb",
     mjw.transmission: "actuator_length",
@@ -155,6 +157,8 @@ def step_after(done: Collection[Part], m: mjw.Model, d: mjw.Data) -> None:
     mjw.crb(m, d)
     if m.opt.run_collision_detection:
         mjw.collision(m, d)
+    if needs_velocities(m):
+        mjw.com_vel(m, d)
     mjw.make_constraint(m, d)
     mjw.transmission(m, d)
     d.sensordata.zero_()

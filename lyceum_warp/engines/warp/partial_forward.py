@@ -9,6 +9,7 @@ import warp as wp
 
 from lyceum_warp.arrays import launch_rows
 from lyceum_warp.engines.warp import partial_kernels as kernels
+from lyceum_warp.engines.warp import substep
 from lyceum_warp.engines.warp.group_turns import Arena, Turns
 from lyceum_warp.engines.warp.model_rows import ModelRows
 from lyceum_warp.engines.warp.overflow import report_pool_overflow
@@ -70,7 +71,7 @@ class PartialForward:
         def turn() -> None:
             self._enter()
             for _ in range(nstep):
-                mjw.step(self._rows.model, group)
+                substep.step(self._rows.model, group)
             mjw.get_state(self._rows.model, group, self._group_states, _SPEC)
             self._turns.give(self._group_states, self._states)
             self._turns.give_bits(group.overflow, data.overflow)

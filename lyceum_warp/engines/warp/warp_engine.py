@@ -13,7 +13,7 @@ from mujoco_warp._src import collision_sdf
 
 from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.engines.warp import overflow
+from lyceum_warp.engines.warp import overflow, substep
 from lyceum_warp.engines.warp.contact_sizes import probe_sizes
 from lyceum_warp.engines.warp.data_memory import data_bytes
 from lyceum_warp.engines.warp.forward_parts import Part, forward_parts, step_after, takes_over
@@ -187,7 +187,7 @@ class WarpEngine(Engine):
                 if i == 0 and self._shared:
                     step_after(self._shared, self.m, self.d)
                 else:
-                    mjw.step(self.m, self.d)
+                    substep.step(self.m, self.d)
         self._copy_snapshots(self._everyone)
         self.refresh_current(self._everyone)
 
@@ -205,7 +205,7 @@ class WarpEngine(Engine):
                 for part in parts:
                     part(m, d)
             elif stage == Stage.ACCELERATION:
-                mjw.forward(m, d)
+                substep.forward(m, d)
             else:
                 # sensors of limits and contacts are written only where there is one; the others stay as they are
                 wp.launch(zero_columns, (d.nworld, len(self._columns)), [self._columns, d.sensordata])
@@ -249,7 +249,7 @@ class WarpEngine(Engine):
         with self._on_device():
             mjw.get_state(self.m, self.d, states, _SPEC)
             for _ in range(nstep):
-                mjw.step(self.m, self.d)
+                substep.step(self.m, self.d)
             mjw.get_state(self.m, self.d, states, _SPEC, mask)
             launch_rows(copy_rows, mask, wp.zeros((self.nworld, 1), dtype=float, device=self.device), states[:, :1])
             mjw.set_state(self.m, self.d, states, _SPEC)
