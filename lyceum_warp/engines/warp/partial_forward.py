@@ -13,6 +13,7 @@ from lyceum_warp.engines.warp import substep
 from lyceum_warp.engines.warp.group_turns import Arena, Turns
 from lyceum_warp.engines.warp.model_rows import ModelRows
 from lyceum_warp.engines.warp.overflow import report_pool_overflow
+from lyceum_warp.engines.warp.static_geoms import StaticGeoms
 from lyceum_warp.kernels.state import copy_rows
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
@@ -29,10 +30,11 @@ class PartialForward:
         data: MuJoCo Warp's data of all worlds.
         group: The same of the group.
         states: Room for the integration states of all worlds, (nworld, integration size), float32.
+        static: Geoms whose poses a forward pass does not compute.
     """
 
-    def __init__(self, rows: ModelRows, data: mjw.Data, group: mjw.Data, states: wp.array) -> None:
-        self._rows, self._data, self._group, self._states = rows, data, group, states
+    def __init__(self, rows: ModelRows, data: mjw.Data, group: mjw.Data, states: wp.array, static: StaticGeoms) -> None:
+        self._rows, self._data, self._group, self._states, self._static = rows, data, group, states, static
         device = wp.get_device(data.qpos.device)
         with wp.ScopedDevice(device):
             self._group_states = wp.zeros((group.nworld, states.shape[1]), dtype=float)
@@ -84,6 +86,7 @@ class PartialForward:
     def _enter(self) -> None:
         """Put the group into the models and states of its worlds."""
         self._rows.take(self._turns)
+        self._static.place(self._rows.model, self._group, self._everyone)
         self._turns.take(self._states, self._group_states)
         mjw.set_state(self._rows.model, self._group, self._group_states, _SPEC)
         self._group.overflow.zero_()

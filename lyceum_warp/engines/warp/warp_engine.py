@@ -21,6 +21,7 @@ from lyceum_warp.engines.warp.group_turns import group_size
 from lyceum_warp.engines.warp.model_constants import ModelConstants
 from lyceum_warp.engines.warp.model_rows import ModelRows, constants_of, outputs_of, owner, put_varied_model
 from lyceum_warp.engines.warp.partial_forward import Conditional, PartialForward
+from lyceum_warp.engines.warp.static_geoms import StaticGeoms
 from lyceum_warp.fields import Field, Stage, early_sensor_columns
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_columns, copy_rows, fill_rows, narrow, widen, zero_columns
@@ -95,6 +96,7 @@ class WarpEngine(Engine):
         for varied in self.dynamics.values():
             self.arrays[varied.name] = self._alias_model(varied)
         self._constants = self._model_constants()
+        self._static = StaticGeoms(model, self.dynamics, device)
         # the model's own initial state follows qpos0 and the poses of mocap bodies, which may differ between worlds
         self._start: wp.array | None = None
         if initial is not None or self.dynamics:
@@ -229,9 +231,10 @@ class WarpEngine(Engine):
             wp.launch(copy_columns, size, [mask, self._columns, own, kept], device=self.device)
 
     def apply_model(self, mask: wp.array) -> None:
-        if self._constants is not None:
-            with wp.ScopedDevice(self.device):
+        with wp.ScopedDevice(self.device):
+            if self._constants is not None:
                 self._constants(mask)
+            self._static.place(self.m, self.d, mask)
 
     def settle(self, mask: wp.array, nstep: int) -> None:
         if nstep == 0:
@@ -308,7 +311,7 @@ class WarpEngine(Engine):
         names = [field.name for field in fields if field.size] + outputs_of(fields)
         with wp.ScopedDevice(self.device):
             rows = ModelRows(self.m, names, size)
-        return PartialForward(rows, self.d, self._make_data(size), self._state)
+        return PartialForward(rows, self.d, self._make_data(size), self._state, self._static)
 
     @contextlib.contextmanager
     def _histories_kept(self) -> Iterator[None]:
