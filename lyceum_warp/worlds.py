@@ -342,9 +342,7 @@ class Worlds:
 
     def _observe_restarted(self) -> None:
         """Observe the worlds that restarted or that an event changed; the others were observed when judged."""
-        for mask in (
-            (self.restarting, self.changed) if self.task.kernels.run_events is not None else (self.restarting,)
-        ):
+        for mask in (self.restarting, self.changed) if self.task.kernels.run_events is not None else (self.restarting,):
             args = [mask, self.after, self.params, self.counters, self.final_obs, self.obs]
             wp.launch(self.task.kernels.observe_worlds, self.nworld, args, device=self.device)
 
