@@ -6,8 +6,12 @@ Environment and bare engine take turns of ten steps: each state that the environ
 the bare engine, outside the clock, so that both step the same states, resets included, under the same load of the
 machine. The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the same model,
 controls and number of substeps. ``kept`` is bare time by environment time; ``added`` is the difference. ``refresh`` is
-the Warp engine's time for fields that ``mj_step`` leaves behind, as a share of the step: those of the new state where
-the task reads positions, a forward pass of the restarted worlds where it reads forces.
+the time for fields that ``mj_step`` leaves behind, as a share of the step. On the Warp engine it counts those of the
+new state where the task reads positions, and a forward pass of the restarted worlds where it reads forces; what the
+next step takes over is counted, too. On the C engine it is what ``Batch.step`` itself takes longer if it computes the
+stage that the task needs.
+
+Beside the package's tasks there is ``quadruped``, dm_control's, which reads sensors; dm_control must be installed.
 """
 
 import dataclasses
@@ -41,6 +45,9 @@ GYMNASIUM = {
     "humanoid": "Humanoid-v5",
 }
 
+FILES = {"quadruped": Path(__file__).with_name("quadruped.py")}
+"""Tasks of this folder."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Options:
@@ -72,6 +79,8 @@ class BareC:
         assert isinstance(engine, MujocoEngine)
         self.rows = engine.batch.state
         self.batch = Batch(engine.batch.model, env.nworld, engine.nthread)
+        self.stage = engine.stage
+        self.staged = Batch(engine.batch.model, env.nworld, engine.nthread, engine.batch.persistent)
         self.bounds = env.action_space.low, env.action_space.high
 
     def snapshot(self) -> tuple[np.ndarray, np.ndarray]:
@@ -83,6 +92,15 @@ class BareC:
 
     def step(self) -> None:
         self.batch.step(nstep=self.env.task.frame_skip)
+
+    def load_staged(self, snapshot: tuple[np.ndarray, np.ndarray]) -> None:
+        """Make ready for a step that goes on from the stage which the last one computed."""
+        self.staged.state[:], self.staged.ctrl[:] = snapshot
+        self.staged.forward(stage=self.stage)
+
+    def step_staged(self) -> None:
+        """A step that computes the stage which the task needs."""
+        self.staged.step(nstep=self.env.task.frame_skip, stage=self.stage)
 
 
 class BareWarp:
@@ -149,9 +167,8 @@ class Row:
     physics_steps_per_second: float
     """Substeps of all worlds."""
     bytes_per_world: float
-    refresh: float | None
-    """Share of the step for fields that the bare engine does not bring up to date; None on the C engine, whose native
-    step does that, too."""
+    refresh: float
+    """Share of the step for fields that the bare engine does not bring up to date."""
     first_step_seconds: float
     """Until the environment was made and its first step was done: with a cold cache, mostly compilation."""
 
@@ -174,7 +191,7 @@ def measure(
         first: Seconds until the environment's first step was done.
     """
     bare = bare_engine(env)
-    whole, alone = [], []
+    whole, alone, staged = [], [], []
     warm = max(2, env.horizon // 500)  # graphs are captured, and states are no longer the first ones
     for repetition in range(warm + options.blocks):
         start = env.get_state()
@@ -185,20 +202,26 @@ def measure(
             act(t)
             snapshots.append(bare.snapshot())
             env.step()
-        time_bare = 0.0
+        time_bare = time_staged = 0.0
         for snapshot in snapshots:
             bare.load(snapshot)
             time_bare += seconds(env, bare.step)
+            if isinstance(bare, BareC) and bare.stage > Stage.NONE:
+                bare.load_staged(snapshot)
+                time_staged += seconds(env, bare.step_staged)
         if repetition >= warm:
+            staged.append((time_staged or time_bare) / BLOCK)
             whole.append(time_env / BLOCK)
             alone.append(time_bare / BLOCK)
     kept = statistics.median(b / a for a, b in zip(whole, alone, strict=True))
     step, step_alone = statistics.median(whole), statistics.median(alone)
     added = statistics.median(a - b for a, b in zip(whole, alone, strict=True)) * 1e6
     rate = env.nworld / step
+    longer = statistics.median(c - b for b, c in zip(alone, staged, strict=True))
+    refresh = refresh_seconds(env) if isinstance(env.engine, WarpEngine) else longer
     return Row(
         name, env.engine.name, env.nworld, rate, env.nworld / step_alone, kept, added, rate * env.task.frame_skip,
-        env.bytes_per_world, refresh_seconds(env) / step if isinstance(env.engine, WarpEngine) else None, first,
+        env.bytes_per_world, refresh / step, first,
     )  # fmt: skip
 
 
@@ -209,7 +232,7 @@ def refresh_seconds(env: lw.Env) -> float:
     if engine.stage == engine.reset_stage == Stage.NONE:
         return 0.0
     with wp.ScopedDevice(env.device), wp.ScopedCapture() as capture:
-        engine.refresh_current()
+        engine.refresh_current(env.worlds.everyone)
         engine.refresh(env.worlds.restarting)
     times = [seconds(env, lambda: wp.capture_launch(capture.graph)) for _ in range(30)]
     return statistics.median(times)
@@ -217,7 +240,7 @@ def refresh_seconds(env: lw.Env) -> float:
 
 def first_step(task: str, nworld: int, options: Options) -> tuple[lw.Env, float]:
     began = time.perf_counter()
-    env = lw.make(task, nworld=nworld, engine=options.engine, device=options.device)
+    env = lw.make(FILES.get(task, task), nworld=nworld, engine=options.engine, device=options.device)
     return env, time.perf_counter() - began + seconds(env, env.step)
 
 
@@ -299,8 +322,7 @@ def main(options: Options) -> None:
 def cells(row: Row) -> list[str]:
     rates = f"{row.env_steps_per_second:,.0f}", f"{row.bare_steps_per_second:,.0f}"
     more = f"{row.physics_steps_per_second:,.0f}", f"{row.bytes_per_world / 1e3:,.1f}", f"{row.first_step_seconds:.1f}"
-    refresh = "" if row.refresh is None else f"{row.refresh:.1%}"
-    numbers = f"{row.kept:.3f}", f"{row.added_microseconds:,.0f}", refresh
+    numbers = f"{row.kept:.3f}", f"{row.added_microseconds:,.0f}", f"{row.refresh:.1%}"
     return [row.task, row.engine, str(row.nworld), *rates, *numbers, *more]
 
 

@@ -24,12 +24,44 @@ from lyceum_warp.control.real_time import control_async
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.done import Done
 from lyceum_warp.env import Env, make
-from lyceum_warp.fields import vec10
+from lyceum_warp.fields import quat, vec10
 from lyceum_warp.kernels.random import normal, uniform
+from lyceum_warp.kernels.rotations import (
+    quat_angle,
+    quat_difference,
+    quat_from_axis_angle,
+    quat_from_mat,
+    quat_from_rotvec,
+    quat_inverse,
+    quat_mul,
+    quat_random,
+    quat_rotate,
+    quat_rotate_inverse,
+    quat_to_mat,
+    quat_to_rotvec,
+)
 from lyceum_warp.openloop import OpenLoop
 from lyceum_warp.options import EnvOptions, PhysicsOptions
 from lyceum_warp.runs import load, load_value
-from lyceum_warp.task import Planning, Row, Task, body, dof, geom, mocap, qpos, sensor, site
+from lyceum_warp.task import (
+    Planning,
+    Row,
+    Task,
+    act,
+    actuator,
+    body,
+    camera,
+    ctrl,
+    dof,
+    equality,
+    geom,
+    joint,
+    mocap,
+    qpos,
+    sensor,
+    site,
+    tendon,
+)
 
 __version__ = "0.1.0"
 
@@ -56,25 +88,45 @@ __all__ = [
     "Task",
     "Trajectory",
     "ValueFunction",
+    "act",
+    "actuator",
     "body",
+    "camera",
     "control",
     "control_async",
     "control_report",
+    "ctrl",
     "dof",
+    "equality",
     "evaluate",
     "geom",
     "gymnasium_model",
     "gymnasium_robotics_model",
+    "joint",
     "load",
     "load_value",
     "make",
     "mocap",
     "normal",
     "qpos",
+    "quat",
+    "quat_angle",
+    "quat_difference",
+    "quat_from_axis_angle",
+    "quat_from_mat",
+    "quat_from_rotvec",
+    "quat_inverse",
+    "quat_mul",
+    "quat_random",
+    "quat_rotate",
+    "quat_rotate_inverse",
+    "quat_to_mat",
+    "quat_to_rotvec",
     "register",
     "sensor",
     "site",
     "task_names",
+    "tendon",
     "uniform",
     "vec10",
 ]

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -12,6 +13,15 @@ def flat(array: wp.array) -> wp.array:
     alias: Any = wp.array(ptr=array.ptr, dtype=wp.float32, shape=(array.shape[0], n), device=array.device)
     alias.owner = array  # keeps the memory alive as long as the alias
     return alias
+
+
+def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> wp.array:
+    """One row as an array of many equal rows, (count, ...), that all lie in the same memory; only for reading."""
+    single: Any = wp.array(row[None], dtype=dtype, device=device)
+    shape, strides = (count, *single.shape[1:]), (0, *single.strides[1:])
+    rows: Any = wp.array(ptr=single.ptr, dtype=dtype, shape=shape, strides=strides, device=device)
+    rows.owner = single  # keeps the memory alive as long as the view
+    return rows
 
 
 def torch_view(array: wp.array) -> torch.Tensor:

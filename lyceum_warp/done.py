@@ -26,7 +26,11 @@ class Done(enum.IntFlag):
     """Any other warning of the engine."""
     ACTION = 64
     """The action was not finite; it was applied as zero."""
+    REWARD = 128
+    """The reward was not finite."""
+    OBSERVATION = 256
+    """A number of the observation was not finite."""
 
 
-FAULTS = Done.NAN | Done.CONTACT_OVERFLOW | Done.CONSTRAINT_OVERFLOW | Done.ENGINE_WARNING | Done.ACTION
+FAULTS = ~(Done.TERMINATED | Done.TRUNCATED)
 """The bits that are faults; the others are ordinary ends of an episode."""

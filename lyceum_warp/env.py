@@ -1,5 +1,6 @@
 """Env: one task in many worlds, the public face of the package."""
 
+import functools
 import inspect
 from collections.abc import Iterable
 from typing import Any
@@ -11,22 +12,24 @@ import warp as wp
 
 from lyceum_warp.arrays import torch_view
 from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.read_only_model import read_only
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.placement import bytes_per_world, find_device, open_engine, options_for_few_worlds
-from lyceum_warp.fields import describe, elements
+from lyceum_warp.fields import describe, elements, has_several_rows
 from lyceum_warp.forks import leave_in_parent
 from lyceum_warp.graphs.compile_ahead import compile_ahead
 from lyceum_warp.kernels import steps
+from lyceum_warp.model_fields import describe_model_field, is_model_field
 from lyceum_warp.options import OPTION_DOCS, EnvOptions, signature_of_options
 from lyceum_warp.spaces import Space
 from lyceum_warp.task import Task
-from lyceum_warp.validate import check_kind, check_tensor, whole_number
+from lyceum_warp.validate import check_kind, check_tensor, described, whole_number
 from lyceum_warp.worlds import Worlds, own_bytes_per_world
 
-_BUFFERS = (*steps.OUTCOMES, "action")
+_BUFFERS = (*steps.OUTCOMES, "obs", "final_obs", "action")
 
 
 _ARGUMENTS = """Args:
@@ -82,6 +85,10 @@ class Env:
     """Observations, (nworld, nobs), float32."""
     final_obs: torch.Tensor
     """Observations of the states that the last step led to, before any reset, (nworld, nobs), float32."""
+    obs_groups: dict[str, torch.Tensor]
+    """Observations by the names of their groups, each (nworld, size of the group); ``policy`` is ``obs``."""
+    final_obs_groups: dict[str, torch.Tensor]
+    """The same for ``final_obs``."""
     reward: torch.Tensor
     """Rewards of the last step, (nworld,), float32."""
     eval: torch.Tensor
@@ -90,6 +97,10 @@ class Env:
     """Whether the task, or a fault, ended the episode, (nworld,), bool."""
     truncated: torch.Tensor
     """Whether the time limit was reached, (nworld,), bool."""
+    metrics: dict[str, torch.Tensor]
+    """The task's metrics of the last step by their names, each (nworld,), float32."""
+    episode_metrics: dict[str, torch.Tensor]
+    """The sums of the metrics over the episode that the last step belongs to, each (nworld,), float32."""
     success: torch.Tensor
     """Whether the task's goal is met, (nworld,), bool."""
     done: torch.Tensor
@@ -108,8 +119,6 @@ class Env:
     """Simulated seconds in a step, all its substeps together."""
     device: wp.Device
     """The Warp device; ``obs.device`` is torch's name of it."""
-    model: mujoco.MjModel
-    """The compiled model. Editing it has no effect: pass an edited MjSpec as ``model=``."""
     options: EnvOptions
     """The options that the environment was made with."""
     task: BoundTask
@@ -120,6 +129,8 @@ class Env:
     """The arrays and the phases behind this environment; not needed to use it."""
     obs_space: Space
     """Parts of an observation and their places."""
+    obs_spaces: dict[str, Space]
+    """The same for every group of observations, by name; ``policy`` is ``obs_space``."""
     action_space: Space
     """Names, places and bounds of an action's numbers."""
     state_space: Space
@@ -136,31 +147,39 @@ class Env:
         self.nworld = options.nworld
         self.device = find_device(options.device)
         self.task = BoundTask(
-            find_task(task), options.nworld, model=options.model, fields=options.fields, physics=options.physics,
-            params=params,
+            find_task(task), options.nworld, model=options.model, fields=options.fields, dynamics=options.dynamics,
+            physics=options.physics, params=params,
         )  # fmt: skip
-        self.timestep, self.model = self.task.timestep, self.task.model
+        self.timestep = self.task.timestep
         if options.nvtx and not torch.backends.cuda.is_built():
             raise ValueError("nvtx=True marks phases through torch, whose build here is without CUDA: leave it out")
-        physics = options.engine, self.model, self.nworld, self.device, self.task.fields
-        self.engine = open_engine(*physics, reserved=own_bytes_per_world(self.task), **options.for_engine())
+        self.engine = open_engine(
+            options.engine, self.task.model, self.nworld, self.device, self.task.fields, dynamics=self.task.dynamics,
+            initial=self.task.initial, reserved=own_bytes_per_world(self.task), **options.for_engine(),
+        )  # fmt: skip
         self._given_params = params
         self._scratch: Env | None = None
         try:
             self.worlds = worlds = Worlds(self.task, self.engine, options)
             for name, buffer in worlds.buffers.items():
                 setattr(self, name, buffer)
-            self.obs_space, self.action_space = worlds.obs_space, worlds.action_space
-            self.state_space = worlds.state_space
+            self.obs_groups, self.final_obs_groups = worlds.obs_groups, worlds.final_obs_groups
+            self.obs_spaces, self.obs_space = worlds.obs_spaces, worlds.obs_spaces["policy"]
+            self.action_space, self.state_space = worlds.action_space, worlds.state_space
+            self.metrics, self.episode_metrics = (
+                dict(zip(self.task.task.metrics, torch_view(array).unbind(1), strict=True)) for array in worlds.metrics
+            )
             self.reward_space = self.eval_space = Space()
-            self._fields = {name: torch_view(array) for name, array in self.engine.arrays.items()}
-            self.time, self.episode_step = self._fields["time"], torch_view(worlds.steps)
+            self._fields = {name: torch_view(array) for name, array in worlds.fields.items()}
+            self.time, self.episode_step = self._fields["time"], torch_view(worlds.counters.step)
             if self.engine.capturable:
                 compile_ahead(worlds.rehearsal, self.device, self.task.name)
                 if options.graphs:
                     self.engine.prepare_capture()
             self.rand_reset(options.seed)
-            self.task.check_observation(worlds.after, worlds.params)
+            if self.task.dynamics:
+                self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
+            self.task.check_observations(worlds.after, worlds.params, worlds.counters)
         except Exception as error:
             if (explained := self.task.explained(error)) is error:
                 raise
@@ -177,6 +196,15 @@ class Env:
             "an environment cannot be pickled or copied: make it again from its arguments (env.replicate() does), and "
             "send env.get_state() to another process"
         )
+
+    @functools.cached_property
+    def model(self) -> mujoco.MjModel:
+        """The compiled model, which can be read alone; ``copy.copy(env.model)`` can be edited.
+
+        To change the physics, list model fields in the task's ``World`` and write them in ``startup`` or
+        ``randomize``, or pass an edited MjSpec as ``model=``.
+        """
+        return read_only(self.task.model)
 
     @property
     def horizon(self) -> int:
@@ -295,9 +323,24 @@ class Env:
 
     # getters and setters of the paper's interface
 
-    def get_obs(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
-        """Observations of the current states, or of given ones, (nworld, nobs)."""
-        return _copied(self.obs if state is None else self._scratch_at(state).obs, out)
+    def get_obs(
+        self, state: torch.Tensor | None = None, out: torch.Tensor | None = None, *, group: str = "policy"
+    ) -> torch.Tensor:
+        """Observations of the current states, or of given ones, (nworld, nobs).
+
+        Args:
+            state: States to observe, (nworld, state_space.size).
+            out: Where to write the observations.
+            group: Which group of observations.
+
+        Raises:
+            ValueError: There is no such group, or an argument has another shape or type.
+        """
+        if group not in self.obs_groups:
+            raise ValueError(
+                f"the task {self.task.name!r} has no group {group!r} of observations: it has {list(self.obs_groups)}"
+            )
+        return _copied((self if state is None else self._scratch_at(state)).obs_groups[group], out)
 
     def get_eval(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
         """The evaluation metric after the last step, or of given states, (nworld,)."""
@@ -353,19 +396,19 @@ class Env:
         check_tensor(action, "action", self.action)
         if not torch.isfinite(action).all():
             world, i = (~torch.isfinite(action)).nonzero()[0].tolist()
-            name = list(self.action_space.parts)[i]
+            name = next(name for name, part in self.action_space.parts.items() if part.start <= i < part.stop)
             raise ValueError(f"the action {name!r} of world {world} is {action[world, i].item()}: it must be finite")
         self.action.copy_(action.detach())
 
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
-        """A live view of one of the engine's fields, by MuJoCo's name.
+        """A live view of a field of the simulation or of the model, by MuJoCo's name.
 
         An environment keeps the fields that its task reads, ``time`` and ``ctrl``; name further ones when making it,
-        as in ``make("hopper", fields=["site_xpos"])``. On the C engine the view is a copy that every step renews: read
-        it, and write through ``set_state``.
+        as in ``make("hopper", fields=["site_xpos", "body_mass"])``. On the C engine the view is a copy that every step
+        renews: read it, and write through ``set_state`` or ``set_dynamics``.
 
         Args:
-            name: Attribute of MjData, for instance "qpos" or "site_xpos".
+            name: Attribute of MjData or MjModel, for instance "qpos", "site_xpos" or "body_mass".
             element: A name from the model: a joint in "qpos" or "qvel", a sensor in "sensordata", a body,
                 site, geom or camera elsewhere.
 
@@ -373,7 +416,7 @@ class Env:
             ValueError: The environment does not keep this field, or the model has no such element.
         """
         if name not in self._fields:
-            describe(self.model, name)  # a misspelt name has an error of its own
+            (describe_model_field if is_model_field(name) else describe)(self.task.model, name)  # names a misspelt one
             kept = ", ".join(sorted(self._fields))
             raise ValueError(
                 f"this environment of {self.task.name!r} does not keep the field {name!r}: make it with "
@@ -382,9 +425,54 @@ class Env:
         view = self._fields[name]
         if element is None:
             return view
-        where = elements(self.model, name, element)
-        one_object = view.ndim > 2 and not name.startswith("cdof")
+        where = elements(self.task.model, name, element)
+        one_object = view.ndim > 2 and not has_several_rows(name)
         return view[:, where.start] if one_object else view[:, where]
+
+    def set_dynamics(self, mask: torch.Tensor | None = None, **fields: Any) -> None:
+        """Set model fields that differ between worlds: those that the task draws, and those named by ``dynamics=``.
+
+        Derived constants follow. A reset draws the fields that the task's ``initialize`` or ``randomize`` writes again;
+        the others keep these values until ``rand_reset(seed=...)``.
+
+        Args:
+            mask: Which worlds, (nworld,) bool; all by default.
+            fields: Values by the names of model fields, as ``body_mass=masses``; each a row for every world, of the
+                shape of ``env.field(name)``, or one row for all worlds.
+
+        Raises:
+            ValueError: A field is unknown or does not differ between worlds, or a value is of the wrong size, not
+                finite, or negative where only positive ones make sense.
+        """
+        state = self.get_state()
+        varied = {field.name: field for field in self.task.dynamics}
+        for name, value in fields.items():
+            if name not in varied:
+                describe_model_field(self.task.model, name)  # a misspelt name has an error of its own
+                raise ValueError(
+                    f"the model field {name!r} is the same in every world of this environment: make it with "
+                    f"dynamics=[{name!r}], or let the task write it"
+                )
+            columns = state[:, self.state_space.parts[name]]
+            try:
+                given = torch.as_tensor(np.asarray(value), dtype=torch.float64, device=state.device)
+                columns.copy_(given.reshape(-1, columns.shape[1]))
+            except (TypeError, ValueError, RuntimeError):
+                shape = tuple(self.field(name).shape)
+                raise ValueError(
+                    f"{name} must be numbers of shape {shape}, or {shape[1:]} for all worlds, not {described(value)}"
+                ) from None
+        self._check_dynamics(state, fields)
+        self.set_state(state, mask)
+
+    def _check_dynamics(self, state: torch.Tensor, names: Iterable[str]) -> None:
+        """Refuse model fields that MuJoCo can't simulate."""
+        for field in self.task.dynamics:
+            if field.name not in names:
+                continue
+            rows = state[:, self.state_space.parts[field.name]].cpu().numpy()
+            if (problem := field.problem(self.task.model, rows)) is not None:
+                raise ValueError(f"{self.task.name!r}: {problem}")
 
     # parameters and other environments of the same task
 
@@ -429,8 +517,9 @@ class Env:
         return self.replicate(nworld=nworld, **(options_for_few_worlds(self.options.engine, self.device) | changes))
 
     def _own_options(self) -> EnvOptions:
-        current = {"horizon": self.horizon, "autoreset": self.autoreset, "seed": 0, "first_world": 0}
-        return self.options.changed(current)
+        # not the model's source, which may have changed since
+        current = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
+        return self.options.changed(current | {"seed": 0, "first_world": 0})
 
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
         """The values of some parameters, for a number of worlds."""
@@ -459,7 +548,7 @@ class Env:
     @property
     def bytes_per_world(self) -> float:
         """An estimate of the memory that a world takes, in bytes, without the model, which all worlds share."""
-        physics = self.options.engine, self.model, self.device, self.task.fields
+        physics = self.options.engine, self.task.model, self.device, self.task.fields
         return bytes_per_world(*physics, **self.options.for_engine()) + own_bytes_per_world(self.task)
 
     @property

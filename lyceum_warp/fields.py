@@ -8,6 +8,9 @@ import mujoco
 import numpy as np
 import warp as wp
 
+quat = wp.vec4
+"""A quaternion in MuJoCo's order w, x, y, z. Functions of Warp that expect x, y, z, w do not take it."""
+
 vec10 = wp.types.vector(length=10, dtype=wp.float32)
 
 
@@ -25,10 +28,13 @@ STATE_FIELDS = {
     "qpos": mujoco.mjtState.mjSTATE_QPOS,
     "qvel": mujoco.mjtState.mjSTATE_QVEL,
     "act": mujoco.mjtState.mjSTATE_ACT,
+    "history": mujoco.mjtState.mjSTATE_HISTORY,
+    "plastic": mujoco.mjtState.mjSTATE_PLASTIC,
     "qacc_warmstart": mujoco.mjtState.mjSTATE_WARMSTART,
     "ctrl": mujoco.mjtState.mjSTATE_CTRL,
     "qfrc_applied": mujoco.mjtState.mjSTATE_QFRC_APPLIED,
     "xfrc_applied": mujoco.mjtState.mjSTATE_XFRC_APPLIED,
+    "eq_active": mujoco.mjtState.mjSTATE_EQ_ACTIVE,
     "mocap_pos": mujoco.mjtState.mjSTATE_MOCAP_POS,
     "mocap_quat": mujoco.mjtState.mjSTATE_MOCAP_QUAT,
     "userdata": mujoco.mjtState.mjSTATE_USERDATA,
@@ -38,13 +44,19 @@ STATE_FIELDS = {
 INPUTS = ("ctrl", "xfrc_applied", "qfrc_applied", "mocap_pos", "mocap_quat", "userdata")
 """State fields that physics reads and does not change: a task may write them before a step."""
 
+INITIAL = ("qpos", "qvel", "act", "eq_active", *INPUTS)
+"""Fields that make up an initial state."""
+
+READ_ONLY = ("history", "plastic")
+"""Fields of the integration state that the physics alone writes: delayed samples and deformations."""
+
 _POSITION = (
     "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat cam_xpos cam_xmat "
-    "light_xpos light_xdir subtree_com cdof cinert ten_length actuator_length crb"
+    "light_xpos light_xdir subtree_com cdof cinert flexvert_xpos flexedge_length ten_length actuator_length crb"
 )
 _VELOCITY = (
-    "cvel cdof_dot ten_velocity actuator_velocity qfrc_bias qfrc_spring qfrc_damper qfrc_gravcomp qfrc_fluid "
-    "qfrc_passive subtree_linvel subtree_angmom"
+    "cvel cdof_dot flexedge_velocity ten_velocity actuator_velocity qfrc_bias qfrc_spring qfrc_damper qfrc_gravcomp "
+    "qfrc_fluid qfrc_adhesion qfrc_passive subtree_linvel subtree_angmom energy"
 )
 _ACCELERATION = (
     "act_dot actuator_force qfrc_actuator qfrc_smooth qacc_smooth qfrc_constraint qacc cacc cfrc_int cfrc_ext"
@@ -68,29 +80,70 @@ ON_DEMAND = {
 SENSED = {"sensordata", *ON_DEMAND}
 """Fields for which the model's sensors must be enabled."""
 
-_TYPES = {3: wp.vec3, 4: wp.quat, 6: wp.spatial_vector, 9: wp.mat33, 10: vec10}
+_TYPES = {3: wp.vec3, 4: quat, 6: wp.spatial_vector, 9: wp.mat33, 10: vec10}
 
-# the kind of object along a field's first axis, by the prefix of the field's name
-_OBJECTS = {
-    "ten": mujoco.mjtObj.mjOBJ_TENDON,
-    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
-    "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "site": mujoco.mjtObj.mjOBJ_SITE,
-    "cam": mujoco.mjtObj.mjOBJ_CAMERA,
-    "light": mujoco.mjtObj.mjOBJ_LIGHT,
-}
+_Kind = mujoco.mjtObj
 
+_KINDS = {
+    "actuator": _Kind.mjOBJ_ACTUATOR,
+    "body": _Kind.mjOBJ_BODY,
+    "cam": _Kind.mjOBJ_CAMERA,
+    "eq": _Kind.mjOBJ_EQUALITY,
+    "geom": _Kind.mjOBJ_GEOM,
+    "jnt": _Kind.mjOBJ_JOINT,
+    "light": _Kind.mjOBJ_LIGHT,
+    "mat": _Kind.mjOBJ_MATERIAL,
+    "pair": _Kind.mjOBJ_PAIR,
+    "sensor": _Kind.mjOBJ_SENSOR,
+    "site": _Kind.mjOBJ_SITE,
+    "ten": _Kind.mjOBJ_TENDON,
+    "tendon": _Kind.mjOBJ_TENDON,
+} | dict.fromkeys(
+    "xpos xquat xmat xipos ximat cvel cacc cinert crb cfrc_int cfrc_ext xfrc_applied subtree_com subtree_linvel "
+    "subtree_angmom".split(),
+    _Kind.mjOBJ_BODY,
+) | dict.fromkeys(("xanchor", "xaxis"), _Kind.mjOBJ_JOINT)  # fmt: skip
+"""The objects of which each has one row in a field, by the field's name or by what it begins with."""
+
+_QPOS = (_Kind.mjOBJ_JOINT, "jnt_qposadr", "nq")
+_DOFS = (_Kind.mjOBJ_JOINT, "jnt_dofadr", "nv")
+_CONTROLS = (_Kind.mjOBJ_ACTUATOR, "actuator_ctrladr", "actuator_ctrlnum")
+_OUTPUTS = (_Kind.mjOBJ_ACTUATOR, "actuator_outadr", "actuator_outnum")
+_ACTIVATIONS = (_Kind.mjOBJ_ACTUATOR, "actuator_actadr", "actuator_actnum")
+_SENSORS = (_Kind.mjOBJ_SENSOR, "sensor_adr", "sensor_dim")
+_VERTICES = (_Kind.mjOBJ_FLEX, "flex_vertadr", "flex_vertnum")
+_EDGES = (_Kind.mjOBJ_FLEX, "flex_edgeadr", "flex_edgenum")
+
+_RANGES = (
+    dict.fromkeys(("qpos", "qpos0", "qpos_spring"), _QPOS)
+    | dict.fromkeys(("qvel", "qacc", "cdof", "cdof_dot", "qacc_warmstart", "qacc_smooth", "qfrc", "dof"), _DOFS)
+    | dict.fromkeys(("ctrl", "actuator_ctrlrange", "actuator_ctrllimited"), _CONTROLS)
+    | dict.fromkeys(
+        ("actuator_length", "actuator_velocity", "actuator_force", "actuator_gear", "actuator_acc0",
+         "actuator_length0", "actuator_lengthrange"),
+        _OUTPUTS,
+    )
+    | dict.fromkeys(("act", "act_dot"), _ACTIVATIONS)
+    | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
+    | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
+)  # fmt: skip
+"""Fields in which an object has several rows, by name or by what it begins with: the kind of object, the array of
+their first rows, and the array of their numbers of rows, or the size of the field where there is no such array."""
 
 _COUNTS = {
-    mujoco.mjtObj.mjOBJ_ACTUATOR: "nu",
-    mujoco.mjtObj.mjOBJ_BODY: "nbody",
-    mujoco.mjtObj.mjOBJ_CAMERA: "ncam",
-    mujoco.mjtObj.mjOBJ_GEOM: "ngeom",
-    mujoco.mjtObj.mjOBJ_JOINT: "njnt",
-    mujoco.mjtObj.mjOBJ_LIGHT: "nlight",
-    mujoco.mjtObj.mjOBJ_SENSOR: "nsensor",
-    mujoco.mjtObj.mjOBJ_SITE: "nsite",
-    mujoco.mjtObj.mjOBJ_TENDON: "ntendon",
+    _Kind.mjOBJ_ACTUATOR: "nactuator",
+    _Kind.mjOBJ_BODY: "nbody",
+    _Kind.mjOBJ_CAMERA: "ncam",
+    _Kind.mjOBJ_EQUALITY: "neq",
+    _Kind.mjOBJ_FLEX: "nflex",
+    _Kind.mjOBJ_GEOM: "ngeom",
+    _Kind.mjOBJ_JOINT: "njnt",
+    _Kind.mjOBJ_LIGHT: "nlight",
+    _Kind.mjOBJ_MATERIAL: "nmat",
+    _Kind.mjOBJ_PAIR: "npair",
+    _Kind.mjOBJ_SENSOR: "nsensor",
+    _Kind.mjOBJ_SITE: "nsite",
+    _Kind.mjOBJ_TENDON: "ntendon",
 }
 
 
@@ -102,7 +155,7 @@ class Field:
     shape: tuple[int, ...]
     """Shape of one world's value, without the axis that ``dtype`` holds."""
     dtype: type
-    """Warp type of an element: float, wp.vec3, wp.quat (w, x, y, z as in MuJoCo), ..."""
+    """Warp type of an element: float, wp.vec3, quat (w, x, y, z), ..."""
     refresh: Stage
     """The stage that must be computed after a step for this field to belong to the new state."""
     reset: Stage
@@ -116,12 +169,22 @@ class Field:
 
     @property
     def size(self) -> int:
-        """Floats in one world's value."""
-        return int(np.prod(self.shape, dtype=int)) * wp.types.type_size_in_bytes(self.dtype) // 4
+        """Numbers in one world's value."""
+        return int(np.prod(self.shape, dtype=int)) * max(1, wp.types.type_size_in_bytes(self.dtype) // 4)
+
+
+def is_data_field(name: str) -> bool:
+    """Whether a name is that of a field of MjData that can be kept."""
+    return name in STATE_FIELDS or name in DERIVED_FIELDS or name in SENSED
 
 
 def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False, written: bool = False) -> Field:
     """Describe a field of a model.
+
+    Positions, velocities and functions of them belong to the current state: after a step, after a restart and after
+    an event that changed a world. Fields of the acceleration stage, such as ``qacc``, ``cfrc_ext`` or the forces of
+    actuators, are what the last substep left, and belong to the state that it started from; in a world that begins an
+    episode, to its first state. ``sensordata`` may hold both: each sensor follows the stage that it belongs to.
 
     Args:
         model: The compiled model.
@@ -163,7 +226,15 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False, written:
     shape: tuple[int, ...] = np.shape(getattr(mujoco.MjData(model), name))
     if len(shape) == 2:
         return Field(name, shape[:1], _TYPES[shape[1]], refresh, reset, lagged, snapshot, written)
-    return Field(name, shape, wp.float32, refresh, reset, lagged, snapshot, written)
+    dtype = wp.bool if name == "eq_active" else wp.float32
+    return Field(name, shape, dtype, refresh, reset, lagged, snapshot, written)
+
+
+def early_sensor_columns(model: mujoco.MjModel) -> np.ndarray:
+    """The columns of ``sensordata`` that hold sensors of the position and velocity stages, (n,) int."""
+    early = np.flatnonzero(model.sensor_needstage < Stage.ACCELERATION)
+    ranges = [np.arange(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i]) for i in early]
+    return np.concatenate([np.zeros(0, int), *ranges])
 
 
 def state_columns(model: mujoco.MjModel, name: str) -> slice:
@@ -189,49 +260,58 @@ def _sensed(model: mujoco.MjModel, name: str) -> bool:
 
 
 def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
-    """The place of a named element of the model in a field, along the axis after the worlds.
+    """The place of a named element of the model in a field of MjData or MjModel, along its first axis.
 
-    A joint has its coordinates in ``qpos`` and its degrees of freedom in ``qvel``, ``qacc`` and other fields of that
-    size, a sensor its numbers in ``sensordata``, a mocap body its row in ``mocap_pos``. In every other field each
-    object has one row.
+    A joint has its coordinates in ``qpos`` and its degrees of freedom in ``qvel``, ``dof_damping`` and other fields of
+    that size, a sensor its numbers in ``sensordata``, an actuator its controls in ``ctrl``, its activations in ``act``
+    and its force outputs in ``actuator_force``, a flex its vertices, a mocap body its row in ``mocap_pos``. In every
+    other field each object has one row.
 
     Raises:
-        ValueError: The model has no such element.
+        ValueError: The model has no such element, or it has no place in the field.
     """
-
-    def find(kind: mujoco.mjtObj) -> int:
-        index = mujoco.mj_name2id(model, kind, element)
-        if index < 0:
-            names = [mujoco.mj_id2name(model, kind, i) for i in range(getattr(model, _COUNTS[kind]))]
-            kind_name = kind.name.removeprefix("mjOBJ_").lower()
-            known = ", ".join(sorted(n for n in names if n)) or "none that are named"
-            raise ValueError(f"the model has no {kind_name} {element!r} for the field {name!r}; it has: {known}")
-        return index
-
-    if name == "sensordata":
-        i = find(mujoco.mjtObj.mjOBJ_SENSOR)
-        return slice(int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i]))
-    if name == "qpos":
-        i = find(mujoco.mjtObj.mjOBJ_JOINT)
-        end = model.jnt_qposadr[i + 1] if i + 1 < model.njnt else model.nq
-        return slice(int(model.jnt_qposadr[i]), int(end))
-    if name in ("qvel", "qacc", "cdof", "cdof_dot", "qacc_warmstart", "qacc_smooth") or name.startswith("qfrc_"):
-        i = find(mujoco.mjtObj.mjOBJ_JOINT)
-        end = model.jnt_dofadr[i + 1] if i + 1 < model.njnt else model.nv
-        return slice(int(model.jnt_dofadr[i]), int(end))
     if name in ("mocap_pos", "mocap_quat"):
-        i = int(model.body_mocapid[find(mujoco.mjtObj.mjOBJ_BODY)])
+        i = int(model.body_mocapid[_find(model, _Kind.mjOBJ_BODY, name, element)])
         if i < 0:
             raise ValueError(f"the body {element!r} is not a mocap body, so it has no {name!r}")
         return slice(i, i + 1)
     prefix = name.partition("_")[0]
-    if name == "ctrl":
-        kind = mujoco.mjtObj.mjOBJ_ACTUATOR
-    elif name in ("xanchor", "xaxis"):
-        kind = mujoco.mjtObj.mjOBJ_JOINT
-    elif name in ("time", "act", "act_dot", "userdata"):
+    if (place := _RANGES.get(name) or _RANGES.get(prefix)) is not None:
+        kind, starts, counts = place
+        i = _find(model, kind, name, element)
+        first = getattr(model, starts)
+        if counts in ("nq", "nv"):
+            end = first[i + 1] if i + 1 < len(first) else getattr(model, counts)
+        else:
+            end = first[i] + getattr(model, counts)[i]
+        if end == first[i] or first[i] < 0:
+            raise ValueError(f"the {_called(kind)} {element!r} has no {name!r}")
+        return slice(int(first[i]), int(end))
+    if (kind := _KINDS.get(name) or _KINDS.get(prefix)) is None:
         raise ValueError(f"the field {name!r} has no named elements")
-    else:
-        kind = _OBJECTS.get(prefix, mujoco.mjtObj.mjOBJ_BODY)
-    i = find(kind)
+    i = _find(model, kind, name, element)
     return slice(i, i + 1)
+
+
+def has_several_rows(name: str) -> bool:
+    """Whether an object may have several rows in a field, as a joint's degrees of freedom in ``cdof``."""
+    return name in _RANGES or name.partition("_")[0] in _RANGES
+
+
+def rows(model: mujoco.MjModel, name: str) -> int:
+    """The length of a field of MjData or MjModel along the axis of its named elements."""
+    owner = model if hasattr(model, name) else mujoco.MjData(model)
+    return len(getattr(owner, name))
+
+
+def _called(kind: mujoco.mjtObj) -> str:
+    return kind.name.removeprefix("mjOBJ_").lower()
+
+
+def _find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, element: str) -> int:
+    index = mujoco.mj_name2id(model, kind, element)
+    if index < 0:
+        names = [mujoco.mj_id2name(model, kind, i) for i in range(getattr(model, _COUNTS[kind]))]
+        known = ", ".join(sorted(n for n in names if n)) or "none that are named"
+        raise ValueError(f"the model has no {_called(kind)} {element!r} for the field {name!r}; it has: {known}")
+    return index

@@ -65,17 +65,31 @@ _FIELDS = (
 _OPTIONS = {"gravity", "magnetic", "wind", "density", "viscosity"}
 """Those of the fields that are options of the model, attributes of MjModel.opt."""
 
+_COMPUTED = set(
+    "body_subtreemass body_invweight0 dof_invweight0 dof_M0 tendon_invweight0 tendon_length0 actuator_acc0 "
+    "actuator_length0 geom_rbound geom_aabb cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0 light_dir0 "
+    "eq_data".split()
+)
+"""Fields that MuJoCo computes from others."""
+
 _REASONS = (
     dict.fromkeys(
-        "body_subtreemass body_invweight0 dof_invweight0 dof_M0 tendon_invweight0 tendon_length0 actuator_acc0 "
-        "actuator_length0 geom_rbound geom_aabb cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0 light_dir0 "
-        "eq_data".split(),
+        _COMPUTED,
         "MuJoCo computes it from other fields; write those instead",
     )
     | {"timestep": "all worlds share the parameter dt", "impratio": "MuJoCo Warp keeps another number instead of it"}
     | dict.fromkeys(("geom_surfacevel", "geom_adhesion", "pair_adhesion"),
                     "MuJoCo Warp decides on the host whether any geom has it")
 )  # fmt: skip
+
+_POSITIVE = {"body_mass", "body_inertia", "geom_size"}
+"""Fields whose numbers must stay positive where the nominal value is."""
+
+_NOT_NEGATIVE = _POSITIVE | set(
+    "geom_friction pair_friction jnt_stiffness dof_damping dof_armature dof_frictionloss tendon_stiffness "
+    "tendon_damping tendon_armature tendon_frictionloss actuator_damping actuator_armature density viscosity".split()
+)
+"""Fields whose numbers are never negative."""
 
 _TYPES = {
     2: wp.vec2, 3: wp.vec3, 4: wp.vec4, 5: wp.types.vector(length=5, dtype=wp.float32), 6: wp.spatial_vector,
@@ -105,21 +119,65 @@ class ModelField:
         """Whether the field is an attribute of MjModel.opt."""
         return self.name in _OPTIONS
 
+    @property
+    def follows(self) -> bool:
+        """Whether MuJoCo computes the field from other fields of the model."""
+        return self.name in _COMPUTED
+
+    def problem(self, model: mujoco.MjModel, rows: np.ndarray) -> str | None:
+        """What is wrong with the values of some worlds, in one line; None if MuJoCo can simulate them.
+
+        Args:
+            model: The compiled model.
+            rows: A row for each world, (nworld, size).
+        """
+        nominal = self.value(model).ravel()
+        bad = ~np.isfinite(rows)
+        if self.name in _NOT_NEGATIVE:
+            bad |= (rows < 0) | ((rows == 0) & (nominal > 0) & (self.name in _POSITIVE))
+        if not bad.any():
+            return None
+        world, column = np.argwhere(bad)[0].tolist()
+        place = np.unravel_index(column, self.value(model).shape) if nominal.size > 1 else ()
+        index = "".join(f"[{int(i)}]" for i in place)
+        wanted = (
+            "positive"
+            if self.name in _POSITIVE and nominal[column] > 0
+            else "0 or more"
+            if self.name in _NOT_NEGATIVE
+            else "finite"
+        )
+        return (
+            f"{self.name}{index} of world {world} is {rows[world, column]:g} and must be {wanted} "
+            f"(its nominal value is {nominal[column]:g})"
+        )
+
     def value(self, model: mujoco.MjModel) -> np.ndarray:
         """The field in a model, float64; for an array the model's own memory."""
         return np.asarray(getattr(model.opt if self.option else model, self.name))
 
 
-def describe_model_field(model: mujoco.MjModel, name: str) -> ModelField:
-    """Describe a field of a model that can differ between worlds.
+def is_model_field(name: str) -> bool:
+    """Whether a name is that of a field of MjModel, or of one of its options that can differ between worlds."""
+    return name in _FIELDS or hasattr(mujoco.MjModel, name)
+
+
+def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = True) -> ModelField:
+    """Describe a field of a model.
 
     Args:
         model: The compiled model.
         name: MuJoCo's name of the field, an attribute of MjModel or, as "gravity", of MjModel.opt.
+        varies: Whether the field must be one that can differ between worlds.
 
     Raises:
-        ValueError: There is no such field, or all worlds share it.
+        ValueError: There is no such field, it does not hold real numbers, or all worlds share it.
     """
+    value = getattr(model, name, None)
+    if not varies and name not in _FIELDS and isinstance(value, np.ndarray):
+        if value.dtype != np.float64 or value.ndim > 2 or (value.ndim == 2 and value.shape[1] not in _TYPES):
+            raise ValueError(f"the model field {name!r} cannot be read in World: it has no rows of real numbers")
+        return _described(name, value.shape, Constants.NONE)
     if name not in _FIELDS:
         if not isinstance(getattr(model, name, getattr(model.opt, name, None)), np.ndarray | float | int):
             close = difflib.get_close_matches(name, _FIELDS, 3)
@@ -131,6 +189,10 @@ def describe_model_field(model: mujoco.MjModel, name: str) -> ModelField:
     if name in _WRAPPED and np.isin(model.wrap_type, _WRAPS).any():
         constants |= _POSES
     shape: tuple[int, ...] = np.shape(getattr(model.opt if name in _OPTIONS else model, name))
+    return _described(name, shape, constants)
+
+
+def _described(name: str, shape: tuple[int, ...], constants: Constants) -> ModelField:
     if len(shape) == 2:
         return ModelField(name, shape[:1], _TYPES[shape[1]], constants)
     return ModelField(name, shape, wp.float32, constants)

@@ -1,19 +1,20 @@
 """Open-loop rollouts: a horizon of given actions in every world, judged by the task."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import launch_rows, torch_view
+from lyceum_warp.arrays import flat, launch_rows, shared_rows, torch_view
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.capture import Calls, Phase
 from lyceum_warp.kernels import planning, state
-from lyceum_warp.spaces import COUNTERS
+from lyceum_warp.task import MEMORIES
 from lyceum_warp.validate import whole_number
+from lyceum_warp.worlds import own_parts
 
 
 @document_attributes
@@ -28,9 +29,14 @@ class OpenLoop:
     Args:
         env: Worlds to roll out in; they belong to the rollouts from then on.
         horizon: Steps.
+        keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device, read in every run. By
+            default every world has the key in ``state``, and so draws what ``env.step`` would draw from there.
+        nominal_model: Whether model fields that differ between worlds have their nominal values instead of those in
+            ``state``.
 
     Raises:
-        ValueError: The environment resets its worlds automatically, or the buffers do not fit into memory.
+        ValueError: The environment resets its worlds automatically, ``keys`` has another shape, type or device, or the
+            buffers do not fit into memory.
     """
 
     state: torch.Tensor
@@ -43,42 +49,62 @@ class OpenLoop:
     """Whether the state after each step ends the episode, (horizon, nworld) bool."""
     final_obs: torch.Tensor
     """Observations after the last step, (nworld, nobs)."""
+    final_obs_groups: dict[str, torch.Tensor]
+    """The same for every group of observations, by name; ``policy`` is ``final_obs``."""
     fault: torch.Tensor
     """Bits of ``Done`` for the faults of a world, (nworld,) int32; if a bit is set, ignore that world's rewards."""
     phases: tuple[Phase, ...]
     """What ``run`` does, in order, for a caller that puts more into the same graph."""
 
-    def __init__(self, env: Env, horizon: int) -> None:
+    def __init__(self, env: Env, horizon: int, *, keys: wp.array | None = None, nominal_model: bool = False) -> None:
         if env.autoreset:
             raise ValueError("open-loop rollouts need worlds that do not reset: make(..., autoreset=False)")
         self.env, self.worlds = env, env.worlds
         self.horizon = whole_number("horizon", horizon, low=1)
         n, nu, task = env.nworld, env.action_space.size, env.task
+        if keys is not None and (keys.shape, keys.dtype, keys.device) != ((n,), wp.uint32, env.device):
+            raise ValueError(
+                f"keys must be a wp.array of shape ({n},) and type uint32 on {env.device}, not of shape {keys.shape} "
+                f"and type {wp.types.type_repr(keys.dtype)} on {keys.device}"
+            )
+        self._keys, self._nominal_model = keys, nominal_model
         rows = self.horizon * n
         check_fit(self._bytes_per_world(env, self.horizon), n, env.device)
         with wp.ScopedDevice(env.device):
             self._state = wp.zeros(env.state_space.size, dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nu), dtype=float)
-            self._controls = wp.zeros((self.horizon, n, env.model.nu), dtype=float)
+            self._controls = wp.zeros((self.horizon, n, env.task.model.nu), dtype=float)
             self._reward = wp.zeros(rows, dtype=float)
             self._terminated = wp.zeros(rows, dtype=bool)
             self._fault = wp.zeros(n, dtype=int)
-            self._obs = wp.zeros((n, env.obs_space.size), dtype=float)
+            self._obs = task.kernels.Observations()
+            for group, space in env.obs_spaces.items():
+                setattr(self._obs, group, wp.zeros((n, space.size), dtype=float))
+            self._no_memory = wp.zeros((rows + n, 0), dtype=float)
             # each field for all steps: the states before a step, after it, and the last ones are views of one buffer
             self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
+            constant = {f.name: shared_rows(f.value(task.model), f.dtype, rows + n, env.device) for f in task.constants}
             for name in task.types:
                 live = getattr(self.worlds.after, name)
-                buffer: wp.array = wp.zeros((rows + n, *live.shape[1:]), dtype=live.dtype)
-                self._fields[name] = buffer.reshape((self.horizon + 1, *live.shape))
+                buffer = constant.get(name)
+                if buffer is None:
+                    buffer = wp.zeros((rows + n, *live.shape[1:]), dtype=live.dtype)
+                    self._fields[name] = buffer.reshape((self.horizon + 1, *live.shape))
                 for batch, start in ((self._before, 0), (self._after, n), (self._last, rows)):
-                    setattr(batch, name, buffer[start : min(start + rows, rows + n)])
-        self._memory = self._fields.pop("memory", None)
+                    # of no numbers there is no slice
+                    part = buffer[start : min(start + rows, rows + n)] if buffer.size else buffer
+                    setattr(batch, name, part)
+        self._memories = {name: self._fields.pop(name) for name in MEMORIES if name in self._fields}
+        self._dynamics = {f.name: self._fields.pop(f.name) for f in task.dynamics if f.name in self._fields}
         self.state, self.actions = torch_view(self._state), torch_view(self._actions)
         self.reward = torch_view(self._reward).view(self.horizon, n)
         self.terminated = torch_view(self._terminated).view(self.horizon, n)
-        self.fault, self.final_obs = torch_view(self._fault), torch_view(self._obs)
-        self.phases = self._whole_horizon() if task.functions["control"] is None else self._step_by_step()
+        self.fault = torch_view(self._fault)
+        self.final_obs_groups = {group: torch_view(getattr(self._obs, group)) for group in env.obs_spaces}
+        self.final_obs = self.final_obs_groups["policy"]
+        stepwise = task.functions["control"] is not None or task.functions["substep"] is not None
+        self.phases = self._step_by_step() if stepwise else self._whole_horizon()
         self._calls = self.sequence(self.phases)
 
     def run(self) -> None:
@@ -95,7 +121,9 @@ class OpenLoop:
     def _bytes_per_world(env: Env, horizon: int) -> int:
         """An estimate of the buffers' memory for each world."""
         fields = [field for field in env.task.fields if field.name in env.task.types]
-        own = 4 * (sum(field.size for field in fields) + env.task.task.memory + env.model.nu + env.action_space.size)
+        numbers = sum(field.size for field in fields) + sum(field.size for field in env.task.dynamics)
+        numbers += sum(own_parts(env.task).values())
+        own = 4 * (numbers + env.task.model.nu + env.action_space.size)
         return horizon * (own + 8) + env.engine.rollout_bytes_per_world(horizon, env.task.frame_skip, fields)
 
     def _whole_horizon(self) -> tuple[Phase, ...]:
@@ -109,7 +137,7 @@ class OpenLoop:
         )
 
     def _step_by_step(self) -> tuple[Phase, ...]:
-        """For a task that maps actions to controls itself: it must see the state that each step starts from."""
+        """For a task with a ``control`` or a ``substep``, which must see the state at every step or substep."""
         engine, worlds = self.env.engine, self.worlds
         phases = [
             Phase("start", self._start),
@@ -119,7 +147,7 @@ class OpenLoop:
         for t in range(self.horizon):
             phases += [
                 Phase("act", partial(self._act, t)),
-                Phase("physics", partial(engine.step, self.env.task.frame_skip), engine=True),
+                *worlds.physics_phases(),
                 Phase("judge", partial(self._judge_step, t)),
             ]
         return (*phases, Phase("end", partial(self._end, worlds.after)))
@@ -128,29 +156,51 @@ class OpenLoop:
         """Put every world at the start, and map the actions of all steps to controls."""
         worlds, device = self.worlds, self.env.device
         wp.launch(planning.broadcast, worlds.state.shape, [self._state, worlds.state], device=device)
+        if self._nominal_model:
+            self._overwrite_model()
         rest = worlds.state[:, self.env.engine.state_size :]
         worlds.restore_counters(worlds.everyone, rest)
-        if self._memory is not None:
-            launch_rows(state.narrow, worlds.everyone, rest[:, len(COUNTERS) :], worlds.memory)
-            wp.copy(self._memory[0], worlds.memory)
+        if self._keys is not None:
+            wp.copy(worlds.counters.key, self._keys)
+        for name, buffer in self._memories.items():
+            columns = worlds.state[:, self.env.state_space.parts[name]]
+            launch_rows(state.narrow, worlds.everyone, columns, getattr(worlds, name))
+            wp.copy(buffer[0], getattr(worlds, name))
+        for name, buffer in self._dynamics.items():
+            columns = worlds.state[:, self.env.state_space.parts[name]]
+            rows = flat(buffer).reshape((*buffer.shape[:2], -1))
+            wp.launch(planning.repeat_columns, rows.shape, [columns, rows], device=device)
         self._fault.zero_()
         args = [self._actions, worlds.ranges, worlds.scale, self._fault, self._controls]
         wp.launch(planning.controls, self._actions.shape[:2], args, device=device)
 
+    def _overwrite_model(self) -> None:
+        """Give the model fields in every world's state their nominal values."""
+        columns, states = self.env.state_space.parts, self.worlds.state
+        nominal: Mapping[str, wp.array] = self.env.engine.nominal
+        for name, row in nominal.items():
+            row = flat(row)
+            args = [row, columns[name].start, states]
+            wp.launch(planning.overwrite, (states.shape[0], row.shape[1]), args, device=self.env.device)
+
     def _judge_rows(self) -> None:
         """Judge the transitions of the whole horizon."""
-        worlds, kernels, device = self.worlds, self.env.task.kernels, self.env.device
+        worlds, kernels, device, n = self.worlds, self.env.task.kernels, self.env.device, self.env.nworld
         actions = self._actions.reshape((-1, self._actions.shape[2]))
         transition = [self._before, self._after, worlds.params, actions]
-        if self._memory is not None and kernels.advance_rows is None:  # it stays as it was at the reset
-            for t in range(self.horizon):
-                wp.copy(self._memory[t + 1], self._memory[0])
-        elif self._memory is not None:
-            counters = [worlds.steps, worlds.key, worlds.episode]
-            memory = self._memory.reshape((-1, self._memory.shape[2]))
-            args = [*transition, *counters, memory, worlds.rng]
-            wp.launch(kernels.advance_rows, self.env.nworld, args, device=device)
+        if kernels.advance_rows is not None:
+            memories = [
+                self._memories[name].reshape((len(actions) + n, -1)) if name in self._memories else self._no_memory
+                for name in MEMORIES
+            ]
+            args = [*transition, worlds.counters, *memories]
+            wp.launch(kernels.advance_rows, n, args, device=device)
+        else:  # they stay as they are at the start
+            for buffer in self._memories.values():
+                for t in range(self.horizon):
+                    wp.copy(buffer[t + 1], buffer[0])
         wp.launch(kernels.judge_rows, len(actions), [*transition, self._reward, self._terminated], device=device)
+        wp.launch(planning.add_steps, n, [self.horizon, worlds.counters.step], device=device)
         self._end(self._last)
 
     def _act(self, t: int) -> None:
@@ -162,8 +212,7 @@ class OpenLoop:
         kernels = self.env.task.kernels
         transition = [worlds.before, worlds.after, worlds.params, self._actions[t]]
         if kernels.advance_memory is not None:
-            args = [*transition, worlds.steps, worlds.key, worlds.episode, worlds.rng]
-            wp.launch(kernels.advance_memory, n, args, device=device)
+            wp.launch(kernels.advance_memory, n, [*transition, worlds.counters], device=device)
         rows = slice(t * n, (t + 1) * n)
         args = [*transition, self._reward[rows], self._terminated[rows]]
         wp.launch(kernels.judge_rows, n, args, device=device)
@@ -173,5 +222,5 @@ class OpenLoop:
         worlds, n, device = self.worlds, self.env.nworld, self.env.device
         self.env.engine.find_faults(worlds.everyone)
         wp.launch(planning.merge_faults, n, [self.env.engine.fault, self._fault], device=device)
-        args = [worlds.everyone, batch, worlds.params, self._obs]
+        args = [worlds.everyone, batch, worlds.params, worlds.counters, self._obs]
         wp.launch(self.env.task.kernels.observe_worlds, n, args, device=device)

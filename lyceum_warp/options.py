@@ -148,6 +148,8 @@ class EnvOptions:
     """Another model than the task's: a file or an MjSpec."""
     fields: Collection[str] = ()
     """Additional fields to keep, for ``env.field``."""
+    dynamics: Collection[str] = ()
+    """Model fields that may differ between worlds, for ``env.set_dynamics``, beside those that the task draws."""
     physics: PhysicsOptions = PhysicsOptions()
     """How the worlds are simulated."""
 
@@ -160,10 +162,12 @@ class EnvOptions:
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         check_kind("physics", self.physics, PhysicsOptions, "as lw.PhysicsOptions(cone='elliptic')")
         _flags(self, "autoreset", "graphs", "nvtx")
-        names = isinstance(self.fields, Collection) and not isinstance(self.fields, str)
-        if not names or not all(isinstance(name, str) for name in self.fields):
-            raise ValueError(f"fields must be names of fields, as in fields=['sensordata'], not {self.fields!r}")
-        object.__setattr__(self, "fields", tuple(self.fields))
+        for option, example in (("fields", "sensordata"), ("dynamics", "body_mass")):
+            names = getattr(self, option)
+            listed = isinstance(names, Collection) and not isinstance(names, str)
+            if not listed or not all(isinstance(name, str) for name in names):
+                raise ValueError(f"{option} must be names of fields, as in {option}=[{example!r}], not {names!r}")
+            object.__setattr__(self, option, tuple(names))
 
     @classmethod
     def split(cls, words: Mapping[str, Any], base: "EnvOptions | None" = None) -> tuple["EnvOptions", dict[str, Any]]:

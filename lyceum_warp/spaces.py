@@ -54,23 +54,45 @@ COUNTERS = ("step", "key", "episode", "done_reason")
 """Counters in a state: steps since the reset, key of the random streams, number of the episode, bits of ``Done``."""
 
 
-def action_space(model: mujoco.MjModel, action_range: tuple[float, float] | None) -> Space:
-    """Actions: one number for each control, by the actuators' names, within ``action_range`` or the control ranges."""
-    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) or f"actuator_{i}" for i in range(model.nu)]
+def action_space(
+    model: mujoco.MjModel, action_range: tuple[float, float] | None, actions: Mapping[str, int] | None = None
+) -> Space:
+    """Actions: the controls of each actuator, by its name, within ``action_range`` or the control ranges.
+
+    Most actuators have one control, some have several or none. One without a name is called by its number. A task's own
+    ``actions`` have bounds only with an ``action_range``.
+    """
+    if actions is not None:
+        space = Space.of(actions)
+        low, high = np.tile(np.array(action_range or (-np.inf, np.inf), dtype=np.float32), (space.size, 1)).T.copy()
+        return dataclasses.replace(space, low=low, high=high)
     bounds = control_ranges(model) if action_range is None else np.tile(action_range, (model.nu, 1))
     low, high = np.ascontiguousarray(bounds.T, dtype=np.float32)
-    return Space.of(dict.fromkeys(names, 1), low=low, high=high)
+    return Space.of(_controls(model), low=low, high=high)
 
 
-def control_map(model: mujoco.MjModel, action_range: tuple[float, float] | None) -> tuple[np.ndarray, np.ndarray]:
-    """The controls' ranges, (nu, 2), and the scale and offset that map actions to controls, (nu, 2).
+def _controls(model: mujoco.MjModel) -> dict[str, int]:
+    """The actuators' names and their numbers of controls, in the order of the controls."""
+    given = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nactuator)]
+    sizes: dict[str, int] = {}
+    for i in np.argsort(model.actuator_ctrladr, kind="stable").tolist():
+        name = given[i] or f"actuator_{i}"
+        while not given[i] and name in given:  # another actuator has this name
+            name = f"{name}_"
+        if model.actuator_ctrlnum[i]:
+            sizes[name] = int(model.actuator_ctrlnum[i])
+    return sizes
+
+
+def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | None) -> np.ndarray:
+    """The scale and the offset that map actions to controls, (nu, 2).
 
     Raises:
         ValueError: There is an ``action_range``, but a control without a range.
     """
-    ranges = control_ranges(model)
     if action_range is None:
-        return ranges, np.tile((1.0, 0.0), (model.nu, 1))
+        return np.tile((1.0, 0.0), (model.nu, 1))
+    ranges = control_ranges(model)
     if not np.isfinite(ranges).all():
         unlimited = np.flatnonzero(~np.isfinite(ranges).all(axis=1)).tolist()
         raise ValueError(
@@ -79,7 +101,7 @@ def control_map(model: mujoco.MjModel, action_range: tuple[float, float] | None)
         )
     low, high = action_range
     gain = (ranges[:, 1] - ranges[:, 0]) / (high - low)
-    return ranges, np.stack([gain, ranges[:, 0] - gain * low], axis=1)
+    return np.stack([gain, ranges[:, 0] - gain * low], axis=1)
 
 
 def control_ranges(model: mujoco.MjModel) -> np.ndarray:
@@ -88,9 +110,16 @@ def control_ranges(model: mujoco.MjModel) -> np.ndarray:
 
 
 def state_space(
-    model: mujoco.MjModel, snapshots: Iterable[Field], memory: int, *, dynamics: Iterable[ModelField] = ()
+    model: mujoco.MjModel, snapshots: Iterable[Field], dynamics: Iterable[ModelField], own: Mapping[str, int]
 ) -> Space:
-    """States: the integration state in MuJoCo's order, the fields and model fields saved with it, counters, memory."""
+    """States: the integration state in MuJoCo's order, fields saved with it, model fields, counters, and further parts.
+
+    Args:
+        model: The compiled model.
+        snapshots: Fields that are saved with the integration state.
+        dynamics: Model fields that differ between worlds.
+        own: Further parts and their sizes, such as the task's memory.
+    """
     sizes = {}
     names = {component.value: name for name, component in STATE_FIELDS.items()}
     components = mujoco.mjtState.mjSTATE_INTEGRATION.value
@@ -99,5 +128,4 @@ def state_space(
             fallback = mujoco.mjtState(component).name.removeprefix("mjSTATE_").lower()
             sizes[names.get(component, fallback)] = size
     sizes |= {field.name: field.size for field in snapshots} | {field.name: field.size for field in dynamics}
-    sizes |= dict.fromkeys(COUNTERS, 1)
-    return Space.of(sizes | ({"memory": memory} if memory else {}), dtype=torch.float64)
+    return Space.of({**sizes, **dict.fromkeys(COUNTERS, 1), **own}, dtype=torch.float64)

@@ -39,6 +39,11 @@ class TaskFunction:
     """Its purpose and its default, for the documentation."""
     default: str | None = None
     """The body of the function that stands in for it; None where it is required."""
+    optional: str = ""
+    """Arguments at the end that a task's function may leave out, as they are written in its file."""
+    writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Which fields of its arguments of type World it may write: "inputs", "memory", "model", or "start" (all that a
+    reset may write). Rows among its arguments that are results, such as ``obs``, may always be written."""
 
     @property
     def signature(self) -> str:
@@ -46,39 +51,89 @@ class TaskFunction:
         return f"{self.name}({self.arguments})" + (f" -> {self.result.__name__}" if self.result else "")
 
     @property
+    def argument_names(self) -> tuple[str, ...]:
+        """The names of its arguments, in order, with those that may be left out."""
+        arguments = ", ".join(filter(None, (self.arguments, self.optional)))
+        return tuple(argument.partition(": ")[0] for argument in arguments.split(", "))
+
+    @property
     def kinds(self) -> tuple[str, ...]:
         """The annotations of its arguments, in order."""
-        return tuple(argument.partition(": ")[2] for argument in self.arguments.split(", "))
+        return _kinds(self.arguments)
+
+    @property
+    def all_kinds(self) -> tuple[str, ...]:
+        """The same with the arguments that may be left out."""
+        return self.kinds + _kinds(self.optional)
+
+
+def _kinds(arguments: str) -> tuple[str, ...]:
+    return tuple(argument.partition(": ")[2] for argument in arguments.split(", ") if argument)
 
 
 _TRANSITION = "s0: World, action: Row[float], s1: World, p: Params"
+
+_RNG = "rng: Row[wp.uint32]"
 
 FUNCTIONS = {
     function.name: function
     for function in (
         TaskFunction("observe", "s: World, p: Params, obs: Row[float]", None,
-                     "Writes the observation. The only function that is required."),
+                     "Writes the observation. The only function that is required. With ``rng`` as a last argument it "
+                     "may draw noise.", optional=_RNG),
         TaskFunction("control", "s: World, action: Row[float], p: Params, ctrl: Row[float]", None,
-                     "Turns an action into controls. Default: copies it, or scales it (see ``action_range``).", "pass"),
+                     "Turns an action into controls, and writes further inputs. Default: copies it, or scales it (see "
+                     "``action_range``).", "pass", writes={"s": "inputs"}),
         TaskFunction("reward", _TRANSITION, float,
                      "Reward of one transition. ``s1.memory`` is already that of ``advance``. Default: 0.",
                      "return 0.0"),
+        TaskFunction("measure", f"{_TRANSITION}, metrics: Row[float]", None,
+                     "Writes the metrics of one transition, in the order of the attribute ``metrics``. Default: none.",
+                     "pass"),
         TaskFunction("evaluate", "s: World, p: Params", float,
                      "The evaluation metric, separate from the reward. Default: the reward.", "return 0.0"),
         TaskFunction("terminated", "s: World, p: Params", bool,
                      "Whether the state ends the episode. Default: False.", "return False"),
         TaskFunction("success", "s: World, p: Params", bool,
                      "Whether the task's goal is met. Default: False.", "return False"),
+        TaskFunction("startup", f"s: World, p: Params, {_RNG}", None,
+                     "Draws model fields once for each world, when its random stream starts. Default: keeps them.",
+                     "pass", writes={"s": "model"}),
         TaskFunction("initialize", "s: World, p: Params", None,
-                     "Changes the fixed initial state, the model's own. Default: keeps it.", "pass"),
-        TaskFunction("randomize", "s: World, p: Params, rng: Row[wp.uint32]", None,
-                     "Turns the fixed initial state into a random one. Default: keeps it.", "pass"),
-        TaskFunction("advance", f"{_TRANSITION}, rng: Row[wp.uint32]", None,
+                     "Changes the fixed initial state, the model's own. Default: keeps it.", "pass",
+                     writes={"s": "start"}),
+        TaskFunction("randomize", f"s: World, p: Params, {_RNG}", None,
+                     "Turns the fixed initial state into a random one. Default: keeps it.", "pass",
+                     writes={"s": "start"}),
+        TaskFunction("reject", "s: World, p: Params", bool,
+                     "Whether a random initial state must be drawn again, at most ``draws`` times. Default: False.",
+                     "return False"),
+        TaskFunction("event", f"s: World, p: Params, {_RNG}", None,
+                     "Changes the state between two steps, after the first is judged and before the next is observed. "
+                     "Default: keeps it.", "pass", writes={"s": "start"}),
+        TaskFunction("substep", "s: World, p: Params", None,
+                     "Writes task memory after each substep. Default: keeps it.", "pass", writes={"s": "memory"}),
+        TaskFunction("advance", f"{_TRANSITION}, {_RNG}", None,
                      "Writes task memory, ``s1.memory``, after each step and before ``reward``. Default: keeps it.",
-                     "pass"),
+                     "pass", writes={"s1": "memory"}),
     )
 }  # fmt: skip
 """The functions of a task, by name. Checks, kernels, error messages and ``help(lw.Task)`` are made from this table."""
+
+
+RESULTS = ("obs", "ctrl", "metrics", "rng")
+"""Rows among the arguments of functions that a function may write."""
+
+MEMORIES = ("memory", "lasting_memory")
+"""Fields of World that the task itself declares, by the names of its attributes with their sizes."""
+
+GROUP_PREFIX = "observe_"
+"""``observe_critic`` writes the group ``critic`` of the observations."""
+
+
+def observer_name(group: str) -> str:
+    """The name of the function that writes a group of observations."""
+    return "observe" if group == "policy" else f"{GROUP_PREFIX}{group}"
 
 
 def _document_functions(cls: type["Task"]) -> type["Task"]:
@@ -117,6 +172,41 @@ def body(name: str) -> int:
 def geom(name: str) -> int:
     """As a default in Params: the index of a geom, in ``geom_xpos`` and the other ``geom_`` fields."""
     return Element("geom_xpos", name)
+
+
+def camera(name: str) -> int:
+    """As a default in Params: the index of a camera, in ``cam_xpos`` and the other ``cam_`` fields."""
+    return Element("cam_xpos", name)
+
+
+def tendon(name: str) -> int:
+    """As a default in Params: the index of a tendon, in ``ten_length`` and the ``ten_`` and ``tendon_`` fields."""
+    return Element("ten_length", name)
+
+
+def equality(name: str) -> int:
+    """As a default in Params: the index of an equality constraint, in ``eq_active`` and the other ``eq_`` fields."""
+    return Element("eq_active", name)
+
+
+def actuator(name: str) -> int:
+    """As a default in Params: the index of an actuator, in ``actuator_force`` and the other ``actuator_`` fields."""
+    return Element("actuator_force", name)
+
+
+def ctrl(actuator: str) -> int:
+    """As a default in Params: where an actuator's controls begin in ``ctrl``. Most have one."""
+    return Element("ctrl", actuator)
+
+
+def act(actuator: str) -> int:
+    """As a default in Params: where an actuator's activations begin in ``act``."""
+    return Element("act", actuator)
+
+
+def joint(name: str) -> int:
+    """As a default in Params: the index of a joint, in ``xanchor``, ``xaxis`` and the ``jnt_`` fields."""
+    return Element("xanchor", name)
 
 
 def qpos(joint: str) -> int:
@@ -173,8 +263,14 @@ class Task:
     defaults; ``dt``, the seconds in a step, is filled in), and the functions, each a ``wp.func``. Each of these may
     also be an attribute of the class.
 
+    ``World`` lists fields of MjData, such as ``qpos`` and ``site_xpos``, and fields of MjModel, such as ``body_mass``
+    and ``geom_friction``, under MuJoCo's names. Model fields that ``startup``, ``initialize``, ``randomize`` or
+    ``event`` write differ between worlds and belong to the state; all others are the model's own.
+
     A default in ``Params`` may name an element of the model, as ``tip: int = lw.site("tip")``: the functions then get
-    its index. ``lw.body``, ``lw.geom``, ``lw.qpos``, ``lw.dof``, ``lw.sensor`` and ``lw.mocap`` work likewise.
+    its index. ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``, ``lw.actuator``,
+    ``lw.ctrl``, ``lw.act``, ``lw.tendon``, ``lw.equality``, ``lw.sensor`` and ``lw.mocap`` work likewise. A field of
+    type ``wp.array[float]`` or ``wp.array2d[float]`` is a table that all worlds share.
 
     Functions:
     {functions}
@@ -184,11 +280,22 @@ class Task:
     substep. Controls are clipped to the model's ranges; costs see the action as given. ``rng`` is the world's random
     stream: pass it to ``lw.uniform`` and ``lw.normal``.
 
-    ``initialize`` and ``randomize`` may write qpos, qvel, act, mocap_pos, mocap_quat, userdata and memory where
-    ``World`` lists them. They must not read derived fields (``xpos``, ``site_xpos``, ``sensordata``): these are
-    computed afterwards.
+    A function may write the following fields where ``World`` lists them; any other write is refused:
 
-    Quaternions in fields are in MuJoCo's order w, x, y, z; Warp's own quaternion functions expect x, y, z, w.
+    - ``control``: the inputs xfrc_applied, qfrc_applied, mocap_pos, mocap_quat and userdata. An input keeps its value
+      until it is written again; a reset clears it.
+    - ``initialize``, ``randomize`` and ``event``: qpos, qvel, act, ctrl, the inputs, memory, lasting_memory and model
+      fields. At every reset model fields get their nominal values back before ``initialize`` runs, so that draws never
+      add up. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``, ``sensordata``):
+      these are computed afterwards.
+    - ``startup``: model fields, which resets then leave as they are.
+    - ``substep``: memory and lasting_memory. ``advance``: the same of ``s1``.
+
+    An event belongs to the environment's randomness: the transition that was judged ends before it, the observation
+    that follows shows it. It does not run in worlds that restart. Open-loop rollouts and planners leave events out.
+
+    Quaternions in fields are in MuJoCo's order w, x, y, z, and typed ``Row[lw.quat]``. Warp's own quaternion functions
+    expect x, y, z, w and refuse them: use ``lw.quat_rotate``, ``lw.quat_mul``, ``lw.quat_from_axis_angle`` and others.
     """
 
     model: ClassVar[Any]
@@ -198,17 +305,34 @@ class Task:
     """Substeps in a step."""
     obs: ClassVar[Any]
     """The observation's parts and their sizes, in order, as ``{"position": 5, "velocity": 6}``; or a static method of
-    the Params that returns them."""
+    the Params that returns them. A task may have several groups of observations, as ``{"policy": {"position": 5},
+    "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy``, which is ``env.obs``, and
+    ``observe_critic``, with the same arguments, writes the group ``critic``."""
+    metrics: ClassVar[tuple[str, ...]] = ()
+    """Names of the metrics that ``measure`` writes, such as the terms of the reward."""
     horizon: ClassVar[int] = 1000
     """Steps after which an episode is truncated; 0 for never."""
     lagged: ClassVar[tuple[str, ...]] = ()
     """Fields to read as ``mj_step`` leaves them, one substep behind the state, as some Gymnasium tasks do."""
     memory: ClassVar[int] = 0
     """Number of floats in the field ``memory``, which the task writes in ``advance`` and which belongs to the state.
-    ``World`` must list it as ``memory: Row[float]``."""
+    ``World`` must list it as ``memory: Row[float]``. A reset clears it."""
+    lasting_memory: ClassVar[int] = 0
+    """Number of floats in the field ``lasting_memory``, which outlives episodes, for instance the level of a
+    curriculum. It is cleared only when a world's random stream starts, by ``rand_reset(seed=...)``."""
+    actions: ClassVar[Mapping[str, int] | None] = None
+    """The parts of an action and their sizes, as ``{"speed": 1, "turn": 1}``, where actions are not controls;
+    ``control`` then turns them into inputs. None: an action has one number for each control."""
     action_range: ClassVar[tuple[float, float] | None] = None
-    """The range of an action that the default ``control`` scales to the model's control ranges; None: actions are
-    controls."""
+    """The range of an action, which the default ``control`` scales to the model's control ranges; None: actions are
+    controls, or, with ``actions``, have no bounds."""
+    keyframe: ClassVar[str | None] = None
+    """Name of the model's keyframe at which ``reset`` starts, before ``initialize``; None: the model's ``qpos0``."""
+    draws: ClassVar[int] = 10
+    """The most random initial states that a reset draws while ``reject`` returns True; the last is kept."""
+    settle: ClassVar[int] = 0
+    """Substeps in which a new episode settles before its first observation, under the controls of its initial state;
+    its time then starts from 0."""
     planning: ClassVar[Planning] = Planning()
     """The task's settings for MPPI: those of the planner, and options and parameters of its worlds, as
     ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
@@ -220,4 +344,8 @@ class Task:
         super().__init_subclass__(**keywords)
         # now: another task, in a later cell of the same notebook, has the same names
         module = vars(sys.modules[cls.__module__])
-        cls.scope = {name: module[name] for name in ("World", "Params", *FUNCTIONS) if name in module}
+        cls.scope = {
+            name: value
+            for name, value in module.items()
+            if name in ("World", "Params", *FUNCTIONS) or name.startswith(GROUP_PREFIX)
+        }

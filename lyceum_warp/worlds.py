@@ -4,12 +4,15 @@ The order of a step is the list in ``Worlds.step_phases``, and stands nowhere el
 """
 
 import dataclasses
+from collections.abc import Iterable, Iterator
 from functools import partial
+from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import launch_rows, torch_view
+from lyceum_warp.arrays import flat, launch_rows, shared_rows, torch_view
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
@@ -17,7 +20,8 @@ from lyceum_warp.fields import Stage
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.kernels import random, state, steps
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.spaces import COUNTERS, Space, action_space, control_map, state_space
+from lyceum_warp.spaces import Space, action_space, control_ranges, control_scale, state_space
+from lyceum_warp.task import MEMORIES
 from lyceum_warp.validate import check_tensor
 
 
@@ -36,9 +40,16 @@ class Programs:
 def own_bytes_per_world(task: BoundTask) -> int:
     """An estimate of the memory that ``Worlds`` takes for each world beside its engine, in bytes."""
     snapshots = [field for field in task.fields if field.snapshot]
-    state_size = state_space(task.model, snapshots, task.task.memory).size
+    state_size = state_space(task.model, snapshots, task.dynamics, own_parts(task)).size
     copies = sum(field.size for field in task.fields)
-    return 4 * copies + 8 * state_size + 8 * sum(task.obs_layout.values()) + 200
+    observations = sum(sum(layout.values()) for layout in task.obs_layouts.values())
+    return 4 * copies + 8 * state_size + 8 * observations + 200
+
+
+def own_parts(task: BoundTask) -> dict[str, int]:
+    """The parts of a state that ``Worlds`` keeps beside the counters, and their sizes."""
+    sizes = {name: getattr(task.task, name) for name in MEMORIES} | {"metrics": len(task.task.metrics)}
+    return {name: size for name, size in sizes.items() if size}
 
 
 class Worlds:
@@ -65,47 +76,70 @@ class Worlds:
     def _allocate(self) -> None:
         """Make every array; a step, a reset or a restored state makes no other."""
         n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
-        # the fields of the state that a step leads to, live, and copies of those of the state before
         self.memory = wp.zeros((n, task.memory), dtype=float)
+        self.lasting_memory = wp.zeros((n, task.lasting_memory), dtype=float)
+        self.metric_sums = wp.zeros((n, len(task.metrics)), dtype=float)
+        """Sums of the metrics over the episode so far."""
+        self._zeros = {name: wp.zeros_like(getattr(self, name)) for name in ("memory", "lasting_memory", "metric_sums")}
+        # the fields of the state that a step leads to, live, and copies of those of the state before
         self.after, self.before = kernels.Batch(), kernels.Batch()
-        self._pairs: list[tuple[wp.array, wp.array]] = []
+        self._copies: dict[str, wp.array] = {}
+        constant = {f.name: shared_rows(f.value(model), f.dtype, n, self.device) for f in self.task.constants}
+        varied = [field.name for field in self.task.dynamics]
         for name in self.task.types:
-            live = self.memory if name == "memory" else self.engine.arrays[name]
+            live: Any = getattr(self, name) if name in MEMORIES else constant.get(name, self.engine.arrays.get(name))
             self.task.check_field(name, live)
-            copy = wp.zeros_like(live)
             setattr(self.after, name, live)
-            setattr(self.before, name, copy)
-            self._pairs.append((copy, live))
-        self._no_memory = wp.zeros((n, task.memory), dtype=float)
+            if name not in constant and name not in varied:  # no step changes the model
+                self._copies[name] = wp.zeros_like(live)
+            setattr(self.before, name, self._copies.get(name, live))
+        self.fields = {**self.engine.arrays, **constant}
+        """The arrays of all fields of the engine and the model, (nworld, ...), by name."""
+        drawn = [f.name for f in self.task.dynamics if f.name in self.task.writes.get("event", ())]
+        self._model_copies = {name: wp.zeros_like(self.engine.arrays[name]) for name in drawn}
         self.params = self.task.parameters.array(self.device)
 
-        self.action_space = action_space(model, task.action_range)
-        self.obs_space = Space.of(self.task.obs_layout)
-        self.state_space = state_space(model, self.engine.snapshots, task.memory)
+        self.action_space = action_space(model, task.action_range, task.actions)
+        self.obs_spaces = {group: Space.of(layout) for group, layout in self.task.obs_layouts.items()}
+        self.state_space = state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
 
         self.outcome = steps.Outcome()
         self.buffers: dict[str, torch.Tensor] = {}
         for name, dtype in steps.OUTCOMES.items():
-            shape = (n, self.obs_space.size) if name in ("obs", "final_obs") else n
-            array: wp.array = wp.zeros(shape, dtype=dtype)
-            setattr(self.outcome, name, array)
-            self.buffers[name] = torch_view(array)
-        nu = self.action_space.size
-        self.action, self.safe_action = wp.zeros((n, nu), dtype=float), wp.zeros((n, nu), dtype=float)
+            setattr(self.outcome, name, wp.zeros(n, dtype=dtype))
+            self.buffers[name] = torch_view(getattr(self.outcome, name))
+        self.metrics: list[Any] = [wp.zeros((n, len(task.metrics)), dtype=float) for _ in range(2)]
+        """The metrics of the last step, and their sums over its episode."""
+        self.outcome.metrics, self.outcome.episode_metrics = self.metrics
+        self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
+        self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
+        self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
+        naction = self.action_space.size
+        self.action, self.safe_action = wp.zeros((n, naction), dtype=float), wp.zeros((n, naction), dtype=float)
         self.buffers["action"] = torch_view(self.action)
-        ranges, scale = control_map(model, task.action_range)
+        ranges, scale = control_ranges(model), np.zeros((model.nu, 2))
+        if self.task.functions["control"] is None:
+            scale = control_scale(model, task.action_range)
         self.ranges: wp.array = wp.array(ranges, dtype=float)
         self.scale: wp.array = wp.array(scale, dtype=float)
 
-        self.steps, self.episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
-        self.key, self.rng = wp.zeros(n, dtype=wp.uint32), wp.zeros((n, 1), dtype=wp.uint32)
+        self.counters = steps.Counters()
+        self.counters.step, self.counters.episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
+        self.counters.key = wp.zeros(n, dtype=wp.uint32)
+        self.counters.rng = wp.zeros((n, 1), dtype=wp.uint32)  # type: ignore[assignment]
         self._seed = wp.zeros(1, dtype=int)
         self._action_fault, self._no_fault = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
         self.fault_count = wp.zeros(int(FAULTS).bit_length(), dtype=int)
         self.everyone, self.mask = wp.full(n, True, dtype=bool), wp.zeros(n, dtype=bool)
-        self.restarting = wp.zeros(n, dtype=bool)
+        self.restarting, self._drawing = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
+        self._going_on, self._changed = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
         self.state = wp.zeros((n, self.state_space.size), dtype=wp.float64)
         self.mask_view, self.state_view = torch_view(self.mask), torch_view(self.state)
+
+    def _allocate_groups(self, into: Any) -> dict[str, torch.Tensor]:
+        for group, space in self.obs_spaces.items():
+            setattr(into, group, wp.zeros((self.nworld, space.size), dtype=float))
+        return {group: torch_view(getattr(into, group)) for group in self.obs_spaces}
 
     def configure(self, *, horizon: int, autoreset: bool, graphs: bool) -> None:
         """Choose the horizon, whether episodes restart automatically, and whether launches become graphs.
@@ -131,25 +165,58 @@ class Worlds:
 
     def step_phases(self) -> list[Phase]:
         """One step, in order."""
-        phases = [
+        return [
             Phase("act", self.act),
-            Phase("physics", partial(self.engine.step, self.task.frame_skip), engine=True),
+            *self.physics_phases(),
             Phase("judge", self._judge_step),
-            Phase("restart", partial(self._restart, self.restarting, randomly=True)),
-            Phase("refresh", partial(self.engine.refresh, self.restarting), engine=True),
+            *self._restart_phases(self.restarting, randomly=True),
+            *self._event_phases(),
+            *self._refresh_phases(self.restarting),
             Phase("observe", self._observe_restarted),
         ]
-        if self.engine.reset_stage == Stage.NONE:  # no field follows from the state
-            phases = [phase for phase in phases if phase.name != "refresh"]
-        return phases
+
+    def physics_phases(self) -> list[Phase]:
+        """The substeps of a step."""
+        skip = self.task.frame_skip
+        if self.task.kernels.substep_memory is None:
+            return [Phase("physics", partial(self.engine.step, skip), engine=True)]
+        substep = [Phase("physics", partial(self.engine.step, 1), engine=True), Phase("substep", self._substep)]
+        return substep * skip
 
     def reset_phases(self, *, randomly: bool) -> list[Phase]:
         """New episodes in the worlds of ``mask``, in order."""
         return [
-            Phase("restart", partial(self._restart, self.mask, randomly=randomly)),
-            Phase("refresh", partial(self.engine.refresh, self.mask), engine=True),
+            *self._restart_phases(self.mask, randomly=randomly),
+            *self._refresh_phases(self.mask),
             Phase("judge", self._judge_state),
         ]
+
+    def _restart_phases(self, mask: wp.array, *, randomly: bool) -> list[Phase]:
+        """The masked worlds into initial states of the task, whose derived fields are not computed yet."""
+        phases = [Phase("restart", partial(self._restart, mask, randomly=randomly))]
+        if self.task.reset_dynamics:
+            phases.append(Phase("dynamics", partial(self.engine.apply_model, mask), engine=True))
+        if randomly and self.task.kernels.reject_worlds is not None:
+            phases.append(Phase("redraw", partial(self._redraw, mask), engine=True))
+        if settle := self.task.task.settle:
+            phases.append(Phase("settle", partial(self.engine.settle, mask, settle), engine=True))
+        return phases
+
+    def _event_phases(self) -> list[Phase]:
+        """What happens between two steps, in worlds that go on."""
+        if self.task.kernels.run_events is None:
+            return []
+        phases = [Phase("event", self._event)]
+        if any(field.name in self.task.writes["event"] for field in self.task.dynamics):
+            phases.append(Phase("dynamics", partial(self.engine.apply_model, self._changed), engine=True))
+        if self.engine.stage > Stage.NONE:
+            phases.append(Phase("refresh", partial(self.engine.refresh_current, self._changed), engine=True))
+        return phases
+
+    def _refresh_phases(self, mask: wp.array) -> list[Phase]:
+        if self.engine.reset_stage == Stage.NONE:  # no field follows from the state
+            return []
+        return [Phase("refresh", partial(self.engine.refresh, mask), engine=True)]
 
     def read_phases(self) -> list[Phase]:
         """Every world's state into ``state``."""
@@ -174,51 +241,106 @@ class Worlds:
 
     def keep_before(self) -> None:
         """Keep the current state as the one that a transition starts from."""
-        for copy, live in self._pairs:
-            wp.copy(copy, live)
+        for name, copy in self._copies.items():
+            wp.copy(copy, getattr(self.after, name))
 
     def act(self) -> None:
         """Keep the state that the step starts from, and turn actions into controls."""
         self.keep_before()
         wp.launch(self.task.kernels.act, self.nworld, [
-            self.after, self.params, self.action, self.ranges, self.scale, self.steps, self.safe_action,
+            self.after, self.params, self.action, self.ranges, self.scale, self.counters, self.safe_action,
             self._action_fault, self.engine.ctrl,
         ], device=self.device)  # fmt: skip
+
+    def _substep(self) -> None:
+        args = [self.after, self.params]
+        wp.launch(self.task.kernels.substep_memory, self.nworld, args, device=self.device)
 
     def _judge_step(self) -> None:
         """Find faults, advance task memory, and judge the transition."""
         self.engine.find_faults(self.everyone)
-        if (advance := self.task.kernels.advance_memory) is not None:
-            wp.launch(advance, self.nworld, [
-                self.before, self.after, self.params, self.safe_action, self.steps, self.key, self.episode, self.rng,
-            ], device=self.device)  # fmt: skip
+        self.advance_memory()
         keep_reason = not self.autoreset
         self._judge(self.everyone, self.engine.fault, self._action_fault, transition=True, keep_reason=keep_reason)
         wp.launch(steps.count_faults, self.nworld, [self.engine.fault, self.fault_count], device=self.device)
 
+    def advance_memory(self) -> None:
+        """Advance task memory by one step."""
+        if (advance := self.task.kernels.advance_memory) is not None:
+            args = [self.before, self.after, self.params, self.safe_action, self.counters]
+            wp.launch(advance, self.nworld, args, device=self.device)
+
     def _judge(
         self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, keep_reason: bool = False
     ) -> None:
-        """Reward, evaluation, ends and observation of the masked worlds; see ``kernels.steps``."""
+        """Reward, metrics, evaluation, ends and observations of the masked worlds; see ``kernels.steps``."""
         wp.launch(self.task.kernels.judge, self.nworld, [
-            mask, self.before, self.after, self.params, self.safe_action, self.steps, self.horizon, transition,
-            keep_reason, fault, action_fault, self.outcome, self.restarting,
+            mask, self.before, self.after, self.params, self.safe_action, self.counters, self.horizon, transition,
+            keep_reason, fault, action_fault, self.outcome, self.metric_sums, self.obs, self.final_obs,
+            self.restarting,
         ], device=self.device)  # fmt: skip
 
-    def _restart(self, mask: wp.array, *, randomly: bool) -> None:
+    def _restart(self, mask: wp.array, *, randomly: bool, again: bool = False) -> None:
         """Put the masked worlds into an initial state of the task."""
         self.engine.reset(mask)
-        if self.task.task.memory:
-            launch_rows(state.copy_rows, mask, self._no_memory, self.memory)
-        wp.launch(self.task.kernels.restart, self.nworld, [
-            mask, randomly, self.after, self.params, self.key, self.rng, self.steps, self.episode,
-        ], device=self.device)  # fmt: skip
+        self._clear(mask, "memory", *([] if again else ["metric_sums"]))
+        self._make_nominal(mask, self.task.reset_dynamics)
+        args = [mask, randomly, again, self.after, self.params, self.counters]
+        wp.launch(self.task.kernels.restart, self.nworld, args, device=self.device)
         self.engine.commit(mask)
 
+    def _clear(self, mask: wp.array, *names: str) -> None:
+        for name in names:
+            launch_rows(state.copy_rows, mask, self._zeros[name], getattr(self, name))
+
+    def _make_nominal(self, mask: wp.array, names: Iterable[str]) -> None:
+        """Give model fields of the masked worlds their nominal values."""
+        for name in names:
+            launch_rows(state.fill_rows, mask, flat(self.engine.nominal[name])[0], flat(self.engine.arrays[name]))
+
+    def _redraw(self, mask: wp.array) -> None:
+        """Draw initial states of the masked worlds again while the task rejects them."""
+        wp.copy(self._drawing, mask)
+        for _ in range(self.task.task.draws - 1):
+            # on a device that runs behind, the launches go on with an empty mask instead
+            if not self.engine.capturable and not self._drawing.numpy().any():
+                return
+            self.engine.refresh(self._drawing)
+            args = [self._drawing, self.after, self.params, self._drawing]
+            wp.launch(self.task.kernels.reject_worlds, self.nworld, args, device=self.device)
+            self._restart(self._drawing, randomly=True, again=True)
+            if self.task.reset_dynamics:
+                self.engine.apply_model(self._drawing)
+
+    def _event(self) -> None:
+        """Run the events, and find the worlds that they changed."""
+        written = [name for name in self._copies if name in self.task.writes["event"]]
+        live = {name: getattr(self.after, name) for name in written}
+        varied = [field.name for field in self.task.dynamics if field.name in self.task.writes["event"]]
+        for name in written:
+            wp.copy(self._copies[name], live[name])
+        for name in varied:
+            wp.copy(self._model_copies[name], self.engine.arrays[name])
+        wp.launch(self.task.kernels.run_events, self.nworld, [
+            self.restarting, self.after, self.params, self.counters, self._going_on, self._changed,
+        ], device=self.device)  # fmt: skip
+        for name in written:
+            self._mark_changes(self._copies[name], live[name])
+        for name in varied:
+            self._mark_changes(self._model_copies[name], self.engine.arrays[name])
+        self.engine.commit(self._changed)
+
+    def _mark_changes(self, before: wp.array, after: wp.array) -> None:
+        args = [self._going_on, flat(before), flat(after), self._changed]
+        wp.launch(steps.mark_changes, self.nworld, args, device=self.device)
+
     def _observe_restarted(self) -> None:
-        """Observe the worlds that restarted; the others were observed when they were judged."""
-        args = [self.restarting, self.after, self.params, self.outcome.obs]
-        wp.launch(self.task.kernels.observe_worlds, self.nworld, args, device=self.device)
+        """Observe the worlds that restarted or that an event changed; the others were observed when judged."""
+        for mask in (
+            (self.restarting, self._changed) if self.task.kernels.run_events is not None else (self.restarting,)
+        ):
+            args = [mask, self.after, self.params, self.counters, self.obs]
+            wp.launch(self.task.kernels.observe_worlds, self.nworld, args, device=self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Observe and judge the states of the masked worlds, without a transition."""
@@ -232,25 +354,29 @@ class Worlds:
         self.engine.get_state(self.state[:, :size])
         # with automatic resets an end is over with its step, without them it stays
         ended = self._no_fault if self.autoreset else self.outcome.done_reason
-        counters = [self.steps, self.key, self.episode, ended, self.state[:, size:]]
+        own = self.counters
+        counters = [own.step, own.key, own.episode, ended, self.state[:, size:]]
         wp.launch(state.pack_counters, self.nworld, counters, device=self.device)
-        if self.task.task.memory:
-            launch_rows(state.widen, self.everyone, self.memory, self._memory_columns)
+        for array, columns in self._own_parts():
+            launch_rows(state.widen, self.everyone, array, columns)
 
     def _restore_counters(self) -> None:
         self.restore_counters(self.mask, self.state[:, self.engine.state_size :])
-        if self.task.task.memory:
-            launch_rows(state.narrow, self.mask, self._memory_columns, self.memory)
+        for array, columns in self._own_parts():
+            launch_rows(state.narrow, self.mask, columns, array)
 
-    @property
-    def _memory_columns(self) -> wp.array:
-        return self.state[:, self.engine.state_size + len(COUNTERS) :]
+    def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
+        """Arrays that belong to the state beside the engine's and the counters, with their columns."""
+        for name in own_parts(self.task):
+            array = self.metric_sums if name == "metrics" else getattr(self, name)
+            yield array, self.state[:, self.state_space.parts[name]]
 
     # parts of phases, and preparations, for environments and open-loop rollouts
 
     def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
         """Set the masked worlds' counters from columns of states."""
-        counters = [mask, columns, self.steps, self.key, self.episode, self.outcome.done_reason]
+        own = self.counters
+        counters = [mask, columns, own.step, own.key, own.episode, self.outcome.done_reason]
         wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)
 
     def judge_transition(self, action: torch.Tensor) -> None:
@@ -259,10 +385,17 @@ class Worlds:
         self._judge(self.everyone, self._no_fault, self._no_fault, transition=True)
 
     def seed_streams(self, seed: int) -> None:
-        """Restart the random streams of the masked worlds."""
+        """Restart the random streams of the masked worlds, and draw what is drawn once for each stream."""
         self._seed.fill_(seed)
-        args = [self.mask, self._seed, self.first_world, self.key, self.episode]
+        args = [self.mask, self._seed, self.first_world, self.counters.key, self.counters.episode]
         wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
+        self._clear(self.mask, "lasting_memory")
+        if self.task.dynamics:
+            self._make_nominal(self.mask, [field.name for field in self.task.dynamics])
+            if self.task.kernels.start_worlds is not None:
+                args = [self.mask, self.after, self.params, self.counters]
+                wp.launch(self.task.kernels.start_worlds, self.nworld, args, device=self.device)
+            self.engine.apply_model(self.mask)
 
     def set_mask(self, mask: torch.Tensor | None) -> None:
         """Choose the worlds that the next reset or restored state concerns; None for all."""

@@ -6,17 +6,22 @@ import pytest
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp.fields import DERIVED_FIELDS, STATE_FIELDS, Stage, describe, elements, vec10
+from lyceum_warp.fields import DERIVED_FIELDS, STATE_FIELDS, Stage, describe, elements, rows, vec10
 
 XML = """
 <mujoco>
   <worldbody>
+    <site name="here"/>
     <body name="target" mocap="true"><geom size=".1" contype="0" conaffinity="0"/></body>
     <body name="base"><freejoint name="root"/><geom name="hull" size=".1"/><site name="tip"/>
       <body name="arm" pos=".5 0 0"><joint name="elbow"/><geom size=".1"/></body>
     </body>
   </worldbody>
-  <actuator><motor name="turn" joint="elbow"/></actuator>
+  <actuator><orientation name="aim" site="tip" refsite="here" kp="1"/><motor name="turn" joint="elbow"/>
+    <position name="slow" joint="elbow" timeconst=".1"/></actuator>
+  <tendon><fixed name="string"><joint joint="elbow" coef="1"/></fixed></tendon>
+  <equality><joint name="held" joint1="elbow" polycoef="0 0 0 0 0"/></equality>
+  <deformable><flex name="cloth" dim="1" body="base arm" vertex="0 0 0 0 0 0" element="0 1"/></deformable>
   <sensor><framepos name="place" objtype="site" objname="tip"/><accelerometer name="shock" site="tip"/></sensor>
 </mujoco>
 """
@@ -32,11 +37,14 @@ def model() -> mujoco.MjModel:
     [
         ("time", (), wp.float32),
         ("qpos", (8,), wp.float32),
-        ("site_xpos", (1,), wp.vec3),
-        ("xquat", (4,), wp.quat),
+        ("site_xpos", (2,), wp.vec3),
+        ("xquat", (4,), lw.quat),
         ("xmat", (4,), wp.mat33),
         ("cvel", (4,), wp.spatial_vector),
         ("cinert", (4,), vec10),
+        ("eq_active", (1,), wp.bool),
+        ("flexvert_xpos", (2,), wp.vec3),
+        ("energy", (2,), wp.float32),
     ],
 )
 def test_a_field_has_mujocos_shape_with_vectors_as_elements(
@@ -93,9 +101,26 @@ def test_a_field_that_only_a_sensor_computes_is_refused_without_one(name: str, m
         ("qfrc_applied", "elbow", slice(6, 7)),
         ("xpos", "arm", slice(3, 4)),
         ("geom_xpos", "hull", slice(1, 2)),
-        ("site_xmat", "tip", slice(0, 1)),
+        ("site_xmat", "tip", slice(1, 2)),
         ("xanchor", "elbow", slice(1, 2)),
-        ("ctrl", "turn", slice(0, 1)),
+        ("ctrl", "aim", slice(0, 3)),
+        ("ctrl", "turn", slice(3, 4)),
+        ("actuator_force", "turn", slice(3, 4)),
+        ("actuator_gear", "aim", slice(0, 3)),
+        ("actuator_gainprm", "turn", slice(1, 2)),
+        ("actuator_ctrlrange", "turn", slice(3, 4)),
+        ("act", "slow", slice(0, 1)),
+        ("ten_length", "string", slice(0, 1)),
+        ("tendon_stiffness", "string", slice(0, 1)),
+        ("eq_active", "held", slice(0, 1)),
+        ("eq_solref", "held", slice(0, 1)),
+        ("flexvert_xpos", "cloth", slice(0, 2)),
+        ("body_mass", "arm", slice(3, 4)),
+        ("geom_friction", "hull", slice(1, 2)),
+        ("dof_damping", "root", slice(0, 6)),
+        ("jnt_range", "elbow", slice(1, 2)),
+        ("qpos0", "elbow", slice(7, 8)),
+        ("site_pos", "tip", slice(1, 2)),
         ("sensordata", "shock", slice(3, 6)),
         ("mocap_pos", "target", slice(0, 1)),
     ],
@@ -106,14 +131,22 @@ def test_a_named_element_has_its_place_in_the_field(
     assert elements(model, name, element) == where
 
 
+def test_an_axis_is_as_long_as_its_field(model: mujoco.MjModel) -> None:
+    assert [rows(model, name) for name in ("xpos", "ctrl", "actuator_force", "actuator_gainprm", "jnt_range")] == [
+        4, 5, 5, 3, 2
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("name", "element", "message"),
     [
-        ("site_xpos", "hand", "the model has no site 'hand' for the field 'site_xpos'; it has: tip"),
+        ("site_xpos", "hand", "the model has no site 'hand' for the field 'site_xpos'; it has: here, tip"),
         ("qpos", "knee", "the model has no joint 'knee' for the field 'qpos'; it has: elbow, root"),
         ("cam_xpos", "eye", "the model has no camera 'eye' for the field 'cam_xpos'; it has: none"),
         ("mocap_pos", "arm", "the body 'arm' is .* mocap body, so it has no 'mocap_pos'"),
         ("time", "noon", "the field 'time' has no named elements"),
+        ("gravity", "down", "the field 'gravity' has no named elements"),
+        ("act", "turn", "the actuator 'turn' has no 'act'"),
     ],
 )
 def test_an_element_that_is_not_there_is_refused(name: str, element: str, message: str, model: mujoco.MjModel) -> None:

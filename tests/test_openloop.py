@@ -299,6 +299,34 @@ def test_parameters_may_change_between_rollouts(engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("task", [Forgetful, Servo])
+def test_worlds_draw_from_keys_of_their_own_if_given(task: type[lw.Task], engine: str) -> None:
+    """What they draw is what stepping draws from states with these keys."""
+    env = lw.make(task, engine=engine, nworld=4, autoreset=False)
+    numbers = np.array([5, 2**32 - 1, 77, 1234567890], dtype=np.uint32)
+    keys = wp.zeros(4, dtype=wp.uint32, device="cpu")
+    loop = OpenLoop(lw.make(task, engine=engine, nworld=4, autoreset=False), 4, keys=keys)
+    state, actions = some_state(env, 1), random_actions(env, 4, 2)
+    for turn in range(2):
+        keys.assign(np.roll(numbers, turn))
+        found = run(loop, state, actions)
+        states = state.repeat(4, 1)
+        states[:, env.state_space.parts["key"]] = torch.from_numpy(keys.numpy().astype(np.float64))[:, None]
+        env.set_state(states)
+        for t, action in enumerate(actions):
+            env.step(action)
+            assert torch.equal(found["reward"][t], env.reward)
+        assert torch.equal(found["final_obs"], env.final_obs)
+
+
+def test_keys_that_do_not_fit_are_refused(shared_env: SharedEnv) -> None:
+    env = shared_env("point_mass", nworld=2, autoreset=False)
+    for wrong in (wp.zeros(3, dtype=wp.uint32, device="cpu"), wp.zeros(2, dtype=int, device="cpu")):
+        with pytest.raises(ValueError, match=r"keys must be a wp.array of shape \(2,\) and type uint32 on cpu, not of"):
+            OpenLoop(env, 3, keys=wrong)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 def test_terminated_is_judged_for_each_state_alone(engine: str) -> None:
     """The arm swings out and back in; only the states outside count as ends."""
     loop = rollouts(Forgetful, 40, engine=engine, nworld=2, bound=0.05)

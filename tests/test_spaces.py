@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lyceum_warp.fields import describe
-from lyceum_warp.spaces import COUNTERS, Space, action_space, control_map, control_ranges, state_space
+from lyceum_warp.spaces import COUNTERS, Space, action_space, control_ranges, control_scale, state_space
 
 XML = """
 <mujoco>
@@ -54,6 +54,29 @@ def test_actions_have_the_actuators_names_and_ranges() -> None:
     assert space.low.dtype == np.float32
 
 
+MANY = """
+<mujoco>
+  <worldbody>
+    <site name="here"/>
+    <body><joint name="a" type="ball"/><geom size=".1"/><site name="tip"/></body>
+    <body><joint name="b"/><geom size=".1"/></body>
+  </worldbody>
+  <actuator>
+    <motor name="actuator_2" joint="b"/>
+    <orientation name="aim" site="tip" refsite="here" kp="1"/>
+    <motor joint="b"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_an_actuator_has_as_many_actions_as_controls_and_a_name_of_its_own() -> None:
+    space = action_space(mujoco.MjModel.from_xml_string(MANY), None)
+    assert space.parts == {"actuator_2": slice(0, 1), "aim": slice(1, 4), "actuator_2_": slice(4, 5)}
+    assert space.low is not None
+    assert space.low.shape == space.shape == (5,)
+
+
 def test_actions_without_a_range_are_unbounded() -> None:
     space = action_space(model(""), None)
     assert space.low is not None and space.high is not None
@@ -66,26 +89,32 @@ def test_an_action_range_replaces_the_control_ranges() -> None:
     assert (space.low.tolist(), space.high.tolist()) == ([-1.0, -1.0], [1.0, 1.0])
 
 
-def test_control_map_keeps_actions_without_an_action_range() -> None:
-    ranges, scale = control_map(model(""), None)
-    np.testing.assert_array_equal(ranges, control_ranges(model("")))
-    np.testing.assert_array_equal(scale, [[1.0, 0.0], [1.0, 0.0]])
+def test_control_scale_keeps_actions_without_an_action_range() -> None:
+    np.testing.assert_array_equal(control_scale(model(""), None), [[1.0, 0.0], [1.0, 0.0]])
 
 
-def test_control_map_takes_the_ends_of_an_action_range_to_those_of_the_controls() -> None:
-    ranges, scale = control_map(model(), (-1.0, 3.0))
+def test_control_scale_takes_the_ends_of_an_action_range_to_those_of_the_controls() -> None:
+    ranges, scale = control_ranges(model()), control_scale(model(), (-1.0, 3.0))
     for action, bound in ((-1.0, ranges[:, 0]), (3.0, ranges[:, 1])):
         np.testing.assert_allclose(scale[:, 0] * action + scale[:, 1], bound)
 
 
+def test_actions_of_a_task_have_bounds_only_with_an_action_range() -> None:
+    space = action_space(model(), (-2.0, 2.0), {"speed": 1, "turn": 2})
+    assert space.parts == {"speed": slice(0, 1), "turn": slice(1, 3)}
+    np.testing.assert_array_equal([space.low, space.high], [[-2.0] * 3, [2.0] * 3])
+    free = action_space(model(), None, {"speed": 1})
+    np.testing.assert_array_equal([free.low, free.high], [[-np.inf], [np.inf]])
+
+
 def test_an_action_range_needs_a_range_of_every_control() -> None:
     with pytest.raises(ValueError, match=r"gives none to the controls \[1\]: set their ctrlrange, or leave action_ra"):
-        control_map(model(""), (-1.0, 1.0))
+        control_scale(model(""), (-1.0, 1.0))
 
 
 def test_a_state_holds_the_integration_state_snapshots_counters_and_memory() -> None:
     compiled = model()
-    space = state_space(compiled, [describe(compiled, "qacc")], memory=4)
+    space = state_space(compiled, [describe(compiled, "qacc")], [], {"memory": 4})
     assert space.dtype == torch.float64
     sizes = {name: part.stop - part.start for name, part in space.parts.items()}
     assert {name: sizes[name] for name in ("time", "qpos", "qvel", "ctrl", "mocap_pos", "userdata", "qacc")} == {

@@ -3,7 +3,8 @@
 Each call improves a plan, a sequence of actions u_t, from the state that it is given:
 
 1. shift: the plan of the last call moves forward in time, and its end is filled;
-2. perturb: sample k adds smoothed noise e_t^k to the plan and is clipped to the actions' bounds;
+2. perturb: sample k adds smoothed noise e_t^k to the plan and is clipped to the actions' bounds; it gets a random
+   stream of its own, for what the task draws in it;
 3. roll out: each sample earns the return R_k, its discounted rewards and the value of the state where it ends;
 4. weigh: w_k = exp((R_k - max R) / temperature), divided by their sum;
 5. average: the new plan is u_t = sum_k w_k u_t^k.
@@ -49,7 +50,8 @@ class MPPI:
     The planner simulates in worlds of its own, one for each sample. It controls a plant: an environment, with
     ``plan(env.get_state()[0])``, or a robot, with ``plan(plan.state_of(qpos=..., qvel=..., time=...))``. The plant's
     model, time step and parameters may differ from the planner's. Randomness is counted: a plan depends on the seed,
-    on the number of plans before it, and on the plan to start from.
+    on the number of plans before it, and on the plan to start from. What a task draws in its functions, every sample
+    draws for itself, from the planner's seed: a plan does not know what the plant will draw.
 
     A task's ``planning`` (see ``lw.Planning``) gives settings of the planner, and options and parameters of its
     worlds. Arguments replace what the task gives.
@@ -113,7 +115,9 @@ class MPPI:
         self.env.reset()
         self.timestep = self.env.timestep
         self._initial = self.env.get_state()[0]
-        self._loop = OpenLoop(self.env, self.horizon)
+        with wp.ScopedDevice(self.env.device):
+            self._keys = wp.zeros(self.samples, dtype=wp.uint32)
+        self._loop = OpenLoop(self.env, self.horizon, keys=self._keys, nominal_model=self.config.nominal_model)
         self._allocate()
         self.value = moved(value, self.env) if isinstance(value, ValueFunction) else value
         self._value_kernel = planning.value_kernel(value) if isinstance(value, wp.Function) else None
@@ -203,6 +207,7 @@ class MPPI:
         else:
             wp.copy(self._nominal, self._plan)
         wp.launch(planning.draw_noise, dim, [self._seed, self._count, self._noise], device=device)
+        wp.launch(planning.draw_keys, self.samples, [self._seed, self._count, self._keys], device=device)
         wp.launch(planning.count_up, 1, [self._count], device=device)
         noise = [self._noise, self._scale, self._diagonal, self._smoothing]
         bounds = [self._low, self._high]

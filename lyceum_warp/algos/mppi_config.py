@@ -49,6 +49,9 @@ class MPPIConfig:
     termination: Literal["stop", "ignore"] = "stop"
     """Whether a sample whose episode ends earns nothing afterwards ("stop"), or goes on ("ignore", as Lyceum and
     trajopt do)."""
+    nominal_model: bool = False
+    """Whether samples have the nominal values of model fields that differ between worlds, or those of the state to
+    plan from (default)."""
 
     def __post_init__(self) -> None:
         """Check everything that does not depend on the task."""
@@ -63,6 +66,8 @@ class MPPIConfig:
         checked["fill"] = _fill(self.fill)
         if not isinstance(self.termination, str) or self.termination not in ("stop", "ignore"):
             raise ValueError(f"termination must be 'stop' or 'ignore', not {self.termination!r}")
+        if not isinstance(self.nominal_model, bool):
+            raise ValueError(f"nominal_model must be True or False, not {self.nominal_model!r}")
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 

@@ -15,13 +15,15 @@ from lyceum_warp.binding.codegen import kernels_of
 from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
-from lyceum_warp.fields import Field, describe, vec10
+from lyceum_warp.binding.writes import Rights, check_writes, written_fields
+from lyceum_warp.fields import INITIAL, INPUTS, Field, describe, is_data_field, vec10
+from lyceum_warp.model_fields import describe_model_field, is_model_field
 from lyceum_warp.options import ModelSource, PhysicsOptions
-from lyceum_warp.task import FUNCTIONS, Task
+from lyceum_warp.task import FUNCTIONS, MEMORIES, RESULTS, Task, TaskFunction, observer_name
 from lyceum_warp.validate import whole_number
 
 _SPELLED = {
-    "float32": "float", "int32": "int", "vec3f": "wp.vec3", "quatf": "wp.quat", "mat33f": "wp.mat33",
+    "float32": "float", "int32": "int", "vec3f": "wp.vec3", "vec4f": "lw.quat", "mat33f": "wp.mat33",
     "spatial_vectorf": "wp.spatial_vector",
 }  # fmt: skip
 
@@ -46,6 +48,7 @@ class BoundTask:
         nworld: Number of worlds, for parameters that differ between them.
         model: Another model than the task's own.
         fields: Fields that the engine keeps beside those of the task.
+        dynamics: Model fields that may differ between worlds beside those that the task writes.
         physics: How the worlds are simulated.
         params: Values for the fields of ``Params``; for a scalar also one value a world.
 
@@ -61,6 +64,7 @@ class BoundTask:
         *,
         model: ModelSource | None = None,
         fields: Collection[str] = (),
+        dynamics: Collection[str] = (),
         physics: PhysicsOptions | None = None,
         params: Mapping[str, Any] | None = None,
     ) -> None:
@@ -71,27 +75,89 @@ class BoundTask:
         self.functions = self.source.functions
         self.types = {name: variable.type for name, variable in self.source.world.vars.items()}
         self._check_class(model)
-        own = [name for name in self.types if name != "memory"]
-        spec = task_spec(task, model)
-        self.model = models.compile_model(spec, [*own, *fields], physics)
-        if self.model.nu == 0:
-            raise ValueError(f"the model of the task {self.name!r} has no actuators, so there is nothing to act on")
+        named = [name for name in dict.fromkeys([*self.types, *fields]) if name not in MEMORIES]
+        self.writes = self._checked_writes()
+        """The fields of World that each function writes, by the functions' names."""
+        own = [name for name in named if is_data_field(name) or not is_model_field(name)]
+        of_model = [name for name in named if name not in own]
+        self.spec = task_spec(task, model)
+        """The model as it was read: other environments of the same task are made from it, not from its source."""
+        self.model = models.compile_model(self.spec.copy(), own, physics, varied={*of_model, *dynamics})
+        self._check_actions()
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.frame_skip = whole_number(f"frame_skip of the task {self.name!r}", skip, low=1)
         self.timestep: float = self.model.opt.timestep * self.frame_skip
-        names = dict.fromkeys([*own, *fields, "time", "ctrl"])
-        self.fields: list[Field] = [describe(self.model, name, lagged=name in task.lagged) for name in names]
+        inputs = self.writes.get("control", frozenset())
+        self.fields: list[Field] = [
+            describe(self.model, name, lagged=name in task.lagged, written=name in inputs)
+            for name in dict.fromkeys([*own, "time", "ctrl"])
+        ]
         """The fields that the engine keeps: the task's own, further ones, time and controls."""
+        self._sort_model_fields(of_model, dynamics)
+        self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
+        """The integration state at which a reset starts, (integration_size,) float64; None for the model's own."""
         self.parameters = Parameters(
             self.source.params, self.name, self.model, nworld=nworld, timestep=self.timestep, given=params or {}
         )
-        self.obs_layout = self._layout()
-        self.kernels = kernels_of(self.source)
+        self.obs_layouts = self._layouts()
+        """The parts of each group of observations and their sizes."""
+        self.observers = self.source.group_functions(self.obs_layouts)
+        """The functions that write the groups of observations, by the groups' names."""
+        observers = {observer_name(group): function for group, function in self.observers.items()}
+        check_writes(self.name, observers, dict.fromkeys(observers, self._rights(FUNCTIONS["observe"])))
+        self.kernels = kernels_of(self.source, self.observers)
 
     @property
     def params(self) -> dict[str, Any]:
         """The parameters' values by name; arrays where they differ between worlds."""
         return self.parameters.values
+
+    @property
+    def has_noise(self) -> bool:
+        """Whether an observation draws random numbers."""
+        return any(len(function.input_types) > len(FUNCTIONS["observe"].kinds) for function in self.observers.values())
+
+    @property
+    def obs_layout(self) -> dict[str, int]:
+        """The parts of the policy's observation and their sizes."""
+        return self.obs_layouts["policy"]
+
+    def _checked_writes(self) -> dict[str, frozenset[str]]:
+        written = {name: function for name, function in self.functions.items() if function is not None}
+        check_writes(self.name, written, {name: self._rights(function) for name, function in FUNCTIONS.items()})
+        return {name: written_fields(function) for name, function in written.items()}
+
+    def _rights(self, function: TaskFunction) -> Rights:
+        """What a function may write, by its arguments."""
+        model = [name for name in self.types if is_model_field(name)]
+        groups = {"inputs": INPUTS, "memory": MEMORIES, "model": model, "start": (*INITIAL, *MEMORIES, *model)}
+        return {
+            name: None if name in RESULTS else groups.get(function.writes.get(name, ""), ())
+            for name in function.argument_names
+        }
+
+    def _sort_model_fields(self, named: list[str], dynamics: Collection[str]) -> None:
+        """Sort the model fields into those that differ between worlds and those that are the model's own."""
+        drawn = {name: self.writes.get(name, frozenset()) for name in ("startup", "initialize", "randomize", "event")}
+        self.reset_dynamics = [name for name in named if name in drawn["initialize"] | drawn["randomize"]]
+        """Names of the model fields that a reset writes, which get their nominal values back before."""
+        if both := [name for name in self.reset_dynamics if name in drawn["startup"]]:
+            raise ValueError(
+                f"the model field {both[0]!r} of the task {self.name!r} is drawn by startup and at resets: draw it in "
+                "one of them"
+            )
+        written = frozenset().union(dynamics, *drawn.values())
+        varied = [name for name in dict.fromkeys([*named, *dynamics]) if name in written]
+        self.dynamics = [describe_model_field(self.model, name) for name in varied]
+        """The model fields that differ between worlds."""
+        self.constants = [describe_model_field(self.model, name, varies=False) for name in named if name not in varied]
+        """The model fields that functions read and that are the same in every world."""
+        drawn_constants = [field.name for field in self.dynamics if field.constants]
+        if drawn_constants and (stale := [field.name for field in self.constants if field.follows]):
+            raise ValueError(
+                f"the task {self.name!r} reads {stale[0]!r}, which follows from {drawn_constants[0]!r} and so differs "
+                "between worlds: read the fields that it follows from instead"
+            )
 
     def change_params(self, params: Mapping[str, Any]) -> None:
         """Change parameters.
@@ -102,7 +168,7 @@ class BoundTask:
         previous = self.parameters.values
         self.parameters.values = self.parameters.checked(params)
         try:
-            same = self._layout() == self.obs_layout
+            same = self._layouts() == self.obs_layouts
         except ValueError:  # one value a world, where the layout needs a single one
             same = False
         if not same:
@@ -111,8 +177,13 @@ class BoundTask:
 
     def _check_class(self, model: ModelSource | None) -> None:
         task = self.task
-        if ("memory" in self.types) != (task.memory > 0):
-            raise ValueError(f"the task {self.name!r} needs both, memory = ... in the class and memory in World")
+        for name in MEMORIES:
+            size = whole_number(f"{name} of the task {self.name!r}", getattr(task, name), low=0)
+            if (name in self.types) != (size > 0):
+                raise ValueError(f"the task {self.name!r} needs both, {name} = ... in the class and {name} in World")
+        whole_number(f"draws of the task {self.name!r}", task.draws, low=1)
+        whole_number(f"settle of the task {self.name!r}", task.settle, low=0)
+        self._check_metrics()
         for name in task.lagged:
             if name not in self.types:
                 raise ValueError(f"the task {self.name!r} wants {name!r} lagged but does not list it in World")
@@ -131,12 +202,56 @@ class BoundTask:
                     f"not {task.action_range!r}"
                 )
 
-    def _layout(self) -> dict[str, int]:
-        """The observation's parts and their sizes, for the parameters as they are."""
+    def _check_metrics(self) -> None:
+        metrics: Any = self.task.metrics
+        if isinstance(metrics, str) or not all(isinstance(name, str) and name for name in metrics):
+            raise ValueError(
+                f"metrics of the task {self.name!r} must be names, as ('forward', 'cost'), not {metrics!r}"
+            )
+        if twice := [name for name in metrics if list(metrics).count(name) > 1]:
+            raise ValueError(f"the task {self.name!r} names the metric {twice[0]!r} twice: give each one name")
+        if bool(metrics) != (self.functions["measure"] is not None):
+            raise ValueError(
+                f"the task {self.name!r} needs both, metrics = (...) in the class and {FUNCTIONS['measure'].signature}"
+            )
+
+    def _check_actions(self) -> None:
+        actions = self.task.actions
+        if actions is None:
+            if self.model.nu == 0:
+                raise ValueError(
+                    f"the model of the task {self.name!r} has no actuators, so there is nothing to act on: add some, "
+                    "or give the task actions = {...} and a control that writes inputs"
+                )
+            return
+        if not isinstance(actions, Mapping) or not actions:
+            raise ValueError(
+                f"actions of the task {self.name!r} must be names with sizes, as {{'speed': 1}}, not {actions!r}"
+            )
+        for name, size in actions.items():
+            whole_number(f"the size of the action {name!r} of the task {self.name!r}", size, low=1)
+        if self.functions["control"] is None:
+            raise ValueError(
+                f"the task {self.name!r} has actions of its own, so it needs {FUNCTIONS['control'].signature}"
+            )
+
+    def _layouts(self) -> dict[str, dict[str, int]]:
+        """The parts of each group of observations and their sizes, for the parameters as they are."""
         params = SimpleNamespace(**self.params)
-        layout = self.task.obs(params) if callable(self.task.obs) else self.task.obs
-        if not isinstance(layout, Mapping):
-            raise ValueError(f"obs of the task {self.name!r} is {layout!r}: add {_MISSING['obs']}")
+        given = self.task.obs(params) if callable(self.task.obs) else self.task.obs
+        if not isinstance(given, Mapping) or not given:
+            raise ValueError(f"obs of the task {self.name!r} is {given!r}: add {_MISSING['obs']}")
+        grouped = [isinstance(part, Mapping) for part in given.values()]
+        if not any(grouped):
+            given = {"policy": given}
+        elif not all(grouped) or "policy" not in given:
+            raise ValueError(
+                f"obs of the task {self.name!r} must name parts with sizes, or groups of them, of which one is "
+                f"'policy', not {given!r}"
+            )
+        return {group: self._layout(layout) for group, layout in given.items()}
+
+    def _layout(self, layout: Mapping[str, Any]) -> dict[str, int]:
         if per_world := [name for name, size in layout.items() if np.ndim(size)]:
             raise ValueError(f"obs of the task {self.name!r} differs between worlds in {per_world}: give one value")
         return {name: int(size) for name, size in layout.items() if size}
@@ -157,6 +272,10 @@ class BoundTask:
             )
         lines = [line.strip(" ;") for line in text.splitlines() if line.strip(" ;")]
         hint = ": a function returns one number, not a tuple" if "tuple_t" in text else ""
+        if re.search(r"overload for '(quat\w*|mul)' .*\bvec4f\b", flat):
+            hint = (
+                ": quaternions are w, x, y, z here: use lw.quat_rotate, lw.quat_mul, ... in place of Warp's functions"
+            )
         return ValueError(f"Warp can't compile the functions of the task {self.name!r}: {' '.join(lines[-3:])}{hint}")
 
     def check_field(self, name: str, array: wp.array) -> None:
@@ -172,27 +291,34 @@ class BoundTask:
             wanted = _SPELLED.get(element, element) if array.ndim == 1 else f"Row[{_SPELLED.get(element, element)}]"
             raise ValueError(f"World.{name} of the task {self.name!r} must be declared as {wanted}")
 
-    def check_observation(self, batch: Any, params: wp.array) -> None:
-        """Let ``observe`` write into a row with room to spare, where a mistake cannot damage other memory.
+    def check_observations(self, batch: Any, params: wp.array, counters: Any) -> None:
+        """Let every group of observations be written into a row with room to spare, where no mistake can do damage.
 
         Raises:
-            ValueError: It writes more or fewer numbers than ``obs`` declares, or writes not-a-number.
+            ValueError: A function writes more or fewer numbers than ``obs`` declares, or writes not-a-number.
         """
-        nobs = sum(self.obs_layout.values())
         device = params.device
         mask = wp.full(1, True, dtype=bool, device=device)
-        written = np.zeros(nobs + 64, dtype=bool)
+        sizes = {group: sum(layout.values()) for group, layout in self.obs_layouts.items()}
+        written = {group: np.zeros(size + 64, dtype=bool) for group, size in sizes.items()}
         for unwritten in (math.nan, _UNWRITTEN):
-            row = wp.full((1, nobs + 64), unwritten, dtype=float, device=device)
-            wp.launch(self.kernels.observe_worlds, 1, [mask, batch, params, row], device=device)
-            found = row.numpy()[0]
-            written |= ~np.isnan(found) if math.isnan(unwritten) else found != np.float32(unwritten)
-        if written[nobs:].any():
+            rows = self.kernels.Observations()
+            for group, size in sizes.items():
+                setattr(rows, group, wp.full((1, size + 64), unwritten, dtype=float, device=device))
+            wp.launch(self.kernels.observe_worlds, 1, [mask, batch, params, counters, rows], device=device)
+            found = {group: getattr(rows, group).numpy()[0] for group in sizes}
+            for group, row in found.items():
+                written[group] |= ~np.isnan(row) if math.isnan(unwritten) else row != np.float32(unwritten)
+        for group, size in sizes.items():
+            self._check_written(observer_name(group), written[group], size, np.isnan(found[group][:size]))
+
+    def _check_written(self, name: str, written: np.ndarray, size: int, bad: np.ndarray) -> None:
+        if written[size:].any():
             last = int(np.flatnonzero(written).max()) + 1
-            raise ValueError(f"observe of the task {self.name!r} writes {last} numbers, but obs declares {nobs}")
-        if not written[:nobs].all():
-            places = np.flatnonzero(~written[:nobs]).tolist()
-            raise ValueError(f"observe of the task {self.name!r} leaves the places {places} of obs unwritten")
-        if np.isnan(found[:nobs]).any():
-            places = np.flatnonzero(np.isnan(found[:nobs])).tolist()
-            raise ValueError(f"observe of the task {self.name!r} writes not-a-number into the places {places} of obs")
+            raise ValueError(f"{name} of the task {self.name!r} writes {last} numbers, but obs declares {size}")
+        if not written[:size].all():
+            places = np.flatnonzero(~written[:size]).tolist()
+            raise ValueError(f"{name} of the task {self.name!r} leaves the places {places} of obs unwritten")
+        if bad.any():
+            places = np.flatnonzero(bad).tolist()
+            raise ValueError(f"{name} of the task {self.name!r} writes not-a-number into the places {places} of obs")

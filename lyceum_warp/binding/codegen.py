@@ -6,12 +6,14 @@ one more axis, a view of world w in it, and default functions. It is text, becau
 
 import linecache
 import re
+from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from lyceum_warp.binding.functions import TaskSource
-from lyceum_warp.kernels import steps
+from lyceum_warp.kernels import random, steps
 from lyceum_warp.task import FUNCTIONS, Row, Task, TaskFunction
 
 _BATCH = """
@@ -25,23 +27,48 @@ def view(batch: Batch, w: int) -> World:
     s = World()
 {rows}
     return s
+
+
+@wp.struct
+class Observations:
+{groups}
+
+
+@wp.func
+def observe_groups(s: World, p: Params, out: Observations, w: int, base: wp.uint32, rng: Row[wp.uint32]):
+{observe}
+
+
+@wp.func
+def all_finite(out: Observations, w: int) -> bool:
+    finite = bool(True)
+{finite}
+    return finite
+
+
+@wp.func
+def copy_observations(source: Observations, target: Observations, w: int):
+{copy}
 """
 
 _kernels: dict[Any, Any] = {}
 _module_names: list[str] = []
 
 
-def kernels_of(source: TaskSource) -> Any:
-    """The kernels of a task, made once for the same functions and structs; see ``kernels.steps.make_kernels``."""
-    key = (source.world, source.params, tuple(source.functions.values()))
+def kernels_of(source: TaskSource, groups: Mapping[str, wp.Function]) -> Any:
+    """The kernels of a task, made once for the same functions and structs; see ``kernels.steps.make_kernels``.
+
+    Args:
+        source: The task's structs and functions.
+        groups: The functions that write its groups of observations.
+    """
+    key = (source.world, source.params, tuple(source.functions.values()), tuple(groups.items()))
     if key not in _kernels:
-        scope = _generated(source)
+        scope = _generated(source, groups)
         functions = {name: function or scope[f"no_{name}"] for name, function in source.functions.items()}
         written = [name for name, function in source.functions.items() if function is not None]
         module = _module_name(source.task)
-        _kernels[key] = steps.make_kernels(
-            scope["Batch"], scope["view"], source.params, functions, written, module=module
-        )
+        _kernels[key] = steps.make_kernels(SimpleNamespace(**scope), functions, written, module=module)
     return _kernels[key]
 
 
@@ -53,8 +80,8 @@ def _module_name(task: type[Task]) -> str:
     return re.sub(r"[^\w.]", "_", _module_names[-1])
 
 
-def _generated(source: TaskSource) -> dict[str, Any]:
-    """The scope of the generated source after it has run: Batch, view and the default functions."""
+def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[str, Any]:
+    """The scope of the generated source after it has run: structs, functions around the task's, and defaults."""
     scope: dict[str, Any] = {"wp": wp, "Row": Row, "World": source.world, "Params": source.params}
     batch, rows = [], []
     for name, variable in source.world.vars.items():
@@ -63,7 +90,24 @@ def _generated(source: TaskSource) -> dict[str, Any]:
         scope[f"type_{name}"] = wp.array(dtype=dtype, ndim=ndim)
         batch.append(f"    {name}: type_{name}")
         rows.append(f"    s.{name} = batch.{name}[w]")
-    parts = [_BATCH.format(batch="\n".join(batch), rows="\n".join(rows))]
+    scope |= {"substream": random.substream, "finite_row": steps.finite_row, "copy_row": steps.copy_row}
+    observe = []
+    for number, (group, function) in enumerate(groups.items()):
+        scope[f"observe_{number}"] = function
+        noisy = len(function.input_types) > len(FUNCTIONS["observe"].kinds)
+        if noisy:  # a stream for each group, so that no group's draws depend on another's
+            observe.append(f"rng[0] = substream(base, {number})")
+        observe.append(f"observe_{number}(s, p, out.{group}[w]{', rng' if noisy else ''})")
+    blocks = {
+        "batch": batch,
+        "rows": rows,
+        "groups": [f"    {group}: type_group" for group in groups],
+        "observe": [f"    {line}" for line in observe],
+        "finite": [f"    finite = finite and finite_row(out.{group}[w])" for group in groups],
+        "copy": [f"    copy_row(source.{group}[w], target.{group}[w])" for group in groups],
+    }
+    scope["type_group"] = wp.array2d(dtype=float)
+    parts = [_BATCH.format(**{name: "\n".join(lines) for name, lines in blocks.items()})]
     parts += [_default(function) for function in FUNCTIONS.values() if function.default is not None]
     text = "\n".join(parts)
     task = source.task

@@ -1,15 +1,17 @@
 """A task's structs and functions: found in its class or module, and checked against the table in ``task.FUNCTIONS``."""
 
 import ast
+import dataclasses
 import difflib
 import inspect
 import sys
 import textwrap
+from collections.abc import Collection
 from typing import Any
 
 import warp as wp
 
-from lyceum_warp.task import FUNCTIONS, Task
+from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, Task, TaskFunction, observer_name
 
 
 class TaskSource:
@@ -28,10 +30,36 @@ class TaskSource:
         self.task, self.name = task, name
         self.world: Any = self._struct("World")
         self.params: Any = self._struct("Params")
-        self.functions: dict[str, wp.Function | None] = {name: self._function(name) for name in FUNCTIONS}
+        self.functions: dict[str, wp.Function | None] = {
+            name: self._function(wanted) for name, wanted in FUNCTIONS.items()
+        }
+        """The task's functions by the names of the table; None for those that it does not have."""
         if self.functions["observe"] is None:
             raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), the one function it needs")
         self._check_names()
+
+    def group_functions(self, groups: Collection[str]) -> dict[str, wp.Function]:
+        """The functions that write groups of observations, by the groups' names.
+
+        Raises:
+            ValueError: No function writes a group, or a function writes a group that is not listed.
+        """
+        found = {}
+        for group in groups:
+            wanted = dataclasses.replace(FUNCTIONS["observe"], name=observer_name(group))
+            function = self._function(wanted)
+            if function is None:
+                raise ValueError(
+                    f"no function of the task {self.name!r} writes the group {group!r} of its observations: add "
+                    f"{wanted.signature}"
+                )
+            found[group] = function
+        for name, value in vars(self.task).items():
+            if name.startswith(GROUP_PREFIX) and isinstance(value, wp.Function | staticmethod):
+                group = name.removeprefix(GROUP_PREFIX)
+                if group not in groups:
+                    raise ValueError(f"obs of the task {self.name!r} has no group {group!r}, which {name} writes")
+        return found
 
     def _written(self, name: str) -> Any:
         """The value of a name in the class, in its module, or in those of the classes that it extends."""
@@ -50,11 +78,11 @@ class TaskSource:
             raise ValueError(f"the task {self.name!r} needs a @wp.struct named {name} in its module")
         return struct
 
-    def _function(self, name: str) -> wp.Function | None:
+    def _function(self, wanted: TaskFunction) -> wp.Function | None:
+        name = wanted.name
         function = self._written(name)
         if function is None:
             return None
-        wanted = FUNCTIONS[name]
         if not isinstance(function, wp.Function):
             raise ValueError(f"{name} of the task {self.name!r} must be a @wp.func, not {function!r}")
         types = list(function.input_types.values())
@@ -76,8 +104,10 @@ class TaskSource:
                 f"{name} of the task {self.name!r} returns a tuple, and must return a single {wanted.result.__name__}"
             )
         self._check_structs(name, structs)
-        if tuple(map(self._kind, types)) != wanted.kinds or (returned is not None and returned is not wanted.result):
-            raise ValueError(f"{name} of the task {self.name!r} must be written as {wanted.signature}")
+        kinds = tuple(map(self._kind, types))
+        if kinds not in (wanted.kinds, wanted.all_kinds) or (returned is not None and returned is not wanted.result):
+            more = f", with or without a last argument {wanted.optional}" if wanted.optional else ""
+            raise ValueError(f"{name} of the task {self.name!r} must be written as {wanted.signature}{more}")
         return function
 
     def _check_structs(self, name: str, structs: list[Any]) -> None:
@@ -104,12 +134,12 @@ class TaskSource:
         """Refuse what looks like a misspelt name of the table: it would never be called."""
         attributes = [name for name in vars(Task) if not name.startswith("_")]
         for name in vars(self.task):
-            if name.startswith("_") or name in (*attributes, "World", "Params", *FUNCTIONS):
+            if name.startswith(("_", GROUP_PREFIX)) or name in (*attributes, "World", "Params", *FUNCTIONS):
                 continue
             if close := difflib.get_close_matches(name, (*attributes, *FUNCTIONS), 1, 0.75):
                 raise ValueError(f"the task {self.name!r} has {name!r} in its class: did you mean {close[0]}?")
         for name, value in vars(sys.modules[self.task.__module__]).items():
-            if isinstance(value, wp.Function) and name not in FUNCTIONS:
+            if isinstance(value, wp.Function) and name not in FUNCTIONS and not name.startswith(GROUP_PREFIX):
                 own = self._kind(next(iter(value.input_types.values()), None)) == "World"
                 close = difflib.get_close_matches(name, [f for f in FUNCTIONS if self.functions[f] is None], 1, 0.85)
                 if own and close:

@@ -10,6 +10,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from lyceum_warp.fields import ON_DEMAND, SENSED
 from lyceum_warp.model_fields import MOVED_INERTIA
@@ -75,18 +76,25 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
             otherwise the name of a model that gymnasium ships; or an MjSpec, which is copied.
         owner: The task class whose own model it is: its path is then relative to the task's file alone.
 
+    Returns:
+        The model, which can be compiled later from any current folder.
+
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: MuJoCo can't read the file, or the source is a compiled model.
+        ValueError: MuJoCo can't read the file, or the source is a compiled model or the text of one.
     """
     if isinstance(source, mujoco.MjModel):
         raise ValueError("a task's model must be a file or an MjSpec, not a compiled MjModel: give its MjSpec")
     if isinstance(source, mujoco.MjSpec):
-        return source.copy()
+        spec = source.copy()
+        spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # where its meshes are
+        return spec
+    if isinstance(source, str) and source.lstrip().startswith("<"):
+        raise ValueError(f"the model {_start(source)} is XML, not a file: give mujoco.MjSpec.from_string(...) of it")
     folder = Path()
     if owner is not None and (file := getattr(sys.modules.get(owner.__module__), "__file__", None)):
         folder = Path(file).parent
-    path = folder / Path(source).expanduser()
+    path = (folder / Path(source).expanduser()).absolute()
     if not path.is_file():
         if Path(source).name != str(source):
             raise FileNotFoundError(f"there is no model file {str(source)!r}")
@@ -104,14 +112,42 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         raise ValueError(f"MuJoCo can't read the model {path}: {error}") from error
 
 
+def _start(text: str) -> str:
+    """The beginning of a text, for a message of one line."""
+    flat = " ".join(text.split())
+    return repr(flat if len(flat) <= 24 else f"{flat[:20]} ...")
+
+
+def keyframe_state(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """The integration state of one of the model's keyframes at time 0, (integration_size,) float64.
+
+    Raises:
+        ValueError: The model has no such keyframe.
+    """
+    key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name)
+    if key < 0:
+        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) for i in range(model.nkey)]
+        known = ", ".join(repr(n) for n in names if n) or "none that is named"
+        raise ValueError(f"the model has no keyframe {name!r}; it has {known}")
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, key)
+    data.time = 0.0
+    spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
+    state = np.zeros(mujoco.mj_stateSize(model, spec))
+    mujoco.mj_getState(model, data, state, spec)
+    return state
+
+
 def compile_model(
     spec: mujoco.MjSpec, fields: Collection[str], physics: PhysicsOptions, *, varied: Collection[str] = ()
 ) -> mujoco.MjModel:
     """Compile a model for either engine.
 
     MuJoCo Warp has no PGS solver, so a model that asks for it gets Newton on both engines, which converges to
-    the same accelerations. Fields that MuJoCo computes only where a sensor needs them get such a sensor, after
-    the model's own: without it a task would read zeros. Where no field needs a sensor, the model's own are turned off.
+    the same accelerations. Sleep is turned off, because a saved state does not tell which bodies are asleep. Fields
+    that MuJoCo computes only where a sensor needs them get such a sensor, after the model's own, and the energy is
+    turned on where it is read: without that a task would read zeros. Where no field needs a sensor, the model's own
+    are turned off.
 
     Args:
         spec: The model; changed in place.
@@ -125,6 +161,11 @@ def compile_model(
     if spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
         spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
         log.info("%s asks for the PGS solver, which MuJoCo Warp lacks: both engines use Newton", spec.modelname)
+    if spec.option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        spec.option.enableflags &= ~mujoco.mjtEnableBit.mjENBL_SLEEP.value
+        log.info("%s asks for sleep, which is not part of MuJoCo's state: no body falls asleep", spec.modelname)
+    if "energy" in fields:
+        spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
     if physics.cone is not None:
         spec.option.cone = CONES[physics.cone]
     if physics.integrator is not None:
@@ -132,11 +173,10 @@ def compile_model(
     for name, limit in (physics.solver or {}).items():
         setattr(spec.option, name, limit)
     for sensor in sorted({ON_DEMAND[name] for name in fields if name in ON_DEMAND}, key=int):
-        body = spec.bodies[1]
+        body = spec.bodies[min(1, len(spec.bodies) - 1)]
         if not body.name:
             body.name = "lyceum_first_body"
-        name = f"lyceum_{sensor.name.removeprefix('mjSENS_').lower()}"
-        spec.add_sensor(name=name, type=sensor, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=body.name)
+        spec.add_sensor(type=sensor, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=body.name)
     if SENSED.isdisjoint(fields):
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
     if not MOVED_INERTIA.isdisjoint(varied):

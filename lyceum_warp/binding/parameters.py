@@ -7,9 +7,12 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from lyceum_warp.fields import elements
+from lyceum_warp.fields import elements, rows
 from lyceum_warp.options import OPTIONS, suggestion
 from lyceum_warp.task import Element
+
+_FILLED_IN = ("dt", "substep_dt")
+"""Fields of ``Params`` that follow from the model and the task."""
 
 
 class Parameters:
@@ -47,8 +50,8 @@ class Parameters:
         self.values: dict[str, Any] = {}
         for name in struct.vars:
             # Warp's structs ignore defaults: they are read from the class behind the struct
-            if name == "dt":
-                self.values["dt"] = timestep
+            if name in _FILLED_IN:
+                self.values[name] = timestep if name == "dt" else float(model.opt.timestep)
             elif hasattr(struct.cls, name):
                 self.values[name] = getattr(struct.cls, name)
         self.values = self.checked(given)
@@ -61,8 +64,8 @@ class Parameters:
         """
         known = self._struct.vars
         for name in given:
-            if name not in known or name == "dt":
-                names = sorted(set(known) - {"dt"})
+            if name not in known or name in _FILLED_IN:
+                names = sorted(set(known) - set(_FILLED_IN))
                 if name in OPTIONS:
                     raise ValueError(
                         f"{name!r} is an option, not a parameter of the task {self._task_name!r}: make another "
@@ -119,7 +122,7 @@ class Parameters:
 
     def _check_index(self, given: str, array: np.ndarray, field: str) -> None:
         if field not in self._sizes:
-            self._sizes[field] = len(getattr(mujoco.MjData(self._model), field))
+            self._sizes[field] = rows(self._model, field)
         count = self._sizes[field]
         if ((array < 0) | (array >= count)).any():
             raise ValueError(

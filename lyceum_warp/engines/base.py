@@ -197,9 +197,10 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def refresh_current(self, mask: wp.array) -> None:
-        """Compute the masked worlds' fields that belong to the current state, after something changed in it.
+        """Compute the masked worlds' fields that belong to the current state, and their sensors.
 
-        Fields that ``mj_step`` leaves behind, as those of the acceleration stage, stay as the last substep left them.
+        Fields and sensors of the acceleration stage stay as the last substep left them. Other worlds, and all
+        sensors' histories, stay as they are.
         """
 
     # rollouts

@@ -11,6 +11,8 @@ from lyceum_warp.kernels.random import stream, world_key
 ACTION = wp.constant(int(Done.ACTION))
 NOISE = wp.constant(-2)
 """Stands in for the number of an episode, so that worlds and samples of one seed draw from independent streams."""
+DRAWS = wp.constant(-3)
+"""The same for the keys of what a task draws in the samples."""
 
 
 @wp.kernel(enable_backward=False)
@@ -18,6 +20,13 @@ def broadcast(state_in: wp.array[wp.float64], state_out: wp.array2d[wp.float64])
     """Copy one state to every world; launched over (nworld, state_size)."""
     w, i = wp.tid()
     state_out[w, i] = state_in[i]
+
+
+@wp.kernel(enable_backward=False)
+def overwrite(row_in: wp.array2d[float], first: int, state_out: wp.array2d[wp.float64]):
+    """Copy one row of float32 into columns of every world's state, from ``first`` on; launched over (nworld, size)."""
+    w, i = wp.tid()
+    state_out[w, first + i] = wp.float64(row_in[0, i])
 
 
 @wp.kernel(enable_backward=False)
@@ -44,6 +53,20 @@ def controls(
     for i in range(ctrl_out.shape[2]):
         ctrl = action_inout[t, w, i] * scale_in[i, 0] + scale_in[i, 1]
         ctrl_out[t, w, i] = wp.clamp(ctrl, range_in[i, 0], range_in[i, 1])
+
+
+@wp.kernel(enable_backward=False)
+def repeat_columns(columns_in: wp.array2d[wp.float64], rows_out: wp.array3d[float]):
+    """Copy columns of states into the rows of every step; launched over (steps, nworld, columns)."""
+    t, w, i = wp.tid()
+    rows_out[t, w, i] = float(columns_in[w, i])
+
+
+@wp.kernel(enable_backward=False)
+def add_steps(count: int, step_inout: wp.array[int]):
+    """Advance the step counters; launched over (nworld,)."""
+    w = wp.tid()
+    step_inout[w] = step_inout[w] + count
 
 
 @wp.kernel(enable_backward=False)
@@ -76,6 +99,16 @@ def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.ar
     rng = stream(key, count_in[0], i)
     for t in range(noise_out.shape[0]):
         noise_out[t, k, i] = wp.randn(rng)
+
+
+@wp.kernel(enable_backward=False)
+def draw_keys(seed_in: wp.array[int], count_in: wp.array[int], key_out: wp.array[wp.uint32]):
+    """Make the samples' stream keys from (seed, sample, count); launched over (nsample,).
+
+    A plant's keys are those of (seed, world) alone, so that no sample draws what the plant will draw.
+    """
+    k = wp.tid()
+    key_out[k] = stream(world_key(seed_in[0], k), DRAWS, count_in[0])
 
 
 @wp.kernel(enable_backward=False)

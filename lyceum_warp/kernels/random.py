@@ -20,6 +20,12 @@ def stream(key: wp.uint32, episode: int, step: int) -> wp.uint32:
 
 
 @wp.func
+def substream(base: wp.uint32, number: int) -> wp.uint32:
+    """Start of one of several independent streams that begin at one place of a stream."""
+    return wp.rand_init(int(base), number)
+
+
+@wp.func
 def uniform(rng: wp.array[wp.uint32], low: float, high: float) -> float:
     """Draw from U(low, high) and advance the stream.
 

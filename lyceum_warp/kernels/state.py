@@ -27,12 +27,48 @@ def narrow(mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_ou
 
 
 @wp.kernel(enable_backward=False)
+def widen_bool(mask_in: wp.array[bool], source_in: wp.array2d[bool], target_out: wp.array2d[wp.float64], lanes: int):
+    """Write the masked rows of truth values as 0 and 1; launched over (nworld, lanes)."""
+    w, lane = wp.tid()
+    if mask_in[w]:
+        for i in range(lane, target_out.shape[1], lanes):
+            target_out[w, i] = wp.where(source_in[w, i], wp.float64(1.0), wp.float64(0.0))
+
+
+@wp.kernel(enable_backward=False)
+def narrow_bool(mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[bool], lanes: int):
+    """Read what ``widen_bool`` writes, in the masked rows; launched over (nworld, lanes)."""
+    w, lane = wp.tid()
+    if mask_in[w]:
+        for i in range(lane, target_out.shape[1], lanes):
+            target_out[w, i] = source_in[w, i] != wp.float64(0.0)
+
+
+@wp.kernel(enable_backward=False)
 def copy_rows(mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[float], lanes: int):
     """Copy the masked rows of float32; launched over (nworld, lanes)."""
     w, lane = wp.tid()
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):
             target_out[w, i] = source_in[w, i]
+
+
+@wp.kernel(enable_backward=False)
+def copy_columns(
+    mask_in: wp.array[bool], column_in: wp.array[int], source_in: wp.array2d[float], target_out: wp.array2d[float]
+):
+    """Copy some columns of the masked rows; launched over (nworld, columns)."""
+    w, i = wp.tid()
+    if mask_in[w]:
+        column = column_in[i]
+        target_out[w, column] = source_in[w, column]
+
+
+@wp.kernel(enable_backward=False)
+def zero_columns(column_in: wp.array[int], target_out: wp.array2d[float]):
+    """Set some columns to zero; launched over (nworld, columns)."""
+    w, i = wp.tid()
+    target_out[w, column_in[i]] = 0.0
 
 
 @wp.kernel(enable_backward=False)

@@ -1,22 +1,45 @@
 """The kernels of one step, around the functions of a task."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from lyceum_warp.done import Done
 from lyceum_warp.kernels import faults
-from lyceum_warp.kernels.random import stream
+from lyceum_warp.kernels.random import stream, substream
 
 TERMINATED = wp.constant(int(Done.TERMINATED))
 TRUNCATED = wp.constant(int(Done.TRUNCATED))
 ACTION = wp.constant(int(Done.ACTION))
+REWARD = wp.constant(int(Done.REWARD))
+OBSERVATION = wp.constant(int(Done.OBSERVATION))
+
+# streams that begin at the place of one step; ``advance`` draws from that place itself
+OBSERVE = wp.constant(-1)
+EVENT = wp.constant(-2)
+STARTUP = wp.constant(-1)
+"""Stands in for the number of an episode."""
+
+
+@wp.struct
+class Counters:
+    """The counters of each world; every array is (nworld,)."""
+
+    step: wp.array[int]
+    """Steps since the reset."""
+    key: wp.array[wp.uint32]
+    """Key of the world's random streams."""
+    episode: wp.array[int]
+    """Number of the episode."""
+    rng: wp.array2d[wp.uint32]
+    """The random stream that a task's function draws from, (nworld, 1); every kernel starts it anew."""
 
 
 @wp.struct
 class Outcome:
-    """The outcome of a step in each world; every array is (nworld,), observations are (nworld, nobs)."""
+    """The outcome of a step in each world; every array is (nworld,), metrics are (nworld, nmetrics)."""
 
     reward: wp.array[float]
     eval: wp.array[float]
@@ -25,8 +48,8 @@ class Outcome:
     success: wp.array[bool]
     done: wp.array[bool]
     done_reason: wp.array[int]
-    obs: wp.array2d[float]
-    final_obs: wp.array2d[float]
+    metrics: wp.array2d[float]
+    episode_metrics: wp.array2d[float]
 
 
 OUTCOMES = {
@@ -37,10 +60,24 @@ OUTCOMES = {
     "success": wp.bool,
     "done": wp.bool,
     "done_reason": wp.int32,
-    "obs": wp.float32,
-    "final_obs": wp.float32,
 }
-"""The fields of Outcome and the types of their elements."""
+"""The fields of Outcome with one number a world, and their types."""
+
+
+@wp.func
+def finite_row(row: wp.array[float]) -> bool:
+    """Whether every number is finite."""
+    for i in range(row.shape[0]):  # noqa: SIM110 (Warp has no all())
+        if not wp.isfinite(row[i]):
+            return False
+    return True
+
+
+@wp.func
+def copy_row(source: wp.array[float], target: wp.array[float]):
+    """Copy a row."""
+    for i in range(source.shape[0]):
+        target[i] = source[i]
 
 
 @wp.kernel(enable_backward=False)
@@ -54,10 +91,20 @@ def count_faults(fault_in: wp.array[int], count_out: wp.array[int]):
                 wp.atomic_add(count_out, bit, 1)
 
 
+@wp.kernel(enable_backward=False)
+def mark_changes(
+    mask_in: wp.array[bool], before_in: wp.array2d[float], after_in: wp.array2d[float], changed_inout: wp.array[bool]
+):
+    """Mark the masked worlds whose rows differ; launched over (nworld,)."""
+    w = wp.tid()
+    if mask_in[w] and not changed_inout[w]:
+        for i in range(after_in.shape[1]):
+            if before_in[w, i] != after_in[w, i]:
+                changed_inout[w] = True
+
+
 def make_kernels(
-    Batch,  # noqa: N803
-    view,
-    Params,  # noqa: N803
+    generated: SimpleNamespace,
     functions: Mapping[str, wp.Function],
     written: Collection[str],
     *,
@@ -66,18 +113,36 @@ def make_kernels(
     """Fuse a task's functions into the kernels of a step.
 
     Args:
-        Batch: Struct of the task's fields for all worlds.
-        view: Function from (batch, world) to the struct that the task's functions take.
-        Params: Struct of the task's parameters; an array of them holds one entry, or one a world.
+        generated: ``World`` and ``Params``, the structs of the task; ``Batch``, a struct of the task's fields for all
+            worlds, and ``view``, the function from (batch, world) to ``World``; ``Observations``, a struct of the
+            groups of observations, with ``observe_groups``, ``all_finite`` and ``copy_observations``.
         functions: The task's functions by name, with defaults for those that it does not have.
         written: Names of the functions that the task has. Without ``control`` a scale and an offset map actions to
             controls; without ``evaluate`` the evaluation is the reward; without ``advance`` memory stays as it is.
         module: Name of the Warp module that the kernels are compiled into, one for each task.
     """
-    observe, control, reward = functions["observe"], functions["control"], functions["reward"]
+    Batch, Params, Observations = generated.Batch, generated.Params, generated.Observations  # noqa: N806
+    World = generated.World  # noqa: N806
+    view, observe_groups = generated.view, generated.observe_groups
+    all_finite, copy_observations = generated.all_finite, generated.copy_observations
+    control, reward, measure = functions["control"], functions["reward"], functions["measure"]
     evaluate, terminated, success = functions["evaluate"], functions["terminated"], functions["success"]
-    initialize, randomize, advance = functions["initialize"], functions["randomize"], functions["advance"]
-    has_control, has_evaluate, has_advance = (name in written for name in ("control", "evaluate", "advance"))
+    initialize, randomize, startup = functions["initialize"], functions["randomize"], functions["startup"]
+    reject, event = functions["reject"], functions["event"]
+    advance, substep = functions["advance"], functions["substep"]
+    has_control, has_evaluate, has_measure = (name in written for name in ("control", "evaluate", "measure"))
+
+    def kernel_for(function: str) -> Callable[[Any], Any]:
+        """Decorator: a kernel for tasks that have a function, and None for the others."""
+        if function in written:
+            return wp.kernel(module=module, enable_backward=False)
+        return lambda body: None
+
+    @wp.func
+    def observe(s: World, p: Params, out: Observations, w: int, counters: Counters):
+        """Write every group of observations; their noise is a function of the counters alone."""
+        base = substream(stream(counters.key[w], counters.episode[w], counters.step[w]), OBSERVE)
+        observe_groups(s, p, out, w, base, counters.rng[w])
 
     @wp.kernel(module=module, enable_backward=False)
     def act(
@@ -86,7 +151,7 @@ def make_kernels(
         action_in: wp.array2d[float],
         range_in: wp.array2d[float],
         scale_in: wp.array2d[float],
-        step_inout: wp.array[int],
+        counters: Counters,
         safe_action_out: wp.array2d[float],
         fault_out: wp.array[int],
         ctrl_out: wp.array2d[float],
@@ -110,24 +175,27 @@ def make_kernels(
                 ctrl_out[w, i] = safe_action_out[w, i] * scale_in[i, 0] + scale_in[i, 1]
         for i in range(ctrl_out.shape[1]):
             ctrl_out[w, i] = wp.clamp(ctrl_out[w, i], range_in[i, 0], range_in[i, 1])
-        step_inout[w] = step_inout[w] + 1
+        counters.step[w] = counters.step[w] + 1
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel_for("advance")
     def advance_memory(
         before: Batch,
         after: Batch,
         params: wp.array[Params],
         action_in: wp.array2d[float],
-        step_in: wp.array[int],
-        key_in: wp.array[wp.uint32],
-        episode_in: wp.array[int],
-        rng_inout: wp.array2d[wp.uint32],
+        counters: Counters,
     ):
         """Advance the task's memory by one step; launched over (nworld,)."""
         w = wp.tid()
-        rng_inout[w, 0] = stream(key_in[w], episode_in[w], step_in[w])
+        counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], counters.step[w])
         p = params[w % params.shape[0]]
-        advance(view(before, w), action_in[w], view(after, w), p, rng_inout[w])
+        advance(view(before, w), action_in[w], view(after, w), p, counters.rng[w])
+
+    @kernel_for("substep")
+    def substep_memory(batch: Batch, params: wp.array[Params]):
+        """Advance the task's memory by one substep; launched over (nworld,)."""
+        w = wp.tid()
+        substep(view(batch, w), params[w % params.shape[0]])
 
     @wp.kernel(module=module, enable_backward=False)
     def judge(
@@ -136,21 +204,24 @@ def make_kernels(
         after: Batch,
         params: wp.array[Params],
         action_in: wp.array2d[float],
-        step_in: wp.array[int],
+        counters: Counters,
         horizon: int,
         transition: bool,
         keep_reason: bool,
         fault_inout: wp.array[int],
         action_fault_in: wp.array[int],
         out: Outcome,
+        metric_sum_inout: wp.array2d[float],
+        obs_out: Observations,
+        final_obs_out: Observations,
         restart_out: wp.array[bool],
     ):
         """Judge a transition, or a state alone, in the masked worlds; launched over (nworld,).
 
-        Writes the reward, the evaluation, termination, success and the observation.
+        Writes the reward, the metrics, the evaluation, termination, success and the observations.
 
-        A transition with a fault has reward 0, the evaluation of the state before it, and the last good observation.
-        It counts as terminated, so that no learner bootstraps from it.
+        A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and the last good
+        observations. It counts as terminated, so that no learner bootstraps from it.
         """
         w = wp.tid()
         if not mask_in[w]:
@@ -159,15 +230,21 @@ def make_kernels(
         s0 = view(before, w)
         s1 = view(after, w)
         fault = fault_inout[w] | action_fault_in[w]
-        fault_inout[w] = fault
         gain = float(0.0)
         if fault == 0:
             if transition:
                 gain = reward(s0, action_in[w], s1, p)
-            observe(s1, p, out.final_obs[w])
+                if not wp.isfinite(gain):
+                    fault = REWARD
+            observe(s1, p, final_obs_out, w, counters)
+            if not all_finite(final_obs_out, w):
+                fault = fault | OBSERVATION
+        if fault == 0:
+            copy_observations(final_obs_out, obs_out, w)
         else:
-            for i in range(out.obs.shape[1]):
-                out.final_obs[w, i] = out.obs[w, i]
+            gain = 0.0
+            copy_observations(obs_out, final_obs_out, w)
+        fault_inout[w] = fault
         if wp.static(has_evaluate):
             if fault == 0:
                 out.eval[w] = evaluate(s1, p)
@@ -178,6 +255,15 @@ def make_kernels(
         else:
             out.eval[w] = gain
         out.reward[w] = gain
+        if wp.static(has_measure):
+            if fault == 0 and transition:
+                measure(s0, action_in[w], s1, p, out.metrics[w])
+            else:
+                for i in range(out.metrics.shape[1]):
+                    out.metrics[w, i] = 0.0
+            for i in range(out.metrics.shape[1]):
+                metric_sum_inout[w, i] = metric_sum_inout[w, i] + out.metrics[w, i]
+                out.episode_metrics[w, i] = metric_sum_inout[w, i]
         reason = fault
         if fault == 0:
             if terminated(s1, p):
@@ -185,7 +271,7 @@ def make_kernels(
             out.success[w] = success(s1, p)
         else:
             out.success[w] = False
-        if horizon > 0 and step_in[w] >= horizon:
+        if horizon > 0 and counters.step[w] >= horizon:
             reason = reason | TRUNCATED
         if keep_reason:
             reason = reason | out.done_reason[w]
@@ -193,8 +279,6 @@ def make_kernels(
         out.terminated[w] = (reason & ~TRUNCATED) != 0
         out.truncated[w] = (reason & TRUNCATED) != 0
         out.done[w] = reason != 0
-        for i in range(out.obs.shape[1]):
-            out.obs[w, i] = out.final_obs[w, i]
         if transition:
             # without automatic resets a world steps on after its end, but not after a fault
             restart_out[w] = wp.where(keep_reason, fault != 0, reason != 0)
@@ -203,36 +287,68 @@ def make_kernels(
     def restart(
         mask_in: wp.array[bool],
         random: bool,
+        again: bool,
         batch: Batch,
         params: wp.array[Params],
-        key_in: wp.array[wp.uint32],
-        rng_inout: wp.array2d[wp.uint32],
-        step_out: wp.array[int],
-        episode_inout: wp.array[int],
+        counters: Counters,
     ):
-        """Begin an episode in the masked worlds; launched over (nworld,).
+        """Begin an episode in the masked worlds, or draw its initial state again; launched over (nworld,).
 
-        The engine has already put them into the model's initial state.
+        The engine has already put them into the fixed initial state. A further draw goes on in the stream of the last.
         """
         w = wp.tid()
         if not mask_in[w]:
             return
-        step_out[w] = 0
-        episode = episode_inout[w] + 1
-        episode_inout[w] = episode
-        rng_inout[w, 0] = stream(key_in[w], episode, 0)
+        if not again:
+            counters.step[w] = 0
+            counters.episode[w] = counters.episode[w] + 1
+            counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], 0)
         p = params[w % params.shape[0]]
         s = view(batch, w)
         initialize(s, p)
         if random:
-            randomize(s, p, rng_inout[w])
+            randomize(s, p, counters.rng[w])
+
+    @kernel_for("reject")
+    def reject_worlds(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], again_out: wp.array[bool]):
+        """Find the masked worlds whose initial state must be drawn again; launched over (nworld,)."""
+        w = wp.tid()
+        again_out[w] = mask_in[w] and reject(view(batch, w), params[w % params.shape[0]])
+
+    @kernel_for("startup")
+    def start_worlds(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], counters: Counters):
+        """Draw the model fields of the masked worlds once; launched over (nworld,)."""
+        w = wp.tid()
+        if mask_in[w]:
+            counters.rng[w, 0] = stream(counters.key[w], STARTUP, 0)
+            startup(view(batch, w), params[w % params.shape[0]], counters.rng[w])
+
+    @kernel_for("event")
+    def run_events(
+        restarting_in: wp.array[bool],
+        batch: Batch,
+        params: wp.array[Params],
+        counters: Counters,
+        mask_out: wp.array[bool],
+        changed_out: wp.array[bool],
+    ):
+        """Run the events of the worlds that do not restart, ``mask_out``; launched over (nworld,)."""
+        w = wp.tid()
+        mask_out[w] = not restarting_in[w]
+        changed_out[w] = False
+        if not restarting_in[w]:
+            at = stream(counters.key[w], counters.episode[w], counters.step[w])
+            counters.rng[w, 0] = substream(at, EVENT)
+            event(view(batch, w), params[w % params.shape[0]], counters.rng[w])
 
     @wp.kernel(module=module, enable_backward=False)
-    def observe_worlds(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], obs_out: wp.array2d[float]):
+    def observe_worlds(
+        mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], counters: Counters, obs_out: Observations
+    ):
         """Observe the masked worlds; launched over (nworld,)."""
         w = wp.tid()
         if mask_in[w]:
-            observe(view(batch, w), params[w % params.shape[0]], obs_out[w])
+            observe(view(batch, w), params[w % params.shape[0]], obs_out, w, counters)
 
     # An open-loop rollout keeps its fields for all steps: row t * nworld + w is world w after t steps. The
     # transition of that row leads to the one nworld further, so `before` and `after` are the same arrays, shifted.
@@ -253,36 +369,39 @@ def make_kernels(
         reward_out[row] = reward(view(before, row), action_in[row], s1, p)
         terminated_out[row] = terminated(s1, p)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @kernel_for("advance")
     def advance_rows(
         before: Batch,
         after: Batch,
         params: wp.array[Params],
         action_in: wp.array2d[float],
-        step_in: wp.array[int],
-        key_in: wp.array[wp.uint32],
-        episode_in: wp.array[int],
+        counters: Counters,
         memory_inout: wp.array2d[float],
-        rng_inout: wp.array2d[wp.uint32],
+        lasting_memory_inout: wp.array2d[float],
     ):
         """Advance the task's memory along a rollout; launched over (nworld,), one thread for all steps of a world."""
         w = wp.tid()
-        n = step_in.shape[0]
+        n = counters.step.shape[0]
         p = params[w % params.shape[0]]
         for t in range(action_in.shape[0] // n):
             row = t * n + w
-            for i in range(memory_inout.shape[1]):
-                memory_inout[row + n, i] = memory_inout[row, i]
-            rng_inout[w, 0] = stream(key_in[w], episode_in[w], step_in[w] + t + 1)
-            advance(view(before, row), action_in[row], view(after, row), p, rng_inout[w])
+            copy_row(memory_inout[row], memory_inout[row + n])
+            copy_row(lasting_memory_inout[row], lasting_memory_inout[row + n])
+            counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], counters.step[w] + t + 1)
+            advance(view(before, row), action_in[row], view(after, row), p, counters.rng[w])
 
     return SimpleNamespace(
         Batch=Batch,
+        Observations=Observations,
         act=act,
-        advance_memory=advance_memory if has_advance else None,
+        substep_memory=substep_memory,
+        advance_memory=advance_memory,
         judge=judge,
+        start_worlds=start_worlds,
         restart=restart,
+        reject_worlds=reject_worlds,
+        run_events=run_events,
         observe_worlds=observe_worlds,
         judge_rows=judge_rows,
-        advance_rows=advance_rows if has_advance else None,
+        advance_rows=advance_rows,
     )

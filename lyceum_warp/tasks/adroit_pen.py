@@ -19,7 +19,7 @@ class World:
     qvel: Row[float]
     xpos: Row[wp.vec3]
     site_xpos: Row[wp.vec3]
-    mocap_quat: Row[wp.quat]
+    mocap_quat: Row[lw.quat]
     memory: Row[float]  # steps of the episode at the goal
 
 
@@ -109,8 +109,8 @@ def success(s: World, p: Params) -> bool:
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     a = 0.5 * lw.uniform(rng, -p.target_range, p.target_range)
     b = 0.5 * lw.uniform(rng, -p.target_range, p.target_range)
-    # a turn about x, then one about the new y; fields hold quaternions in MuJoCo's order, w first
-    s.mocap_quat[p.target] = wp.quat(
+    # a turn about x, then one about the new y
+    s.mocap_quat[p.target] = lw.quat(
         wp.cos(a) * wp.cos(b), wp.sin(a) * wp.cos(b), wp.cos(a) * wp.sin(b), wp.sin(a) * wp.sin(b)
     )
 

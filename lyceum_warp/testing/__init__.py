@@ -14,6 +14,7 @@ from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.engines.base import EngineFactory
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
+from lyceum_warp.testing import bounds_rules as bounds
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import episode_rules as episodes
 from lyceum_warp.testing import fault_rules as faults
@@ -43,6 +44,7 @@ CHECKS: tuple[Callable[[Context], None], ...] = (
     episodes.check_no_autoreset,
     episodes.check_graphs,
     episodes.check_memory,
+    bounds.check_bounds,
     faults.check_bad_state,
     faults.check_bad_action,
     faults.check_bad_warmstart,

@@ -13,7 +13,7 @@ from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import steps
 
-OUTCOMES = tuple(steps.OUTCOMES)
+OUTCOMES = (*steps.OUTCOMES, "obs", "final_obs")
 """The buffers that a step fills."""
 
 SHORT = 8

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from coin_tasks import TossedAfter, TossedAfterWithControl, TossedBefore
 from plain_mppi import Plain, PlainReach
 from rail_task import Picky, rail
 
@@ -444,11 +445,76 @@ def test_hopper_hops_without_falling() -> None:
     assert evals[-1] > 0.3 and rewards.sum() > 165, (evals[-1], rewards.sum())
 
 
+# random numbers of the task
+
+
+def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
+    """The mean sum of 100 rewards, and its standard deviation if the coins were tossed after the actions.
+
+    Plant and planner have equal seeds. Given the actions, the sum of action times coin over 20 runs has the variance of
+    the sum of the squared actions: coins are independent of each other and of the actions before them.
+    """
+    plan = MPPI(task, engine="mujoco", horizon=4, noise=2.0, smoothing=(1, 0, 0))
+    plant = lw.make(task, autoreset=False)
+    total = squares = 0.0
+    for seed in range(runs):
+        plan.reset(seed)
+        plant.rand_reset(seed)
+        for _ in range(100):
+            action = plan(plant.get_state()[0])
+            plant.step(action[None])
+            total += plant.reward.item()
+            squares += action.item() ** 2
+        assert plant.truncated.item()
+    return total / runs, squares**0.5 / runs
+
+
+@pytest.mark.parametrize("task", [TossedAfter, TossedAfterWithControl])
+def test_a_coin_tossed_after_the_action_earns_a_planner_nothing(task: type[lw.Task]) -> None:
+    mean, deviation = earned(task)
+    assert 0.5 < deviation < 2.3, "the planner should act"
+    assert abs(mean) < 3 * deviation
+
+
+def test_a_coin_tossed_before_the_action_earns_a_planner_almost_everything() -> None:
+    mean, _ = earned(TossedBefore)
+    assert mean > 80
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("task", [TossedAfter, TossedAfterWithControl])
+def test_every_sample_of_every_improvement_draws_its_own(task: type[lw.Task], engine: str) -> None:
+    coins: list[torch.Tensor] = []
+
+    def value(obs: torch.Tensor) -> torch.Tensor:
+        coins.append(obs[:, 0].clone())
+        return obs[:, 0]
+
+    plan = MPPI(task, engine=engine, horizon=3, samples=200, iterations=2, seed=4, value=value)
+    state = plan.state_of()
+    plan(state), plan(state)
+    found = torch.stack(coins[-4:]).double()  # an earlier call checked the function
+    assert set(found.unique().tolist()) == {-1.0, 1.0}
+    assert found.mean(1).abs().max() < 4 / 200**0.5
+    correlation = np.corrcoef(found.numpy()) - np.eye(4)
+    assert np.abs(correlation).max() < 4 / 200**0.5
+    first = found.clone()
+    plan.reset(4)
+    plan(state), plan(state)
+    assert torch.equal(torch.stack(coins[-4:]).double(), first), "draws are counted from the planner's seed"
+
+
+def test_rollouts_step_by_step_draw_as_those_of_a_whole_horizon() -> None:
+    whole, steps = (MPPI(task, engine="mujoco", horizon=5) for task in (TossedAfter, TossedAfterWithControl))
+    state = whole.state_of()
+    assert same(numbers(whole, state), numbers(steps, state))
+
+
 # attributes and worlds
 
 
 @pytest.mark.parametrize("name", ["horizon", "samples", "temperature", "noise", "smoothing", "discount", "iterations",
-                                  "fill", "termination", "config", "value", "seed"])  # fmt: skip
+                                  "fill", "termination", "nominal_model", "config", "value", "seed"])  # fmt: skip
 def test_settings_cannot_be_assigned(name: str) -> None:
     plan = MPPI("point_mass", horizon=3, samples=2)
     with pytest.raises(AttributeError, match=rf"make another MPPI with {name}=2\.0"):
@@ -492,4 +558,4 @@ def test_resets_of_the_planners_worlds_do_not_change_plans() -> None:
         first, second = (plan(state) for plan in plans)
         assert torch.equal(first, second)
         env.step(first[None])
-    assert plans[0].env.episode_step.tolist() == [2, 2, 2, 2]
+    assert plans[0].env.episode_step.tolist() == [5, 5, 5, 5]  # at the ends of the rollouts

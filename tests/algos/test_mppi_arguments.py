@@ -253,7 +253,8 @@ def test_settings_are_what_json_can_hold() -> None:
     )  # fmt: skip
     assert json.loads(json.dumps(plan.settings)) == plan.settings == {
         "horizon": 2, "samples": 2, "temperature": 0.1, "noise": [[0.5]], "smoothing": [0.25, 0.8, 0.0],
-        "discount": 1.0, "iterations": 1, "fill": [0.1], "termination": "stop", "solver": {"iterations": 3},
+        "discount": 1.0, "iterations": 1, "fill": [0.1], "termination": "stop", "nominal_model": False,
+        "solver": {"iterations": 3},
         "model": "MjSpec 'MuJoCo Model'", "limit": [1.0, 2.0], "wrong": 3.0, "fields": ["xpos"],
     }  # fmt: skip
     assert MPPI("hopper", horizon=2, samples=2).settings["healthy_reward"] == 2.0

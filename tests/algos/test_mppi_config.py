@@ -15,7 +15,7 @@ from lyceum_warp.spaces import Space
 def test_defaults_are_those_of_the_documentation() -> None:
     assert MPPIConfig() == MPPIConfig(
         horizon=32, samples=64, temperature=0.1, noise=0.5, smoothing=(0.25, 0.8, 0.0), discount=None, iterations=1,
-        fill="zero", termination="stop",
+        fill="zero", termination="stop", nominal_model=False,
     )  # fmt: skip
 
 
@@ -45,6 +45,7 @@ def test_a_configuration_cannot_be_changed_or_given_by_position() -> None:
         ("smoothing", [(1, 0), 1, (1, 0, math.nan), "abc", [1, [2, 3], 4], None], "smoothing must be 3 finite numbers"),
         ("fill", ["x", [1, math.nan], ["a", "b"], [[1.0]], [], None, math.inf], "fill must be 'zero', 'repeat' or"),
         ("termination", ["x", True, 3, ["stop"]], "termination must be 'stop' or 'ignore'"),
+        ("nominal_model", [1, "yes", None], "nominal_model must be True or False"),
     ],
 )  # fmt: skip
 def test_a_setting_out_of_range_is_refused_by_name(name: str, wrong: list[Any], message: str) -> None:

@@ -60,6 +60,7 @@ def test_an_incomplete_class_says_what_is_missing(old: str, new: str, message: s
 DECLARED_OTHERWISE = {
     "element": ("qpos: Row[wp.vec3]", r"World.qpos of the task 'tiny' must be declared as Row\[float\]"),
     "vector": ("qpos: Row[float]\n    xpos: Row[float]", r"World.xpos .* must be declared as Row\[wp.vec3\]"),
+    "quaternion": ("qpos: Row[float]\n    xquat: Row[wp.quat]", r"World.xquat .* must be declared as Row\[lw.quat\]"),
     "scalar": ("qpos: Row[float]\n    time: Row[float]", "World.time of the task 'tiny' must be declared as float"),
 }
 
@@ -90,6 +91,14 @@ def test_an_observation_that_does_not_fit_obs_is_refused(case: str, task_file: T
 REWARD = "def reward(s0: World, action: Row[float], s1: World, p: Params)"
 NOT_COMPILED = {
     "unknown field": (f"{REWARD} -> float:\n    return s1.qvel[0]", "can't compile the functions of the task .*qvel"),
+    "quaternion": (
+        f"{REWARD} -> float:\n    return wp.quat_rotate(lw.quat(1.0, 0.0, 0.0, 0.0), wp.vec3(1.0, 0.0, 0.0))[0]",
+        "quat_rotate.*: quaternions are w, x, y, z here: use lw.quat_rotate",
+    ),
+    "product": (
+        f"{REWARD} -> float:\n    q = lw.quat(1.0, 0.0, 0.0, 0.0)\n    return (q * q)[0]",
+        "quaternions are w, x, y, z here: use lw.quat_rotate, lw.quat_mul",
+    ),
     "whole number": (
         f"{REWARD}:\n    return 1",
         r"reward of the task 'tiny' returns int32: it must be written as reward\(s0: World, .* -> float",

@@ -10,16 +10,22 @@ from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.registry import find_task, task_name
 from lyceum_warp.task import FUNCTIONS, Task
 
+RNG = "rng: Row[wp.uint32]"
 REWARD = "def reward(s0: World, action: Row[float], s1: World, p: Params)"
 MEANT = {
     "observe": "def observe(s: World, p: Params, obs: Row[float]):\n    obs[0] = 1.0",
     "control": "def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):\n    ctrl[0] = 1.0",
     "reward": f"{REWARD} -> float:\n    return 1.0",
+    "measure": f"{REWARD[:-1]}, metrics: Row[float]):\n    metrics[0] = 1.0".replace("reward", "measure"),
     "evaluate": "def evaluate(s: World, p: Params) -> float:\n    return 1.0",
     "terminated": "def terminated(s: World, p: Params) -> bool:\n    return True",
     "success": "def success(s: World, p: Params) -> bool:\n    return True",
+    "startup": f"def startup(s: World, p: Params, {RNG}):\n    s.qpos[0] = lw.normal(rng)",
     "initialize": "def initialize(s: World, p: Params):\n    s.qpos[0] = 1.0",
     "randomize": "def randomize(s: World, p: Params, rng: Row[wp.uint32]):\n    s.qpos[0] = lw.normal(rng)",
+    "reject": "def reject(s: World, p: Params) -> bool:\n    return s.qpos[0] < 0.0",
+    "event": f"def event(s: World, p: Params, {RNG}):\n    s.qpos[0] = lw.normal(rng)",
+    "substep": "def substep(s: World, p: Params):\n    pass",
     "advance": "def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):\n    pass",
 }
 
@@ -48,7 +54,8 @@ def test_a_function_with_other_arguments_is_refused_with_the_line_to_write(name:
     text = tiny_task.TINY if name == "observe" else tiny_task.with_function(MEANT[name])
     with pytest.raises(ValueError) as caught:
         source_of(tmp_path, text.replace(f"def {name}(", f"def {name}(more: float, "))
-    assert str(caught.value) == f"{name} of the task 'tiny' must be written as {FUNCTIONS[name].signature}"
+    more = f", with or without a last argument {RNG}" if name == "observe" else ""
+    assert str(caught.value) == f"{name} of the task 'tiny' must be written as {FUNCTIONS[name].signature}{more}"
 
 
 WRITTEN_OTHERWISE = {

@@ -109,6 +109,18 @@ def test_the_pgs_solver_becomes_newton() -> None:
     assert compile_model(ball('solver="CG"'), (), PHYSICS).opt.solver == mujoco.mjtSolver.mjSOL_CG
 
 
+def test_sleep_is_turned_off_with_a_line_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO"):
+        model = compile_model(ball('timestep="0.002"><flag sleep="enable"/></option><option'), (), PHYSICS)
+    assert not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
+    assert "ball asks for sleep, which is not part of MuJoCo's state" in caplog.text
+
+
+def test_the_energy_is_turned_on_where_it_is_read() -> None:
+    assert compile_model(ball(), ["energy"], PHYSICS).opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY
+    assert not compile_model(ball(), ["qpos"], PHYSICS).opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY
+
+
 def test_physics_options_replace_the_models_own() -> None:
     physics = PhysicsOptions(cone="elliptic", integrator="implicitfast", solver={"iterations": 7, "ls_iterations": 9})
     option = compile_model(ball('cone="pyramidal" integrator="RK4"'), (), physics).opt
@@ -134,3 +146,56 @@ def test_a_model_that_mujoco_refuses_is_named() -> None:
     spec.worldbody.add_body().add_joint()
     with pytest.raises(ValueError, match="MuJoCo refuses the model 'ball': "):
         compile_model(spec, (), PHYSICS)
+
+
+# other environments of a task have its model
+
+
+def test_a_replica_has_the_model_of_its_original(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also after a caller edits the MjSpec, and where a task's model is drawn anew each time it is called."""
+    spec = lw.gymnasium_model("hopper.xml")
+    env = lw.make("hopper", model=spec)
+    spec.geom("torso_geom").density = 5000
+    masses = iter((1000, 2000, 3000))
+
+    def drawn() -> mujoco.MjSpec:
+        spec = lw.gymnasium_model("hopper.xml")
+        spec.geom("torso_geom").density = next(masses)
+        return spec
+
+    class Drawn(find_task("hopper")):  # type: ignore[misc]
+        model = staticmethod(drawn)
+
+    for original in (env, lw.make(Drawn)):
+        assert (original.replicate().model.body_mass == original.model.body_mass).all()
+        original.get_obs(original.get_state())
+        assert original._scratch is not None
+        assert (original._scratch.model.body_mass == original.model.body_mass).all()
+    assert env.replicate(model=spec).model.body_mass[1] > 2 * env.model.body_mass[1]
+
+
+CUBE = """<mujoco><asset><mesh name="cube" file="cube.obj"/></asset>
+<worldbody><body><joint name="hinge"/><geom type="mesh" mesh="cube"/></body></worldbody>
+<actuator><motor joint="hinge"/></actuator></mujoco>"""
+CORNERS = "".join(f"v {x} {y} {z}\n" for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1))
+
+
+@pytest.mark.parametrize("as_spec", [False, True])
+def test_a_relative_model_and_its_meshes_are_found_from_another_folder(
+    as_spec: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "robot.xml").write_text(CUBE)
+    (tmp_path / "cube.obj").write_text(CORNERS)
+    monkeypatch.chdir(tmp_path)
+    env = lw.make(tiny_task.write(tmp_path, tiny_task.TINY),
+                  model=mujoco.MjSpec.from_file("robot.xml") if as_spec else "robot.xml")  # fmt: skip
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert env.replicate().model.nmesh == 1
+
+
+def test_the_text_of_a_model_is_refused_with_the_way_to_give_it() -> None:
+    with pytest.raises(
+        ValueError, match=r"^the model '<mujoco><asset><mesh \.\.\.' is XML.*mujoco.MjSpec.from_string\(\.\.\.\)"
+    ):
+        load_spec(f"\n  {CUBE}")

@@ -60,6 +60,10 @@ def keep_warm_start(engine: MujocoEngine) -> None:
     engine._initial.numpy()[start : start + engine.model.nv] = np.nan
 
 
+def narrow_positions(worlds: Worlds) -> None:
+    worlds.after.qpos = worlds.after.qpos[:, :-1]
+
+
 BREAKS: list[tuple[str, Any, str, Callable[[Function], Function]]] = [
     ("spaces", Worlds, "_allocate", then(lambda worlds: setattr(worlds, "obs_space", worlds.action_space))),
     ("addresses", lw.Env, "step", then(lambda env: env.__dict__.update(obs=env.obs.clone()))),
@@ -83,6 +87,7 @@ BREAKS: list[tuple[str, Any, str, Callable[[Function], Function]]] = [
     ("graphs", Graphs, "sequence", skip_some_replays),
     ("memory", lw.Env, "step", then(lambda env: leak.append(float(env.nworld)))),  # 32 bytes
     ("memory", lw.Env, "get_state", then(lambda env: env.__dict__.setdefault("kept", []).append(env.obs.clone()))),
+    ("bounds", Worlds, "_allocate", then(narrow_positions)),
     ("bad_state", MujocoEngine, "find_faults", nothing),
     ("bad_action", Worlds, "_judge", without_action_faults),
     ("bad_warmstart", MujocoEngine, "__init__", then(keep_warm_start)),

@@ -15,9 +15,9 @@ from lyceum_warp.engines.c.batch_faults import errors_as_warnings
 from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
 from lyceum_warp.engines.c.world_models import WorldModels
 from lyceum_warp.engines.c.world_models import bytes_per_world as model_bytes_per_world
-from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
+from lyceum_warp.fields import READ_ONLY, STATE_FIELDS, Field, Stage, early_sensor_columns, state_columns
 from lyceum_warp.kernels import faults
-from lyceum_warp.kernels.state import copy_rows64, fill_rows64, narrow, widen
+from lyceum_warp.kernels.state import copy_rows64, fill_rows64, narrow, narrow_bool, widen, widen_bool
 from lyceum_warp.model_fields import ModelField
 from lyceum_warp.mujoco_log import quiet
 from lyceum_warp.validate import whole_number
@@ -84,6 +84,7 @@ class MujocoEngine(Engine):
         self._derived = [field for field in kept if field.name not in STATE_FIELDS]
         self._lagged = [field for field in kept if field.lagged]
         self._unlagged = [field for field in kept if not field.lagged and field.name != "ctrl"]
+        self._early_columns = np.isin(np.arange(model.nsensordata), early_sensor_columns(model))
         self._written = [field for field in kept if field.written]
         self._rollouts: dict[Any, NativeRollout | None] = {}
         self._values: dict[str, np.ndarray] = {}
@@ -100,6 +101,8 @@ class MujocoEngine(Engine):
         """The initial state as float32 fields show it, whichever of them are kept."""
         initial = self.initial.copy()
         for name in STATE_FIELDS:
+            if name in READ_ONLY:
+                continue  # rounded, the times of delayed samples would differ from the engine's own
             columns = state_columns(self.model, name)
             initial[columns] = initial[columns].astype(np.float32)
         return wp.array(initial, dtype=wp.float64, device=self.device)
@@ -145,15 +148,24 @@ class MujocoEngine(Engine):
                 self.batch.forward(stage=self.stage)
         self._copy(self._unlagged)
 
-    def _copy(self, fields: list[Field], mask: np.ndarray | None = None) -> None:
-        """Copy fields from the engine's float64 arrays into their float32 arrays, in all worlds or masked ones."""
+    def _copy(self, fields: list[Field], mask: np.ndarray | None = None, *, early: bool = False) -> None:
+        """Copy fields from the engine's float64 arrays into their float32 arrays.
+
+        Args:
+            fields: Which fields.
+            mask: Which worlds; None for all.
+            early: Whether to leave out sensors of the acceleration stage.
+        """
         with np.errstate(over="ignore"):  # a world with a fault may hold numbers beyond float32
             for field in fields:
                 target, source = self._copies[field.name]
                 if mask is None:
                     np.copyto(target, source, "unsafe")
-                else:
-                    np.copyto(target, source, "unsafe", where=mask.reshape(-1, *[1] * (target.ndim - 1)))
+                    continue
+                where = mask.reshape(-1, *[1] * (target.ndim - 1))
+                if early and field.name == "sensordata":
+                    where = where & self._early_columns
+                np.copyto(target, source, "unsafe", where=where)
 
     def rollout(self, state: wp.array, controls: wp.array, nstep: int, buffers: Mapping[str, wp.array]) -> None:
         key = (len(controls), nstep, *buffers)
@@ -209,25 +221,34 @@ class MujocoEngine(Engine):
 
     def _read_state_fields(self, mask: wp.array) -> None:
         for name, column in self._columns.items():
-            launch_rows(narrow, mask, column, flat(self.arrays[name]))
+            array = self.arrays[name]
+            if array.dtype is wp.bool:
+                launch_rows(narrow_bool, mask, column, array)
+            else:
+                launch_rows(narrow, mask, column, flat(array))
 
     def commit(self, mask: wp.array) -> None:
         for name, column in self._columns.items():
-            launch_rows(widen, mask, flat(self.arrays[name]), column)
+            array = self.arrays[name]
+            if array.dtype is wp.bool:
+                launch_rows(widen_bool, mask, array, column)
+            elif name not in READ_ONLY:
+                launch_rows(widen, mask, flat(array), column)
 
     def refresh(self, mask: wp.array) -> None:
         self._forward(mask, self.reset_stage, self._derived)
 
     def refresh_current(self, mask: wp.array) -> None:
-        self._forward(mask, self.stage, [field for field in self._derived if not field.snapshot])
+        current = [field for field in self._derived if field.refresh > Stage.NONE]
+        self._forward(mask, self.stage, current, early=True)
         self._read_state_fields(mask)
 
-    def _forward(self, mask: wp.array, stage: Stage, fields: list[Field]) -> None:
+    def _forward(self, mask: wp.array, stage: Stage, fields: list[Field], *, early: bool = False) -> None:
         chosen = mask.numpy()
         if stage > Stage.NONE and chosen.any():
             with errors_as_warnings(self.batch):
                 self.batch.forward(ids=chosen, stage=stage)
-            self._copy(fields, chosen)
+            self._copy(fields, chosen, early=early)
 
     # state
 

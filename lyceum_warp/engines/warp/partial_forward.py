@@ -1,5 +1,6 @@
 """A forward pass, or steps, for a few worlds of many."""
 
+import contextlib
 from collections.abc import Callable, Mapping
 
 import mujoco
@@ -7,7 +8,8 @@ import mujoco_warp as mjw
 import warp as wp
 
 from lyceum_warp.arrays import launch_rows
-from lyceum_warp.engines.warp.group_turns import Turns
+from lyceum_warp.engines.warp import partial_kernels as kernels
+from lyceum_warp.engines.warp.group_turns import Arena, Turns
 from lyceum_warp.engines.warp.model_rows import ModelRows
 from lyceum_warp.engines.warp.overflow import report_pool_overflow
 from lyceum_warp.engines.warp.static_geoms import StaticGeoms
@@ -32,12 +34,12 @@ class PartialForward:
 
     def __init__(self, rows: ModelRows, data: mjw.Data, group: mjw.Data, states: wp.array, static: StaticGeoms) -> None:
         self._rows, self._data, self._group, self._states, self._static = rows, data, group, states, static
-        device = wp.get_device(data.qpos.device)
-        with wp.ScopedDevice(device):
+        self._device = wp.get_device(data.qpos.device)
+        with wp.ScopedDevice(self._device):
             self._group_states = wp.zeros((group.nworld, states.shape[1]), dtype=float)
             self._everyone = wp.full(group.nworld, True, dtype=bool)
             self._no_time = wp.zeros((data.nworld, 1), dtype=float)
-        self._turns = Turns(data.nworld, group.nworld, device)
+        self._turns = Turns(data.nworld, group.nworld, self._device)
 
     def __call__(
         self, mask: wp.array, forward: Callable[[mjw.Model, mjw.Data], None], targets: Mapping[str, wp.array]
@@ -56,14 +58,13 @@ class PartialForward:
             forward(self._rows.model, group)
             report_pool_overflow(group, self._everyone)
             results = {name: (getattr(group, name), target) for name, target in targets.items()}
-            if self._rows.model.nhistory:  # a forward pass adds its sensors' samples to it
-                results["history"] = group.history, data.history
             for source, target in results.values():
                 self._turns.give(source, target)
             self._turns.give_bits(group.overflow, data.overflow)
 
-        mjw.get_state(self._rows.whole, data, self._states, _SPEC, mask)
-        self._turns.run(mask, turn)
+        with wp.ScopedDevice(self._device):
+            mjw.get_state(self._rows.whole, data, self._states, _SPEC, mask)
+            self._turns.run(mask, turn)
 
     def settle(self, mask: wp.array, nstep: int) -> None:
         """Advance the masked worlds' states by some substeps, and set their time to 0; made of launches."""
@@ -77,10 +78,11 @@ class PartialForward:
             self._turns.give(self._group_states, self._states)
             self._turns.give_bits(group.overflow, data.overflow)
 
-        mjw.get_state(self._rows.whole, data, self._states, _SPEC, mask)
-        self._turns.run(mask, turn)
-        launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # time is the first number of a state
-        mjw.set_state(self._rows.whole, data, self._states, _SPEC, mask)
+        with wp.ScopedDevice(self._device):
+            mjw.get_state(self._rows.whole, data, self._states, _SPEC, mask)
+            self._turns.run(mask, turn)
+            launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # time is the first number of a state
+            mjw.set_state(self._rows.whole, data, self._states, _SPEC, mask)
 
     def _enter(self) -> None:
         """Put the group into the models and states of its worlds."""
@@ -89,3 +91,36 @@ class PartialForward:
         self._turns.take(self._states, self._group_states)
         mjw.set_state(self._rows.model, self._group, self._group_states, _SPEC)
         self._group.overflow.zero_()
+
+
+class Conditional:
+    """Runs launches if a mask holds a world, and costs next to nothing in a graph if it holds none.
+
+    Outside a graph it always runs them, without a look at the mask, which may still be in the making.
+
+    Args:
+        device: Where the launches run.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        self._device = device
+        self._any = wp.zeros(1, dtype=int, device=device)
+        self._arena = None if device.is_cpu else Arena(device)
+
+    def __call__(self, mask: wp.array, run: Callable[[], None]) -> None:
+        """Run launches for the masked worlds, (nworld,) bool, which may not matter to any other world."""
+        if not self._device.is_capturing:
+            with contextlib.nullcontext() if self._arena is None else self._arena.counting():
+                self._open()
+                run()
+            return
+        with wp.ScopedDevice(self._device):
+            self._any.zero_()
+            wp.launch(kernels.find_any, len(mask), [mask, self._any])
+            self._open()
+            with contextlib.nullcontext() if self._arena is None else self._arena.serving():
+                wp.capture_if(self._any, on_true=run)
+
+    def _open(self) -> None:
+        if self._arena is not None:
+            self._arena.open()

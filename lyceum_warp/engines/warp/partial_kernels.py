@@ -7,6 +7,14 @@ import warp as wp
 
 
 @wp.kernel(enable_backward=False)
+def find_any(mask_in: wp.array[bool], any_out: wp.array[int]):
+    """Set the one element to 1 if the mask holds a world, else leave it; launched over (nworld,)."""
+    w = wp.tid()
+    if mask_in[w]:
+        any_out[0] = 1
+
+
+@wp.kernel(enable_backward=False)
 def rank_worlds(mask_in: wp.array[bool], rank_out: wp.array[int], count_inout: wp.array[int]):
     """Number the masked worlds, in no particular order, from a count of 0 on; launched over (nworld,)."""
     w = wp.tid()

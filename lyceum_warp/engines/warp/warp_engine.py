@@ -2,38 +2,33 @@
 
 import contextlib
 import copy
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
+from mujoco_warp._src import collision_sdf
 
 from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.warp import overflow
 from lyceum_warp.engines.warp.contact_sizes import probe_sizes
 from lyceum_warp.engines.warp.data_memory import data_bytes
+from lyceum_warp.engines.warp.forward_parts import Part, forward_parts, step_after, takes_over
 from lyceum_warp.engines.warp.group_turns import group_size
 from lyceum_warp.engines.warp.model_constants import ModelConstants
 from lyceum_warp.engines.warp.model_rows import ModelRows, constants_of, outputs_of, owner, put_varied_model
-from lyceum_warp.engines.warp.partial_forward import PartialForward
+from lyceum_warp.engines.warp.partial_forward import Conditional, PartialForward
 from lyceum_warp.engines.warp.static_geoms import StaticGeoms
-from lyceum_warp.fields import Field, Stage
+from lyceum_warp.fields import Field, Stage, early_sensor_columns
 from lyceum_warp.kernels import faults
-from lyceum_warp.kernels.state import copy_rows, fill_rows, narrow, widen
+from lyceum_warp.kernels.state import copy_columns, copy_rows, fill_rows, narrow, widen, zero_columns
 from lyceum_warp.model_fields import ModelField
 from lyceum_warp.validate import whole_number
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
-
-_PARTS = (
-    (mjw.kinematics, "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat".split()),
-    (mjw.com_pos, "subtree_com cdof cinert".split()),
-    (mjw.com_vel, "cvel cdof_dot".split()),
-)
-"""The cheap parts of a forward pass in their order, and the fields that each computes; each needs those before it."""
 
 _MOST_UNROLLED = 20
 """The most iterations of the solver that are unrolled; more would take minutes to capture and gain nothing."""
@@ -64,7 +59,8 @@ class WarpEngine(Engine):
     capturable = True
 
     partial_refresh = True
-    """Whether restarting worlds get a separate forward pass if its cheap parts are not enough."""
+    """Whether restarting worlds get a separate forward pass if its cheap parts are not enough, and no pass at all if
+    there are none."""
 
     def __init__(
         self,
@@ -105,8 +101,16 @@ class WarpEngine(Engine):
         self._start: wp.array | None = None
         if initial is not None or self.dynamics:
             self._start = wp.array(self.initial, dtype=float, device=device)
-        self._current = [field.name for field in self.fields.values() if field.refresh > Stage.NONE]
         self._reset = [field.name for field in self.fields.values() if field.reset > Stage.NONE]
+        self._current_parts = forward_parts(model, [f.name for f in self.fields.values() if f.refresh > Stage.NONE])
+        self._reset_parts = None
+        if self.reset_stage < Stage.ACCELERATION:
+            self._reset_parts = forward_parts(model, self._reset)
+        self._columns: wp.array = wp.array(early_sensor_columns(model), dtype=int, device=device)
+        # a step goes on from the parts that were computed for its state, whether a world stepped there or restarted
+        moved = any(getattr(self.fields.get(name), "written", False) for name in ("mocap_pos", "mocap_quat"))
+        self._shared = () if moved else takes_over(model, self._current_parts or ())
+        self._conditional = Conditional(device)
         self._partial = self._partial_forward()
         self._settling: PartialForward | None = None
         self.apply_model(self._everyone)
@@ -173,41 +177,58 @@ class WarpEngine(Engine):
         own.owner = source  # a view of this memory may outlive the engine
         return own
 
-    def _copy_snapshots(self, mask: wp.array, *, lagged: bool | None = None) -> None:
+    def _copy_snapshots(self, mask: wp.array) -> None:
         for field in self.snapshots:
-            if lagged is None or field.lagged == lagged:
-                launch_rows(copy_rows, mask, flat(self._own[field.name]), flat(self.arrays[field.name]))
+            launch_rows(copy_rows, mask, flat(self._own[field.name]), flat(self.arrays[field.name]))
 
     # physics
 
     def step(self, nstep: int) -> None:
         with self._on_device():
-            for _ in range(nstep):
-                mjw.step(self.m, self.d)
-        self._copy_snapshots(self._everyone, lagged=True)
-        self.refresh_current()
-        self._copy_snapshots(self._everyone, lagged=False)
+            for i in range(nstep):
+                if i == 0 and self._shared:
+                    step_after(self._shared, self.m, self.d)
+                else:
+                    mjw.step(self.m, self.d)
+        self._copy_snapshots(self._everyone)
+        self.refresh_current(self._everyone)
 
     def _forward(
-        self, names: Collection[str], stage: Stage, data: mjw.Data | None = None, model: mjw.Model | None = None
+        self,
+        parts: Collection[Part] | None,
+        stage: Stage,
+        data: mjw.Data | None = None,
+        model: mjw.Model | None = None,
     ) -> None:
-        """Run the part of a forward pass that the named fields need, in every world of a data."""
+        """Run parts of a forward pass in every world of a data; None for all parts up to a stage."""
         m, d = self.m if model is None else model, self.d if data is None else data
         with self._on_device():
-            if (parts := _parts(names)) is not None:
+            if parts is not None:
                 for part in parts:
                     part(m, d)
             elif stage == Stage.ACCELERATION:
                 mjw.forward(m, d)
             else:
-                mjw.fwd_position(m, d)
+                # sensors of limits and contacts are written only where there is one; the others stay as they are
+                wp.launch(zero_columns, (d.nworld, len(self._columns)), [self._columns, d.sensordata])
+                mjw.fwd_position(m, d, factorize=False)
                 mjw.sensor_pos(m, d)
                 if stage == Stage.VELOCITY:
                     mjw.fwd_velocity(m, d)
                     mjw.sensor_vel(m, d)
+                if "energy" in self.fields:  # of a model whose sensors do not compute it
+                    mjw.energy_pos(m, d)
+                    mjw.energy_vel(m, d)
 
-    def refresh_current(self, mask: wp.array | None = None) -> None:
-        self._forward(self._current, self.stage)
+    def refresh_current(self, mask: wp.array) -> None:
+        if self.stage == Stage.NONE:
+            return
+        with self._histories_kept():
+            self._forward(self._current_parts, self.stage)
+        if (mixed := self.fields.get("sensordata")) and mixed.snapshot and not mixed.lagged:
+            own, kept = self._own["sensordata"], self.arrays["sensordata"]
+            size = self.nworld, len(self._columns)
+            wp.launch(copy_columns, size, [mask, self._columns, own, kept], device=self.device)
 
     def apply_model(self, mask: wp.array) -> None:
         with wp.ScopedDevice(self.device):
@@ -257,19 +278,23 @@ class WarpEngine(Engine):
 
     def refresh(self, mask: wp.array) -> None:
         if self._partial is not None and self.partial_refresh:
-            targets = {name: self.arrays[name] for name in self._reset}
-            with wp.ScopedDevice(self.device):
-                self._partial(mask, self._reset_forward, targets)
-            return
-        with self._histories_of_others_kept(mask):
-            self._forward(self._reset, self.reset_stage)
-        self._copy_snapshots(mask)
-        if _parts(self._reset) is None:
-            overflow.report_pool_overflow(self.d, mask)
+            self._partial(mask, self._forward_group, {name: self.arrays[name] for name in self._reset})
+        elif self.partial_refresh:
+            self._conditional(mask, lambda: self._refresh(mask))
+        else:
+            self._refresh(mask)
 
-    def _reset_forward(self, model: mjw.Model, data: mjw.Data) -> None:
-        """Compute the fields that restarting worlds need, in a group of them."""
-        self._forward(self._reset, self.reset_stage, data, model)
+    def _forward_group(self, model: mjw.Model, group: mjw.Data) -> None:
+        self._forward(None, self.reset_stage, group, model)
+        self._forward(self._shared, self.reset_stage)  # from which the next step goes on
+
+    def _refresh(self, mask: wp.array) -> None:
+        """A forward pass of all worlds; those outside the mask stay as they are."""
+        with self._histories_kept():
+            self._forward(self._reset_parts, self.reset_stage)
+        self._copy_snapshots(mask)
+        if self._reset_parts is None:
+            overflow.report_pool_overflow(self.d, mask)
 
     def _is_partial(self) -> bool:
         """Whether a group of worlds can be stepped alone."""
@@ -278,7 +303,7 @@ class WarpEngine(Engine):
 
     def _partial_forward(self) -> PartialForward | None:
         """A forward pass of restarting worlds alone, or None where it gains nothing or is not possible."""
-        return self._group_of_worlds() if self._is_partial() and _parts(self._reset) is None else None
+        return self._group_of_worlds() if self._is_partial() and self._reset_parts is None else None
 
     def _group_of_worlds(self) -> PartialForward:
         size = group_size(self.nworld, self.device)
@@ -289,16 +314,13 @@ class WarpEngine(Engine):
         return PartialForward(rows, self.d, self._make_data(size), self._state, self._static)
 
     @contextlib.contextmanager
-    def _histories_of_others_kept(self, mask: wp.array) -> Iterator[None]:
-        """A forward pass adds samples to the sensors' histories, here only in the masked worlds."""
-        history = self.d.history
-        if not history.size:
-            yield
-            return
-        wp.copy(self._history, history)
+    def _histories_kept(self) -> Iterator[None]:
+        """A forward pass adds samples to the sensors' histories; the step that follows adds the same ones."""
+        if self.d.history.size:
+            wp.copy(self._history, self.d.history)
         yield
-        launch_rows(copy_rows, mask, history, self._history)
-        wp.copy(history, self._history)
+        if self.d.history.size:
+            wp.copy(self.d.history, self._history)
 
     # state
 
@@ -324,6 +346,8 @@ def _refusals() -> Iterator[None]:
 
 def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied: Collection[str]) -> tuple[int, int]:
     """Contacts and constraints that each world has room for: those given, and probed ones for those that are not."""
+    with _refusals():
+        _check_sdf_plugins(model)  # now: probing such a model takes long
     given = {"nconmax": nconmax, "njmax": njmax}
     sizes = [size if size is None else whole_number(name, size, low=1) for name, size in given.items()]
     probed = probe_sizes(_with_friction_losses(model, varied)) if None in sizes else (0, 0)
@@ -342,6 +366,12 @@ def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> muj
     return model
 
 
+def _check_sdf_plugins(model: mujoco.MjModel) -> None:
+    """Refuse plugins whose distance function MuJoCo Warp leaves to its user, who has not written it."""
+    if (model.geom_plugin >= 0).any() and collision_sdf.user_sdf.func.__module__ == collision_sdf.__name__:
+        raise NotImplementedError("it has no functions of SDF plugins")
+
+
 def _check_unrolled(model: mujoco.MjModel) -> None:
     if model.opt.iterations > _MOST_UNROLLED:
         raise ValueError(
@@ -350,17 +380,6 @@ def _check_unrolled(model: mujoco.MjModel) -> None:
         )
     if model.nflex:
         raise ValueError("unroll=True would unroll the collisions of the model's flexes, too: leave it out")
-
-
-def _parts(names: Collection[str]) -> list[Callable[[mjw.Model, mjw.Data], None]] | None:
-    """The parts of a forward pass that compute the named fields, or None if collisions and constraints are needed."""
-    last = -1
-    for name in names:
-        place = next((i for i, (_, fields) in enumerate(_PARTS) if name in fields), None)
-        if place is None:
-            return None
-        last = max(last, place)
-    return [part for part, _ in _PARTS[: last + 1]]
 
 
 def _contacts_of_one_world(model: mjw.Model) -> int:

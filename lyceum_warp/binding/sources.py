@@ -1,0 +1,121 @@
+"""The source of a Warp function: its syntax tree, its lines in the file, and what its names stand for."""
+
+import ast
+import builtins
+import types
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+
+class FunctionSource:
+    """The source of a ``wp.func`` as it was when the function was made, even if its file has changed since.
+
+    Args:
+        function: A function with a source; see ``has_source``.
+
+    Raises:
+        ValueError: The source is not a single function definition.
+    """
+
+    def __init__(self, function: wp.Function) -> None:
+        adj: Any = function.adj
+        body = ast.parse(adj.source).body
+        if len(body) != 1 or not isinstance(body[0], ast.FunctionDef):
+            raise ValueError(f"the source of {name_of(function)} is not a function definition that starts with def")
+        self.function = function
+        self.tree = body[0]
+        self.name = name_of(function)
+        self.file = Path(adj.filename).name
+        self._first_line: int = adj.fun_lineno
+        self.scope = _scope(function.func)
+        """The values of global names and of those that the function encloses."""
+        self.locals = {argument.arg for argument in self.tree.args.args} | {
+            node.id for node in ast.walk(self.tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+        }
+        """Its arguments, and the names that it assigns."""
+
+    def line(self, node: ast.AST) -> int:
+        """The line of a node in the file."""
+        return self._first_line + getattr(node, "lineno", 1) - 1
+
+    def place(self, node: ast.AST) -> str:
+        """The file and the line of a node, for messages."""
+        return f"{self.file}, line {self.line(node)}"
+
+    def value(self, node: ast.expr) -> Any:
+        """What a name, a path such as ``module.helper`` or a ``wp.static(...)`` stands for; None if it is not known."""
+        if isinstance(node, ast.Name):
+            if node.id in self.locals:
+                return None
+            return self.scope.get(node.id, builtin(node.id))
+        if isinstance(node, ast.Attribute):
+            owner = self.value(node.value)
+            if owner is None:
+                return None
+            return getattr(owner, node.attr, builtin(node.attr) if owner is wp else None)
+        if self.is_static(node):
+            assert isinstance(node, ast.Call)
+            try:
+                return eval(ast.unparse(node.args[0]), dict(self.scope))
+            except Exception:  # it may be anything, such as the counter of a loop that Warp unrolls
+                return None
+        return None
+
+    def is_static(self, node: ast.AST) -> bool:
+        """Whether a node is ``wp.static(...)``, which Warp replaces with the value of its argument."""
+        return (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name | ast.Attribute)
+            and self.value(node.func) is wp.static
+            and len(node.args) == 1
+        )
+
+    def condition(self, node: ast.expr) -> bool | None:
+        """The value of a condition that Warp evaluates when it compiles; None for all others."""
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
+            inner = self.condition(node.operand)
+            return None if inner is None else not inner
+        if self.is_static(node):
+            found = self.value(node)
+            return None if found is None else bool(found)
+        return None
+
+
+def has_source(function: wp.Function) -> bool:
+    """Whether a function's source is Python: not that of a builtin, or of a ``wp.func_native``."""
+    return function.func is not None and function.native_snippet is None
+
+
+def name_of(function: wp.Function) -> str:
+    """A function's name, as in its source."""
+    return function.func.__name__ if function.func is not None else function.key
+
+
+def builtin(name: str) -> Any:
+    """Warp's builtin of a name, which may not be an attribute of the module, or Python's; None if there is none."""
+    return _BUILTINS.get(name) or getattr(wp, name, None) or getattr(builtins, name, None)
+
+
+def overloads(function: wp.Function) -> list[wp.Function]:
+    """A function and those of the same name with arguments of other types."""
+    if not has_source(function):
+        return [function]
+    found = [*function.user_overloads.values(), *function.user_templates.values()]
+    # without those that Warp made from a generic one
+    return [overload for overload in found if overload.generic_parent is None] or [function]
+
+
+_BUILTINS: dict[str, Any] = wp._src.context.builtin_functions  # wp.tid and others are only here
+
+
+def _scope(function: Any) -> dict[str, Any]:
+    assert isinstance(function, types.FunctionType)
+    scope = dict(function.__globals__)
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        try:
+            scope[name] = cell.cell_contents
+        except ValueError:  # not assigned yet
+            scope.pop(name, None)
+    return scope

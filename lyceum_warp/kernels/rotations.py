@@ -1,0 +1,155 @@
+"""Unit quaternions in MuJoCo's order w, x, y, z, as Warp functions for tasks.
+
+The functions expect unit quaternions, as MuJoCo's fields hold them; none of them normalises its arguments. Where MuJoCo
+has the same function, it is named. Warp's own quaternion functions expect x, y, z, w and refuse these quaternions.
+"""
+
+import warp as wp
+
+from lyceum_warp.kernels.random import uniform
+
+
+@wp.func
+def quat_mul(a: wp.vec4, b: wp.vec4) -> wp.vec4:
+    """Multiply two quaternions, a b: the rotation b followed by a.
+
+    (w, v) = (a_w b_w - a_v . b_v, a_w b_v + b_w a_v + a_v x b_v), as mju_mulQuat.
+    """
+    return wp.vec4(
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    )
+
+
+@wp.func
+def quat_inverse(q: wp.vec4) -> wp.vec4:
+    """Invert a rotation: the conjugate (w, -x, -y, -z), as mju_negQuat."""
+    return wp.vec4(q[0], -q[1], -q[2], -q[3])
+
+
+@wp.func
+def quat_rotate(q: wp.vec4, v: wp.vec3) -> wp.vec3:
+    """Rotate a vector, from the frame whose orientation is q into the world's.
+
+    v + 2 u x (w v + u x v) for q = (w, u), as mju_rotVecQuat.
+    """
+    u = wp.vec3(q[1], q[2], q[3])
+    return v + 2.0 * wp.cross(u, q[0] * v + wp.cross(u, v))
+
+
+@wp.func
+def quat_rotate_inverse(q: wp.vec4, v: wp.vec3) -> wp.vec3:
+    """Rotate a vector of the world into the frame whose orientation is q, as a velocity into a body's own frame.
+
+    v - 2 u x (w v - u x v) for q = (w, u), as mju_rotVecQuat with the inverse.
+    """
+    u = wp.vec3(q[1], q[2], q[3])
+    return v - 2.0 * wp.cross(u, q[0] * v - wp.cross(u, v))
+
+
+@wp.func
+def quat_from_axis_angle(axis: wp.vec3, angle: float) -> wp.vec4:
+    """Make the rotation by an angle, in radians, about a unit axis.
+
+    (cos(angle / 2), sin(angle / 2) axis), as mju_axisAngle2Quat.
+    """
+    s = wp.sin(0.5 * angle)
+    return wp.vec4(wp.cos(0.5 * angle), s * axis[0], s * axis[1], s * axis[2])
+
+
+@wp.func
+def quat_from_rotvec(r: wp.vec3) -> wp.vec4:
+    """Make the rotation by |r| radians about r; an angular velocity times a duration is such a vector."""
+    angle = wp.length(r)
+    scale = float(0.5)  # the limit of sin(angle / 2) / angle
+    if angle > 0.0:
+        scale = wp.sin(0.5 * angle) / angle
+    return wp.vec4(wp.cos(0.5 * angle), scale * r[0], scale * r[1], scale * r[2])
+
+
+@wp.func
+def quat_to_rotvec(q: wp.vec4) -> wp.vec3:
+    """Turn a rotation into its axis times its angle, of at most pi radians.
+
+    2 atan2(|u|, w) u / |u| for q = (w, u) with w >= 0, else for -q, the same rotation; as mju_quat2Vel for a second.
+    """
+    u = wp.vec3(q[1], q[2], q[3])
+    w = q[0]
+    if w < 0.0:
+        u = -u
+        w = -w
+    sine = wp.length(u)
+    scale = float(2.0)  # the limit of 2 atan2(|u|, w) / |u|
+    if sine > 0.0:
+        scale = 2.0 * wp.atan2(sine, w) / sine
+    return scale * u
+
+
+@wp.func
+def quat_difference(a: wp.vec4, b: wp.vec4) -> wp.vec3:
+    """Find the rotation vector r, in the frame of b, that turns b into a: a = b quat_from_rotvec(r), as mju_subQuat."""
+    return quat_to_rotvec(quat_mul(quat_inverse(b), a))
+
+
+@wp.func
+def quat_angle(a: wp.vec4, b: wp.vec4) -> float:
+    """Measure the angle between two orientations, from 0 to pi: the length of ``quat_difference``."""
+    return wp.length(quat_difference(a, b))
+
+
+@wp.func
+def quat_to_mat(q: wp.vec4) -> wp.mat33:
+    """Turn a rotation into its matrix, whose columns are the rotated axes, as mju_quat2Mat."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return wp.mat33(
+        w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), w * w - x * x + y * y - z * z, 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z,
+    )  # fmt: skip
+
+
+@wp.func
+def quat_from_mat(m: wp.mat33) -> wp.vec4:
+    """Turn a rotation matrix, as ``site_xmat`` holds, into its quaternion; up to the sign, as mju_mat2Quat.
+
+    The trace and the diagonal show which of w, x, y, z is large enough to divide by (Shepperd 1978,
+    "Quaternion from rotation matrix").
+    """
+    q = wp.vec4()
+    if m[0, 0] + m[1, 1] + m[2, 2] > 0.0:
+        q[0] = 0.5 * wp.sqrt(1.0 + m[0, 0] + m[1, 1] + m[2, 2])
+        q[1] = 0.25 * (m[2, 1] - m[1, 2]) / q[0]
+        q[2] = 0.25 * (m[0, 2] - m[2, 0]) / q[0]
+        q[3] = 0.25 * (m[1, 0] - m[0, 1]) / q[0]
+    elif m[0, 0] > m[1, 1] and m[0, 0] > m[2, 2]:
+        q[1] = 0.5 * wp.sqrt(1.0 + m[0, 0] - m[1, 1] - m[2, 2])
+        q[0] = 0.25 * (m[2, 1] - m[1, 2]) / q[1]
+        q[2] = 0.25 * (m[0, 1] + m[1, 0]) / q[1]
+        q[3] = 0.25 * (m[0, 2] + m[2, 0]) / q[1]
+    elif m[1, 1] > m[2, 2]:
+        q[2] = 0.5 * wp.sqrt(1.0 - m[0, 0] + m[1, 1] - m[2, 2])
+        q[0] = 0.25 * (m[0, 2] - m[2, 0]) / q[2]
+        q[1] = 0.25 * (m[0, 1] + m[1, 0]) / q[2]
+        q[3] = 0.25 * (m[1, 2] + m[2, 1]) / q[2]
+    else:
+        q[3] = 0.5 * wp.sqrt(1.0 - m[0, 0] - m[1, 1] + m[2, 2])
+        q[0] = 0.25 * (m[1, 0] - m[0, 1]) / q[3]
+        q[1] = 0.25 * (m[0, 2] + m[2, 0]) / q[3]
+        q[2] = 0.25 * (m[1, 2] + m[2, 1]) / q[3]
+    return q
+
+
+@wp.func
+def quat_random(rng: wp.array[wp.uint32]) -> wp.vec4:
+    """Draw a rotation, all of them equally likely, and advance the stream.
+
+    (a sin t, a cos t, b sin s, b cos s) for a^2 = 1 - b^2 from U(0, 1) and angles t, s from U(0, 2 pi) (Shoemake 1992,
+    "Uniform random rotations").
+    """
+    u = uniform(rng, 0.0, 1.0)
+    t = uniform(rng, 0.0, 2.0 * wp.pi)
+    s = uniform(rng, 0.0, 2.0 * wp.pi)
+    a, b = wp.sqrt(1.0 - u), wp.sqrt(u)
+    return wp.vec4(a * wp.sin(t), a * wp.cos(t), b * wp.sin(s), b * wp.cos(s))

@@ -1,0 +1,150 @@
+"""The rule about indices."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from lyceum_warp.arrays import torch_view
+from lyceum_warp.binding.writes import written_fields
+from lyceum_warp.task import FUNCTIONS
+from lyceum_warp.testing.checked_functions import CheckedFunctions, Unchecked, checked_functions
+from lyceum_warp.testing.context import Context
+
+_RESET = ("startup", "initialize", "randomize")
+"""The functions that a reset runs, in order, on the engine's initial state."""
+
+_MEMORIES = ("memory", "lasting_memory")
+"""Fields that ``advance`` finds as the step before left them."""
+
+_MOST_LISTED = 8
+"""Problems that the message of a failure lists."""
+
+
+def check_bounds(ctx: Context) -> None:
+    """No function of the task reads or writes a row, a vector or a matrix out of range.
+
+    An index that is negative counts as out of range too, because Warp takes it from the other end, unless it is written
+    as a constant such as ``-1``. Copies of the functions with checks run on the states of random steps.
+    """
+    run = _Run(ctx)
+    with ctx.changed(ctx.a, autoreset=False):
+        run.steps()
+    if problems := run.checked.problems(run.report):
+        more = [f"and {len(problems) - _MOST_LISTED} more"] if len(problems) > _MOST_LISTED else []
+        ctx.fail("; ".join([*problems[:_MOST_LISTED], *more]))
+
+
+class _Run:
+    """The checked functions of a task, the arrays that they get, and the states to run them on."""
+
+    def __init__(self, ctx: Context) -> None:
+        self.ctx, self.env, self.worlds = ctx, ctx.a, ctx.a.worlds
+        task = self.env.task
+        self.functions = {name: function for name, function in task.functions.items() if function is not None}
+        name = f"{task.task.__module__}.{task.task.__qualname__}"
+        try:
+            self.checked: CheckedFunctions = checked_functions(
+                name, self.functions, task.source.world, task.kernels.Batch, self.env.device
+            )
+        except Unchecked as error:
+            ctx.fail(f"the functions could not be checked: {error}")
+        self.report = self.checked.report(self.env.device)
+        self.keep: list[wp.array] = []
+        self.before, self.after, self.start = (self._batch() for _ in range(3))
+        self.rng = np.random.default_rng(ctx.seed)
+        n = self.env.nworld
+        sizes = {
+            "action": self.worlds.action_space.size,
+            "obs": self.worlds.obs_spaces["policy"].size,
+            "ctrl": task.model.nu,
+            "metrics": len(getattr(task.task, "metrics", ())),
+        }  # fmt: skip
+        self.rows = {name: self._array((n, size), wp.float32) for name, size in sizes.items()}
+        self.rows["rng"] = self._array((n, 1), wp.uint32)
+
+    def steps(self) -> None:
+        """Run the functions on the states of random steps, and of resets between them."""
+        env = self.env
+        self._keep_start()
+        self.ctx.restart()
+        for i, action in enumerate(self.ctx.actions(self.ctx.steps)):
+            ended = env.done.clone()
+            if i == 0 or ended.any():
+                self._run_reset()
+                env.rand_reset(mask=ended)
+            torch_view(self.rows["action"]).copy_(action)
+            self._copy(self.worlds.after, self.before)
+            self._run("control", self.before)
+            self._copy(self.worlds.after, self.before)
+            env.step(action)
+            self._run_step()
+
+    def _run_step(self) -> None:
+        """Run the functions of a step on the transition that it made, and on the state that it led to."""
+        dirty = True
+        for name, function in self.functions.items():
+            if name in (*_RESET, "control"):
+                continue
+            if dirty:
+                self._copy(self.worlds.after, self.after)
+            if name == "advance":
+                for memory in _MEMORIES:
+                    if memory in self.env.task.types:
+                        wp.copy(getattr(self.after, memory), getattr(self.before, memory))
+            self._run(name, self.after)
+            dirty = name == "advance" or bool(written_fields(function))
+
+    def _run_reset(self) -> None:
+        """Run the functions of a reset on the engine's initial state."""
+        self._copy(self.start, self.after)
+        if "lasting_memory" in self.env.task.types:
+            wp.copy(self.after.lasting_memory, self.worlds.after.lasting_memory)
+        for name in _RESET:
+            self._run(name, self.after)
+
+    def _keep_start(self) -> None:
+        """Keep the state that a reset starts from, before the task changes it."""
+        env = self.ctx.b
+        env.engine.reset(env.worlds.everyone)
+        self._copy(env.worlds.after, self.start)
+        for memory in _MEMORIES:
+            if memory in env.task.types:
+                getattr(self.start, memory).zero_()
+        env.reset()
+
+    def _run(self, name: str, state: Any) -> None:
+        """Run the copy of a function of the task, if it has it; ``state`` is ``s`` or ``s1``."""
+        if name not in self.functions:
+            return
+        draws = self.rng.integers(0, 2**32, (self.env.nworld, 1), dtype=np.uint32)
+        self.rows["rng"].assign(draws)
+        values = {"s": state, "s0": self.before, "s1": state, "p": self.worlds.params} | self.rows
+        names = [argument.partition(":")[0] for argument in FUNCTIONS[name].arguments.split(", ")]
+        wp.launch(
+            self.checked.kernels[name], self.env.nworld, [self.report, *(values[name] for name in names)],
+            device=self.env.device,
+        )  # fmt: skip
+
+    def _batch(self) -> Any:
+        """Arrays for copies of the task's fields."""
+        batch = self.env.task.kernels.Batch()
+        for name in self.env.task.types:
+            live = getattr(self.worlds.after, name)
+            setattr(batch, name, self._array(live.shape, live.dtype))
+        return batch
+
+    def _array(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        """An array of zeros; where a row has no elements, with memory for one that a checked function may touch."""
+        with wp.ScopedDevice(self.env.device):
+            made: wp.array = wp.zeros([max(size, 1) for size in shape], dtype=dtype)
+            self.keep.append(made)
+            return (
+                made if made.shape == shape else wp.array(ptr=made.ptr, shape=shape, strides=made.strides, dtype=dtype)
+            )
+
+    def _copy(self, source: Any, target: Any) -> None:
+        for name in self.env.task.types:
+            array = getattr(source, name)
+            if array.size:
+                wp.copy(getattr(target, name), array)

@@ -1,0 +1,402 @@
+"""Copies of a task's functions that check every index, and kernels that run them.
+
+The copies are made from the functions' sources: each index of a row, a vector or a matrix goes through a function that
+compares it with the size, and each ``while`` loop counts its rounds. Everything else stays as it is, so that the
+numbers are those of the task. Native functions (``wp.func_native``) are C++ and cannot be checked.
+"""
+
+import ast
+import copy
+import dataclasses
+import linecache
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from lyceum_warp.binding.sources import FunctionSource, has_source, name_of, overloads
+from lyceum_warp.kernels import bounds
+
+_SHAPES = ("shape", "strides")
+"""Attributes of an array that are tuples."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """One index, or one loop, in the source of a function."""
+
+    function: str
+    text: str
+    """The expression with the index, as in the source."""
+    where: str
+    """The file and the line."""
+    verb: str
+    """What the function does there: "reads", "writes" or "loops"."""
+
+    def problem(self, index: int, size: int) -> str:
+        """What went wrong, in one line."""
+        if self.verb == "loops":
+            rounds = int(bounds.MOST_ROUNDS)
+            return f"{self.function} is still in its loop {self.text!r} after {rounds} rounds ({self.where})"
+        there = f"{size} elements, 0 to {size - 1}" if size else "no elements"
+        return (
+            f"{self.function} {self.verb} {self.text} out of range ({self.where}): the index is {index}, and there are "
+            f"{there}"
+        )
+
+
+_HELPERS = {
+    "bounds_at": bounds.at, "bounds_from_end": bounds.from_end, "bounds_element": bounds.element,
+    "bounds_is_endless": bounds.is_endless,
+}  # fmt: skip
+"""The names that the copies use, chosen so that no task has them."""
+
+
+class Unchecked(Exception):  # noqa: N818
+    """A function can't be checked; the message says why."""
+
+
+class CheckedFunctions:
+    """The checked copies of some functions, with a kernel for each.
+
+    A kernel gets the report, (places, 3) int32, and for each argument of its function the values of all worlds: a
+    ``Batch`` for the task's World, (nworld,) or (1,) for Params, (nworld, size) for a row. The report has, for each
+    place, the number of times that its index was out of range, the first such index and the size.
+
+    Args:
+        module: Name of the Warp module that the copies are compiled into.
+        functions: The functions by name.
+        world: The task's World.
+        batch: The struct of the task's fields for all worlds.
+        unrolled: Whether Warp writes short loops out, as it does for the task itself. Without it the copies compile in
+            a fraction of the time, but a loop cannot change a name that was assigned a constant.
+
+    Raises:
+        Unchecked: A function can't be copied.
+    """
+
+    def __init__(
+        self,
+        module: str,
+        functions: Mapping[str, wp.Function],
+        world: Any,
+        batch: Any,
+        *,
+        unrolled: bool = False,
+    ) -> None:
+        self._module, self._world, self._batch, self.unrolled = module, world, batch, unrolled
+        if not unrolled:
+            wp.get_module(module).options["max_unroll"] = 0
+        self.places: list[Place] = []
+        self._numbers: dict[wp.Function, int] = {}
+        self._copies: dict[int, wp.Function] = {}
+        self._scopes: list[tuple[dict[str, Any], list[int]]] = []
+        self.kernels = {name: self._kernel(name, function) for name, function in functions.items()}
+        for scope, numbers in self._scopes:  # functions may call each other
+            scope |= {f"bounds_{number}": self._copies[number] for number in numbers}
+
+    def load(self, device: wp.Device) -> None:
+        """Compile the kernels.
+
+        Raises:
+            Unchecked: Warp can't compile the copies.
+        """
+        try:
+            wp.get_module(self._module).load(device)
+        except Exception as error:
+            lines = [line.strip(" ;") for line in str(error).splitlines() if line.strip(" ;")]
+            raise Unchecked(f"Warp can't compile the functions with checks: {' '.join(lines[-2:])}") from error
+
+    def report(self, device: wp.Device) -> wp.array:
+        """A report without findings."""
+        return wp.zeros((max(len(self.places), 1), 3), dtype=int, device=device)
+
+    def problems(self, report: wp.array) -> list[str]:
+        """The findings of a report, one line each."""
+        found: np.ndarray = report.numpy()
+        return list(dict.fromkeys(place.problem(*found[i, 1:]) for i, place in enumerate(self.places) if found[i, 0]))
+
+    # parts of the copies, for the rewriter
+
+    def place(self, source: FunctionSource, node: ast.AST, text: str, verb: str) -> int:
+        """The number of a new place."""
+        self.places.append(Place(source.name, text, source.place(node), verb))
+        return len(self.places) - 1
+
+    def number(self, function: wp.Function) -> int:
+        """The number of a function's copy, which is made if it is not there yet."""
+        if function not in self._numbers:
+            number = self._numbers[function] = len(self._numbers)
+            for overload in overloads(function):
+                self._copies[number] = self._copy(overload, number)
+        return self._numbers[function]
+
+    def _copy(self, function: wp.Function, number: int) -> wp.Function:
+        try:
+            source = FunctionSource(function)
+        except ValueError as error:
+            raise Unchecked(str(error)) from error
+        rewriter = _Rewriter(self, source)
+        tree = rewriter.visit(copy.deepcopy(source.tree))
+        tree.name = f"checked_{number}_{source.name}"
+        tree.decorator_list = [ast.parse("bounds_wp.func(module=bounds_module)", mode="eval").body]
+        types = {f"bounds_type_{i}": kind for i, kind in enumerate(function.input_types.values())}
+        for argument, name in zip(tree.args.args, types, strict=True):
+            argument.annotation = ast.Name(name, ast.Load())
+        tree.args.args.insert(0, ast.arg("bounds_report", ast.Name("bounds_report_type", ast.Load())))
+        defaults = {
+            f"bounds_default_{i}": value for i, value in enumerate(getattr(function.func, "__defaults__", None) or ())
+        }
+        tree.args.defaults = [ast.Name(name, ast.Load()) for name in defaults]
+        returned = function.adj.arg_types.get("return")
+        tree.returns = None if returned is None else ast.Name("bounds_result_type", ast.Load())
+        types |= {"bounds_report_type": wp.array2d(dtype=int), "bounds_result_type": returned}
+        scope = source.scope | _HELPERS | types | defaults
+        scope |= {"bounds_wp": wp, "bounds_module": wp.get_module(self._module)}
+        if number in self._copies:  # Warp takes the next for an overload of this one
+            scope[tree.name] = self._copies[number]
+        self._scopes.append((scope, rewriter.callees))
+        self._execute(ast.unparse(ast.fix_missing_locations(tree)), scope, len(self._scopes))
+        copied: wp.Function = scope[tree.name]
+        return copied
+
+    def _execute(self, text: str, scope: dict[str, Any], part: int | str) -> None:
+        """Run generated source in a scope, and keep it where Warp looks for it."""
+        file = f"<{self._module} {part}>"
+        linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
+        scope["__name__"] = self._module
+        exec(compile(text, file, "exec"), scope)
+
+    def _kernel(self, name: str, function: wp.Function) -> wp.Kernel:
+        """The kernel that runs the copy of one function in every world."""
+        number = self.number(function)
+        scope: dict[str, Any] = {
+            "wp": wp, "World": self._world, "Batch": self._batch, "copy": self._copies[number],
+        }  # fmt: skip
+        arguments, lines, values = ["report: wp.array2d[int]"], ["w = wp.tid()"], ["report"]
+        for i, kind in enumerate(function.input_types.values()):
+            if kind is self._world:
+                arguments.append(f"batch_{i}: Batch")
+                lines.append(f"s_{i} = World()")
+                lines += [f"s_{i}.{field} = batch_{i}.{field}[w % batch_{i}.{field}.shape[0]]" for field in kind.vars]
+                values.append(f"s_{i}")
+            else:
+                scope[f"type_{i}"] = wp.array2d(dtype=kind.dtype) if _is_row(kind) else wp.array(dtype=kind)
+                arguments.append(f"values_{i}: type_{i}")
+                values.append(f"values_{i}[w % values_{i}.shape[0]]")
+        lines.append(f"copy({', '.join(values)})")
+        text = f"def run_{name}({', '.join(arguments)}):\n" + "\n".join(f"    {line}" for line in lines) + "\n"
+        self._execute(text, scope, name)
+        return wp.kernel(scope[f"run_{name}"], module=wp.get_module(self._module), enable_backward=False)
+
+
+class _Rewriter(ast.NodeTransformer):
+    """Puts checks into the syntax tree of one function."""
+
+    def __init__(self, checked: CheckedFunctions, source: FunctionSource) -> None:
+        self.checked, self.source = checked, source
+        self.callees: list[int] = []
+        self.loops = 0
+        self.writes = False
+        """Whether the expression at hand is written: of ``a[i].x = 1.0`` all parts are."""
+
+    def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
+        """Leave the type of a local name alone."""
+        node.target = self.visit(node.target)
+        node.value = node.value and self.visit(node.value)
+        return node
+
+    def visit_Name(self, node: ast.Name) -> ast.AST:
+        return self._refused(node)
+
+    def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
+        self._refused(node)
+        node.value = self._visit(node.value, writes=self.writes or not isinstance(node.ctx, ast.Load))
+        return node
+
+    def _visit(self, node: ast.expr, *, writes: bool) -> ast.expr:
+        kept, self.writes = self.writes, writes
+        visited: ast.expr = self.visit(node)
+        self.writes = kept
+        return visited
+
+    def _refused(self, node: ast.Name | ast.Attribute) -> ast.AST:
+        """Refuse a function that is not called here: the copy that is called elsewhere takes one argument more."""
+        function = self.source.value(node)
+        if isinstance(function, wp.Function) and function.func is not None:
+            raise Unchecked(
+                f"{self.source.name} uses {name_of(function)} as a value ({self.source.place(node)}): call it instead"
+            )
+        return node
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        if self.source.is_static(node):
+            return node
+        callee = self.source.value(node.func)
+        if callee is None and self.source.is_static(node.func):
+            raise Unchecked(f"{self.source.name} calls what a loop chooses ({self.source.place(node)})")
+        if isinstance(callee, wp.Function) and callee.func is None and callee.key.startswith("atomic_"):
+            self._check_atomic(node, callee.key)
+        node.args = [self.visit(argument) for argument in node.args]
+        for keyword in node.keywords:
+            keyword.value = self.visit(keyword.value)
+        if not isinstance(callee, wp.Function) or callee.func is None:
+            if not isinstance(node.func, ast.Name):
+                node.func = self.visit(node.func)
+            return node
+        if has_source(callee):
+            number = self.checked.number(callee)
+            self.callees.append(number)
+            node.func = _name(f"bounds_{number}")
+            node.args.insert(0, _name("bounds_report"))
+        elif any(_is_row(kind) or hasattr(kind, "vars") for kind in callee.input_types.values()):
+            raise Unchecked(
+                f"{self.source.name} calls the native function {name_of(callee)} ({self.source.place(node)}), which "
+                "has no source in Python: give it numbers instead of rows"
+            )
+        return node
+
+    def _check_atomic(self, node: ast.Call, key: str) -> None:
+        """Put checks around the indices of ``wp.atomic_add(row, i, value)`` and other functions of its kind."""
+        text, values = ast.unparse(node), 2 if key == "atomic_cas" else 1
+        row = self.visit(copy.deepcopy(node.args[0]))
+        for axis, index in enumerate(node.args[1:-values]):
+            node.args[1 + axis] = self._checked(node, text, "writes", row, axis, index)
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
+        if self._is_left_alone(node):
+            return node
+        writes = self.writes or not isinstance(node.ctx, ast.Load)
+        text, verb = ast.unparse(node), "writes" if writes else "reads"
+        called = any(isinstance(inner, ast.Call) for inner in ast.walk(node.value))
+        base = self._visit(node.value, writes=writes)
+        indices = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        if called and len(indices) == 1 and not isinstance(indices[0], ast.Slice) and verb == "reads":
+            place = ast.Constant(self.checked.place(self.source, node, text, verb))
+            index = self._visit(indices[0], writes=False)
+            return _call("bounds_element", _name("bounds_report"), place, base, index)
+        checked = [
+            self._visit(index, writes=False)
+            if isinstance(index, ast.Slice)
+            else self._checked(node, text, verb, base, axis, self._visit(index, writes=False))
+            for axis, index in enumerate(indices)
+        ]
+        node.value = base
+        node.slice = ast.Tuple(checked, ast.Load()) if isinstance(node.slice, ast.Tuple) else checked[0]
+        return node
+
+    def _is_left_alone(self, node: ast.Subscript) -> bool:
+        """Whether Warp itself checks the index, which must be a constant."""
+        value = self.source.value(node.value)
+        not_ours = value is not None and not hasattr(value, "_wp_scalar_type_")  # a type, or Python's own tuple
+        return not_ours or _is_tuple(self.source, node.value)
+
+    def _checked(self, node: ast.AST, text: str, verb: str, base: ast.expr, axis: int, index: ast.expr) -> ast.expr:
+        """An index along one axis, with its check."""
+        place = ast.Constant(self.checked.place(self.source, node, text, verb))
+        for _ in range(axis):
+            base = ast.Subscript(_loaded(base), ast.Constant(0), ast.Load())
+        negative = isinstance(index, ast.UnaryOp) and isinstance(index.op, ast.USub)
+        constant = negative and isinstance(index.operand, ast.Constant)  # type: ignore[attr-defined]
+        size = _call("len", _loaded(base))
+        return _call("bounds_from_end" if constant else "bounds_at", _name("bounds_report"), place, index, size)
+
+    def visit_While(self, node: ast.While) -> list[ast.stmt]:
+        """Count the rounds of a loop."""
+        place = self.checked.place(self.source, node, f"while {ast.unparse(node.test)}", "loops")
+        self.loops += 1
+        rounds = f"bounds_rounds_{self.loops}"
+        node = self.generic_visit(node)  # type: ignore[assignment]
+        count = ast.parse(
+            f"{rounds} = int(0)\n{rounds} += 1\nif bounds_is_endless(bounds_report, {place}, {rounds}):\n    break"
+        ).body
+        node.body = [*count[1:], *node.body]
+        return [count[0], node]
+
+
+def _is_tuple(source: FunctionSource, node: ast.expr, seen: frozenset[Any] = frozenset()) -> bool:
+    """Whether an expression is a tuple, or the shape of an array."""
+    if isinstance(node, ast.Attribute):
+        return node.attr in _SHAPES
+    if isinstance(node, ast.Tuple):
+        return True
+    if isinstance(node, ast.Name):
+        key: Any = (source.function, node.id)
+        values = [
+            inner.value
+            for inner in ast.walk(source.tree)
+            if isinstance(inner, ast.Assign)
+            and any(isinstance(target, ast.Name) and target.id == node.id for target in inner.targets)
+        ]
+    elif isinstance(node, ast.Call):
+        key = source.value(node.func)
+        if not isinstance(key, wp.Function) or not has_source(key):
+            return False
+        source = FunctionSource(key)
+        values = [inner.value for inner in ast.walk(source.tree) if isinstance(inner, ast.Return) and inner.value]
+    else:
+        return False
+    return key not in seen and any(_is_tuple(source, value, seen | {key}) for value in values)
+
+
+def _is_row(kind: Any) -> bool:
+    return hasattr(kind, "ndim") and hasattr(kind, "dtype")
+
+
+def _name(name: str) -> ast.Name:
+    return ast.Name(name, ast.Load())
+
+
+def _call(name: str, *arguments: ast.expr) -> ast.Call:
+    return ast.Call(_name(name), list(arguments), [])
+
+
+def _loaded(node: ast.expr) -> ast.expr:
+    """A copy of an expression that is read."""
+    loaded = copy.deepcopy(node)
+    if isinstance(loaded, ast.Attribute | ast.Subscript | ast.Name):
+        loaded.ctx = ast.Load()
+    return loaded
+
+
+_made: dict[Any, CheckedFunctions] = {}
+_module_names: list[str] = []
+
+
+def checked_functions(
+    name: str, functions: Mapping[str, wp.Function], world: Any, batch: Any, device: wp.Device
+) -> CheckedFunctions:
+    """The compiled copies of a task's functions, made once for the same functions.
+
+    Args:
+        name: A name for their Warp module, the same in every process.
+        functions: The task's functions by name.
+        world: The task's World.
+        batch: The struct of the task's fields for all worlds.
+        device: The device to compile for.
+
+    Raises:
+        Unchecked: A function can't be checked.
+    """
+    key = (world, batch, *functions.items())
+    if key in _made:
+        _made[key].load(device)
+        return _made[key]
+    failure: Unchecked | None = None
+    for unrolled in (False, True):
+        module = re.sub(r"[^\w.]", "_", f"lyceum_warp.checked.{name}{'.unrolled' * unrolled}")
+        taken = sum(other == module or other.startswith(f"{module}_again") for other in _module_names)
+        module = f"{module}_again{taken}" if taken else module
+        _module_names.append(module)
+        checked = CheckedFunctions(module, functions, world, batch, unrolled=unrolled)
+        try:
+            checked.load(device)
+        except Unchecked as error:
+            failure = failure or error
+        else:
+            _made[key] = checked
+            return checked
+    assert failure is not None
+    raise failure

@@ -1,0 +1,78 @@
+"""Tasks for tests of the planner: they pay the action times a coin, which falls on -1 or 1 with equal probability."""
+
+import warp as wp
+from rail_task import rail
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+
+@wp.struct
+class Coin:
+    qpos: Row[float]
+    memory: Row[float]  # the coin
+
+
+@wp.struct
+class CoinParams:
+    dt: float
+
+
+@wp.func
+def toss(rng: Row[wp.uint32]) -> float:
+    return wp.where(lw.uniform(rng, 0.0, 1.0) < 0.5, -1.0, 1.0)
+
+
+@wp.func
+def toss_at_reset(s: Coin, p: CoinParams, rng: Row[wp.uint32]):
+    s.memory[0] = toss(rng)
+
+
+@wp.func
+def toss_in_step(s0: Coin, action: Row[float], s1: Coin, p: CoinParams, rng: Row[wp.uint32]):
+    s1.memory[0] = toss(rng)
+
+
+@wp.func
+def observe_coin(s: Coin, p: CoinParams, obs: Row[float]):
+    obs[0] = s.memory[0]
+
+
+@wp.func
+def paid_by_coin_after_action(s0: Coin, action: Row[float], s1: Coin, p: CoinParams) -> float:
+    return action[0] * s1.memory[0]
+
+
+@wp.func
+def paid_by_coin_before_action(s0: Coin, action: Row[float], s1: Coin, p: CoinParams) -> float:
+    return action[0] * s0.memory[0]
+
+
+@wp.func
+def copied(s: Coin, action: Row[float], p: CoinParams, ctrl: Row[float]):
+    ctrl[0] = action[0]
+
+
+class TossedAfter(lw.Task):
+    """The coin that pays is tossed in ``advance``, after the action: no action is better than another."""
+
+    model = staticmethod(lambda: rail(limits='ctrllimited="true" ctrlrange="-1 1"'))
+    obs = {"coin": 1}
+    memory = 1
+    horizon = 100
+    World = Coin
+    Params = CoinParams
+    observe, reward = observe_coin, paid_by_coin_after_action
+    randomize, advance = toss_at_reset, toss_in_step
+
+
+class TossedAfterWithControl(TossedAfter):
+    """The same with a ``control``, so that rollouts go step by step."""
+
+    control = copied
+
+
+class TossedBefore(TossedAfter):
+    """The coin that pays is the one that was tossed in the last step and is remembered."""
+
+    reward = paid_by_coin_before_action

@@ -1,0 +1,93 @@
+"""The rule about indices: mistakes in a task's file that give wrong numbers silently are found and named."""
+
+import re
+
+import pytest
+import tiny_task
+from conftest import TaskFile
+
+from lyceum_warp.testing import check_task
+from lyceum_warp.testing.bounds_rules import check_bounds
+
+ENGINES = ["mujoco", "warp"]
+
+MISTAKES = [
+    r"observe reads s\.qpos\[60\] out of range \(wrong\.py, line \d+\): the index is 60, and there are 6 elements, 0",
+    r"observe writes obs\[2\] out of range \(wrong\.py, line \d+\): the index is 2, and there are 2 elements",
+    r"reward reads s1\.memory\[3\] out of range \(wrong\.py, line \d+\): the index is 3, and there are 1 elements",
+    r"height reads s\.xpos\[p\.tip\] out of range \(wrong\.py, line \d+\): the index is 7, and there are 5 elements",
+    r"terminated reads s\.qpos\[p\.joint - 1\] out of range \(wrong\.py, line \d+\): the index is -1, ",
+    r"control reads action\[3\] out of range ",
+    r"initialize writes s\.memory\[1\] out of range ",
+    r"advance reads s0\.memory\[int\(s0\.memory\[0\]\)\] out of range .*: the index is 2, ",
+]
+
+FIELDS = "    qpos: Row[float]"
+WRONG = tiny_task.changed(
+    (FIELDS, f"{FIELDS}\n    xpos: Row[wp.vec3]\n    memory: Row[float]"),
+    ("    dt: float", "    dt: float\n    tip: int = 7\n    joint: int = 0"),
+    (
+        "    obs[0] = s.qpos[0]",
+        "    obs[0] = wp.clamp(s.qpos[60], -1.0, 1.0)\n    obs[1] = 0.0\n"
+        "    if s.memory[0] > 1.0:\n        obs[2] = 1.0",
+    ),
+    ('obs = {"x": 1}', 'obs = {"x": 2}\n    memory = 1\n    horizon = 5'),
+    (
+        "class Tiny",
+        """@wp.func
+def height(s: World, p: Params) -> float:
+    return s.xpos[p.tip][2]
+
+@wp.func
+def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
+    ctrl[0] = action[3]
+
+@wp.func
+def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
+    if s0.memory[0] == 2.0:
+        s1.qpos[0] = s0.memory[int(s0.memory[0])]
+    s1.memory[0] = s0.memory[0] + 1.0
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    return wp.clamp(s1.memory[3], 0.0, 1.0)
+
+@wp.func
+def evaluate(s: World, p: Params) -> float:
+    return wp.clamp(height(s, p), 0.0, 1.0)
+
+@wp.func
+def terminated(s: World, p: Params) -> bool:
+    return s.qpos[p.joint - 1] > 100.0
+
+@wp.func
+def initialize(s: World, p: Params):
+    if p.joint == 0:
+        s.memory[1] = 0.0
+
+class Tiny""",
+    ),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_indices_out_of_range_are_found_and_named(task_file: TaskFile, engine: str) -> None:
+    with pytest.raises(AssertionError, match="tiny on the .* engine breaks the rule 'bounds': ") as caught:
+        check_task(task_file("wrong.py", WRONG), engine=engine, steps=10, checks=[check_bounds])
+    message = str(caught.value)
+    assert "\n" not in message
+    for pattern in MISTAKES:
+        assert re.search(pattern, message), f"{pattern} is not in {message}"
+    assert message.count("out of range") == len(MISTAKES)
+
+
+def test_a_function_that_cannot_be_checked_breaks_the_rule(task_file: TaskFile) -> None:
+    source = tiny_task.changed(
+        ("@wp.func", """@wp.func_native("return row.data[0];")
+def peek(row: Row[float]) -> float: ...
+
+@wp.func"""),
+        ("obs[0] = s.qpos[0]", "obs[0] = peek(s.qpos)"),
+    )  # fmt: skip
+    with pytest.raises(AssertionError, match=r"could not be checked: observe calls the native function peek \(native"):
+        check_task(task_file("native.py", source), engine="mujoco", checks=[check_bounds])

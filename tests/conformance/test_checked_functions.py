@@ -1,0 +1,289 @@
+"""Copies of Warp functions that check every index: what they find, and that they compute the same numbers."""
+
+import re
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+from lyceum_warp.testing.checked_functions import CheckedFunctions, Unchecked, checked_functions
+
+THIS = sys.modules[__name__]
+
+
+@wp.struct
+class World:
+    time: float
+    qpos: Row[float]
+    site_xpos: Row[wp.vec3]
+    xmat: Row[wp.mat33]
+    sensordata: Row[float]
+
+
+@wp.struct
+class Params:
+    dt: float
+    where: int
+    table: wp.array2d[float]
+    gains: wp.vec3
+
+
+@wp.struct
+class Batch:
+    time: wp.array[float]
+    qpos: wp.array2d[float]
+    site_xpos: wp.array2d[wp.vec3]
+    xmat: wp.array2d[wp.mat33]
+    sensordata: wp.array2d[float]
+
+
+# functions without a mistake, in every form that Warp takes
+
+ORDER = wp.constant(wp.vec3i(2, 1, 0))
+
+
+@wp.func
+def size_of(row: Row[float]) -> int:
+    return row.shape[0]
+
+
+@wp.func
+def size_of(s: World) -> int:  # noqa: F811
+    return size_of(s.qpos)
+
+
+@wp.func
+def last(row: Any, scale: float = 2.0):
+    return scale * row[len(row) - 1]
+
+
+@wp.func
+def both(s: World):
+    return s.qpos[0], s.qpos[1]
+
+
+def enclosing(helper: Any, offset: float) -> Any:
+    @wp.func
+    def enclosed(s: World) -> float:
+        return helper(s.qpos) + wp.static(2.0 * offset)
+
+    return enclosed
+
+
+enclosed = enclosing(last, 0.25)
+
+
+@wp.func
+def doubled(v: wp.vec3) -> wp.vec3:
+    return 2.0 * v
+
+
+@wp.func
+def right(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):
+    total = 0.0
+    for i in range(3):  # written out, because it changes a constant
+        total += s.qpos[i] * p.gains[i]
+    obs[0] = total
+    obs[1] = s.qpos[-1] + s.site_xpos[1][2] + s.site_xpos[-1].x + s.xmat[0][1, 2] + s.xmat[0][-1][0]
+    s.site_xpos[0][ORDER[0]] = 5.0
+    obs[2] = s.site_xpos[0][2] + p.table[1, 2] + p.table[2][0] + last(p.table[0])
+    obs[3] = float(size_of(s)) + last(s.qpos) + last(s.qpos, scale=3.0) + enclosed(s) + doubled(s.site_xpos[1])[1]
+    pair = both(s)
+    obs[4] = pair[1] + lw.uniform(rng, 0.0, 1.0)
+    wp.atomic_add(obs, 4, 1.0)
+    rounds = int(0)  # noqa: RUF046
+    while rounds < 5:
+        rounds += 1
+        obs[5] += float(rounds)
+    if wp.static(ORDER[0] == 0):
+        obs[77] = 0.0
+    part = p.gains[1:3]
+    obs[6] = part[0] + THIS.last(part) + wp.where(s.time > 0.0, s.qpos[0], s.qpos[1])
+
+
+# functions with mistakes
+
+
+@wp.func
+def reads_beyond(s: World, p: Params) -> float:
+    return s.qpos[4]
+
+
+@wp.func
+def reads_before(s: World, p: Params) -> float:
+    return s.qpos[p.where - 1] + s.qpos[-5]
+
+
+@wp.func
+def component(s: World, p: Params) -> float:
+    i = 3
+    return s.site_xpos[0][i] + s.xmat[0][0, p.where + 3] + doubled(p.gains)[p.where + 4]
+
+
+@wp.func
+def element(s: World, p: Params):
+    s.site_xpos[p.where + 2][1] = 1.0
+    s.qpos[p.where + 7] += 1.0
+
+
+@wp.func
+def of_a_table(s: World, p: Params) -> float:
+    return p.table[p.where + 3, 0] + p.table[0, p.where + 5]
+
+
+@wp.func
+def adds_beyond(s: World, p: Params):
+    wp.atomic_add(s.qpos, p.where + 9, 1.0)
+
+
+@wp.func
+def of_nothing(s: World, p: Params) -> float:
+    return s.sensordata[0]
+
+
+@wp.func
+def in_a_helper(s: World, p: Params) -> float:
+    return of_nothing(s, p)
+
+
+@wp.func
+def endless(s: World, p: Params) -> float:
+    x = float(0.0)
+    while x < 2.0e6:
+        x += 1.0
+    return x
+
+
+WRONG = {
+    function.key.rpartition(".")[2]: function
+    for function in (
+        reads_beyond, reads_before, component, element, of_a_table, adds_beyond, in_a_helper, endless,
+    )
+}  # fmt: skip
+FINDINGS = {
+    "reads_beyond": [
+        r"reads_beyond reads s\.qpos\[4\] out of range \(.*\.py, line \d+\): the index is 4, and there are 4 el"
+    ],
+    "reads_before": [r"reads s\.qpos\[p\.where - 1\] .* the index is -1,", r"reads s\.qpos\[-5\] .* the index is -5,"],
+    "component": [
+        r"reads s\.site_xpos\[0\]\[i\] .* the index is 3, and there are 3 elements",
+        r"reads s\.xmat\[0\]\[0, p\.where \+ 3\] .* the index is 3, and there are 3 elements",
+        r"reads doubled\(p\.gains\)\[p\.where \+ 4\] .* the index is 4, and there are 3 elements",
+    ],
+    "element": [r"writes s\.site_xpos\[p\.where \+ 2\] .*: the index is 2, and there are 2 elements",
+                r"writes s\.qpos\[p\.where \+ 7\] .*: the index is 7, "],
+    "of_a_table": [r"reads p\.table\[p\.where \+ 3, 0\] .* the index is 3, and there are 3 elements",
+                   r"reads p\.table\[0, p\.where \+ 5\] .* the index is 5, and there are 4 elements"],
+    "adds_beyond": [r"writes wp\.atomic_add\(s\.qpos, p\.where \+ 9, 1\.0\) .*: the index is 9, "],
+    "in_a_helper": [r"of_nothing reads s\.sensordata\[0\] .*: the index is 0, and there are no elements"],
+    "endless": [r"endless is still in its loop 'while x < 2000000\.0' after 1000000 rounds \(.*, line \d+\)"],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def device() -> wp.Device:
+    return wp.get_device("cpu")
+
+
+@pytest.fixture(scope="module")
+def params() -> wp.array:
+    p = Params()
+    p.dt, p.where, p.gains = 0.5, 0, wp.vec3(1.0, 2.0, 3.0)
+    p.table = wp.array(np.arange(12.0).reshape(3, 4), dtype=float)
+    return wp.array([p], dtype=Params)
+
+
+KEPT: list[wp.array] = []
+"""Memory behind rows without elements."""
+
+
+def batch() -> Any:
+    made = Batch()
+    made.time = wp.array([1.0, 0.0], dtype=float)
+    made.qpos = wp.array(np.arange(8.0).reshape(2, 4), dtype=float)
+    made.site_xpos = wp.array(np.arange(12.0).reshape(2, 2, 3), dtype=wp.vec3)
+    made.xmat = wp.array(np.arange(18.0).reshape(2, 1, 3, 3), dtype=wp.mat33)
+    memory = wp.zeros((2, 1), dtype=float)
+    made.sensordata = wp.array(ptr=memory.ptr, shape=(2, 0), strides=memory.strides, dtype=float)
+    KEPT.append(memory)
+    return made
+
+
+@wp.kernel(module="unique")
+def run_right(batch: Batch, params: wp.array[Params], obs: wp.array2d[float], rng: wp.array2d[wp.uint32]):
+    w = wp.tid()
+    s = World()
+    s.time = batch.time[w]
+    s.qpos = batch.qpos[w]
+    s.site_xpos = batch.site_xpos[w]
+    s.xmat = batch.xmat[w]
+    s.sensordata = batch.sensordata[w]
+    right(s, params[0], obs[w], rng[w])
+
+
+def test_a_checked_copy_computes_the_same_numbers_and_finds_nothing(device: wp.Device, params: wp.array) -> None:
+    checked = checked_functions("test.right", {"right": right}, World, Batch, device)
+    assert checked.unrolled, "a loop changes a constant"
+    report = checked.report(device)
+    results = []
+    for kernel, first in ((checked.kernels["right"], [report]), (run_right, [])):
+        s, obs, rng = batch(), wp.zeros((2, 7), dtype=float), wp.array([[1], [2]], dtype=wp.uint32)
+        wp.launch(kernel, 2, [*first, s, params, obs, rng], device=device)
+        results.append((obs.numpy(), s.site_xpos.numpy(), rng.numpy()))
+    for found, wanted in zip(*results, strict=True):
+        np.testing.assert_array_equal(found, wanted)
+    assert checked.problems(report) == []
+    assert checked_functions("test.right", {"right": right}, World, Batch, device) is checked
+
+
+@pytest.fixture(scope="module")
+def wrong(device: wp.Device) -> CheckedFunctions:
+    return checked_functions("test.wrong", WRONG, World, Batch, device)
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_an_index_out_of_range_is_found_and_named(
+    name: str, wrong: CheckedFunctions, device: wp.Device, params: wp.array
+) -> None:
+    report = wrong.report(device)
+    states = [batch()] * sum(kind is World for kind in WRONG[name].input_types.values())
+    wp.launch(wrong.kernels[name], 2, [report, *states, params], device=device)
+    problems = wrong.problems(report)
+    assert len(problems) == len(FINDINGS[name]), problems
+    for problem in problems:
+        assert any(re.search(pattern, problem) for pattern in FINDINGS[name]), problem
+        assert "\n" not in problem
+
+
+native = wp.func_native("return row.data[0];")
+
+
+@native
+def peek(row: Row[float]) -> float: ...
+
+
+@wp.func
+def calls_native(s: World, p: Params) -> float:
+    return peek(s.qpos)
+
+
+@wp.func
+def function_as_a_value(s: World, p: Params) -> float:
+    helper = last
+    return helper(s.qpos)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (calls_native, r"calls_native calls the native function peek \(.*, line \d+\), which has no source in Python"),
+        (function_as_a_value, r"function_as_a_value uses last as a value \(.*, line \d+\): call it instead"),
+    ],
+)
+def test_a_function_that_cannot_be_checked_is_named(function: Any, message: str, device: wp.Device) -> None:
+    with pytest.raises(Unchecked, match=message):
+        checked_functions("test.unchecked", {"function": function}, World, Batch, device)

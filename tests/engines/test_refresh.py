@@ -1,0 +1,318 @@
+"""A refresh computes what fields and sensors need, no more, and to the bit what a full forward pass does."""
+
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import pytest
+import warp as wp
+
+from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
+from lyceum_warp.engines.warp import forward_parts
+from lyceum_warp.engines.warp.warp_engine import WarpEngine
+from lyceum_warp.fields import Stage, describe, early_sensor_columns, state_columns
+
+CHEAP = """
+<velocimeter site="tip"/> <gyro site="tip"/> <magnetometer site="tip"/> <clock/>
+<framepos objtype="site" objname="tip"/> <framequat objtype="body" objname="torso"/>
+<framexaxis objtype="geom" objname="leg"/> <frameyaxis objtype="camera" objname="eye"/>
+<framezaxis objtype="xbody" objname="torso" reftype="site" refname="tip"/>
+<framelinvel objtype="camera" objname="eye" reftype="body" refname="torso"/>
+<frameangvel objtype="site" objname="tip"/>
+<jointpos joint="knee"/> <jointvel joint="knee"/> <ballquat joint="hip"/> <ballangvel joint="hip"/>
+<tendonpos tendon="band"/> <actuatorpos actuator="pull"/>
+<subtreecom body="torso"/> <subtreelinvel body="torso"/> <subtreeangmom body="torso"/>
+<camprojection site="tip" camera="eye"/> <insidesite site="zone" objtype="body" objname="torso"/>
+<rangefinder site="tip"/> <e_potential/>
+"""
+SENSORS = {
+    "cheap": CHEAP,
+    "velocities of tendons": CHEAP + '<tendonvel tendon="cord"/> <actuatorvel actuator="pull"/> <e_kinetic/>',
+    "limits": CHEAP
+    + """<jointlimitpos joint="knee"/> <jointlimitvel joint="knee"/> <tendonlimitpos tendon="cord"/>
+    <tendonlimitvel tendon="cord"/> <distance geom1="leg" geom2="floor" cutoff="1"/>
+    <fromto geom1="leg" geom2="floor" cutoff="1"/>""",
+    "mixed": CHEAP
+    + """<accelerometer site="tip"/> <touch site="tip"/> <force site="tip"/> <actuatorfrc actuator="pull"/>
+    <framelinacc objtype="site" objname="tip"/> <jointlimitfrc joint="knee"/>""",
+    "histories": """<jointpos joint="knee" nsample="4" delay="0.005"/> <gyro site="tip" nsample="4" interval="0.006"/>
+    <framepos objtype="site" objname="tip"/> <accelerometer site="tip" nsample="4" delay="0.004"/>""",
+}
+FIELDS = "site_xpos xpos xquat subtree_com cam_xpos cvel sensordata"
+
+
+def model_of(sensors: str, integrator: str = "Euler") -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(f"""
+    <mujoco>
+      <option timestep="0.002" integrator="{integrator}"/>
+      <worldbody>
+        <geom name="floor" type="plane" size="5 5 1"/>
+        <site name="zone" type="box" size="1 1 .5" pos="0 0 .5"/>
+        <body name="torso" pos="0 0 0.7">
+          <freejoint/>
+          <geom name="trunk" type="box" size=".15 .1 .05"/>
+          <camera name="eye" pos="-1 0 1" xyaxes="0 -1 0 1 0 1" resolution="64 48"/>
+          <site name="hook" pos=".1 0 0"/>
+          <body pos=".15 0 0">
+            <joint name="hip" type="ball" damping=".5"/>
+            <geom type="capsule" fromto="0 0 0 0 0 -.25" size=".04"/>
+            <body pos="0 0 -.25">
+              <joint name="knee" axis="0 1 0" range="-40 5" limited="true" damping=".1"/>
+              <geom name="leg" type="capsule" fromto="0 0 0 .05 0 -.2" size=".03"/>
+              <site name="tip" pos=".05 0 -.2" size=".05"/>
+            </body>
+          </body>
+        </body>
+      </worldbody>
+      <tendon>
+        <spatial name="band" stiffness="5"><site site="hook"/><site site="tip"/></spatial>
+        <fixed name="cord" range="-.5 .05" limited="true"><joint joint="knee" coef="1"/></fixed>
+      </tendon>
+      <actuator>
+        <general name="pull" tendon="band" gainprm="5" dyntype="filter" dynprm=".05"/>
+        <motor name="bend" joint="knee" gear="3"/>
+      </actuator>
+      <sensor>{sensors}</sensor>
+    </mujoco>""")
+
+
+def everyone(engine: Engine) -> wp.array:
+    return wp.full(engine.nworld, True, dtype=bool, device=engine.device)
+
+
+def only(engine: Engine, *worlds: int) -> wp.array:
+    return wp.array(np.isin(np.arange(engine.nworld), worlds), dtype=bool, device=engine.device)
+
+
+def begin(engine: Engine, mask: wp.array, seed: int) -> None:
+    """Episodes in the masked worlds, in states drawn at random, some beyond a limit or in contact."""
+    rng, chosen = np.random.default_rng(seed), mask.numpy().astype(bool)
+    engine.reset(mask)
+    write(engine, "qpos", chosen, engine.arrays["qpos"].numpy() + 0.1 * rng.normal(size=engine.arrays["qpos"].shape))
+    write(engine, "qvel", chosen, rng.normal(size=engine.arrays["qvel"].shape))
+    engine.commit(mask)
+    engine.refresh(mask)
+
+
+def write(engine: Engine, name: str, chosen: np.ndarray, values: np.ndarray) -> None:
+    array = engine.arrays[name]
+    array.assign(np.where(chosen[:, None], values.astype(np.float32), array.numpy()))
+
+
+def state_of(engine: Engine) -> np.ndarray:
+    state = wp.zeros((engine.nworld, engine.state_size), dtype=wp.float64, device=engine.device)
+    engine.get_state(state)
+    return state.numpy().copy()
+
+
+def put(engine: Engine, state: np.ndarray, mask: wp.array) -> None:
+    engine.set_state(wp.array(state, dtype=wp.float64, device=engine.device), mask)
+
+
+def shown(engine: Engine) -> dict[str, np.ndarray]:
+    """Copies of all derived fields."""
+    return {name: engine.arrays[name].numpy().copy() for name in engine.fields if name in FIELDS.split()}
+
+
+def full_forward(engine: Engine) -> dict[str, np.ndarray]:
+    """The same by MuJoCo's own forward pass at the worlds' states, in other data."""
+    state = state_of(engine)[:, : engine.integration_size]
+    spec, names = mujoco.mjtState.mjSTATE_INTEGRATION.value, [n for n in FIELDS.split() if n in engine.fields]
+    if isinstance(engine, WarpEngine):
+        m, d = engine.bare()
+        mjw.set_state(m, d, wp.array(state, dtype=float, device=engine.device), spec)
+        mjw.forward(m, d)
+        return {name: getattr(d, name).numpy().copy() for name in names}
+    rows: dict[str, list[Any]] = {name: [] for name in names}
+    for row in state:
+        data = mujoco.MjData(engine.model)
+        mujoco.mj_setState(engine.model, data, row, spec)
+        mujoco.mj_forward(engine.model, data)
+        for name in names:
+            rows[name].append(getattr(data, name).astype(np.float32).copy())
+    return {name: np.array(row) for name, row in rows.items()}
+
+
+def check_current(engine: Engine, *, whole: bool = False, worlds: slice = slice(None)) -> None:
+    """Every field, and every sensor of the position and velocity stages, is that of a full forward pass."""
+    found, wanted = shown(engine), full_forward(engine)
+    columns = early_sensor_columns(engine.model)
+    for name, value in found.items():
+        expected = wanted[name].reshape(value.shape)
+        if name == "sensordata" and not whole:
+            value, expected = value[:, columns], expected[:, columns]
+        np.testing.assert_array_equal(value[worlds], expected[worlds], err_msg=name)
+
+
+@pytest.fixture(params=[MujocoEngine, WarpEngine], ids=["mujoco", "warp"])
+def kind(request: pytest.FixtureRequest) -> type[Engine]:
+    engine: type[Engine] = request.param
+    return engine
+
+
+def make(kind: type[Engine], sensors: str, nworld: int = 4, integrator: str = "Euler", **options: Any) -> Engine:
+    model = model_of(SENSORS[sensors], integrator)
+    fields = [describe(model, name) for name in ("qpos", "qvel", *FIELDS.split())]
+    sizes = {"nconmax": 8, "njmax": 48} if kind is WarpEngine else {}
+    engine = kind(model, nworld, wp.get_device("cpu"), fields, **sizes, **options)
+    begin(engine, everyone(engine), 0)
+    return engine
+
+
+@pytest.mark.parametrize("sensors", SENSORS)
+def test_a_refresh_equals_a_full_forward_pass(kind: type[Engine], sensors: str) -> None:
+    """After a restart, after steps, after a restored state, after a change; histories included."""
+    engine = make(kind, sensors)
+    for steps in (1, 3):
+        check_current(engine, whole=True)
+        for _ in range(5):
+            engine.step(steps)
+            check_current(engine)
+        state = state_of(engine)
+        engine.step(2)
+        put(engine, state, only(engine, 1, 2))
+        check_current(engine)
+        np.testing.assert_array_equal(state_of(engine)[1:3], state[1:3])
+        begin(engine, only(engine, 3), steps)
+        check_current(engine, whole=True, worlds=slice(3, 4))
+        check_current(engine)
+        begin(engine, everyone(engine), steps)
+
+
+@pytest.mark.parametrize("sensors", ["cheap", "velocities of tendons", "mixed", "histories"])
+def test_a_refresh_on_warp_runs_no_collisions_and_no_constraints(sensors: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = make(WarpEngine, sensors)
+    engine.step(1)
+    state = state_of(engine)
+
+    def refuse(*args: Any, **options: Any) -> None:
+        raise AssertionError("more of a forward pass than is needed")
+
+    for name in ("forward", "fwd_position", "collision", "make_constraint", "solve"):
+        monkeypatch.setattr(mjw, name, refuse)
+    engine.refresh_current(everyone(engine))
+    put(engine, state, everyone(engine))
+    if engine.reset_stage < Stage.ACCELERATION:
+        begin(engine, only(engine, 1), 1)
+
+
+@pytest.mark.parametrize("sensors", ["mixed", "histories"])
+def test_sensors_of_the_acceleration_stage_stay_as_the_last_substep_left_them(kind: type[Engine], sensors: str) -> None:
+    engine = make(kind, sensors)
+    late = np.setdiff1d(np.arange(engine.model.nsensordata), early_sensor_columns(engine.model))
+    engine.step(3)
+    left = shown(engine)["sensordata"]
+    assert np.abs(left[:, late]).max() > 0
+    engine.refresh_current(everyone(engine))
+    np.testing.assert_array_equal(shown(engine)["sensordata"], left)
+    # an event: two worlds are pushed
+    before, chosen = state_of(engine), only(engine, 0, 2)
+    write(engine, "qvel", chosen.numpy(), engine.arrays["qvel"].numpy() + 1.0)
+    engine.commit(chosen)
+    engine.refresh_current(chosen)
+    check_current(engine)
+    pushed = shown(engine)["sensordata"]
+    np.testing.assert_array_equal(pushed[:, late], left[:, late])
+    np.testing.assert_array_equal(pushed[[1, 3]], left[[1, 3]])
+    assert (pushed[[0, 2]] != left[[0, 2]]).any()
+    # a restored world has those of its state, before and after another refresh
+    engine.step(1)
+    put(engine, before, only(engine, 1))
+    engine.refresh_current(everyone(engine))
+    np.testing.assert_array_equal(shown(engine)["sensordata"][1], left[1])
+
+
+def test_no_refresh_adds_to_a_sensors_history(kind: type[Engine]) -> None:
+    engine = make(kind, "histories")
+    parts = mujoco.mj_stateSize(engine.model, mujoco.mjtState.mjSTATE_HISTORY.value)
+    assert parts > 0
+    for _ in range(4):
+        engine.step(1)
+        before = state_of(engine)
+        engine.refresh_current(everyone(engine))
+        np.testing.assert_array_equal(state_of(engine), before)
+        engine.refresh(only(engine, 1))
+        size = engine.integration_size  # a restart's sensors of the acceleration stage belong to its first state
+        np.testing.assert_array_equal(state_of(engine)[:, :size], before[:, :size])
+    before = state_of(engine)
+    begin(engine, only(engine, 2), 5)
+    others = [0, 1, 3]
+    np.testing.assert_array_equal(state_of(engine)[others], before[others])
+    fresh = make(kind, "histories")
+    for made in (engine, fresh):
+        begin(made, everyone(made), 6)
+        made.step(2)
+    np.testing.assert_array_equal(state_of(engine), state_of(fresh))
+
+
+def test_the_sensor_of_a_limit_that_ended_is_zero(kind: type[Engine]) -> None:
+    """Also where the limit ended in a state that was set, not stepped to."""
+    engine = make(kind, "limits")
+    knee = int(engine.model.joint("knee").qposadr[0])
+    column = state_columns(engine.model, "qpos").start + knee
+    sensor = next(i for i in range(engine.model.nsensor)
+                  if engine.model.sensor_type[i] == mujoco.mjtSensor.mjSENS_JOINTLIMITPOS)  # fmt: skip
+    adr = int(engine.model.sensor_adr[sensor])
+    state = state_of(engine)
+    for angle, beyond in ((0.2, True), (-0.3, False), (0.2, True), (-0.3, False)):
+        state[:, column] = angle
+        put(engine, state, only(engine, 0, 1))
+        found = shown(engine)["sensordata"][:2, adr]
+        assert (found < -0.1).all() if beyond else (found == 0.0).all()
+        check_current(engine)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
+@pytest.mark.parametrize("sensors", ["velocities of tendons", "mixed"])
+def test_a_step_goes_on_from_the_refresh_to_the_bit(sensors: str, integrator: str) -> None:
+    """Its first substep takes over what the refresh after the last one computed, in worlds that restarted, too."""
+    one, other = (make(WarpEngine, sensors, integrator=integrator) for _ in range(2))
+    assert isinstance(one, WarpEngine) and isinstance(other, WarpEngine)
+    assert mjw.kinematics in one._shared and mjw.tendon in one._shared
+    other._shared = ()
+    for t in range(6):
+        for engine in (one, other):
+            engine.ctrl.assign(np.full(engine.ctrl.shape, 0.3 * t, np.float32))
+            engine.step(1 + t % 2)
+            if t == 1:
+                begin(engine, only(engine, 0, 3), t)
+            if t == 3:
+                put(engine, state_of(engine)[::-1].copy(), only(engine, 1))
+        np.testing.assert_array_equal(state_of(one), state_of(other))
+
+
+def test_restarts_in_a_graph_equal_those_outside(sensors: str = "cheap") -> None:
+    """A graph skips the refresh where no world restarts."""
+    plain, captured = make(WarpEngine, sensors), make(WarpEngine, sensors)
+    mask = only(captured)
+    with wp.ScopedCapture(device="cpu") as capture:
+        captured.refresh(mask)
+    for t in range(4):
+        restarting = only(plain, t) if t % 2 else only(plain)
+        for engine in (plain, captured):
+            engine.step(1)
+            engine.reset(restarting)
+        mask.assign(restarting)
+        plain.refresh(restarting)
+        wp.capture_launch(capture.graph)
+        for name, value in shown(captured).items():
+            np.testing.assert_array_equal(value, shown(plain)[name], err_msg=name)
+        check_current(captured)
+
+
+def test_fields_take_the_parts_that_compute_them() -> None:
+    parts, cheap = forward_parts.forward_parts, model_of(CHEAP)
+    assert parts(cheap, []) == ()
+    assert parts(cheap, ["site_xpos"]) == (mjw.kinematics,)
+    assert parts(cheap, ["cam_xpos"]) == (mjw.kinematics, mjw.com_pos, mjw.camlight)
+    assert parts(cheap, ["xpos", "cvel"]) == (mjw.kinematics, mjw.com_pos, mjw.com_vel)
+    assert parts(cheap, ["qfrc_bias"])[-1] is mjw.fwd_velocity  # type: ignore[index]
+    assert parts(model_of('<jointpos joint="knee"/>'), ["sensordata"]) == (mjw.sensor_pos,)
+    gyro = (mjw.kinematics, mjw.com_pos, mjw.com_vel, mjw.sensor_pos, mjw.sensor_vel)
+    assert parts(model_of('<gyro site="tip"/> <accelerometer site="tip"/>'), ["sensordata"]) == gyro
+    assert parts(cheap, ["xpos", "qacc"]) is None
+    for name in ("jointlimitpos", "jointlimitvel"):
+        assert parts(model_of(f'<{name} joint="knee"/>'), ["sensordata"]) is None
+        assert parts(model_of(f'<{name} joint="knee"/>'), ["xpos"]) == (mjw.kinematics,)

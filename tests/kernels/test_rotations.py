@@ -1,0 +1,204 @@
+"""Quaternions against MuJoCo's own functions, on random numbers and at the edges."""
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import pytest
+import warp as wp
+from checks import check_uniform, put_at_random
+
+import lyceum_warp as lw
+
+N = 2000
+
+
+@wp.kernel(enable_backward=False)
+def compute(
+    a_in: wp.array[wp.vec4], b_in: wp.array[wp.vec4], v_in: wp.array[wp.vec3], angle_in: wp.array[float],
+    mul_out: wp.array[wp.vec4], inverse_out: wp.array[wp.vec4], rotate_out: wp.array[wp.vec3],
+    rotate_inverse_out: wp.array[wp.vec3], from_axis_angle_out: wp.array[wp.vec4], from_rotvec_out: wp.array[wp.vec4],
+    to_rotvec_out: wp.array[wp.vec3], difference_out: wp.array[wp.vec3], angle_out: wp.array[float],
+    to_mat_out: wp.array[wp.mat33], from_mat_out: wp.array[wp.vec4],
+):  # fmt: skip
+    """Every function of one pair of quaternions, one vector and one angle; launched over (n,)."""
+    i = wp.tid()
+    a, b, v = a_in[i], b_in[i], v_in[i]
+    mul_out[i] = lw.quat_mul(a, b)
+    inverse_out[i] = lw.quat_inverse(a)
+    rotate_out[i] = lw.quat_rotate(a, v)
+    rotate_inverse_out[i] = lw.quat_rotate_inverse(a, v)
+    from_axis_angle_out[i] = lw.quat_from_axis_angle(wp.normalize(v), angle_in[i])
+    from_rotvec_out[i] = lw.quat_from_rotvec(v)
+    to_rotvec_out[i] = lw.quat_to_rotvec(a)
+    difference_out[i] = lw.quat_difference(a, b)
+    angle_out[i] = lw.quat_angle(a, b)
+    to_mat_out[i] = lw.quat_to_mat(a)
+    from_mat_out[i] = lw.quat_from_mat(lw.quat_to_mat(a))
+
+
+@wp.kernel(enable_backward=False)
+def draw(rng_inout: wp.array2d[wp.uint32], quat_out: wp.array2d[wp.vec4]):
+    """Draw two quaternions from each stream; launched over (n,)."""
+    i = wp.tid()
+    rng_inout[i, 0] = wp.rand_init(3, i)
+    for k in range(2):
+        quat_out[i, k] = lw.quat_random(rng_inout[i])
+
+
+def unit(rows: np.ndarray) -> np.ndarray:
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def inputs() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Two quaternions, a vector and an angle in each row, in float32; the first rows are special ones."""
+    rng = np.random.default_rng(0)
+    a, b = (unit(rng.normal(size=(N, 4))) for _ in range(2))
+    v, angle = rng.normal(size=(N, 3)), rng.uniform(-7, 7, N)
+    a[:8] = np.vstack([np.eye(4), -np.eye(4)])
+    a[8:12] = unit(np.array([[1, 1e-4, -2e-4, 0], [-1, 1e-4, 0, 1e-4], [1e-5, 1, 0, 0], [1, 1e-25, 0, 0]]))
+    b[12], b[13] = a[12], -a[13]
+    v[:2], angle[0] = [[0, 0, 0], [1e-6, 0, 0]], 0.0
+    return a.astype(np.float32), b.astype(np.float32), v.astype(np.float32), angle.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def found() -> dict[str, np.ndarray]:
+    types = (wp.vec4, wp.vec4, wp.vec3, float)
+    arguments = [wp.array(x, dtype=t, device="cpu") for x, t in zip(inputs(), types, strict=True)]
+    outputs = {arg.label.removesuffix("_out"): arg.type for arg in compute.adj.args[4:]}
+    arrays = {name: wp.zeros(N, dtype=kind.dtype, device="cpu") for name, kind in outputs.items()}
+    wp.launch(compute, N, [*arguments, *arrays.values()], device="cpu")
+    return {name: array.numpy().astype(float) for name, array in arrays.items()}
+
+
+def mju(function: Callable[..., None], size: int, *columns: np.ndarray) -> np.ndarray:
+    """The results of one of MuJoCo's functions, row by row."""
+    results = np.zeros((N, size))
+    for row, *values in zip(results, *(column.astype(float) for column in columns), strict=True):
+        function(row, *values)
+    return results
+
+
+def check(found: np.ndarray, expected: np.ndarray, tolerance: float = 2e-6) -> None:
+    np.testing.assert_allclose(found.reshape(expected.shape), expected, atol=tolerance, rtol=tolerance)
+
+
+def test_products_inverses_and_matrices_are_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
+    a, b, _, _ = inputs()
+    check(found["mul"], mju(mujoco.mju_mulQuat, 4, a, b))
+    check(found["inverse"], mju(mujoco.mju_negQuat, 4, a))
+    check(found["to_mat"].reshape(N, 9), mju(mujoco.mju_quat2Mat, 9, a))
+
+
+def test_rotated_vectors_are_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
+    a, _, v, _ = inputs()
+    check(found["rotate"], mju(mujoco.mju_rotVecQuat, 3, v, a), 5e-6)
+    check(found["rotate_inverse"], mju(mujoco.mju_rotVecQuat, 3, v, mju(mujoco.mju_negQuat, 4, a)), 5e-6)
+
+
+def test_quaternions_from_axis_and_angle_are_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
+    _, _, v, angle = inputs()
+    length = np.linalg.norm(v.astype(float), axis=1)
+    axis = v / np.maximum(length, 1e-30)[:, None]
+    check(found["from_axis_angle"][1:], mju(mujoco.mju_axisAngle2Quat, 4, axis, angle)[1:])
+    check(found["from_rotvec"], mju(mujoco.mju_axisAngle2Quat, 4, axis, length))
+    assert found["from_axis_angle"][0].tolist() == found["from_rotvec"][0].tolist() == [1, 0, 0, 0]
+
+
+def test_rotation_vectors_are_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
+    a, b, _, _ = inputs()
+    check(found["to_rotvec"], mju(lambda row, q: mujoco.mju_quat2Vel(row, q, 1.0), 3, a), 1e-5)
+    difference = mju(mujoco.mju_subQuat, 3, a, b)
+    close = np.linalg.norm(difference, axis=1) < 3.1  # at pi, either sign is right
+    assert close.mean() > 0.95
+    check(found["difference"][close], difference[close], 1e-5)
+    check(found["angle"], np.linalg.norm(difference, axis=1), 1e-5)
+    assert found["angle"][12] == 0 and found["angle"].max() <= 3.1415928
+
+
+def test_small_rotations_keep_their_digits(found: dict[str, np.ndarray]) -> None:
+    a, _, _, _ = inputs()
+    np.testing.assert_allclose(found["to_rotvec"][8], 2 * a[8, 1:].astype(float), rtol=1e-6)
+    np.testing.assert_allclose(found["to_rotvec"][9], -2 * a[9, 1:].astype(float), rtol=1e-6)
+    np.testing.assert_allclose(found["to_rotvec"][11], [2e-25, 0, 0], rtol=1e-6)
+    np.testing.assert_allclose(found["from_rotvec"][1], [1, 0.5e-6, 0, 0], rtol=1e-6)
+
+
+def test_a_matrix_gives_its_quaternion_back(found: dict[str, np.ndarray]) -> None:
+    a, _, _, _ = inputs()
+    largest = np.abs(a).argmax(axis=1)
+    assert set(largest) == {0, 1, 2, 3}
+    sign = np.sign(np.sum(a * found["from_mat"], axis=1))[:, None]
+    check(sign * found["from_mat"], a.astype(float))
+
+
+def test_random_rotations_are_uniform_and_independent() -> None:
+    """The parts of a uniform unit quaternion in a plane have a squared length that is U(0, 1), and a uniform angle."""
+    n = 4000
+    rng, quats = (wp.zeros((n, k), dtype=t, device="cpu") for k, t in ((1, wp.uint32), (2, wp.vec4)))
+    wp.launch(draw, n, [rng, quats], device="cpu")
+    draws = quats.numpy().astype(float)
+    np.testing.assert_allclose(np.linalg.norm(draws, axis=2), 1, atol=1e-6)
+    for first, second, third, fourth in ((0, 1, 2, 3), (0, 2, 1, 3), (0, 3, 1, 2)):
+        columns = []
+        for q in draws.transpose(1, 0, 2):
+            columns += [
+                2 * (q[:, first] ** 2 + q[:, second] ** 2) - 1,
+                np.arctan2(q[:, first], q[:, second]) / np.pi,
+                np.arctan2(q[:, third], q[:, fourth]) / np.pi,
+            ]
+        check_uniform(np.stack(columns, axis=1))
+
+
+# in a task
+
+FREE = """
+<mujoco>
+  <worldbody>
+    <body><freejoint/><geom size=".1 .2 .3" type="box"/><site name="middle"/>
+      <body pos="0 0 1"><joint name="turn"/><geom size=".1"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="turn"/></actuator>
+  <sensor><velocimeter site="middle"/></sensor>
+</mujoco>
+"""
+
+
+@wp.struct
+class Free:
+    qvel: lw.Row[float]
+    xquat: lw.Row[lw.quat]
+    sensordata: lw.Row[float]
+
+
+@wp.struct
+class FreeParams:
+    dt: float
+
+
+@wp.func
+def observe_velocity(s: Free, p: FreeParams, obs: lw.Row[float]):
+    velocity = lw.quat_rotate_inverse(s.xquat[1], wp.vec3(s.qvel[0], s.qvel[1], s.qvel[2]))
+    for i in range(3):
+        obs[i] = velocity[i]
+        obs[3 + i] = s.sensordata[i]
+
+
+class Floating(lw.Task):
+    model = staticmethod(lambda: mujoco.MjSpec.from_string(FREE))
+    obs = {"computed": 3, "measured": 3}
+    World = Free
+    Params = FreeParams
+    observe = observe_velocity
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_a_velocity_in_a_bodys_frame_is_what_a_velocimeter_measures(engine: str) -> None:
+    env = lw.make(Floating, engine=engine, nworld=8)
+    put_at_random(env, np.random.default_rng(0), 1.0, 2.0)
+    env.step()
+    obs = env.obs.numpy()
+    assert np.abs(obs[:, 3:]).min(axis=0).max() > 1e-3
+    np.testing.assert_allclose(obs[:, :3], obs[:, 3:], atol=2e-5)
