@@ -35,12 +35,12 @@ class PartialForward:
 
     def __init__(self, rows: ModelRows, data: mjw.Data, group: mjw.Data, states: wp.array, static: StaticGeoms) -> None:
         self._rows, self._data, self._group, self._states, self._static = rows, data, group, states, static
-        device = wp.get_device(data.qpos.device)
-        with wp.ScopedDevice(device):
+        self._device = wp.get_device(data.qpos.device)
+        with wp.ScopedDevice(self._device):
             self._group_states = wp.zeros((group.nworld, states.shape[1]), dtype=float)
             self._everyone = wp.full(group.nworld, True, dtype=bool)
             self._no_time = wp.zeros((data.nworld, 1), dtype=float)
-        self._turns = Turns(data.nworld, group.nworld, device)
+        self._turns = Turns(data.nworld, group.nworld, self._device)
 
     def __call__(
         self, mask: wp.array, forward: Callable[[mjw.Model, mjw.Data], None], targets: Mapping[str, wp.array]
@@ -63,8 +63,9 @@ class PartialForward:
                 self._turns.give(source, target)
             self._turns.give_bits(group.overflow, data.overflow)
 
-        mjw.get_state(self._rows.whole, data, self._states, _SPEC, mask)
-        self._turns.run(mask, turn)
+        with wp.ScopedDevice(self._device):
+            mjw.get_state(self._rows.whole, data, self._states, _SPEC, mask)
+            self._turns.run(mask, turn)
 
     def settle(self, mask: wp.array, nstep: int) -> None:
         """Advance the masked worlds' states by some substeps, and set their time to 0; made of launches."""
@@ -78,10 +79,11 @@ class PartialForward:
             self._turns.give(self._group_states, self._states)
             self._turns.give_bits(group.overflow, data.overflow)
 
-        mjw.get_state(self._rows.whole, data, self._states, _SPEC, mask)
-        self._turns.run(mask, turn)
-        launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # time is the first number of a state
-        mjw.set_state(self._rows.whole, data, self._states, _SPEC, mask)
+        with wp.ScopedDevice(self._device):
+            mjw.get_state(self._rows.whole, data, self._states, _SPEC, mask)
+            self._turns.run(mask, turn)
+            launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # time is the first number of a state
+            mjw.set_state(self._rows.whole, data, self._states, _SPEC, mask)
 
     def _enter(self) -> None:
         """Put the group into the models and states of its worlds."""
