@@ -107,21 +107,33 @@ class Conditional:
         self._device = device
         self._any = wp.zeros(1, dtype=int, device=device)
         self._arena = None if device.is_cpu else Arena(device)
+        self._inside = False
 
     def __call__(self, mask: wp.array, run: Callable[[], None]) -> None:
-        """Run launches for the masked worlds, (nworld,) bool, which may not matter to any other world."""
-        if not self._device.is_capturing:
-            with contextlib.nullcontext() if self._arena is None else self._arena.counting():
-                self._open()
-                run()
-            return
-        with wp.ScopedDevice(self._device):
-            self._any.zero_()
-            wp.launch(kernels.find_any, len(mask), [mask, self._any])
-            self._open()
-            with contextlib.nullcontext() if self._arena is None else self._arena.serving():
-                wp.capture_if(self._any, on_true=run)
+        """Run launches for the masked worlds, (nworld,) bool, which may not matter to any other world.
 
-    def _open(self) -> None:
-        if self._arena is not None:
-            self._arena.open()
+        Within such launches, others run unconditionally.
+        """
+        if self._inside:
+            run()
+            return
+        self._inside = True
+        try:
+            with wp.ScopedDevice(self._device):
+                if not self._device.is_capturing:
+                    with self._reserved(capturing=False):
+                        run()
+                    return
+                self._any.zero_()
+                wp.launch(kernels.find_any, len(mask), [mask, self._any])
+                with self._reserved(capturing=True):
+                    wp.capture_if(self._any, on_true=run)
+        finally:
+            self._inside = False
+
+    def _reserved(self, *, capturing: bool) -> contextlib.AbstractContextManager[object]:
+        """Memory for temporary arrays: within a conditional part of a CUDA graph nothing may be allocated."""
+        if self._arena is None:
+            return contextlib.nullcontext()
+        self._arena.open()
+        return self._arena.serving() if capturing else self._arena.counting()

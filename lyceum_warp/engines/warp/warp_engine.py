@@ -2,7 +2,7 @@
 
 import contextlib
 import copy
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Any
 
 import mujoco
@@ -102,14 +102,15 @@ class WarpEngine(Engine):
         if initial is not None or self.dynamics:
             self._start = wp.array(self.initial, dtype=float, device=device)
         self._reset = [field.name for field in self.fields.values() if field.reset > Stage.NONE]
-        self._current_parts = forward_parts(model, [f.name for f in self.fields.values() if f.refresh > Stage.NONE])
+        current = [field.name for field in self.fields.values() if field.refresh > Stage.NONE]
+        self._current_parts = forward_parts(model, current, self.dynamics)
         self._reset_parts = None
         if self.reset_stage < Stage.ACCELERATION:
-            self._reset_parts = forward_parts(model, self._reset)
+            self._reset_parts = forward_parts(model, self._reset, self.dynamics)
         self._columns: wp.array = wp.array(early_sensor_columns(model), dtype=int, device=device)
         # a step goes on from the parts that were computed for its state, whether a world stepped there or restarted
-        moved = any(getattr(self.fields.get(name), "written", False) for name in ("mocap_pos", "mocap_quat"))
-        self._shared = () if moved else takes_over(model, self._current_parts or ())
+        moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
+        self._shared = () if moved else takes_over(model, self._current_parts or (), self.dynamics)
         self._conditional = Conditional(device)
         self._partial = self._partial_forward()
         self._settling: PartialForward | None = None
@@ -276,13 +277,17 @@ class WarpEngine(Engine):
     def commit(self, mask: wp.array) -> None:
         """Nothing to do: the fields are the engine's own arrays."""
 
+    def run_for(self, mask: wp.array, run: Callable[[], None]) -> None:
+        if self.partial_refresh:
+            self._conditional(mask, run)
+        else:
+            run()
+
     def refresh(self, mask: wp.array) -> None:
         if self._partial is not None and self.partial_refresh:
             self._partial(mask, self._forward_group, {name: self.arrays[name] for name in self._reset})
-        elif self.partial_refresh:
-            self._conditional(mask, lambda: self._refresh(mask))
         else:
-            self._refresh(mask)
+            self.run_for(mask, lambda: self._refresh(mask))
 
     def _forward_group(self, model: mjw.Model, group: mjw.Data) -> None:
         self._forward(None, self.reset_stage, group, model)
