@@ -173,3 +173,11 @@ def test_an_axis_is_as_long_as_its_field(model: mujoco.MjModel) -> None:
 def test_an_element_that_is_not_there_is_refused(name: str, element: str, message: str, model: mujoco.MjModel) -> None:
     with pytest.raises(ValueError, match=message):
         elements(model, name, element)
+
+
+def test_inputs_alone_may_be_written_before_a_step(model: mujoco.MjModel) -> None:
+    assert describe(model, "ctrl").written
+    assert describe(model, "xfrc_applied", written=True).written
+    assert not describe(model, "xfrc_applied").written
+    with pytest.raises(ValueError, match="the field 'qpos' cannot be written before a step: the inputs are ctrl, "):
+        describe(model, "qpos", written=True)

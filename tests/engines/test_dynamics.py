@@ -235,7 +235,7 @@ def test_a_restored_state_brings_its_model(engine: type[Engine]) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_model_that_becomes_nominal_again_leaves_no_trace(engine: type[Engine]) -> None:
+def test_a_model_that_becomes_nominal_again_runs_as_before(engine: type[Engine]) -> None:
     made, untouched = make(engine, *DRAWN), make(engine, *DRAWN)
     draw(made)
     for name, nominal in made.nominal.items():
