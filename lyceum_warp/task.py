@@ -260,7 +260,7 @@ class Task:
 
     A subclass names its model and the parts of its observation. Its module holds two Warp structs, ``World`` (the
     fields that the functions read, by MuJoCo's names) and ``Params`` (the keyword arguments of ``make``, with
-    defaults; ``dt``, the seconds in a step, is filled in), and the functions, each a ``wp.func``. Each of these may
+    defaults; ``dt`` and ``substep_dt``, the seconds in a step and in a substep, are filled in), and the functions, each a ``wp.func``. Each of these may
     also be an attribute of the class.
 
     ``World`` lists fields of MjData, such as ``qpos`` and ``site_xpos``, and fields of MjModel, such as ``body_mass``
