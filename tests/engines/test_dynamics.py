@@ -302,7 +302,7 @@ def test_settling_advances_the_masked_worlds_alone(engine: type[Engine]) -> None
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_settling_nobody_changes_nothing(engine: type[Engine]) -> None:
+def test_settling_no_world_changes_nothing(engine: type[Engine]) -> None:
     made = make(engine, "body_mass")
     run(made, 2)
     before = state_of(made).numpy().copy()
