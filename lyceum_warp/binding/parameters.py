@@ -103,14 +103,12 @@ class Parameters:
     def _bring(self, name: str, dtype: type, device: wp.Device) -> None:
         """Bring a table to the device."""
         value = self.values[name]
-        known, array = self._arrays.get(name, (None, None))
-        if known is value and array.device == device:
-            return
-        if known is not None and array.device == device and known.shape == value.shape:
-            array.assign(value)
-        else:
-            array = wp.array(value, dtype=dtype, device=device)
-        self._arrays[name] = value, array
+        kept = self._arrays.get(name)
+        if kept is None or kept[1].device != device or kept[0].shape != value.shape:
+            self._arrays[name] = value, wp.array(value, dtype=dtype, device=device)
+        elif kept[0] is not value:
+            kept[1].assign(value)
+            self._arrays[name] = value, kept[1]
 
     def _check_tables(self) -> None:
         for name, kind in self.tables.items():
