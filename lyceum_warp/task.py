@@ -270,7 +270,8 @@ class Task:
     A default in ``Params`` may name an element of the model, as ``tip: int = lw.site("tip")``: the functions then get
     its index. ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``, ``lw.actuator``,
     ``lw.ctrl``, ``lw.act``, ``lw.tendon``, ``lw.equality``, ``lw.sensor`` and ``lw.mocap`` work likewise. A field of
-    type ``wp.array[float]`` or ``wp.array2d[float]`` is a table that all worlds share.
+    type ``wp.array[float]``, ``wp.array2d[wp.vec3]`` or the like is a table that all worlds share, such as a motion to
+    follow; its default is a nested list or an array.
 
     Functions:
     {functions}

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from metered_task import Metered
+from varied_task import Varied
 
 import lyceum_warp as lw
 
@@ -68,3 +69,26 @@ def test_parameters_of_each_world_reach_the_worlds_of_the_mean_policy() -> None:
     env.set_params(success_distance=9.0)
     it = next(npg)
     assert it.mean_success == it.success == 1.0
+
+
+def test_each_episode_has_dynamics_of_its_own() -> None:
+    """What resets draw differs between all episodes, what is drawn at the start differs between worlds."""
+    env = lw.make(Varied, nworld=3)
+    policy = lw.GaussianPolicy(1, 1)
+    got = lw.evaluate(env, policy, 6, seed=3)
+    masses, heights = (got.metrics[name].div(env.horizon).view(2, 3) for name in ("mass", "height"))
+    assert masses.unique().numel() == 6 and masses.min() >= 0.5 and masses.max() <= 1.5
+    torch.testing.assert_close(heights[0], heights[1])
+    assert heights[0].unique().numel() == 3
+    assert torch.equal(lw.evaluate(env, policy, 6, seed=3).metrics["mass"], got.metrics["mass"])
+
+
+def test_the_mean_policy_is_evaluated_under_dynamics_of_its_own() -> None:
+    env = lw.make(Varied, nworld=2)
+    config = lw.NPGConfig(samples=20, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=3)
+    npg = lw.NPG(env, config=config)
+    before = env.field("body_mass").clone()
+    next(npg)
+    few = npg._evaluate_mean._few
+    assert few is not None and few.field("body_mass")[:, 1].unique().numel() == 3
+    assert not torch.isin(few.field("body_mass")[:, 1], torch.cat([before, env.field("body_mass")])).any()
