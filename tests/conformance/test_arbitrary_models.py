@@ -92,7 +92,7 @@ def start_sensing(s: SensingWorld, p: Params, rng: Row[wp.uint32]):
 
 
 class Sensing(lw.Task):
-    """Moves, and sees what its sensors tell."""
+    """Moves, and sees what its sensors measure."""
 
     horizon = 15
 
