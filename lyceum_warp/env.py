@@ -455,7 +455,8 @@ class Env:
                 )
             columns = state[:, self.state_space.parts[name]]
             try:
-                given = torch.as_tensor(np.asarray(value), dtype=torch.float64, device=state.device)
+                numbers = value if isinstance(value, torch.Tensor) else np.asarray(value)
+                given = torch.as_tensor(numbers, dtype=torch.float64, device=state.device)
                 columns.copy_(given.reshape(-1, columns.shape[1]))
             except (TypeError, ValueError, RuntimeError):
                 shape = tuple(self.field(name).shape)

@@ -69,11 +69,13 @@ class OpenLoop:
             )
         self._keys, self._nominal_model = keys, nominal_model
         rows = self.horizon * n
+        stepwise = task.functions["control"] is not None or task.functions["substep"] is not None
         check_fit(self._bytes_per_world(env, self.horizon), n, env.device)
         with wp.ScopedDevice(env.device):
             self._state = wp.zeros(env.state_space.size, dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nu), dtype=float)
-            self._controls = wp.zeros((self.horizon, n, env.task.model.nu), dtype=float)
+            # step by step, controls are made when their step comes
+            self._controls = wp.zeros((self.horizon, n, 0 if stepwise else task.model.nu), dtype=float)
             self._reward = wp.zeros(rows, dtype=float)
             self._terminated = wp.zeros(rows, dtype=bool)
             self._fault = wp.zeros(n, dtype=int)
@@ -103,7 +105,6 @@ class OpenLoop:
         self.fault = torch_view(self._fault)
         self.final_obs_groups = {group: torch_view(getattr(self._obs, group)) for group in env.obs_spaces}
         self.final_obs = self.final_obs_groups["policy"]
-        stepwise = task.functions["control"] is not None or task.functions["substep"] is not None
         self.phases = self._step_by_step() if stepwise else self._whole_horizon()
         self._calls = self.sequence(self.phases)
 
@@ -222,5 +223,5 @@ class OpenLoop:
         worlds, n, device = self.worlds, self.env.nworld, self.env.device
         self.env.engine.find_faults(worlds.everyone)
         wp.launch(planning.merge_faults, n, [self.env.engine.fault, self._fault], device=device)
-        args = [worlds.everyone, batch, worlds.params, worlds.counters, self._obs]
+        args = [worlds.everyone, batch, worlds.params, worlds.counters, self._obs, self._obs]
         wp.launch(self.env.task.kernels.observe_worlds, n, args, device=device)

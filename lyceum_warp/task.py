@@ -260,7 +260,7 @@ class Task:
 
     A subclass names its model and the parts of its observation. Its module holds two Warp structs, ``World`` (the
     fields that the functions read, by MuJoCo's names) and ``Params`` (the keyword arguments of ``make``, with
-    defaults; ``dt``, the seconds in a step, is filled in), and the functions, each a ``wp.func``. Each of these may
+    defaults; ``dt`` and ``substep_dt``, the seconds in a step and in a substep, are filled in), and the functions, each a ``wp.func``. Each of these may
     also be an attribute of the class.
 
     ``World`` lists fields of MjData, such as ``qpos`` and ``site_xpos``, and fields of MjModel, such as ``body_mass``
@@ -285,9 +285,9 @@ class Task:
     - ``control``: the inputs xfrc_applied, qfrc_applied, mocap_pos, mocap_quat and userdata. An input keeps its value
       until it is written again; a reset clears it.
     - ``initialize``, ``randomize`` and ``event``: qpos, qvel, act, ctrl, the inputs, memory, lasting_memory and model
-      fields. At every reset model fields get their nominal values back before ``initialize`` runs, so that draws never
-      add up. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``, ``sensordata``):
-      these are computed afterwards.
+      fields. At every reset these model fields get their nominal values back before ``initialize`` runs, so that draws
+      never add up. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
+      ``sensordata``): these are computed afterwards.
     - ``startup``: model fields, which resets then leave as they are.
     - ``substep``: memory and lasting_memory. ``advance``: the same of ``s1``.
 

@@ -78,6 +78,7 @@ class Worlds:
         n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
         self.memory = wp.zeros((n, task.memory), dtype=float)
         self.lasting_memory = wp.zeros((n, task.lasting_memory), dtype=float)
+        self._lasting_before = wp.zeros((n, task.lasting_memory), dtype=float)
         self.metric_sums = wp.zeros((n, len(task.metrics)), dtype=float)
         """Sums of the metrics over the episode so far."""
         self._zeros = {name: wp.zeros_like(getattr(self, name)) for name in ("memory", "lasting_memory", "metric_sums")}
@@ -128,11 +129,13 @@ class Worlds:
         self.counters.key = wp.zeros(n, dtype=wp.uint32)
         self.counters.rng = wp.zeros((n, 1), dtype=wp.uint32)  # type: ignore[assignment]
         self._seed = wp.zeros(1, dtype=int)
-        self._action_fault, self._no_fault = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
+        self._action_fault, self._no_fault, self._judged = (wp.zeros(n, dtype=int) for _ in range(3))
         self.fault_count = wp.zeros(int(FAULTS).bit_length(), dtype=int)
         self.everyone, self.mask = wp.full(n, True, dtype=bool), wp.zeros(n, dtype=bool)
         self.restarting, self._drawing = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
-        self._going_on, self._changed = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
+        self._going_on, self.changed = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
+        self.changed_view = torch_view(self.changed)
+        """The worlds that the events of the last step changed, (nworld,) bool."""
         self.state = wp.zeros((n, self.state_space.size), dtype=wp.float64)
         self.mask_view, self.state_view = torch_view(self.mask), torch_view(self.state)
 
@@ -152,7 +155,7 @@ class Worlds:
             capture = Graphs(self.device, enabled=graphs, capture_engine=self.engine.capturable, nvtx=self._nvtx)
             self._programs[key] = Programs(
                 capture,
-                step=capture.sequence(self.step_phases()),
+                step=capture.sequence(self._phases_of_a_graph() if graphs else self.step_phases()),
                 reset=capture.sequence(self.reset_phases(randomly=False)),
                 rand_reset=capture.sequence(self.reset_phases(randomly=True)),
                 read_state=capture.sequence(self.read_phases()),
@@ -165,15 +168,32 @@ class Worlds:
 
     def step_phases(self) -> list[Phase]:
         """One step, in order."""
+        return [*self._transition_phases(), *self._between_phases()]
+
+    def _transition_phases(self) -> list[Phase]:
+        """From a state to the next one, and what it is worth."""
+        return [Phase("act", self.act), *self.physics_phases(), Phase("judge", self._judge_step)]
+
+    def _between_phases(self) -> list[Phase]:
+        """What happens between two transitions."""
         return [
-            Phase("act", self.act),
-            *self.physics_phases(),
-            Phase("judge", self._judge_step),
             *self._restart_phases(self.restarting, randomly=True),
             *self._event_phases(),
             *self._refresh_phases(self.restarting),
             Phase("observe", self._observe_restarted),
         ]
+
+    def _phases_of_a_graph(self) -> list[Phase]:
+        """One step where all of it is one graph: restarts are left out where no world restarts."""
+        if not self.engine.capturable or self._nvtx or self.task.kernels.run_events is not None:
+            return self.step_phases()
+
+        def run() -> None:
+            for phase in self._between_phases():
+                phase.run()
+
+        restarts = Phase("restart", partial(self.engine.run_for, self.restarting, run), engine=True)
+        return [*self._transition_phases(), restarts]
 
     def physics_phases(self) -> list[Phase]:
         """The substeps of a step."""
@@ -208,9 +228,9 @@ class Worlds:
             return []
         phases = [Phase("event", self._event)]
         if any(field.name in self.task.writes["event"] for field in self.task.dynamics):
-            phases.append(Phase("dynamics", partial(self.engine.apply_model, self._changed), engine=True))
+            phases.append(Phase("event dynamics", partial(self.engine.apply_model, self.changed), engine=True))
         if self.engine.stage > Stage.NONE:
-            phases.append(Phase("refresh", partial(self.engine.refresh_current, self._changed), engine=True))
+            phases.append(Phase("event refresh", partial(self.engine.refresh_current, self.changed), engine=True))
         return phases
 
     def _refresh_phases(self, mask: wp.array) -> list[Phase]:
@@ -284,6 +304,9 @@ class Worlds:
         """Put the masked worlds into an initial state of the task."""
         self.engine.reset(mask)
         self._clear(mask, "memory", *([] if again else ["metric_sums"]))
+        if self.task.kernels.reject_worlds is not None:  # a rejected draw leaves no trace
+            kept, live = self._lasting_before, self.lasting_memory
+            launch_rows(state.copy_rows, mask, *((kept, live) if again else (live, kept)))
         self._make_nominal(mask, self.task.reset_dynamics)
         args = [mask, randomly, again, self.after, self.params, self.counters]
         wp.launch(self.task.kernels.restart, self.nworld, args, device=self.device)
@@ -322,24 +345,22 @@ class Worlds:
         for name in varied:
             wp.copy(self._model_copies[name], self.engine.arrays[name])
         wp.launch(self.task.kernels.run_events, self.nworld, [
-            self.restarting, self.after, self.params, self.counters, self._going_on, self._changed,
+            self.restarting, self.after, self.params, self.counters, self._going_on, self.changed,
         ], device=self.device)  # fmt: skip
         for name in written:
             self._mark_changes(self._copies[name], live[name])
         for name in varied:
             self._mark_changes(self._model_copies[name], self.engine.arrays[name])
-        self.engine.commit(self._changed)
+        self.engine.commit(self.changed)
 
     def _mark_changes(self, before: wp.array, after: wp.array) -> None:
-        args = [self._going_on, flat(before), flat(after), self._changed]
+        args = [self._going_on, flat(before), flat(after), self.changed]
         wp.launch(steps.mark_changes, self.nworld, args, device=self.device)
 
     def _observe_restarted(self) -> None:
         """Observe the worlds that restarted or that an event changed; the others were observed when judged."""
-        for mask in (
-            (self.restarting, self._changed) if self.task.kernels.run_events is not None else (self.restarting,)
-        ):
-            args = [mask, self.after, self.params, self.counters, self.obs]
+        for mask in (self.restarting, self.changed) if self.task.kernels.run_events is not None else (self.restarting,):
+            args = [mask, self.after, self.params, self.counters, self.final_obs, self.obs]
             wp.launch(self.task.kernels.observe_worlds, self.nworld, args, device=self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
@@ -382,7 +403,8 @@ class Worlds:
     def judge_transition(self, action: torch.Tensor) -> None:
         """Judge the transition from ``before`` to the current state under some actions, without looking for faults."""
         torch_view(self.safe_action).copy_(action)
-        self._judge(self.everyone, self._no_fault, self._no_fault, transition=True)
+        self._judged.zero_()  # gets the faults of this transition
+        self._judge(self.everyone, self._judged, self._no_fault, transition=True)
 
     def seed_streams(self, seed: int) -> None:
         """Restart the random streams of the masked worlds, and draw what is drawn once for each stream."""

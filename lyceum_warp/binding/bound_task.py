@@ -139,12 +139,13 @@ class BoundTask:
     def _sort_model_fields(self, named: list[str], dynamics: Collection[str]) -> None:
         """Sort the model fields into those that differ between worlds and those that are the model's own."""
         drawn = {name: self.writes.get(name, frozenset()) for name in ("startup", "initialize", "randomize", "event")}
-        self.reset_dynamics = [name for name in named if name in drawn["initialize"] | drawn["randomize"]]
-        """Names of the model fields that a reset writes, which get their nominal values back before."""
+        between = drawn["initialize"] | drawn["randomize"] | drawn["event"]
+        self.reset_dynamics = [name for name in named if name in between]
+        """Names of the model fields that resets or events write, which get their nominal values back at a reset."""
         if both := [name for name in self.reset_dynamics if name in drawn["startup"]]:
             raise ValueError(
-                f"the model field {both[0]!r} of the task {self.name!r} is drawn by startup and at resets: draw it in "
-                "one of them"
+                f"the model field {both[0]!r} of the task {self.name!r} is written by startup and by resets or "
+                "events: write it in one of them"
             )
         written = frozenset().union(dynamics, *drawn.values())
         varied = [name for name in dict.fromkeys([*named, *dynamics]) if name in written]
@@ -276,6 +277,8 @@ class BoundTask:
             hint = (
                 ": quaternions are w, x, y, z here: use lw.quat_rotate, lw.quat_mul, ... in place of Warp's functions"
             )
+        if "overload for 'extract'" in flat and re.search(r"\]\s*(\*|/|//|%|\*\*)=", flat):
+            hint = ": Warp has no such assignment to an element of a row: write a[i] = a[i] * x in place of a[i] *= x"
         return ValueError(f"Warp can't compile the functions of the task {self.name!r}: {' '.join(lines[-3:])}{hint}")
 
     def check_field(self, name: str, array: wp.array) -> None:
@@ -305,7 +308,7 @@ class BoundTask:
             rows = self.kernels.Observations()
             for group, size in sizes.items():
                 setattr(rows, group, wp.full((1, size + 64), unwritten, dtype=float, device=device))
-            wp.launch(self.kernels.observe_worlds, 1, [mask, batch, params, counters, rows], device=device)
+            wp.launch(self.kernels.observe_worlds, 1, [mask, batch, params, counters, rows, rows], device=device)
             found = {group: getattr(rows, group).numpy()[0] for group in sizes}
             for group, row in found.items():
                 written[group] |= ~np.isnan(row) if math.isnan(unwritten) else row != np.float32(unwritten)

@@ -263,7 +263,7 @@ def _learn(run: Run | None, npg: NPG, options: Train) -> int:
             while npg.iteration < options.iterations:
                 iteration = next(npg)
                 if run is not None:
-                    run.write(dataclasses.asdict(iteration))
+                    run.write(iteration.row())
                 _save(run, npg)
                 if display is not None:
                     display(iteration)

@@ -188,6 +188,13 @@ class Engine(abc.ABC):
         """
         raise NotImplementedError(f"the {self.name} engine cannot settle single worlds")
 
+    def run_for(self, mask: wp.array, run: Callable[[], None]) -> None:
+        """Run launches that concern the masked worlds alone; an engine may leave them out where there are none.
+
+        Only for an engine that is ``capturable``. By default they always run.
+        """
+        run()
+
     @abc.abstractmethod
     def refresh(self, mask: wp.array) -> None:
         """Compute every derived field of the masked worlds as a forward pass at their state does.

@@ -343,12 +343,22 @@ def make_kernels(
 
     @wp.kernel(module=module, enable_backward=False)
     def observe_worlds(
-        mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], counters: Counters, obs_out: Observations
+        mask_in: wp.array[bool],
+        batch: Batch,
+        params: wp.array[Params],
+        counters: Counters,
+        good_in: Observations,
+        obs_out: Observations,
     ):
-        """Observe the masked worlds; launched over (nworld,)."""
+        """Observe the masked worlds; launched over (nworld,).
+
+        Where a number is not finite, which is a fault of the next step, the last good observations take its place.
+        """
         w = wp.tid()
         if mask_in[w]:
             observe(view(batch, w), params[w % params.shape[0]], obs_out, w, counters)
+            if not all_finite(obs_out, w):
+                copy_observations(good_in, obs_out, w)
 
     # An open-loop rollout keeps its fields for all steps: row t * nworld + w is world w after t steps. The
     # transition of that row leads to the one nworld further, so `before` and `after` are the same arrays, shifted.

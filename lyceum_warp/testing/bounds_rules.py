@@ -7,15 +7,12 @@ import warp as wp
 
 from lyceum_warp.arrays import torch_view
 from lyceum_warp.binding.writes import written_fields
-from lyceum_warp.task import FUNCTIONS
+from lyceum_warp.task import FUNCTIONS, MEMORIES, observer_name
 from lyceum_warp.testing.checked_functions import CheckedFunctions, Unchecked, checked_functions
 from lyceum_warp.testing.context import Context
 
 _RESET = ("startup", "initialize", "randomize")
 """The functions that a reset runs, in order, on the engine's initial state."""
-
-_MEMORIES = ("memory", "lasting_memory")
-"""Fields that ``advance`` finds as the step before left them."""
 
 _MOST_LISTED = 8
 """Problems that the message of a failure lists."""
@@ -42,6 +39,7 @@ class _Run:
         self.ctx, self.env, self.worlds = ctx, ctx.a, ctx.a.worlds
         task = self.env.task
         self.functions = {name: function for name, function in task.functions.items() if function is not None}
+        self.functions |= {observer_name(group): function for group, function in task.observers.items()}
         name = f"{task.task.__module__}.{task.task.__qualname__}"
         try:
             self.checked: CheckedFunctions = checked_functions(
@@ -55,12 +53,13 @@ class _Run:
         self.rng = np.random.default_rng(ctx.seed)
         n = self.env.nworld
         sizes = {
-            "action": self.worlds.action_space.size,
-            "obs": self.worlds.obs_spaces["policy"].size,
-            "ctrl": task.model.nu,
-            "metrics": len(getattr(task.task, "metrics", ())),
+            "action": self.worlds.action_space.size, "ctrl": task.model.nu, "metrics": len(task.task.metrics),
         }  # fmt: skip
         self.rows = {name: self._array((n, size), wp.float32) for name, size in sizes.items()}
+        self.obs = {
+            observer_name(group): self._array((n, space.size), wp.float32)
+            for group, space in self.worlds.obs_spaces.items()
+        }
         self.rows["rng"] = self._array((n, 1), wp.uint32)
 
     def steps(self) -> None:
@@ -88,8 +87,8 @@ class _Run:
                 continue
             if dirty:
                 self._copy(self.worlds.after, self.after)
-            if name == "advance":
-                for memory in _MEMORIES:
+            if name == "advance":  # it finds them as the step before left them
+                for memory in MEMORIES:
                     if memory in self.env.task.types:
                         wp.copy(getattr(self.after, memory), getattr(self.before, memory))
             self._run(name, self.after)
@@ -108,7 +107,7 @@ class _Run:
         env = self.ctx.b
         env.engine.reset(env.worlds.everyone)
         self._copy(env.worlds.after, self.start)
-        for memory in _MEMORIES:
+        for memory in MEMORIES:
             if memory in env.task.types:
                 getattr(self.start, memory).zero_()
         env.reset()
@@ -120,11 +119,12 @@ class _Run:
         draws = self.rng.integers(0, 2**32, (self.env.nworld, 1), dtype=np.uint32)
         self.rows["rng"].assign(draws)
         values = {"s": state, "s0": self.before, "s1": state, "p": self.worlds.params} | self.rows
-        names = [argument.partition(":")[0] for argument in FUNCTIONS[name].arguments.split(", ")]
-        wp.launch(
-            self.checked.kernels[name], self.env.nworld, [self.report, *(values[name] for name in names)],
-            device=self.env.device,
-        )  # fmt: skip
+        if name in self.obs:
+            values["obs"] = self.obs[name]
+        names = FUNCTIONS["observe" if name in self.obs else name].argument_names
+        given = [values[argument] for argument in names[: len(self.functions[name].input_types)]]
+        kernel = self.checked.kernels[name]
+        wp.launch(kernel, self.env.nworld, [self.report, *given], device=self.env.device)
 
     def _batch(self) -> Any:
         """Arrays for copies of the task's fields."""

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from metered_task import Metered
 
 import lyceum_warp as lw
 
@@ -33,6 +34,21 @@ def test_evaluate_takes_the_same_number_of_episodes_of_every_world() -> None:
     np.testing.assert_allclose(got.returns, [e[0] for e in flat], rtol=1e-5)
     np.testing.assert_array_equal(got.lengths, [e[1] for e in flat])
     np.testing.assert_allclose(got.evals, [e[2] for e in flat], rtol=1e-5)
+
+
+def test_evaluate_returns_the_metrics_of_each_episode() -> None:
+    env = lw.make(Metered, nworld=3)
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
+    got = lw.evaluate(env, policy, 6, seed=3)
+    assert list(got.metrics) == ["forward", "effort"]
+    expected = got.metrics["forward"] - 0.1 * got.metrics["effort"]
+    torch.testing.assert_close(got.returns, expected, rtol=0.0, atol=1e-5)
+    assert got.returns.std() > 0.1
+    few = got.first(2)
+    assert torch.equal(few.returns, got.returns[:2])
+    assert torch.equal(few.metrics["effort"], got.metrics["effort"][:2])
+    point_mass = lw.make("point_mass", horizon=3)
+    assert lw.evaluate(point_mass, lw.GaussianPolicy(6, 2), 1).metrics == {}
 
 
 def test_evaluate_needs_automatic_resets_and_a_horizon() -> None:

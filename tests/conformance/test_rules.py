@@ -61,7 +61,8 @@ def keep_warm_start(engine: MujocoEngine) -> None:
 
 
 def narrow_positions(worlds: Worlds) -> None:
-    worlds.after.qpos = worlds.after.qpos[:, :-1]
+    worlds.after.qpos = worlds.before.qpos = worlds.after.qpos[:, :-1]
+    del worlds._copies["qpos"]
 
 
 BREAKS: list[tuple[str, Any, str, Callable[[Function], Function]]] = [

@@ -66,10 +66,17 @@ _PARTS_OF_SENSOR = {
 }
 
 
-def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, ...] | None:
+def forward_parts(
+    model: mujoco.MjModel, names: Collection[str], varied: Collection[str] = ()
+) -> tuple[Part, ...] | None:
     """The parts of a forward pass that compute the named fields, in order, without collisions and constraints.
 
     Of ``sensordata`` the parts compute the sensors of the position and velocity stages.
+
+    Args:
+        model: The compiled model.
+        names: The fields.
+        varied: Names of model fields that differ between worlds.
 
     Returns:
         The parts, or None if the fields need collisions or constraints.
@@ -93,7 +100,7 @@ def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, 
         wanted.discard(mjw.com_vel)
     if _touching(model) and wanted & {mjw.transmission, mjw.fwd_velocity}:
         return None
-    if mjw.crb in wanted and model.tendon_armature.any():
+    if mjw.crb in wanted and _has_armature(model, varied):
         return None
     return (*(part for part in _NEEDS if part in wanted), *sensors)
 
@@ -126,14 +133,19 @@ def _touching(model: mujoco.MjModel) -> bool:
     return bool((model.actuator_trntype == int(body)).any() or np.any(getattr(model, "geom_adhesion", 0)))
 
 
-def takes_over(model: mujoco.MjModel, parts: Collection[Part]) -> tuple[Part, ...]:
+def _has_armature(model: mujoco.MjModel, varied: Collection[str]) -> bool:
+    """Whether tendons add to the inertia, which ``mujoco_warp.crb`` leaves to a function that it does not show."""
+    return "tendon_armature" in varied or bool(model.tendon_armature.any())
+
+
+def takes_over(model: mujoco.MjModel, parts: Collection[Part], varied: Collection[str] = ()) -> tuple[Part, ...]:
     """Those of some parts that ``step_after`` can take over; they are a function of positions alone."""
     enabled, integrators = mujoco.mjtEnableBit, mujoco.mjtIntegrator
     flags = enabled.mjENBL_SLEEP | enabled.mjENBL_ENERGY
     known = (integrators.mjINT_EULER, integrators.mjINT_RK4, integrators.mjINT_IMPLICIT, integrators.mjINT_IMPLICITFAST)
     if model.opt.enableflags & flags or model.opt.integrator not in [int(i) for i in known]:
         return ()
-    if model.tendon_armature.any():
+    if _has_armature(model, varied):
         return ()
     return tuple(part for part in parts if part in _POSITION)
 
