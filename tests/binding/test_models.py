@@ -152,7 +152,7 @@ def test_a_model_that_mujoco_refuses_is_named() -> None:
 
 
 def test_a_replica_has_the_model_of_its_original(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also after a caller edits the MjSpec, and where a task's model is drawn anew each time it is called."""
+    """Also after a caller edits the MjSpec, and where a task's model is drawn again each time it is called."""
     spec = lw.gymnasium_model("hopper.xml")
     env = lw.make("hopper", model=spec)
     spec.geom("torso_geom").density = 5000
