@@ -260,8 +260,8 @@ class Task:
 
     A subclass names its model and the parts of its observation. Its module holds two Warp structs, ``World`` (the
     fields that the functions read, by MuJoCo's names) and ``Params`` (the keyword arguments of ``make``, with
-    defaults; ``dt`` and ``substep_dt``, the seconds in a step and in a substep, are filled in), and the functions, each a ``wp.func``. Each of these may
-    also be an attribute of the class.
+    defaults; ``dt`` and ``substep_dt``, the seconds in a step and in a substep, are filled in), and the functions, each
+    a ``wp.func``. Each of these may also be an attribute of the class.
 
     ``World`` lists fields of MjData, such as ``qpos`` and ``site_xpos``, and fields of MjModel, such as ``body_mass``
     and ``geom_friction``, under MuJoCo's names. Model fields that ``startup``, ``initialize``, ``randomize`` or
