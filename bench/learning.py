@@ -73,7 +73,7 @@ def run(options: Options, seed: int) -> list[dict[str, Any]]:
         start = time.perf_counter()
         iteration = next(npg)
         seconds += time.perf_counter() - start
-        row = dataclasses.asdict(iteration) | {"seed": seed, "seconds": seconds, "judged": None}
+        row = iteration.row() | {"seed": seed, "seconds": seconds, "judged": None}
         rows.append(row)
         if judge is not None and options.target is not None and number % options.judge_every == 0:
             row["judged"] = judge(npg.policy)

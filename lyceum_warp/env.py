@@ -37,7 +37,7 @@ _ARGUMENTS = """Args:
     options: Options in one piece; those given by name replace single ones.
 {options}
     **params: Every other keyword is a parameter of the task, a field of its ``Params``; a scalar may also be given
-        as one value a world, (nworld,).
+        as one value a world, (nworld,). A table is an array, a tensor, a nested list, or the path of a ``.npy`` file.
 
 Raises:
     ValueError: An argument is unknown or does not fit; the message names the argument and says how to fix it.
@@ -524,14 +524,16 @@ class Env:
 
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
         """The values of some parameters, for a number of worlds."""
-        params, worlds = self.task.params, np.arange(nworld) % self.nworld
-        return {
-            name: params[name][worlds]
-            if isinstance(params[name], np.ndarray)
-            # as it was given: a name of the model, not its index
-            else self._given_params.get(name, params[name])
-            for name in names
-        }
+        parameters, worlds = self.task.parameters, np.arange(nworld) % self.nworld
+        values: dict[str, Any] = {}
+        for name in names:
+            if name in parameters.per_world:
+                values[name] = parameters.values[name][worlds]
+            elif name in parameters.tables:
+                values[name] = parameters.values[name]
+            else:  # as it was given: a name of the model, not its index
+                values[name] = self._given_params.get(name, parameters.values[name])
+        return values
 
     def _scratch_at(self, given: torch.Tensor) -> "Env":
         """Worlds of the same task in given states; made when first needed."""

@@ -138,17 +138,30 @@ class Run:
     # the table
 
     def write(self, row: Mapping[str, Any]) -> None:
-        """Append a row to the table. The first row's names are the header.
+        """Append a row to the table. A column that is new, as after an update of the task, is empty in earlier rows.
 
         Args:
-            row: Values by name, in the order of the columns. None becomes an empty cell; floats keep all their digits.
+            row: Values by the names of their columns. None becomes an empty cell; floats keep all their digits.
         """
-        exists = self.metrics.exists() and self.metrics.stat().st_size > 0
+        columns = self._columns()
+        if new := [name for name in row if name not in columns]:
+            cells = []
+            if columns:
+                with self.metrics.open(newline="") as file:
+                    cells = [line + [""] * len(new) for line in list(csv.reader(file))[1:]]
+            columns += new
+            with replaced(self.metrics) as temporary, temporary.open("w", newline="") as file:
+                csv.writer(file).writerows([columns, *cells])
         with self.metrics.open("a", newline="") as file:
-            writer = csv.writer(file)
-            if not exists:
-                writer.writerow(row)
-            writer.writerow(["" if value is None else value for value in row.values()])
+            values = (row.get(name) for name in columns)
+            csv.writer(file).writerow(["" if value is None else value for value in values])
+
+    def _columns(self) -> list[str]:
+        """The names in the table's header; none where there is no table yet."""
+        if not self.metrics.exists():
+            return []
+        with self.metrics.open(newline="") as file:
+            return next(csv.reader(file), [])
 
     def rows(self) -> list[dict[str, float | None]]:
         """Read the rows of the table. An empty cell is None.

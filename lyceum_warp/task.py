@@ -260,8 +260,8 @@ class Task:
 
     A subclass names its model and the parts of its observation. Its module holds two Warp structs, ``World`` (the
     fields that the functions read, by MuJoCo's names) and ``Params`` (the keyword arguments of ``make``, with
-    defaults; ``dt``, the seconds in a step, is filled in), and the functions, each a ``wp.func``. Each of these may
-    also be an attribute of the class.
+    defaults; ``dt`` and ``substep_dt``, the seconds in a step and in a substep, are filled in), and the functions, each
+    a ``wp.func``. Each of these may also be an attribute of the class.
 
     ``World`` lists fields of MjData, such as ``qpos`` and ``site_xpos``, and fields of MjModel, such as ``body_mass``
     and ``geom_friction``, under MuJoCo's names. Model fields that ``startup``, ``initialize``, ``randomize`` or
@@ -270,7 +270,8 @@ class Task:
     A default in ``Params`` may name an element of the model, as ``tip: int = lw.site("tip")``: the functions then get
     its index. ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``, ``lw.actuator``,
     ``lw.ctrl``, ``lw.act``, ``lw.tendon``, ``lw.equality``, ``lw.sensor`` and ``lw.mocap`` work likewise. A field of
-    type ``wp.array[float]`` or ``wp.array2d[float]`` is a table that all worlds share.
+    type ``wp.array[float]``, ``wp.array2d[wp.vec3]`` or the like is a table that all worlds share, such as a motion to
+    follow; its default is a nested list or an array.
 
     Functions:
     {functions}
@@ -284,9 +285,9 @@ class Task:
 
     - ``control``: the inputs xfrc_applied, qfrc_applied, mocap_pos, mocap_quat and userdata. An input keeps its value
       until it is written again; a reset clears it.
-    - ``initialize``, ``randomize`` and ``event``: qpos, qvel, act, ctrl, the inputs, memory, lasting_memory and model
-      fields. At every reset these model fields get their nominal values back before ``initialize`` runs, so that draws
-      never add up. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
+    - ``initialize``, ``randomize`` and ``event``: qpos, qvel, act, ctrl, eq_active, the inputs, memory, lasting_memory
+      and model fields. At every reset these model fields get their nominal values back before ``initialize`` runs, so
+      that draws never add up. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
       ``sensordata``): these are computed afterwards.
     - ``startup``: model fields, which resets then leave as they are.
     - ``substep``: memory and lasting_memory. ``advance``: the same of ``s1``.

@@ -155,7 +155,7 @@ class Worlds:
             capture = Graphs(self.device, enabled=graphs, capture_engine=self.engine.capturable, nvtx=self._nvtx)
             self._programs[key] = Programs(
                 capture,
-                step=capture.sequence(self.step_phases()),
+                step=capture.sequence(self._phases_of_a_graph() if graphs else self.step_phases()),
                 reset=capture.sequence(self.reset_phases(randomly=False)),
                 rand_reset=capture.sequence(self.reset_phases(randomly=True)),
                 read_state=capture.sequence(self.read_phases()),
@@ -168,15 +168,32 @@ class Worlds:
 
     def step_phases(self) -> list[Phase]:
         """One step, in order."""
+        return [*self._transition_phases(), *self._between_phases()]
+
+    def _transition_phases(self) -> list[Phase]:
+        """From a state to the next one, and what it is worth."""
+        return [Phase("act", self.act), *self.physics_phases(), Phase("judge", self._judge_step)]
+
+    def _between_phases(self) -> list[Phase]:
+        """What happens between two transitions."""
         return [
-            Phase("act", self.act),
-            *self.physics_phases(),
-            Phase("judge", self._judge_step),
             *self._restart_phases(self.restarting, randomly=True),
             *self._event_phases(),
             *self._refresh_phases(self.restarting),
             Phase("observe", self._observe_restarted),
         ]
+
+    def _phases_of_a_graph(self) -> list[Phase]:
+        """One step where all of it is one graph: restarts are left out where no world restarts."""
+        if not self.engine.capturable or self._nvtx or self.task.kernels.run_events is not None:
+            return self.step_phases()
+
+        def run() -> None:
+            for phase in self._between_phases():
+                phase.run()
+
+        restarts = Phase("restart", partial(self.engine.run_for, self.restarting, run), engine=True)
+        return [*self._transition_phases(), restarts]
 
     def physics_phases(self) -> list[Phase]:
         """The substeps of a step."""
@@ -287,7 +304,7 @@ class Worlds:
         """Put the masked worlds into an initial state of the task."""
         self.engine.reset(mask)
         self._clear(mask, "memory", *([] if again else ["metric_sums"]))
-        if self.task.kernels.reject_worlds is not None:  # a rejected draw leaves no trace
+        if self.task.kernels.reject_worlds is not None:  # a rejected draw changes nothing else
             kept, live = self._lasting_before, self.lasting_memory
             launch_rows(state.copy_rows, mask, *((kept, live) if again else (live, kept)))
         self._make_nominal(mask, self.task.reset_dynamics)

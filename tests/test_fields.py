@@ -7,11 +7,12 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp.fields import DERIVED_FIELDS, STATE_FIELDS, Stage, describe, elements, rows, vec10
+from lyceum_warp.task import Element
 
 XML = """
 <mujoco>
   <worldbody>
-    <site name="here"/>
+    <site name="here"/><camera name="eye"/>
     <body name="target" mocap="true"><geom size=".1" contype="0" conaffinity="0"/></body>
     <body name="base"><freejoint name="root"/><geom name="hull" size=".1"/><site name="tip"/>
       <body name="arm" pos=".5 0 0"><joint name="elbow"/><geom size=".1"/></body>
@@ -131,6 +132,26 @@ def test_a_named_element_has_its_place_in_the_field(
     assert elements(model, name, element) == where
 
 
+@pytest.mark.parametrize(
+    ("element", "place"),
+    [
+        (lw.actuator("turn"), 3),  # after the three outputs of another actuator
+        (lw.ctrl("turn"), 3),
+        (lw.act("slow"), 0),
+        (lw.tendon("string"), 0),
+        (lw.equality("held"), 0),
+        (lw.joint("elbow"), 1),
+        (lw.dof("elbow"), 6),
+        (lw.qpos("elbow"), 7),
+        (lw.body("arm"), 3),
+        (lw.camera("eye"), 0),
+        (lw.mocap("target"), 0),
+    ],
+)
+def test_a_function_for_defaults_names_an_element(element: Element, place: int, model: mujoco.MjModel) -> None:
+    assert elements(model, element.field, element.name).start == place
+
+
 def test_an_axis_is_as_long_as_its_field(model: mujoco.MjModel) -> None:
     assert [rows(model, name) for name in ("xpos", "ctrl", "actuator_force", "actuator_gainprm", "jnt_range")] == [
         4, 5, 5, 3, 2
@@ -142,7 +163,7 @@ def test_an_axis_is_as_long_as_its_field(model: mujoco.MjModel) -> None:
     [
         ("site_xpos", "hand", "the model has no site 'hand' for the field 'site_xpos'; it has: here, tip"),
         ("qpos", "knee", "the model has no joint 'knee' for the field 'qpos'; it has: elbow, root"),
-        ("cam_xpos", "eye", "the model has no camera 'eye' for the field 'cam_xpos'; it has: none"),
+        ("light_xpos", "lamp", "the model has no light 'lamp' for the field 'light_xpos'; it has: none"),
         ("mocap_pos", "arm", "the body 'arm' is .* mocap body, so it has no 'mocap_pos'"),
         ("time", "noon", "the field 'time' has no named elements"),
         ("gravity", "down", "the field 'gravity' has no named elements"),
@@ -152,3 +173,11 @@ def test_an_axis_is_as_long_as_its_field(model: mujoco.MjModel) -> None:
 def test_an_element_that_is_not_there_is_refused(name: str, element: str, message: str, model: mujoco.MjModel) -> None:
     with pytest.raises(ValueError, match=message):
         elements(model, name, element)
+
+
+def test_inputs_alone_may_be_written_before_a_step(model: mujoco.MjModel) -> None:
+    assert describe(model, "ctrl").written
+    assert describe(model, "xfrc_applied", written=True).written
+    assert not describe(model, "xfrc_applied").written
+    with pytest.raises(ValueError, match="the field 'qpos' cannot be written before a step: the inputs are ctrl, "):
+        describe(model, "qpos", written=True)

@@ -74,6 +74,18 @@ def test_open_refuses_a_run_of_a_newer_release(tmp_path: Path) -> None:
         Run.open(tmp_path)
 
 
+def test_a_new_column_is_empty_in_earlier_rows(run: Run) -> None:
+    """As after an update of the task, or of the package; the order of a row's names does not matter."""
+    run.write({"iteration": 1, "kl": 0.5})
+    run.write({"iteration": 2, "kl": None, "metrics/forward, m": 1.5})
+    run.write({"metrics/forward, m": 2.5, "iteration": 3})
+    assert run.rows() == [
+        {"iteration": 1, "kl": 0.5, "metrics/forward, m": None},
+        {"iteration": 2, "kl": None, "metrics/forward, m": 1.5},
+        {"iteration": 3, "kl": None, "metrics/forward, m": 2.5},
+    ]
+
+
 def test_rows_before_the_first_iteration_are_missing(run: Run) -> None:
     with pytest.raises(FileNotFoundError, match="the run has no complete iteration"):
         run.rows()

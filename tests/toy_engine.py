@@ -112,7 +112,7 @@ class ToyEngine(Engine):
             mujoco.mj_setConst(self.models[w], mujoco.MjData(self.models[w]))
 
     def settle(self, mask: wp.array, nstep: int) -> None:
-        for w in mask.numpy().nonzero()[0]:
+        for w in mask.numpy().nonzero()[0] if nstep else ():
             self._advance(w, nstep)
             self._rows.numpy()[w, state_columns(self.model, "time")] = 0.0
         self._read_state_fields(mask)

@@ -1,6 +1,7 @@
 """Evaluation of policies: whole episodes under the mean action."""
 
 import dataclasses
+from collections.abc import Mapping
 
 import torch
 
@@ -28,6 +29,14 @@ class Episodes:
     """The evaluation metric at the end."""
     success: torch.Tensor
     """Whether the goal was met at the end, 1 or 0."""
+    metrics: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
+    """Sums of the task's metrics, by the metrics' names."""
+
+    def first(self, count: int) -> "Episodes":
+        """The first of the episodes."""
+        names = [field.name for field in dataclasses.fields(self) if field.name != "metrics"]
+        metrics = {name: sums[:count] for name, sums in self.metrics.items()}
+        return dataclasses.replace(self, metrics=metrics, **{name: getattr(self, name)[:count] for name in names})
 
 
 @torch.no_grad()
@@ -52,7 +61,8 @@ def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | No
         raise ValueError("evaluate needs an environment that resets automatically: make it with autoreset=True")
     each = -(-episodes // env.nworld)
     env.rand_reset(seed)
-    results = torch.zeros(5, each, env.nworld, device=env.obs.device)
+    metrics = list(env.episode_metrics.values())
+    results = torch.zeros(5 + len(metrics), each, env.nworld, device=env.obs.device)
     count = torch.zeros(env.nworld, dtype=torch.long, device=env.obs.device)
     total = torch.zeros(env.nworld, device=env.obs.device)
     worlds = torch.arange(env.nworld, device=env.obs.device)
@@ -61,7 +71,7 @@ def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | No
         env.action.copy_(policy(env.obs))
         env.step()
         total += env.reward
-        now = torch.stack([total, length, env.reward, env.eval, env.success.float()])
+        now = torch.stack([total, length, env.reward, env.eval, env.success.float(), *metrics])
         slot = count.clamp_max(each - 1)
         wanted = env.done & (count < each)
         results[:, slot, worlds] = torch.where(wanted, now, results[:, slot, worlds])
@@ -69,7 +79,8 @@ def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | No
         count += wanted
         if t % 50 == 49 and bool((count >= each).all()):
             break
-    return Episodes(*results.reshape(5, -1).cpu())
+    returns, lengths, rewards, evals, success, *sums = results.flatten(1).cpu()
+    return Episodes(returns, lengths, rewards, evals, success, dict(zip(env.episode_metrics, sums, strict=True)))
 
 
 class MeanPolicyEvaluation:

@@ -24,6 +24,7 @@ from lyceum_warp.algos.npg_statistics import (
     UpdateNumbers,
     ValueSums,
     finished,
+    finished_metrics,
     prediction_sums,
     summary,
 )
@@ -184,7 +185,7 @@ class NPG:
             finite=finite, kl=kl, step_norm=step.norm(), gradient_norm=gradient.norm(),
             std_mean=self.policy.log_std.detach().exp().mean(), faults=rollout.faults.sum(),
         )  # fmt: skip
-        packed = ProcessNumbers(update, prediction, finished(rollout)).pack()
+        packed = ProcessNumbers(update, prediction, finished(rollout), finished_metrics(rollout)).pack()
         processes = [ProcessNumbers.unpack(numbers) for numbers in team.gather(packed[None]).tolist()]
         if not processes[0].update.finite:
             raise FloatingPointError(
@@ -211,7 +212,7 @@ class NPG:
         return Iteration(
             iteration=self.iteration,
             samples=self.samples,
-            **summary(processes, len(obs)),
+            **summary(processes, len(obs), self.env.task.task.metrics),
             **mean,
             time_sample=time_sample,
             time_gradient=time_gradient,

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import torch
@@ -79,6 +79,18 @@ class Iteration:
     """Seconds of evaluating the mean policy."""
     samples_per_second: float
     """Samples divided by the seconds of sampling."""
+    metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Means of the task's metrics, each summed over an episode, by the metrics' names."""
+
+    def row(self) -> dict[str, Any]:
+        """The numbers by the names of their columns in metrics.csv; the metric ``forward`` is ``metrics/forward``."""
+        names = [field.name for field in dataclasses.fields(self) if field.name != "metrics"]
+        metrics = {METRIC_COLUMN + name: mean for name, mean in self.metrics.items()}
+        return {name: getattr(self, name) for name in names} | metrics
+
+
+METRIC_COLUMN = "metrics/"
+"""What the columns of a task's own metrics begin with."""
 
 
 class UpdateNumbers(NamedTuple):
@@ -140,6 +152,8 @@ class ProcessNumbers(NamedTuple):
     update: UpdateNumbers
     values: ValueSums
     episodes: EpisodeSums
+    metrics: tuple[Scalar, ...] = ()
+    """Sums of the task's metrics over the episodes that ended, in the order of their names."""
 
     def pack(self) -> torch.Tensor:
         """All numbers in one float64 tensor, so that one copy brings them to other processes and to the host."""
@@ -153,6 +167,7 @@ class ProcessNumbers(NamedTuple):
             update=UpdateNumbers(*itertools.islice(rest, len(UpdateNumbers._fields))),
             values=ValueSums(*itertools.islice(rest, len(ValueSums._fields))),
             episodes=EpisodeSums(*itertools.islice(rest, len(EpisodeSums._fields))),
+            metrics=tuple(rest),
         )
 
 
@@ -166,7 +181,7 @@ class Moments(NamedTuple):
 
 def finished(rollout: Rollout) -> EpisodeSums:
     """Sums over the episodes that ended within a rollout, scalar tensors on its device."""
-    ended = rollout.done & ~rollout.episode_return.isnan()
+    ended = _ended(rollout)
     returns = rollout.episode_return.double()
     infinity = torch.inf
 
@@ -188,6 +203,17 @@ def finished(rollout: Rollout) -> EpisodeSums:
     )
 
 
+def finished_metrics(rollout: Rollout) -> tuple[torch.Tensor, ...]:
+    """Sums of the task's metrics over the episodes that ended within a rollout, scalar tensors on its device."""
+    ended = _ended(rollout)
+    return tuple(sums.double().masked_fill(~ended, 0.0).sum() for sums in rollout.episode_metrics.values())
+
+
+def _ended(rollout: Rollout) -> torch.Tensor:
+    """The last steps of the episodes that count, (steps, nworld) bool."""
+    return rollout.done & ~rollout.episode_return.isnan()
+
+
 def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums:
     """How well a value function predicted returns, scalar tensors on their device."""
     target, error = returns.double(), (returns - predicted).double()
@@ -199,12 +225,13 @@ def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums
     )
 
 
-def summary(processes: Sequence[ProcessNumbers], samples: int) -> dict[str, Any]:
+def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence[str] = ()) -> dict[str, Any]:
     """Statistics of an iteration from the numbers of all processes, by their names in ``Iteration``.
 
     Args:
         processes: The numbers of each process, as floats.
         samples: Samples of each process.
+        metrics: Names of the task's metrics.
     """
     update = processes[0].update
     return {
@@ -215,7 +242,15 @@ def summary(processes: Sequence[ProcessNumbers], samples: int) -> dict[str, Any]
         "std_mean": update.std_mean,
         **value_statistics([process.values for process in processes], samples),
         "faults": round(sum(process.update.faults for process in processes)),
+        "metrics": metric_means(processes, metrics),
     }
+
+
+def metric_means(processes: Sequence[ProcessNumbers], names: Sequence[str]) -> dict[str, float]:
+    """Means of the task's metrics over the episodes of all processes; nan where none ended."""
+    episodes = sum(process.episodes.episodes for process in processes)
+    totals = (sum(sums) for sums in zip(*(process.metrics for process in processes), strict=True))
+    return {name: total / episodes if episodes else math.nan for name, total in zip(names, totals, strict=True)}
 
 
 def episode_statistics(sums: Sequence[EpisodeSums]) -> dict[str, float]:

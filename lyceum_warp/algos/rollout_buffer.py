@@ -1,5 +1,7 @@
 """The buffer of NPG's samples."""
 
+from collections.abc import Collection
+
 import torch
 import warp as wp
 
@@ -19,6 +21,10 @@ class Rollout:
     Args:
         env: The environment.
         steps: Number of steps.
+        groups: Groups of observations to store beside "policy", as ``("critic",)``.
+
+    Raises:
+        ValueError: The task has no such group of observations.
     """
 
     obs: torch.Tensor
@@ -29,6 +35,10 @@ class Rollout:
     """Steps since the reset before each step, (steps, nworld)."""
     final_obs: torch.Tensor
     """Observations of the states that each step led to, before any reset, (steps, nworld, nobs)."""
+    obs_groups: dict[str, torch.Tensor]
+    """Observations before each step by the names of their groups; ``policy`` is ``obs``."""
+    final_obs_groups: dict[str, torch.Tensor]
+    """The same for ``final_obs``."""
     reward: torch.Tensor
     """Rewards, (steps, nworld)."""
     eval: torch.Tensor
@@ -43,13 +53,19 @@ class Rollout:
     """Sum of the rewards of the episode so far, (steps, nworld)."""
     episode_length: torch.Tensor
     """Steps of the episode so far, (steps, nworld)."""
+    episode_metrics: dict[str, torch.Tensor]
+    """Sums of the task's metrics over the episode so far, by the metrics' names, each (steps, nworld)."""
 
     running_return: torch.Tensor
     """Sum of the rewards of each world's current episode, (nworld,); nan in an episode that does not count."""
     faults: torch.Tensor
     """Faults of each world within these steps, (nworld,) int32."""
 
-    def __init__(self, env: Env, steps: int) -> None:
+    def __init__(self, env: Env, steps: int, *, groups: Collection[str] = ()) -> None:
+        if unknown := [group for group in groups if group not in env.obs_groups]:
+            raise ValueError(
+                f"the task {env.task.name!r} has no group {unknown[0]!r} of observations: it has {list(env.obs_groups)}"
+            )
         self.env = env
         self.steps = steps
         n, nobs, nact = env.nworld, env.obs_space.size, env.action_space.size
@@ -66,12 +82,29 @@ class Rollout:
             self._return = wp.zeros(n, dtype=float)
             self._fault = wp.zeros(n, dtype=int)
         self.running_return, self.faults = torch_view(self._return), torch_view(self._fault)
+        self._rows_before: list[_Rows] = []
+        self._rows_after: list[_Rows] = []
+        self.obs_groups, self.final_obs_groups = {"policy": self.obs}, {"policy": self.final_obs}
+        for group in dict.fromkeys(groups):
+            if group != "policy":
+                self.obs_groups[group] = self._stored(env.obs_groups[group], self._rows_before)
+                self.final_obs_groups[group] = self._stored(env.final_obs_groups[group], self._rows_after)
+        self.episode_metrics = {}
+        if names := env.task.task.metrics:
+            _, episode_metrics = env.worlds.metrics
+            sums = self._stored(torch_view(episode_metrics), self._rows_after)
+            self.episode_metrics = dict(zip(names, sums.unbind(-1), strict=True))
         inputs = (env.obs, env.action, env.episode_step)
         outputs = (env.final_obs, env.reward, env.eval, env.terminated, env.done, env.success, env.done_reason)
         self._inputs, self._outputs = [wp.from_torch(t) for t in inputs], [wp.from_torch(t) for t in outputs]
         graphs = Graphs(env.device, enabled=env.options.graphs)
         self._before_step = graphs.sequence([Phase("store inputs", self._store_inputs)])
         self._after_step = graphs.sequence([Phase("store outputs", self._store_outputs)])
+
+    def _stored(self, source: torch.Tensor, into: list["_Rows"]) -> torch.Tensor:
+        """Storage for rows of the environment, (steps, nworld, size), filled by the phases before or after a step."""
+        into.append(_Rows(source, self.steps, self.env.device))
+        return into[-1].stored
 
     @torch.no_grad()
     def collect(self, policy: GaussianPolicy, noise: torch.Tensor) -> None:
@@ -140,9 +173,27 @@ class Rollout:
         dim = (self.env.nworld, max(self.env.obs_space.size, self.env.action_space.size))
         args = [self._index, *self._inputs, self._arrays]
         wp.launch(collect.store_inputs, dim, args, device=self.env.device)
+        for rows in self._rows_before:
+            rows.store(self._index)
 
     def _store_outputs(self) -> None:
         dim = (self.env.nworld, self.env.obs_space.size)
         args = [self._index, *self._outputs, self._return, self._fault, self._arrays]
         wp.launch(collect.store_outputs, dim, args, device=self.env.device)
+        for rows in self._rows_after:
+            rows.store(self._index)
         wp.launch(collect.advance_index, 1, [self._index], device=self.env.device)
+
+
+class _Rows:
+    """Storage for one of an environment's buffers of rows, (nworld, size)."""
+
+    def __init__(self, source: torch.Tensor, steps: int, device: wp.Device) -> None:
+        self._source = wp.from_torch(source)
+        self._rows: wp.array = wp.zeros((steps, *source.shape), dtype=float, device=device)
+        self.stored = torch_view(self._rows)
+
+    def store(self, index: wp.array) -> None:
+        """Store the rows of the step at an index; a launch."""
+        args = [index, self._source, self._rows]
+        wp.launch(collect.store_rows, self._source.shape, args, device=self._rows.device)

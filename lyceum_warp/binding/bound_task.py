@@ -277,6 +277,8 @@ class BoundTask:
             hint = (
                 ": quaternions are w, x, y, z here: use lw.quat_rotate, lw.quat_mul, ... in place of Warp's functions"
             )
+        if "overload for 'extract'" in flat and re.search(r"\]\s*(\*|/|//|%|\*\*)=", flat):
+            hint = ": Warp has no such assignment to an element of a row: write a[i] = a[i] * x in place of a[i] *= x"
         return ValueError(f"Warp can't compile the functions of the task {self.name!r}: {' '.join(lines[-3:])}{hint}")
 
     def check_field(self, name: str, array: wp.array) -> None:

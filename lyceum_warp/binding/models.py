@@ -144,7 +144,7 @@ def compile_model(
     """Compile a model for either engine.
 
     MuJoCo Warp has no PGS solver, so a model that asks for it gets Newton on both engines, which converges to
-    the same accelerations. Sleep is turned off, because a saved state does not tell which bodies are asleep. Fields
+    the same accelerations. Sleep is turned off, because a saved state does not hold which bodies are asleep. Fields
     that MuJoCo computes only where a sensor needs them get such a sensor, after the model's own, and the energy is
     turned on where it is read: without that a task would read zeros. Where no field needs a sensor, the model's own
     are turned off.

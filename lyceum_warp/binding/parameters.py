@@ -1,6 +1,7 @@
 """The values of a task's parameters, the fields of its ``Params``: defaults, checks, and the array for the kernels."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -16,7 +17,9 @@ _FILLED_IN = ("dt", "substep_dt")
 
 
 class Parameters:
-    """Values for every field of a task's ``Params``: scalars and vectors, or arrays with one value a world.
+    """Values for every field of a task's ``Params``: scalars and vectors, arrays with one value a world, or tables.
+
+    A table is a field that is itself an array, as ``motion: wp.array2d[float]``. All worlds share it.
 
     Args:
         struct: The task's ``Params``.
@@ -42,6 +45,10 @@ class Parameters:
     ) -> None:
         self._struct, self._task_name, self._model, self._nworld = struct, task_name, model, nworld
         self._sizes: dict[str, int] = {}
+        self.tables = {name: field.type for name, field in struct.vars.items() if hasattr(field.type, "ndim")}
+        """The types of the fields that are tables, by name."""
+        self._arrays: dict[str, tuple[np.ndarray, wp.array]] = {}
+        self._check_tables()
         if taken := [name for name in struct.vars if name in (*OPTIONS, "task", "options")]:
             raise ValueError(
                 f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), so that no "
@@ -55,6 +62,11 @@ class Parameters:
             elif hasattr(struct.cls, name):
                 self.values[name] = getattr(struct.cls, name)
         self.values = self.checked(given)
+
+    @property
+    def per_world(self) -> dict[str, np.ndarray]:
+        """The values that differ between worlds, by name, each with a leading ``nworld`` axis."""
+        return {name: v for name, v in self.values.items() if isinstance(v, np.ndarray) and name not in self.tables}
 
     def checked(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """The values with some replaced, each converted to what its field holds.
@@ -78,14 +90,40 @@ class Parameters:
         return {name: self._converted(name, value) for name, value in {**self.values, **given}.items()}
 
     def array(self, device: wp.Device) -> wp.array:
-        """The values as the kernels read them: one entry, or one a world where any value differs."""
-        differ = any(isinstance(value, np.ndarray) for value in self.values.values())
-        instances = [self._instance(w) for w in range(self._nworld if differ else 1)]
+        """The values as the kernels read them: one entry, or one a world where any value differs.
+
+        Its entries point to the tables, which live on the device as long as these parameters. A table that changed is
+        copied into the memory of the last one where the shape is the same.
+        """
+        for name, kind in self.tables.items():
+            self._bring(name, kind.dtype, device)
+        instances = [self._instance(w) for w in range(self._nworld if self.per_world else 1)]
         return wp.array(instances, dtype=self._struct, device=device)
+
+    def _bring(self, name: str, dtype: type, device: wp.Device) -> None:
+        """Bring a table to the device."""
+        value = self.values[name]
+        kept = self._arrays.get(name)
+        if kept is None or kept[1].device != device or kept[0].shape != value.shape:
+            self._arrays[name] = value, wp.array(value, dtype=dtype, device=device)
+        elif kept[0] is not value:
+            kept[1].assign(value)
+            self._arrays[name] = value, kept[1]
+
+    def _check_tables(self) -> None:
+        for name, kind in self.tables.items():
+            scalar = getattr(kind.dtype, "_wp_scalar_type_", kind.dtype)
+            if not wp.types.type_repr(kind).startswith("array(") or scalar not in (wp.float32, wp.int32):
+                raise ValueError(
+                    f"the parameter {name!r} of the task {self._task_name!r} has the type {wp.types.type_repr(kind)}: "
+                    "a table is a wp.array, wp.array2d or wp.array3d of float, int, or vectors and matrices of float"
+                )
 
     def _converted(self, name: str, value: Any) -> Any:
         """A value as its field holds it: a scalar or vector, or an array with one a world."""
         kind = self._struct.vars[name].type
+        if name in self.tables:
+            return self._table(name, value)
         default = getattr(self._struct.cls, name, None)
         what = f"the parameter {name} of {self._task_name!r}"
         given = f"the parameter {name}={value!r} of {self._task_name!r}"
@@ -120,6 +158,35 @@ class Parameters:
             f"{what} has shape {array.shape}; it takes {shape or 'one number'}, or one a world, {per_world}"
         )
 
+    def _table(self, name: str, value: Any) -> np.ndarray:
+        """A table as a read-only array of float32 or int32, with the axes of its elements last."""
+        if value is self.values.get(name) and isinstance(value, np.ndarray) and not value.flags.writeable:
+            return value
+        kind, what = self.tables[name], f"the parameter {name} of {self._task_name!r}"
+        element = tuple(getattr(kind.dtype, "_shape_", ()))
+        whole = getattr(kind.dtype, "_wp_scalar_type_", kind.dtype) is wp.int32
+        if isinstance(value, (str, Path)):
+            what += f" from {str(value)!r}"
+            value = _loaded(what, value)
+        try:
+            given = value.detach().cpu() if hasattr(value, "detach") else value
+            given = np.asarray(given.numpy() if isinstance(given, wp.array) else given, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{what} must be a table of numbers: {error}") from error
+        with np.errstate(over="ignore", invalid="ignore"):
+            table: np.ndarray = given.astype(np.int32 if whole else np.float32)
+        axes = kind.ndim + len(element)
+        if table.ndim != axes or table.shape[kind.ndim :] != element or not table.size:
+            last = f", the last {element}" if element else ""
+            raise ValueError(f"{what} has shape {table.shape}: it takes {axes} axes{last}, none of them empty")
+        bad = table != given if whole else ~np.isfinite(table)
+        if bad.any():
+            place = np.argwhere(bad)[0].tolist()
+            wanted = "a whole number of 32 bits" if whole else "a finite number of 32 bits"
+            raise ValueError(f"{what} has {given[tuple(place)]} at {place}: it must be {wanted}")
+        table.flags.writeable = False
+        return table
+
     def _check_index(self, given: str, array: np.ndarray, field: str) -> None:
         if field not in self._sizes:
             self._sizes[field] = rows(self._model, field)
@@ -134,7 +201,22 @@ class Parameters:
         instance = self._struct()
         for name, value in self.values.items():
             kind = self._struct.vars[name].type
-            if isinstance(value, np.ndarray):
+            if name in self.tables:
+                _, value = self._arrays[name]
+            elif isinstance(value, np.ndarray):
                 value = kind(*value[world].ravel()) if getattr(kind, "_shape_", ()) else kind(value[world])
             setattr(instance, name, value)
         return instance
+
+
+def _loaded(what: str, path: str | Path) -> np.ndarray:
+    """The array in a file that ``numpy.save`` wrote."""
+    try:
+        loaded: np.ndarray = np.load(path, allow_pickle=False)
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{what}: there is no such file") from None
+    except (OSError, ValueError, EOFError) as error:
+        raise ValueError(f"{what} cannot be read: {error}") from error
+    if not isinstance(loaded, np.ndarray):
+        raise ValueError(f"{what} must be a single array, a .npy file of numpy.save")
+    return loaded

@@ -38,14 +38,14 @@ class ReadOnlyArray(np.ndarray):
 
     fill = put = sort = partition = setflags = _refuse
 
-    def copy(self, order: Any = "C") -> np.ndarray:
+    def copy(self, order: Any = "C") -> Any:
         """An ordinary array with the same values."""
         return np.array(self, order=order)
 
-    def __copy__(self) -> np.ndarray:
+    def __copy__(self) -> Any:
         return self.copy()
 
-    def __deepcopy__(self, memo: Any) -> np.ndarray:
+    def __deepcopy__(self, memo: Any) -> Any:
         return self.copy()
 
     def __reduce__(self) -> Any:

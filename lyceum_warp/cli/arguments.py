@@ -70,7 +70,7 @@ def given(flags: Any) -> dict[str, Any]:
     return {name: value for name, (value, default) in values.items() if value != default}
 
 
-NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "nvtx", "model", "fields", "physics")
+NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "nvtx", "model", "fields", "dynamics", "physics")
 """Options of an environment that do not become flags automatically: commands define nworld, seed and the model in their
 own way, Physics has the flags of ``physics``, and the others are for programs in Python."""
 
@@ -167,12 +167,16 @@ def portable(task: str) -> str:
 def parameter(text: str) -> tuple[str, Any]:
     """Name and value of a parameter of a task, or of a limit of the solver, from NAME=VALUE or NAME=0.7,inf.
 
+    The path of a ``.npy`` file, which holds a table, becomes absolute.
+
     Raises:
         ValueError: The text is written in another way.
     """
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
         raise ValueError(f"{text!r} must be written as NAME=VALUE")
+    if value.strip().endswith(".npy"):
+        return name.strip(), str(Path(value.strip()).expanduser().resolve())
     parts = [_value(part, text) for part in value.strip().strip("[]()").split(",") if part.strip()]
     if not parts:
         raise ValueError(f"{text!r} must be written as NAME=VALUE")

@@ -8,7 +8,7 @@ import rich.box
 import tyro
 from rich.table import Table
 
-from lyceum_warp.algos.evaluation import Episodes, evaluate
+from lyceum_warp.algos.evaluation import evaluate
 from lyceum_warp.cli.arguments import NO_FLAGS, given, optional_flags, run_options
 from lyceum_warp.cli.display import make_console, policy_video
 from lyceum_warp.engines.placement import options_for_few_worlds
@@ -74,13 +74,13 @@ def evaluate_run(options: Eval) -> int:
             f"the policy in {options.run} takes {sizes[0]} observations and gives {sizes[1]} actions, but the task "
             f"{env.task.name!r} now has {wanted[0]} and {wanted[1]}: evaluate it with the task that it was trained on"
         )
-    episodes = evaluate(env, policy, options.episodes, seed=options.seed)
-    episodes = Episodes(*(getattr(episodes, f.name)[: options.episodes] for f in dataclasses.fields(episodes)))
+    episodes = evaluate(env, policy, options.episodes, seed=options.seed).first(options.episodes)
     table = Table(box=rich.box.SIMPLE)
     for heading in ("", "mean", "std", "min", "max"):
         table.add_column(heading, justify="right" if heading else "left")
     for name, values in (("return", episodes.returns), ("evaluation at the end", episodes.evals),
-                         ("last reward", episodes.rewards), ("length", episodes.lengths)):  # fmt: skip
+                         ("last reward", episodes.rewards), ("length", episodes.lengths),
+                         *episodes.metrics.items()):  # fmt: skip
         numbers = (values.mean(), values.std(correction=0), values.min(), values.max())
         table.add_row(name, *(f"{number.item():.6g}" for number in numbers))
     console = make_console()

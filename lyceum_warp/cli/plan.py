@@ -85,7 +85,8 @@ class Plan:
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
     """NPG run whose value function gives the value of the state where a plan ends."""
     param: Repeated = ()
-    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf; may be given several times."""
+    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf, a table as NAME=file.npy; may be given several
+    times."""
     planner_param: Repeated = ()
     """Another value of a parameter, only for the planner."""
     planner_model: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None

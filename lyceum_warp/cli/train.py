@@ -92,7 +92,8 @@ class Train:
     """Threads of torch on the CPU. Small networks gain little from more. Runs are equal to the bit only with the same
     number. They are not the threads of the mujoco engine, which are --nthread."""
     param: Repeated = ()
-    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf; may be given several times."""
+    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf, a table as NAME=file.npy; may be given several
+    times."""
     video: bool = True
     """Whether to write a video of one episode of the trained policy at the end."""
     plot: bool = True
@@ -263,7 +264,7 @@ def _learn(run: Run | None, npg: NPG, options: Train) -> int:
             while npg.iteration < options.iterations:
                 iteration = next(npg)
                 if run is not None:
-                    run.write(dataclasses.asdict(iteration))
+                    run.write(iteration.row())
                 _save(run, npg)
                 if display is not None:
                     display(iteration)

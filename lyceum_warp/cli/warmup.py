@@ -38,7 +38,8 @@ class Warmup:
     npg: bool = False
     """Whether to compile NPG's kernels, too."""
     param: Repeated = ()
-    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf; may be given several times."""
+    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf, a table as NAME=file.npy; may be given several
+    times."""
     env: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 

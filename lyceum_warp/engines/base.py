@@ -188,6 +188,13 @@ class Engine(abc.ABC):
         """
         raise NotImplementedError(f"the {self.name} engine cannot settle single worlds")
 
+    def run_for(self, mask: wp.array, run: Callable[[], None]) -> None:
+        """Run launches that concern the masked worlds alone; an engine may leave them out where there are none.
+
+        Only for an engine that is ``capturable``. By default they always run.
+        """
+        run()
+
     @abc.abstractmethod
     def refresh(self, mask: wp.array) -> None:
         """Compute every derived field of the masked worlds as a forward pass at their state does.
@@ -221,7 +228,8 @@ class Engine(abc.ABC):
         self.set_state(state, self._everyone)
         self._copy_fields(buffers, 0)
         for t in range(len(controls)):
-            wp.copy(self.ctrl, controls[t])
+            if self.ctrl.size:
+                wp.copy(self.ctrl, controls[t])
             self.step(nstep)
             self._copy_fields(buffers, t + 1)
 
@@ -237,7 +245,8 @@ class Engine(abc.ABC):
 
     def _copy_fields(self, buffers: Mapping[str, wp.array], t: int) -> None:
         for name, buffer in buffers.items():
-            wp.copy(buffer[t], self.arrays[name])
+            if buffer.size:
+                wp.copy(buffer[t], self.arrays[name])
 
     # state
 

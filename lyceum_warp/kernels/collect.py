@@ -78,6 +78,13 @@ def store_outputs(
 
 
 @wp.kernel(enable_backward=False)
+def store_rows(index_in: wp.array[int], rows_in: wp.array2d[float], rows_out: wp.array3d[float]):
+    """Store a row of every world; launched over (nworld, size of a row)."""
+    w, i = wp.tid()
+    rows_out[index_in[0], w, i] = rows_in[w, i]
+
+
+@wp.kernel(enable_backward=False)
 def advance_index(index_inout: wp.array[int]):
     """Advance the index by one step; launched over (1,)."""
     index_inout[0] = index_inout[0] + 1

@@ -39,7 +39,6 @@ class _Run:
         self.ctx, self.env, self.worlds = ctx, ctx.a, ctx.a.worlds
         task = self.env.task
         self.functions = {name: function for name, function in task.functions.items() if function is not None}
-        self.groups = {observer_name(group): group for group in task.observers}
         self.functions |= {observer_name(group): function for group, function in task.observers.items()}
         name = f"{task.task.__module__}.{task.task.__qualname__}"
         try:
@@ -54,11 +53,13 @@ class _Run:
         self.rng = np.random.default_rng(ctx.seed)
         n = self.env.nworld
         sizes = {
-            "action": self.worlds.action_space.size,
-            "ctrl": task.model.nu,
-            "metrics": len(task.task.metrics),
-        } | {f"obs {group}": space.size for group, space in self.worlds.obs_spaces.items()}
+            "action": self.worlds.action_space.size, "ctrl": task.model.nu, "metrics": len(task.task.metrics),
+        }  # fmt: skip
         self.rows = {name: self._array((n, size), wp.float32) for name, size in sizes.items()}
+        self.obs = {
+            observer_name(group): self._array((n, space.size), wp.float32)
+            for group, space in self.worlds.obs_spaces.items()
+        }
         self.rows["rng"] = self._array((n, 1), wp.uint32)
 
     def steps(self) -> None:
@@ -86,8 +87,8 @@ class _Run:
                 continue
             if dirty:
                 self._copy(self.worlds.after, self.after)
-            if name == "advance":
-                for memory in MEMORIES:  # as the step before left them
+            if name == "advance":  # it finds them as the step before left them
+                for memory in MEMORIES:
                     if memory in self.env.task.types:
                         wp.copy(getattr(self.after, memory), getattr(self.before, memory))
             self._run(name, self.after)
@@ -118,10 +119,12 @@ class _Run:
         draws = self.rng.integers(0, 2**32, (self.env.nworld, 1), dtype=np.uint32)
         self.rows["rng"].assign(draws)
         values = {"s": state, "s0": self.before, "s1": state, "p": self.worlds.params} | self.rows
-        values["obs"] = self.rows[f"obs {self.groups.get(name, 'policy')}"]
-        names = FUNCTIONS["observe" if name in self.groups else name].argument_names
-        args = [values[argument] for argument in names[: len(self.functions[name].input_types)]]
-        wp.launch(self.checked.kernels[name], self.env.nworld, [self.report, *args], device=self.env.device)
+        if name in self.obs:
+            values["obs"] = self.obs[name]
+        names = FUNCTIONS["observe" if name in self.obs else name].argument_names
+        given = [values[argument] for argument in names[: len(self.functions[name].input_types)]]
+        kernel = self.checked.kernels[name]
+        wp.launch(kernel, self.env.nworld, [self.report, *given], device=self.env.device)
 
     def _batch(self) -> Any:
         """Arrays for copies of the task's fields."""

@@ -147,7 +147,7 @@ def check_reset(ctx: Context) -> None:
     env.reset()
     state, obs = _physics(env, env.get_state()), env.obs.clone()
     noisy = env.task.has_noise  # each episode has noise of its own
-    if not noisy and not any(isinstance(value, np.ndarray) for value in env.task.params.values()):
+    if not noisy and not env.task.parameters.per_world:
         ctx.equal(obs, obs[:1].expand_as(obs).contiguous(), "the worlds' observations after reset")
     for action in ctx.actions(100):
         env.step(action)
@@ -207,7 +207,7 @@ def check_rand_reset(ctx: Context) -> None:
 def check_world_count(ctx: Context) -> None:
     """A seed gives a world the same initial state for any number of worlds."""
     n = ctx.a.nworld
-    doubled = {k: np.concatenate([v, v]) for k, v in ctx.a.task.params.items() if isinstance(v, np.ndarray)}
+    doubled = {name: np.concatenate([v, v]) for name, v in ctx.a.task.parameters.per_world.items()}
     more = ctx.make(nworld=2 * n, seed=ctx.seed, **doubled)
     ctx.restart()
     ctx.equal(more.get_state()[:n], ctx.a.get_state(), f"the states of {n} of {2 * n} worlds")

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from lyceum_warp.algos.npg_statistics import METRIC_COLUMN
 from lyceum_warp.runs import Run, read_metrics
 from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_png
 
 
 def learning_curve(run: str | Path | Run, out: str | Path | None = None, *, title: str | None = None) -> Path:
-    """Draw a run's learning curve as PNG: returns and the evaluation metric against samples.
+    """Draw a run's learning curve as PNG: returns, the evaluation metric and the task's own metrics against samples.
 
     Args:
         run: A run, its folder, or a table of metrics.
@@ -25,6 +26,7 @@ def learning_curve(run: str | Path | Run, out: str | Path | None = None, *, titl
         ImportError: matplotlib is not installed.
     """
     figure = new_figure("a learning curve", 7.5, 6.0)
+    from matplotlib import colormaps
     from matplotlib.ticker import EngFormatter
 
     if isinstance(run, Run) or Path(run).is_dir():
@@ -36,7 +38,11 @@ def learning_curve(run: str | Path | Run, out: str | Path | None = None, *, titl
     if not rows:
         raise ValueError(f"{folder} has no complete iteration to draw: train it first")
 
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+    metrics = [name for name in rows[0] if name.startswith(METRIC_COLUMN)]
+    figure.set_figheight(8.0 if metrics else 6.0)
+    heights = (2, 1, 2) if metrics else (2, 1)
+    panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+    top, bottom = panels[:2]
     samples = _column(rows, "samples")
     middle, spread = _column(rows, "return_mean"), _column(rows, "return_std")
     low = [m - s for m, s in zip(middle, spread, strict=True)]
@@ -50,9 +56,15 @@ def learning_curve(run: str | Path | Run, out: str | Path | None = None, *, titl
     bottom.plot(samples, _column(rows, "eval_mean"), **line)
     _draw_mean_policy(bottom, rows, "mean_eval")
     bottom.set_ylabel("evaluation metric\nat the end")
-    bottom.set_xlabel("samples")
-    bottom.xaxis.set_major_formatter(EngFormatter(sep=""))
-    finish_axes((top, bottom))
+    for i, name in enumerate(metrics):
+        style = line | {"color": colormaps["viridis"](i / len(metrics)), "label": name.removeprefix(METRIC_COLUMN)}
+        panels[2].plot(samples, _column(rows, name), **style)
+    if metrics:
+        panels[2].set_ylabel("metrics,\nsums of an episode")
+        panels[2].legend(frameon=False, loc="best")
+    panels[-1].set_xlabel("samples")
+    panels[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
+    finish_axes(panels)
     if title:
         top.set_title(title, loc="left")
     return save_png(figure, out if out is not None else folder / "curve.png")

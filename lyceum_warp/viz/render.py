@@ -1,5 +1,8 @@
 """A program that draws states into a video: ``python render.py job.npz model.mjb out.mp4``.
 
+The job holds a row for each frame of ``qpos``, ``mocap_pos``, ``mocap_quat``, and of each model field that differs
+between states, as ``model_geom_size``.
+
 MuJoCo chooses its graphics library once, when it is imported, and a driver that fails may end the process. Therefore
 ``video.py`` runs this file in a process for each library that it tries. The file imports nothing of the package. Exit
 code 3 means that this machine cannot draw with this library; the last line on stderr holds the reason.
@@ -11,6 +14,9 @@ from typing import Any
 import numpy as np
 
 CANNOT_DRAW = 3
+
+MODEL_FIELD = "model_"
+"""What the job's names of model fields begin with."""
 
 
 def camera(mujoco: Any, model: Any) -> Any:
@@ -31,8 +37,20 @@ def camera(mujoco: Any, model: Any) -> Any:
     return view
 
 
+def change_model(mujoco: Any, model: Any, rows: dict[str, Any]) -> None:
+    """Set fields of a model by their names, and compute what follows from them, such as the poses of cameras."""
+    for name, row in rows.items():
+        owner = model if hasattr(model, name) else model.opt
+        value = getattr(owner, name)
+        if isinstance(value, np.ndarray):
+            value[...] = row.reshape(value.shape)
+        else:
+            setattr(owner, name, row.item())
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
 def main(job_path: str, model_path: str, out: str) -> int:
-    """Draw one frame for each row of the job's qpos (and of its mocap poses)."""
+    """Draw one frame for each row of the job."""
     try:
         import mujoco
 
@@ -48,10 +66,13 @@ def main(job_path: str, model_path: str, out: str) -> int:
     import imageio.v2 as imageio
 
     data, view = mujoco.MjData(model), camera(mujoco, model)
+    fields = {key.removeprefix(MODEL_FIELD): job[key] for key in job.files if key.startswith(MODEL_FIELD)}
     options: Any = dict(fps=float(job["fps"]), codec="libx264", pixelformat="yuv420p", quality=8, macro_block_size=2)
     writer: Any = imageio.get_writer(out, format="FFMPEG", **options)
     with writer:
         for i in range(len(job["qpos"])):
+            if any(i == 0 or (rows[i] != rows[i - 1]).any() for rows in fields.values()):
+                change_model(mujoco, model, {name: rows[i] for name, rows in fields.items()})
             data.qpos[:] = job["qpos"][i]
             if model.nmocap:
                 data.mocap_pos[:] = job["mocap_pos"][i].reshape(-1, 3)

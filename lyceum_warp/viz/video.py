@@ -16,7 +16,7 @@ import torch
 
 from lyceum_warp.env import Env
 from lyceum_warp.viz import EXTRA
-from lyceum_warp.viz.render import CANNOT_DRAW
+from lyceum_warp.viz.render import CANNOT_DRAW, MODEL_FIELD
 
 _MAX_RATE = 60  # frames per second; screens rarely show more
 _POSES = ("qpos", "mocap_pos", "mocap_quat")
@@ -57,7 +57,7 @@ def episode(env: Env, policy: Callable[[torch.Tensor], torch.Tensor], *, seed: i
 def write_video(
     env: Env, states: torch.Tensor, out: str | Path, *, size: tuple[int, int] = (640, 480), speed: float = 1.0
 ) -> Path:
-    """Draw states into an mp4 file.
+    """Draw states into an mp4 file, each with the model fields that belong to it.
 
     The camera is the model's first tracking camera, else its first camera that is fixed to the world, else a camera
     that follows the first body. The video has at most 60 frames per second: with a shorter time step, states are left
@@ -86,10 +86,12 @@ def write_video(
     rate = speed / env.timestep
     stride = max(1, math.ceil(rate / _MAX_RATE - 1e-9))
     parts = env.state_space.parts
-    poses: Any = {name: states[::stride, parts[name]].numpy() for name in _POSES if name in parts}
+    keys = {name: name for name in _POSES if name in parts}
+    keys |= {MODEL_FIELD + field.name: field.name for field in env.task.dynamics}
+    rows: Any = {key: states[::stride, parts[name]].numpy() for key, name in keys.items()}
     with tempfile.TemporaryDirectory() as folder:
         job, model, video = Path(folder, "job.npz"), Path(folder, "model.mjb"), Path(folder, "video.mp4")
-        np.savez(job, fps=rate / stride, size=size, **poses)
+        np.savez(job, fps=rate / stride, size=size, **rows)
         mujoco.mj_saveModel(env.model, str(model), None)
         _draw([str(job), str(model), str(video)])
         out.parent.mkdir(parents=True, exist_ok=True)

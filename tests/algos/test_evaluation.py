@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import torch
+from metered_task import Metered
+from varied_task import Varied
 
 import lyceum_warp as lw
 
@@ -35,6 +37,21 @@ def test_evaluate_takes_the_same_number_of_episodes_of_every_world() -> None:
     np.testing.assert_allclose(got.evals, [e[2] for e in flat], rtol=1e-5)
 
 
+def test_evaluate_returns_the_metrics_of_each_episode() -> None:
+    env = lw.make(Metered, nworld=3)
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
+    got = lw.evaluate(env, policy, 6, seed=3)
+    assert list(got.metrics) == ["forward", "effort"]
+    expected = got.metrics["forward"] - 0.1 * got.metrics["effort"]
+    torch.testing.assert_close(got.returns, expected, rtol=0.0, atol=1e-5)
+    assert got.returns.std() > 0.1
+    few = got.first(2)
+    assert torch.equal(few.returns, got.returns[:2])
+    assert torch.equal(few.metrics["effort"], got.metrics["effort"][:2])
+    point_mass = lw.make("point_mass", horizon=3)
+    assert lw.evaluate(point_mass, lw.GaussianPolicy(6, 2), 1).metrics == {}
+
+
 def test_evaluate_needs_automatic_resets_and_a_horizon() -> None:
     policy = lw.GaussianPolicy(6, 2)
     with pytest.raises(ValueError, match="autoreset=True"):
@@ -52,3 +69,26 @@ def test_parameters_of_each_world_reach_the_worlds_of_the_mean_policy() -> None:
     env.set_params(success_distance=9.0)
     it = next(npg)
     assert it.mean_success == it.success == 1.0
+
+
+def test_each_episode_has_dynamics_of_its_own() -> None:
+    """What resets draw differs between all episodes, what is drawn at the start differs between worlds."""
+    env = lw.make(Varied, nworld=3)
+    policy = lw.GaussianPolicy(1, 1)
+    got = lw.evaluate(env, policy, 6, seed=3)
+    masses, heights = (got.metrics[name].div(env.horizon).view(2, 3) for name in ("mass", "height"))
+    assert masses.unique().numel() == 6 and masses.min() >= 0.5 and masses.max() <= 1.5
+    torch.testing.assert_close(heights[0], heights[1])
+    assert heights[0].unique().numel() == 3
+    assert torch.equal(lw.evaluate(env, policy, 6, seed=3).metrics["mass"], got.metrics["mass"])
+
+
+def test_the_mean_policy_is_evaluated_under_dynamics_of_its_own() -> None:
+    env = lw.make(Varied, nworld=2)
+    config = lw.NPGConfig(samples=20, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=3)
+    npg = lw.NPG(env, config=config)
+    before = env.field("body_mass").clone()
+    next(npg)
+    few = npg._evaluate_mean._few
+    assert few is not None and few.field("body_mass")[:, 1].unique().numel() == 3
+    assert not torch.isin(few.field("body_mass")[:, 1], torch.cat([before, env.field("body_mass")])).any()

@@ -3,9 +3,11 @@
 import dataclasses
 import math
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from metered_task import Metered
 
 import lyceum_warp as lw
 from lyceum_warp.algos.npg_statistics import (
@@ -16,11 +18,15 @@ from lyceum_warp.algos.npg_statistics import (
     ValueSums,
     episode_statistics,
     finished,
+    finished_metrics,
+    metric_means,
     pooled,
     prediction_sums,
     summary,
     value_statistics,
 )
+
+NAMES = ("done", "episode_return", "episode_length", "reward", "eval", "success")
 
 
 def floats(sums: EpisodeSums) -> EpisodeSums:
@@ -32,7 +38,8 @@ def test_episode_statistics_are_those_of_the_episodes_that_ended() -> None:
     env = lw.make("hopper", nworld=6)
     rollout = lw.Rollout(env, 60)
     rollout.running_return[0] = math.nan  # an episode that began in its middle does not count
-    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, log_std=0.0)
+    generator = torch.Generator().manual_seed(1)
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, log_std=0.0, generator=generator)
     rollout.collect(policy, torch.randn(rollout.action.shape, generator=torch.Generator().manual_seed(0)))
     ended = rollout.done & ~rollout.episode_return.isnan()
     assert 6 < ended.sum() < rollout.done.sum()
@@ -45,9 +52,8 @@ def test_episode_statistics_are_those_of_the_episodes_that_ended() -> None:
     }  # fmt: skip
     expected = {name: tensor.item() for name, tensor in tensors.items()}
     assert episode_statistics([floats(finished(rollout))]) == pytest.approx(expected, rel=1e-5)
-    names = ("done", "episode_return", "episode_length", "reward", "eval", "success")
     parts = [
-        floats(finished(SimpleNamespace(**{name: getattr(rollout, name)[:, part] for name in names})))  # type: ignore[arg-type]
+        floats(finished(SimpleNamespace(**{name: getattr(rollout, name)[:, part] for name in NAMES})))  # type: ignore[arg-type]
         for part in (slice(0, 1), slice(1, None))
     ]
     assert parts[0].episodes < parts[1].episodes
@@ -79,6 +85,49 @@ def test_pooled_moments_equal_those_of_all_numbers() -> None:
     square = (numbers - numbers.mean()).square().sum().item()
     assert pooled(parts) == pytest.approx(Moments(30, numbers.mean().item(), square))
     assert pooled([Moments(0, 0.0, 0.0)]) == Moments(0, 0.0, 0.0)
+
+
+def test_metric_means_are_those_of_the_episodes_that_ended() -> None:
+    """In one rollout, and pooled from two parts of its worlds; nan where none ended."""
+    env = lw.make(Metered, nworld=6)
+    rollout = lw.Rollout(env, 150)
+    rollout.running_return[0] = math.nan  # an episode that began in its middle does not count
+    generator = torch.Generator().manual_seed(1)
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, log_std=0.0, generator=generator)
+    rollout.collect(policy, torch.randn(rollout.action.shape, generator=torch.Generator().manual_seed(0)))
+    ended = rollout.done & ~rollout.episode_return.isnan()
+    assert 6 < ended.sum() < rollout.done.sum()
+    expected = {name: sums[ended].mean().item() for name, sums in rollout.episode_metrics.items()}
+    assert list(expected) == ["forward", "effort"] and expected["effort"] > 0.1
+    returns = rollout.episode_return[ended].mean().item()
+    assert returns == pytest.approx(expected["forward"] - 0.1 * expected["effort"], abs=1e-5)
+
+    def numbers(worlds: slice) -> ProcessNumbers:
+        part: Any = SimpleNamespace(
+            **{name: getattr(rollout, name)[:, worlds] for name in NAMES},
+            episode_metrics={name: sums[:, worlds] for name, sums in rollout.episode_metrics.items()},
+        )
+        sums = process(1.0, 0)._replace(episodes=finished(part), metrics=finished_metrics(part))
+        return ProcessNumbers.unpack(sums.pack().tolist())
+
+    assert metric_means([numbers(slice(None))], list(expected)) == pytest.approx(expected, rel=1e-5)
+    parts = [numbers(slice(0, 1)), numbers(slice(1, None))]
+    assert parts[0].episodes.episodes < parts[1].episodes.episodes
+    both = summary(parts, 10, list(expected))
+    assert both["metrics"] == pytest.approx(expected, rel=1e-5)
+    none = [part._replace(episodes=EpisodeSums(*[0.0] * 9), metrics=(0.0, 0.0)) for part in parts]
+    assert all(math.isnan(mean) for mean in metric_means(none, list(expected)).values())
+
+
+def test_a_row_of_metrics_has_a_column_for_each_metric() -> None:
+    env = lw.make(Metered, nworld=4)
+    config = lw.NPGConfig(samples=400, hidden=(8,), value_hidden=(8,), mean_every=0)
+    it = next(lw.NPG(env, config=config))
+    assert list(it.metrics) == ["forward", "effort"]
+    assert it.return_mean == pytest.approx(it.metrics["forward"] - 0.1 * it.metrics["effort"], abs=1e-5)
+    row = it.row()
+    assert "metrics" not in row and list(row)[-2:] == ["metrics/forward", "metrics/effort"]
+    assert row["metrics/effort"] == it.metrics["effort"] and row["return_mean"] == it.return_mean
 
 
 def process(first: float, faults: float) -> ProcessNumbers:

@@ -2,7 +2,9 @@
 
 import math
 
+import pytest
 import torch
+from metered_task import Metered
 
 import lyceum_warp as lw
 
@@ -31,6 +33,36 @@ def test_collect_stores_inputs_and_results_of_each_step() -> None:
         torch.testing.assert_close(rollout.running_return, rollout.reward[4:].sum(0))
         stored.append(rollout.obs)
     assert torch.equal(*stored)
+
+
+def test_collect_stores_groups_and_metrics_of_each_step() -> None:
+    """The same with graphs and without; groups that are not asked for are not stored."""
+    for graphs in (True, False):
+        env, plain = (lw.make(Metered, nworld=3, horizon=4, graphs=g) for g in (graphs, True))
+        rollout = lw.Rollout(env, 6, groups=("critic",))
+        policy = lw.GaussianPolicy(1, 1, generator=torch.Generator().manual_seed(0))
+        noise = torch.randn(rollout.action.shape, generator=torch.Generator().manual_seed(0))
+        rollout.collect(policy, noise)
+        assert list(rollout.obs_groups) == list(rollout.final_obs_groups) == ["policy", "critic"]
+        assert rollout.obs_groups["policy"] is rollout.obs
+        assert rollout.final_obs_groups["critic"].shape == (6, 3, 2)
+        for t in range(6):
+            for name, obs in plain.obs_groups.items():
+                assert torch.equal(rollout.obs_groups[name][t], obs)
+            plain.step(rollout.action[t])
+            for name, obs in plain.final_obs_groups.items():
+                assert torch.equal(rollout.final_obs_groups[name][t], obs)
+            for name, sums in plain.episode_metrics.items():
+                assert torch.equal(rollout.episode_metrics[name][t], sums)
+        effort = rollout.action.square().sum(-1)
+        torch.testing.assert_close(rollout.episode_metrics["effort"][3], effort[:4].sum(0))
+        torch.testing.assert_close(rollout.episode_metrics["effort"][5], effort[4:].sum(0))
+    assert list(lw.Rollout(env, 2).obs_groups) == ["policy"]
+
+
+def test_an_unknown_group_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"'metered' has no group 'actor' of observations: it has \['policy', 'crit"):
+        lw.Rollout(lw.make(Metered), 2, groups=("actor",))
 
 
 def test_faults_within_a_rollout_are_counted() -> None:

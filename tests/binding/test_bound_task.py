@@ -95,6 +95,10 @@ NOT_COMPILED = {
         f"{REWARD} -> float:\n    return wp.quat_rotate(lw.quat(1.0, 0.0, 0.0, 0.0), wp.vec3(1.0, 0.0, 0.0))[0]",
         "quat_rotate.*: quaternions are w, x, y, z here: use lw.quat_rotate",
     ),
+    "assignment": (
+        "def randomize(s: World, p: Params, rng: Row[wp.uint32]):\n    s.qpos[0] *= 2.0",
+        r"write a\[i\] = a\[i\] \* x in place of a\[i\] \*= x",
+    ),
     "product": (
         f"{REWARD} -> float:\n    q = lw.quat(1.0, 0.0, 0.0, 0.0)\n    return (q * q)[0]",
         "quaternions are w, x, y, z here: use lw.quat_rotate, lw.quat_mul",

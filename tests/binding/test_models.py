@@ -152,7 +152,7 @@ def test_a_model_that_mujoco_refuses_is_named() -> None:
 
 
 def test_a_replica_has_the_model_of_its_original(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also after a caller edits the MjSpec, and where a task's model is drawn anew each time it is called."""
+    """Also after a caller edits the MjSpec, and where a task's model is drawn again each time it is called."""
     spec = lw.gymnasium_model("hopper.xml")
     env = lw.make("hopper", model=spec)
     spec.geom("torso_geom").density = 5000
@@ -199,3 +199,9 @@ def test_the_text_of_a_model_is_refused_with_the_way_to_give_it() -> None:
         ValueError, match=r"^the model '<mujoco><asset><mesh \.\.\.' is XML.*mujoco.MjSpec.from_string\(\.\.\.\)"
     ):
         load_spec(f"\n  {CUBE}")
+
+
+def test_no_body_is_simple_where_inertial_frames_move() -> None:
+    assert compile_model(ball(), (), PHYSICS).body_simple[1] == 1
+    assert compile_model(ball(), (), PHYSICS, varied=["body_mass"]).body_simple[1] == 1
+    assert compile_model(ball(), (), PHYSICS, varied=["body_ipos"]).body_simple[1] == 0

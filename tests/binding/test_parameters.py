@@ -1,5 +1,6 @@
 """The values of a task's parameters: defaults, checks, and what the kernels read."""
 
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -7,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from table_task import Follow
 
 import lyceum_warp as lw
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.options import OPTIONS
+from lyceum_warp.testing import check_task
 
 XML = """
 <mujoco>
@@ -129,3 +132,130 @@ def test_checked_leaves_the_values_as_they_are(model: mujoco.MjModel) -> None:
     values = parameters(model)
     assert values.checked({"gain": 5.0})["gain"] == 5.0
     assert values.values["gain"] == 1.0
+
+
+# tables
+
+
+@wp.struct
+class Tables:
+    dt: float
+    motion: wp.array2d[float] = [[0.0, 1.0], [2.0, 3.0]]
+    points: wp.array[wp.vec3] = np.ones((3, 3))
+    order: wp.array[int] = (2, 0, 1)
+
+
+def test_a_table_may_come_as_array_tensor_list_or_file(model: mujoco.MjModel, tmp_path: Path) -> None:
+    rows = [[1.0, 2.0], [3.0, 4.0], [5.0, 6.5]]
+    np.save(tmp_path / "rows.npy", rows)
+    for given in (rows, np.array(rows), torch.tensor(rows, requires_grad=True), wp.array(rows, dtype=float),
+                  tmp_path / "rows.npy", str(tmp_path / "rows.npy")):  # fmt: skip
+        values = parameters(model, Tables, motion=given).values
+        assert values["motion"].dtype == np.float32 and values["order"].dtype == np.int32
+        np.testing.assert_array_equal(values["motion"], np.float32(rows))
+    assert (values["points"].shape, values["order"].tolist()) == ((3, 3), [2, 0, 1])
+
+
+def test_a_table_is_a_copy_that_cannot_be_written(model: mujoco.MjModel) -> None:
+    given = np.zeros((2, 2), dtype=np.float32)
+    values = parameters(model, Tables, motion=given).values
+    given[0, 0] = 5.0
+    assert values["motion"][0, 0] == 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        values["motion"][0, 0] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"motion": 1.0}, r"the parameter motion of 'arm' has shape \(\): it takes 2 axes, none of them empty"),
+        ({"motion": [1.0, 2.0]}, r"has shape \(2,\): it takes 2 axes"),
+        ({"motion": np.zeros((0, 2))}, r"has shape \(0, 2\): it takes 2 axes, none of them empty"),
+        ({"motion": [[1.0], [2.0, 3.0]]}, "motion of 'arm' must be a table of numbers: "),
+        ({"motion": [[1.0, np.nan]]}, r"motion of 'arm' has nan at \[0, 1\]: it must be a finite number of 32 bits"),
+        ({"motion": [[1e60, 1.0]]}, r"motion of 'arm' has 1e\+60 at \[0, 0\]: it must be a finite number of 32 bits"),
+        ({"motion": "none.npy"}, "motion of 'arm' from 'none.npy': there is no such file"),
+        ({"points": [1.0, 2.0, 3.0]}, r"points of 'arm' has shape \(3,\): it takes 2 axes, the last \(3,\)"),
+        ({"points": np.ones((3, 2))}, r"points of 'arm' has shape \(3, 2\): it takes 2 axes, the last \(3,\)"),
+        ({"order": [0.5]}, r"order of 'arm' has 0.5 at \[0\]: it must be a whole number of 32 bits"),
+        ({"order": [2**40]}, r"order of 'arm' has 1.*at \[0\]: it must be a whole number of 32 bits"),
+    ],
+)
+def test_a_table_that_does_not_fit_is_refused(given: dict[str, Any], message: str, model: mujoco.MjModel) -> None:
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        parameters(model, Tables, **given)
+
+
+def test_a_file_without_a_table_is_refused(model: mujoco.MjModel, tmp_path: Path) -> None:
+    (tmp_path / "text.npy").write_text("1 2 3")
+    np.savez(tmp_path / "several.npz", a=1)
+    for name, message in (("text.npy", "cannot be read"), ("several.npz", "a .npy file of numpy.save")):
+        with pytest.raises(ValueError, match=f"motion of 'arm' from '.*{name}' .*{message}"):
+            parameters(model, Tables, motion=tmp_path / name)
+
+
+def test_a_table_of_another_type_is_refused(model: mujoco.MjModel) -> None:
+    struct = wp.struct(type("Params", (), {"__annotations__": {"t": wp.array(dtype=wp.float64)}, "t": [1.0]}))
+    with pytest.raises(ValueError, match="the parameter 't' of the task 'arm' has the type .*float64.*: a table is"):
+        parameters(model, struct)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_functions_read_tables_which_change_in_place(engine: str) -> None:
+    """With graphs, which are captured by then: the same shape, another shape, and beside a value a world."""
+    env = lw.make(Follow, engine=engine, nworld=2)
+
+    def first_steps() -> torch.Tensor:
+        env.reset()
+        seen = [env.obs[:, 1:].clone()]
+        for _ in range(3):
+            env.step()
+            seen.append(env.obs[:, 1:].clone())
+        return torch.stack(seen)[:, 0]
+
+    assert first_steps().tolist() == [[0, 1, 3], [0.5, 2, 3], [1, 3, 3], [1, 3, 3]]
+    first_steps()
+    env.set_params(motion=[[4.0, 5.0], [6.0, 7.0], [8.0, 9.0]])
+    assert first_steps().tolist() == [[4, 5, 3], [6, 7, 3], [8, 9, 3], [8, 9, 3]]
+    env.set_params(motion=[[2.0, 1.0], [3.0, 0.0]], points=[(0.0, 0.0, 7.0), (0.0, 0.0, 1.0)])
+    assert first_steps().tolist() == [[2, 1, 7], [3, 0, 7], [3, 0, 7], [3, 0, 7]]
+    env.set_params(gain=[1.0, 2.0])
+    assert first_steps().tolist() == [[2, 1, 7], [3, 0, 7], [3, 0, 7], [3, 0, 7]]
+    torch.testing.assert_close(env.reward[1], 2.0 * env.reward[0])
+
+
+def test_other_environments_get_the_tables() -> None:
+    """A replica of another size, scratch worlds, worlds that follow, a planner, and a trained policy's evaluation."""
+    motion = np.array([[0.25, 0.0]])
+    env = lw.make(Follow, motion=motion, gain=[1.0, 2.0], nworld=2)
+    motion[:] = 9.0  # the environment has a copy
+    more = env.replicate(nworld=3)
+    assert more.obs[:, 1].tolist() == [0.25] * 3
+    env.set_params(motion=[[0.75, 0.0], [0.5, 0.0]])
+    more.follow(env)
+    more.reset()
+    assert more.obs[:, 1].tolist() == [0.75] * 3
+    assert env.get_obs(env.get_state())[0, 1] == 0.75
+    env.set_params(motion=[[0.5, 0.0]])
+    assert env.get_obs(env.get_state())[0, 1] == 0.5
+    planner = lw.MPPI(Follow, samples=4, horizon=2, motion=[[0.125, 0.0]])
+    assert planner.env.obs[0, 1] == 0.125
+    npg = lw.NPG(env, config=lw.NPGConfig(samples=32, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2))
+    assert next(npg).mean_return is not None
+
+
+def test_a_table_is_not_written_by_functions(task_file: Any) -> None:
+    source = (Path(__file__).parent.parent / "table_task.py").read_text()
+    wrong = source.replace("    obs[0] = s.qpos[0]", "    obs[0] = s.qpos[0]\n    p.motion[0, 0] = 1.0")
+    with pytest.raises(ValueError, match=r"observe .*writes p\.motion|p\.motion.*observe"):
+        lw.make(str(task_file("writes_table.py", wrong)))
+
+
+def test_check_task_finds_a_read_out_of_a_table(task_file: Any) -> None:
+    check_task(Follow, steps=12)
+    source = (Path(__file__).parent.parent / "table_task.py").read_text()
+    wrong = source.replace("p.motion.shape[0] - 1)", "p.motion.shape[0])")
+    with pytest.raises(
+        AssertionError, match=r"observe reads p\.motion\[frame.*out of range .*the index is 3, and there"
+    ):
+        check_task(str(task_file("beyond_table.py", wrong)), steps=12)

@@ -51,6 +51,13 @@ def test_a_parameter_written_in_another_way_is_refused(text: str, message: str) 
         parameter(text)
 
 
+def test_a_file_with_a_table_gets_its_whole_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    name, path = parameter("motion=here/walk.npy")
+    assert (name, path) == ("motion", str(tmp_path / "here/walk.npy"))
+    assert parameter(f"motion={spelled(path)}") == (name, path)
+
+
 def test_portable_makes_the_path_of_a_file_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert portable("hopper") == "hopper"

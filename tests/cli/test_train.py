@@ -34,6 +34,19 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+def test_metrics_of_a_task_are_columns_also_after_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    metered, out = str(Path(__file__).parent.parent / "metered_task.py"), tmp_path / "run"
+    assert train(out, "--iterations", "1", task=metered) == 0
+    assert cli.main(["train", "--resume", str(out), "--iterations", "2", *QUIET]) == 0
+    for row in Run.open(out).rows():
+        forward, effort = row["metrics/forward"], row["metrics/effort"]
+        assert forward is not None and effort is not None
+        assert row["return_mean"] == pytest.approx(forward - 0.1 * effort, abs=1e-5)
+    assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
+    printed = capsys.readouterr().out
+    assert " forward " in printed and " effort " in printed
+
+
 def test_a_task_file_is_trained_and_evaluated(
     task_file: TaskFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,8 +6,9 @@ import pytest
 import tiny_task
 from conftest import TaskFile
 
-from lyceum_warp.testing import check_task
+from lyceum_warp.testing import bounds_rules, check_task
 from lyceum_warp.testing.bounds_rules import check_bounds
+from lyceum_warp.testing.checked_functions import Unchecked
 
 ENGINES = ["mujoco", "warp"]
 
@@ -44,9 +45,9 @@ def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
 
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    if s0.memory[0] == 2.0:
-        s1.qpos[0] = s0.memory[int(s0.memory[0])]
     s1.memory[0] = s0.memory[0] + 1.0
+    if s0.memory[0] == 2.0:
+        s1.memory[0] += s0.memory[int(s0.memory[0])]
 
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
@@ -81,13 +82,12 @@ def test_indices_out_of_range_are_found_and_named(task_file: TaskFile, engine: s
     assert message.count("out of range") == len(MISTAKES)
 
 
-def test_a_function_that_cannot_be_checked_breaks_the_rule(task_file: TaskFile) -> None:
-    source = tiny_task.changed(
-        ("@wp.func", """@wp.func_native("return row.data[0];")
-def peek(row: Row[float]) -> float: ...
+def test_a_function_that_cannot_be_checked_breaks_the_rule(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unchecked(*args: object) -> None:
+        raise Unchecked("observe uses last as a value (wrong.py, line 3): call it instead")
 
-@wp.func"""),
-        ("obs[0] = s.qpos[0]", "obs[0] = peek(s.qpos)"),
-    )  # fmt: skip
-    with pytest.raises(AssertionError, match=r"could not be checked: observe calls the native function peek \(native"):
-        check_task(task_file("native.py", source), engine="mujoco", checks=[check_bounds])
+    monkeypatch.setattr(bounds_rules, "checked_functions", unchecked)
+    with pytest.raises(
+        AssertionError, match="the rule 'bounds': the functions could not be checked: observe uses last"
+    ):
+        check_task("hopper", engine="mujoco", checks=[check_bounds])

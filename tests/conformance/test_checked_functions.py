@@ -184,6 +184,10 @@ FINDINGS = {
 }  # fmt: skip
 
 
+KEPT: list[wp.array] = []
+"""Arrays that others only point to."""
+
+
 @pytest.fixture(scope="module")
 def device() -> wp.Device:
     return wp.get_device("cpu")
@@ -194,11 +198,8 @@ def params() -> wp.array:
     p = Params()
     p.dt, p.where, p.gains = 0.5, 0, wp.vec3(1.0, 2.0, 3.0)
     p.table = wp.array(np.arange(12.0).reshape(3, 4), dtype=float)
+    KEPT.append(p.table)
     return wp.array([p], dtype=Params)
-
-
-KEPT: list[wp.array] = []
-"""Memory behind rows without elements."""
 
 
 def batch() -> Any:

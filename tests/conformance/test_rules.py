@@ -13,7 +13,7 @@ import lyceum_warp as lw
 import lyceum_warp.env
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
-from lyceum_warp.testing import CHECKS, Report, bounds_rules, check_task
+from lyceum_warp.testing import CHECKS, Report, check_task
 from lyceum_warp.worlds import Worlds
 
 Function = Callable[..., Any]
@@ -61,8 +61,9 @@ def keep_warm_start(engine: MujocoEngine) -> None:
     engine._initial.numpy()[start : start + engine.model.nv] = np.nan
 
 
-def narrow_observations(run: Any) -> None:
-    run.rows["obs policy"] = run.rows["obs policy"][:, :-1]
+def narrow_positions(worlds: Worlds) -> None:
+    worlds.after.qpos = worlds.before.qpos = worlds.after.qpos[:, :-1]
+    del worlds._copies["qpos"]
 
 
 def spoil_rewards(env: lw.Env) -> None:
@@ -155,7 +156,7 @@ BREAKS: list[Break] = [
     ("graphs", Graphs, "sequence", skip_some_replays),
     ("memory", lw.Env, "step", then(lambda env: leak.append(float(env.nworld)))),  # 32 bytes
     ("memory", lw.Env, "get_state", then(lambda env: env.__dict__.setdefault("kept", []).append(env.obs.clone()))),
-    ("bounds", bounds_rules._Run, "__init__", then(narrow_observations)),
+    ("bounds", Worlds, "_allocate", then(narrow_positions)),
     ("bad_state", MujocoEngine, "find_faults", nothing),
     ("bad_action", Worlds, "_judge", without_action_faults),
     ("bad_warmstart", MujocoEngine, "__init__", then(keep_warm_start)),

@@ -35,6 +35,18 @@ def test_a_table_is_drawn_into_a_given_file(run: Run, tmp_path: Path) -> None:
     assert is_png(learning_curve(run.metrics, tmp_path / "new" / "other.png", title="by table"))
 
 
+def test_a_run_with_metrics_gets_a_panel_for_them(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    sizes = []
+    for number, metrics in enumerate(({}, {"metrics/forward": 1.0, "metrics/effort": float("nan")})):
+        run = Run.create(tmp_path / str(number), {"task": "point_mass", "seed": 3})
+        for i in (1, 2):
+            run.write({"samples": i, "return_mean": 1.0, "return_std": 0.5, "eval_mean": 1.0, **metrics})
+        header = learning_curve(run).read_bytes()[16:24]
+        sizes.append(int.from_bytes(header[4:], "big"))
+    assert sizes[1] > sizes[0]
+
+
 def test_a_run_without_rows_is_refused(run: Run) -> None:
     pytest.importorskip("matplotlib")
     run.cut(0)

@@ -6,9 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from conftest import SharedEnv
+from varied_task import Varied
 
 import lyceum_warp as lw
 from lyceum_warp.viz import video
@@ -57,6 +59,42 @@ with imageio.get_reader(sys.argv[1]) as reader:
     assert count == len(states)
     assert shape == [120, 160, 3]
     assert brightest > 100  # the scene has light
+
+
+def test_a_video_has_the_model_fields_of_its_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("imageio")
+    env = lw.make(Varied, autoreset=False)
+    first, second = (video.episode(env, lambda obs: torch.zeros(1, 1), seed=seed) for seed in (1, 2))
+    states, parts = torch.cat([first, second]), env.state_space.parts
+    sizes = states[:, parts["geom_size"]][:, 0]
+    assert sizes.unique().numel() == 2
+    jobs = []
+
+    def drawn(arguments: list[str]) -> None:
+        with np.load(arguments[0]) as job:
+            jobs.append(dict(job))
+        Path(arguments[2]).write_bytes(b"")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(video, "_draw", drawn)
+        video.write_video(env, states, tmp_path / "none.mp4", speed=1e-3)
+    for name in ("body_mass", "body_pos", "geom_size"):
+        np.testing.assert_array_equal(jobs[0][f"model_{name}"], states[:, parts[name]].numpy())
+    try:
+        path = video.write_video(env, states, tmp_path / "video.mp4", size=(160, 120), speed=0.01)
+    except video.NoVideoError as error:
+        pytest.skip(str(error))
+    program = """
+import json, sys
+import imageio.v2 as imageio
+with imageio.get_reader(sys.argv[1]) as reader:
+    print(json.dumps([int((f[..., 0] > f[..., 1].astype(int) + 60).sum()) for f in reader.iter_data()]))
+"""
+    done = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True)
+    areas = np.array(json.loads(done.stdout), dtype=float)  # of the red ball, which is seen from a fixed place
+    assert len(areas) == len(states) and areas.min() > 0
+    ratio = areas[len(first) :].mean() / areas[: len(first)].mean()
+    assert ratio == pytest.approx((sizes[-1] / sizes[0]).item() ** 2, rel=0.25)
 
 
 def test_a_machine_that_cannot_draw_is_reported_with_a_fix(

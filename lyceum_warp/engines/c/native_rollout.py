@@ -54,7 +54,7 @@ class NativeRollout:
         self.by_step = self.control.reshape(nworld, steps, nstep, model.nu)
         self._given: Any = None
         self._views: Any = None
-        self.fields = list(fields)
+        self.fields = [field for field in fields if field.size]
         self.stage = max((field.refresh for field in self.fields), default=Stage.NONE)
         self.start: dict[str, slice] = {}
         """Columns of the state vector that hold a field's value at the start."""

@@ -6,6 +6,7 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 
+from lyceum_warp.engines.warp.substep import needs_velocities
 from lyceum_warp.fields import Stage
 
 Part = Callable[[mjw.Model, mjw.Data], None]
@@ -30,6 +31,7 @@ _FIELDS: dict[Part, str] = {
     mjw.kinematics: "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat",
     mjw.com_pos: "subtree_com cdof cinert",
     mjw.camlight: "cam_xpos cam_xmat light_xpos light_xdir",
+    mjw.flex: "flexvert_xpos flexedge_length",
     mjw.tendon: "ten_length",
     mjw.crb: "crb",
     mjw.transmission: "actuator_length",
@@ -64,10 +66,17 @@ _PARTS_OF_SENSOR = {
 }
 
 
-def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, ...] | None:
+def forward_parts(
+    model: mujoco.MjModel, names: Collection[str], varied: Collection[str] = ()
+) -> tuple[Part, ...] | None:
     """The parts of a forward pass that compute the named fields, in order, without collisions and constraints.
 
     Of ``sensordata`` the parts compute the sensors of the position and velocity stages.
+
+    Args:
+        model: The compiled model.
+        names: The fields.
+        varied: Names of model fields that differ between worlds.
 
     Returns:
         The parts, or None if the fields need collisions or constraints.
@@ -91,7 +100,7 @@ def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, 
         wanted.discard(mjw.com_vel)
     if _touching(model) and wanted & {mjw.transmission, mjw.fwd_velocity}:
         return None
-    if mjw.crb in wanted and model.tendon_armature.any():
+    if mjw.crb in wanted and _has_armature(model, varied):
         return None
     return (*(part for part in _NEEDS if part in wanted), *sensors)
 
@@ -124,14 +133,19 @@ def _touching(model: mujoco.MjModel) -> bool:
     return bool((model.actuator_trntype == int(body)).any() or np.any(getattr(model, "geom_adhesion", 0)))
 
 
-def takes_over(model: mujoco.MjModel, parts: Collection[Part]) -> tuple[Part, ...]:
+def _has_armature(model: mujoco.MjModel, varied: Collection[str]) -> bool:
+    """Whether tendons add to the inertia, which ``mujoco_warp.crb`` leaves to a function that it does not show."""
+    return "tendon_armature" in varied or bool(model.tendon_armature.any())
+
+
+def takes_over(model: mujoco.MjModel, parts: Collection[Part], varied: Collection[str] = ()) -> tuple[Part, ...]:
     """Those of some parts that ``step_after`` can take over; they are a function of positions alone."""
     enabled, integrators = mujoco.mjtEnableBit, mujoco.mjtIntegrator
     flags = enabled.mjENBL_SLEEP | enabled.mjENBL_ENERGY
     known = (integrators.mjINT_EULER, integrators.mjINT_RK4, integrators.mjINT_IMPLICIT, integrators.mjINT_IMPLICITFAST)
     if model.opt.enableflags & flags or model.opt.integrator not in [int(i) for i in known]:
         return ()
-    if model.tendon_armature.any():
+    if _has_armature(model, varied):
         return ()
     return tuple(part for part in parts if part in _POSITION)
 
@@ -155,6 +169,8 @@ def step_after(done: Collection[Part], m: mjw.Model, d: mjw.Data) -> None:
     mjw.crb(m, d)
     if m.opt.run_collision_detection:
         mjw.collision(m, d)
+    if needs_velocities(m):
+        mjw.com_vel(m, d)
     mjw.make_constraint(m, d)
     mjw.transmission(m, d)
     d.sensordata.zero_()

@@ -9,9 +9,11 @@ import warp as wp
 
 from lyceum_warp.arrays import launch_rows
 from lyceum_warp.engines.warp import partial_kernels as kernels
+from lyceum_warp.engines.warp import substep
 from lyceum_warp.engines.warp.group_turns import Arena, Turns
 from lyceum_warp.engines.warp.model_rows import ModelRows
 from lyceum_warp.engines.warp.overflow import report_pool_overflow
+from lyceum_warp.engines.warp.static_geoms import StaticGeoms
 from lyceum_warp.kernels.state import copy_rows
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
@@ -28,16 +30,17 @@ class PartialForward:
         data: MuJoCo Warp's data of all worlds.
         group: The same of the group.
         states: Room for the integration states of all worlds, (nworld, integration size), float32.
+        static: Geoms whose poses a forward pass does not compute.
     """
 
-    def __init__(self, rows: ModelRows, data: mjw.Data, group: mjw.Data, states: wp.array) -> None:
-        self._rows, self._data, self._group, self._states = rows, data, group, states
-        device = wp.get_device(data.qpos.device)
-        with wp.ScopedDevice(device):
+    def __init__(self, rows: ModelRows, data: mjw.Data, group: mjw.Data, states: wp.array, static: StaticGeoms) -> None:
+        self._rows, self._data, self._group, self._states, self._static = rows, data, group, states, static
+        self._device = wp.get_device(data.qpos.device)
+        with wp.ScopedDevice(self._device):
             self._group_states = wp.zeros((group.nworld, states.shape[1]), dtype=float)
             self._everyone = wp.full(group.nworld, True, dtype=bool)
             self._no_time = wp.zeros((data.nworld, 1), dtype=float)
-        self._turns = Turns(data.nworld, group.nworld, device)
+        self._turns = Turns(data.nworld, group.nworld, self._device)
 
     def __call__(
         self, mask: wp.array, forward: Callable[[mjw.Model, mjw.Data], None], targets: Mapping[str, wp.array]
@@ -60,8 +63,9 @@ class PartialForward:
                 self._turns.give(source, target)
             self._turns.give_bits(group.overflow, data.overflow)
 
-        mjw.get_state(self._rows.whole, data, self._states, _SPEC, mask)
-        self._turns.run(mask, turn)
+        with wp.ScopedDevice(self._device):
+            mjw.get_state(self._rows.whole, data, self._states, _SPEC, mask)
+            self._turns.run(mask, turn)
 
     def settle(self, mask: wp.array, nstep: int) -> None:
         """Advance the masked worlds' states by some substeps, and set their time to 0; made of launches."""
@@ -70,19 +74,21 @@ class PartialForward:
         def turn() -> None:
             self._enter()
             for _ in range(nstep):
-                mjw.step(self._rows.model, group)
+                substep.step(self._rows.model, group)
             mjw.get_state(self._rows.model, group, self._group_states, _SPEC)
             self._turns.give(self._group_states, self._states)
             self._turns.give_bits(group.overflow, data.overflow)
 
-        mjw.get_state(self._rows.whole, data, self._states, _SPEC, mask)
-        self._turns.run(mask, turn)
-        launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # time is the first number of a state
-        mjw.set_state(self._rows.whole, data, self._states, _SPEC, mask)
+        with wp.ScopedDevice(self._device):
+            mjw.get_state(self._rows.whole, data, self._states, _SPEC, mask)
+            self._turns.run(mask, turn)
+            launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # time is the first number of a state
+            mjw.set_state(self._rows.whole, data, self._states, _SPEC, mask)
 
     def _enter(self) -> None:
         """Put the group into the models and states of its worlds."""
         self._rows.take(self._turns)
+        self._static.place(self._rows.model, self._group, self._everyone)
         self._turns.take(self._states, self._group_states)
         mjw.set_state(self._rows.model, self._group, self._group_states, _SPEC)
         self._group.overflow.zero_()
@@ -101,21 +107,33 @@ class Conditional:
         self._device = device
         self._any = wp.zeros(1, dtype=int, device=device)
         self._arena = None if device.is_cpu else Arena(device)
+        self._inside = False
 
     def __call__(self, mask: wp.array, run: Callable[[], None]) -> None:
-        """Run launches for the masked worlds, (nworld,) bool, which may not matter to any other world."""
-        if not self._device.is_capturing:
-            with contextlib.nullcontext() if self._arena is None else self._arena.counting():
-                self._open()
-                run()
-            return
-        with wp.ScopedDevice(self._device):
-            self._any.zero_()
-            wp.launch(kernels.find_any, len(mask), [mask, self._any])
-            self._open()
-            with contextlib.nullcontext() if self._arena is None else self._arena.serving():
-                wp.capture_if(self._any, on_true=run)
+        """Run launches for the masked worlds, (nworld,) bool, which may not matter to any other world.
 
-    def _open(self) -> None:
-        if self._arena is not None:
-            self._arena.open()
+        Within such launches, others run unconditionally.
+        """
+        if self._inside:
+            run()
+            return
+        self._inside = True
+        try:
+            with wp.ScopedDevice(self._device):
+                if not self._device.is_capturing:
+                    with self._reserved(capturing=False):
+                        run()
+                    return
+                self._any.zero_()
+                wp.launch(kernels.find_any, len(mask), [mask, self._any])
+                with self._reserved(capturing=True):
+                    wp.capture_if(self._any, on_true=run)
+        finally:
+            self._inside = False
+
+    def _reserved(self, *, capturing: bool) -> contextlib.AbstractContextManager[object]:
+        """Memory for temporary arrays: within a conditional part of a CUDA graph nothing may be allocated."""
+        if self._arena is None:
+            return contextlib.nullcontext()
+        self._arena.open()
+        return self._arena.serving() if capturing else self._arena.counting()

@@ -2,7 +2,7 @@
 
 import contextlib
 import copy
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Any
 
 import mujoco
@@ -13,7 +13,7 @@ from mujoco_warp._src import collision_sdf
 
 from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.engines.warp import overflow
+from lyceum_warp.engines.warp import overflow, substep
 from lyceum_warp.engines.warp.contact_sizes import probe_sizes
 from lyceum_warp.engines.warp.data_memory import data_bytes
 from lyceum_warp.engines.warp.forward_parts import Part, forward_parts, step_after, takes_over
@@ -21,6 +21,7 @@ from lyceum_warp.engines.warp.group_turns import group_size
 from lyceum_warp.engines.warp.model_constants import ModelConstants
 from lyceum_warp.engines.warp.model_rows import ModelRows, constants_of, outputs_of, owner, put_varied_model
 from lyceum_warp.engines.warp.partial_forward import Conditional, PartialForward
+from lyceum_warp.engines.warp.static_geoms import StaticGeoms
 from lyceum_warp.fields import Field, Stage, early_sensor_columns
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_columns, copy_rows, fill_rows, narrow, widen, zero_columns
@@ -95,19 +96,21 @@ class WarpEngine(Engine):
         for varied in self.dynamics.values():
             self.arrays[varied.name] = self._alias_model(varied)
         self._constants = self._model_constants()
+        self._static = StaticGeoms(model, self.dynamics, device)
         # the model's own initial state follows qpos0 and the poses of mocap bodies, which may differ between worlds
         self._start: wp.array | None = None
         if initial is not None or self.dynamics:
             self._start = wp.array(self.initial, dtype=float, device=device)
         self._reset = [field.name for field in self.fields.values() if field.reset > Stage.NONE]
-        self._current_parts = forward_parts(model, [f.name for f in self.fields.values() if f.refresh > Stage.NONE])
+        current = [field.name for field in self.fields.values() if field.refresh > Stage.NONE]
+        self._current_parts = forward_parts(model, current, self.dynamics)
         self._reset_parts = None
         if self.reset_stage < Stage.ACCELERATION:
-            self._reset_parts = forward_parts(model, self._reset)
+            self._reset_parts = forward_parts(model, self._reset, self.dynamics)
         self._columns: wp.array = wp.array(early_sensor_columns(model), dtype=int, device=device)
         # a step goes on from the parts that were computed for its state, whether a world stepped there or restarted
-        moved = any(getattr(self.fields.get(name), "written", False) for name in ("mocap_pos", "mocap_quat"))
-        self._shared = () if moved else takes_over(model, self._current_parts or ())
+        moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
+        self._shared = () if moved else takes_over(model, self._current_parts or (), self.dynamics)
         self._conditional = Conditional(device)
         self._partial = self._partial_forward()
         self._settling: PartialForward | None = None
@@ -187,7 +190,7 @@ class WarpEngine(Engine):
                 if i == 0 and self._shared:
                     step_after(self._shared, self.m, self.d)
                 else:
-                    mjw.step(self.m, self.d)
+                    substep.step(self.m, self.d)
         self._copy_snapshots(self._everyone)
         self.refresh_current(self._everyone)
 
@@ -205,7 +208,7 @@ class WarpEngine(Engine):
                 for part in parts:
                     part(m, d)
             elif stage == Stage.ACCELERATION:
-                mjw.forward(m, d)
+                substep.forward(m, d)
             else:
                 # sensors of limits and contacts are written only where there is one; the others stay as they are
                 wp.launch(zero_columns, (d.nworld, len(self._columns)), [self._columns, d.sensordata])
@@ -229,9 +232,10 @@ class WarpEngine(Engine):
             wp.launch(copy_columns, size, [mask, self._columns, own, kept], device=self.device)
 
     def apply_model(self, mask: wp.array) -> None:
-        if self._constants is not None:
-            with wp.ScopedDevice(self.device):
+        with wp.ScopedDevice(self.device):
+            if self._constants is not None:
                 self._constants(mask)
+            self._static.place(self.m, self.d, mask)
 
     def settle(self, mask: wp.array, nstep: int) -> None:
         if nstep == 0:
@@ -249,7 +253,7 @@ class WarpEngine(Engine):
         with self._on_device():
             mjw.get_state(self.m, self.d, states, _SPEC)
             for _ in range(nstep):
-                mjw.step(self.m, self.d)
+                substep.step(self.m, self.d)
             mjw.get_state(self.m, self.d, states, _SPEC, mask)
             launch_rows(copy_rows, mask, wp.zeros((self.nworld, 1), dtype=float, device=self.device), states[:, :1])
             mjw.set_state(self.m, self.d, states, _SPEC)
@@ -273,13 +277,17 @@ class WarpEngine(Engine):
     def commit(self, mask: wp.array) -> None:
         """Nothing to do: the fields are the engine's own arrays."""
 
+    def run_for(self, mask: wp.array, run: Callable[[], None]) -> None:
+        if self.partial_refresh:
+            self._conditional(mask, run)
+        else:
+            run()
+
     def refresh(self, mask: wp.array) -> None:
         if self._partial is not None and self.partial_refresh:
             self._partial(mask, self._forward_group, {name: self.arrays[name] for name in self._reset})
-        elif self.partial_refresh:
-            self._conditional(mask, lambda: self._refresh(mask))
         else:
-            self._refresh(mask)
+            self.run_for(mask, lambda: self._refresh(mask))
 
     def _forward_group(self, model: mjw.Model, group: mjw.Data) -> None:
         self._forward(None, self.reset_stage, group, model)
@@ -308,7 +316,7 @@ class WarpEngine(Engine):
         names = [field.name for field in fields if field.size] + outputs_of(fields)
         with wp.ScopedDevice(self.device):
             rows = ModelRows(self.m, names, size)
-        return PartialForward(rows, self.d, self._make_data(size), self._state)
+        return PartialForward(rows, self.d, self._make_data(size), self._state, self._static)
 
     @contextlib.contextmanager
     def _histories_kept(self) -> Iterator[None]:

@@ -3,19 +3,23 @@
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import pytest
+import torch
 import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp import Row
+from lyceum_warp.testing import CHECKS, check_task
 from lyceum_warp.testing import buffer_rules as buffers
-from lyceum_warp.testing import check_task
 from lyceum_warp.testing import episode_rules as episodes
 from lyceum_warp.testing import fault_rules as faults
 from lyceum_warp.testing import state_rules as state
 
-# the slow engine on the CPU keeps those rules that depend on the model
-WARP_CHECKS = (
+# without the one that looks through all objects, whatever the model
+QUICK_CHECKS = tuple(check for check in CHECKS if check is not episodes.check_memory)
+# those rules that depend on the model, where an engine is slow on the CPU, or a model slow to compile
+MODEL_CHECKS = (
     buffers.check_spaces,
     state.check_restoring,
     state.check_masked_restoring,
@@ -90,7 +94,7 @@ def start_sensing(s: SensingWorld, p: Params, rng: Row[wp.uint32]):
 
 
 class Sensing(lw.Task):
-    """Moves, and sees what its sensors tell."""
+    """Moves, and sees what its sensors measure."""
 
     horizon = 15
 
@@ -203,6 +207,11 @@ SENSING = {
         MOTOR + '<sensor><framequat objtype="site" objname="end"/><accelerometer site="end"/><force site="tip"/>'
         '<touch site="end"/><actuatorfrc actuator="push"/><contact geom1="floor" num="1" data="found force"/></sensor>',
     ),
+    "welds and sensors": text(
+        ARM + BALL.format(z=1.5) + '<body name="target" mocap="true" pos=".3 0 .6"/>',
+        '<equality><weld body1="hand" body2="target" solref=".1 1"/></equality>'
+        '<sensor><gyro site="end"/><framepos objtype="site" objname="end"/></sensor>' + MOTOR,
+    ),
     "delayed sensors": text(
         ARM,
         MOTOR + '<sensor><jointpos joint="hinge" nsample="4" delay=".012"/><jointvel joint="hinge" nsample="4" '
@@ -230,25 +239,25 @@ def sensing(model: str) -> type[lw.Task]:
 
 @pytest.mark.parametrize("model", MOVING.values(), ids=MOVING)
 def test_a_model_keeps_the_rules_on_the_mujoco_engine(model: str) -> None:
-    check_task(moving(model), engine="mujoco", nworld=3, steps=20, frame_skip=2)
+    check_task(moving(model), engine="mujoco", nworld=3, steps=20, frame_skip=2, checks=QUICK_CHECKS)
 
 
 @pytest.mark.parametrize("model", MOVING.values(), ids=MOVING)
 def test_a_model_keeps_the_rules_on_the_warp_engine(model: str) -> None:
     task = moving(model)
-    check_task(task, engine="warp", nworld=2, steps=20, horizon=6, frame_skip=1, checks=WARP_CHECKS)
+    check_task(task, engine="warp", nworld=2, steps=20, horizon=6, frame_skip=1, checks=MODEL_CHECKS)
 
 
 @pytest.mark.parametrize("model", SENSING.values(), ids=SENSING)
 def test_a_model_with_sensors_keeps_the_rules_on_the_mujoco_engine(model: str) -> None:
     task = sensing(model)
-    check_task(task, engine="mujoco", nworld=3, steps=20, frame_skip=2)
+    check_task(task, engine="mujoco", nworld=3, steps=20, frame_skip=2, checks=QUICK_CHECKS)
 
 
 @pytest.mark.parametrize("model", SENSING.values(), ids=SENSING)
 def test_a_model_with_sensors_keeps_the_rules_on_the_warp_engine(model: str) -> None:
     task = sensing(model)
-    check_task(task, engine="warp", nworld=2, steps=20, horizon=6, frame_skip=1, checks=WARP_CHECKS)
+    check_task(task, engine="warp", nworld=2, steps=20, horizon=6, frame_skip=1, checks=MODEL_CHECKS)
 
 
 # plugins, and what MuJoCo Warp does not have
@@ -276,7 +285,7 @@ PLUGINS = {
 
 @pytest.mark.parametrize("model", PLUGINS.values(), ids=PLUGINS)
 def test_a_model_of_the_mujoco_engine_alone_keeps_the_rules_there(model: str) -> None:
-    check_task(moving(model), engine="mujoco", nworld=3, steps=20, frame_skip=2)
+    check_task(moving(model), engine="mujoco", nworld=2, steps=20, frame_skip=2, checks=MODEL_CHECKS)
 
 
 @pytest.mark.parametrize(("reason", "model"), PLUGINS.items())
@@ -291,3 +300,123 @@ def test_names_that_are_used_twice_are_refused_in_a_line(tmp_path: Path) -> None
     file.write_text(text(ARM, actuated('<motor name="twice" joint="hinge"/>', '<motor name="twice" joint="wrist"/>')))
     with pytest.raises(ValueError, match="^MuJoCo can't read the model .*: Error: repeated name 'twice' in actuator"):
         lw.make(moving(text(ARM)), model=file)
+
+
+# fields that only some models have
+
+RICH = text(
+    ARM
+    + '<flexcomp name="cloth" type="grid" dim="2" count="3 3 1" spacing=".1 .1 .1" pos="2 0 3" radius=".02" mass=".1">'
+    '<contact selfcollide="none"/><edge equality="true"/></flexcomp>',
+    '<equality><connect name="hung" active="false" body1="hand" body2="world" anchor="0 0 0"/></equality>'
+    + actuated('<motor name="push" joint="hinge" nsample="4" delay=".01"/>'),
+)
+FIELDS = ("eq_active", "history", "plastic", "energy", "flexvert_xpos", "flexedge_length", "flexedge_velocity")
+
+
+def test_fields_of_some_models_are_the_same_on_both_engines_and_in_mujoco() -> None:
+    seen = []
+    for engine in ("mujoco", "warp"):
+        env = lw.make(moving(RICH), engine=engine, nworld=2, fields=FIELDS, seed=1)
+        for _ in range(3):
+            env.action.fill_(0.3)
+            env.step()
+        data = mujoco.MjData(env.model)
+        state = env.get_state()[1, : env.engine.integration_size].numpy()
+        mujoco.mj_setState(env.model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION.value)
+        mujoco.mj_forward(env.model, data)
+        for name in ("eq_active", "energy", "flexvert_xpos", "flexedge_length", "flexedge_velocity"):
+            found = env.field(name)[1].numpy().reshape(np.shape(getattr(data, name)))
+            np.testing.assert_allclose(found, getattr(data, name), rtol=1e-4, atol=1e-4, err_msg=f"{engine} {name}")
+        assert env.field("flexvert_xpos", "cloth").shape == (2, 9, 3)
+        assert env.field("eq_active", "hung").dtype == torch.bool
+        seen.append({name: env.field(name).float() for name in FIELDS})
+    for name in FIELDS:
+        torch.testing.assert_close(*(fields[name] for fields in seen), rtol=1e-3, atol=1e-3, msg=name)
+
+
+def test_an_equality_constraint_is_switched_on_at_a_reset_alike_on_both_engines() -> None:
+    """The engine takes over truth values as it does numbers."""
+    ends = []
+    for engine in ("mujoco", "warp"):
+        env = lw.make(moving(RICH), engine=engine, nworld=2, fields=["eq_active"])
+        env.reset()
+        env.field("eq_active")[1, 0] = True
+        env.engine.commit(wp.full(2, True, dtype=bool))
+        for _ in range(10):
+            env.step(torch.ones_like(env.action))
+        assert env.field("eq_active", "hung").tolist() == [[False], [True]]
+        ends.append(env.obs[:, :2].clone())
+        state = env.get_state()
+        env.reset()
+        assert not env.field("eq_active", "hung").any()
+        env.set_state(state)
+        assert env.field("eq_active", "hung").tolist() == [[False], [True]]
+    assert (ends[0][0] - ends[0][1]).abs().max() > 1e-3
+    torch.testing.assert_close(*ends, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_a_field_of_no_numbers_rolls_out(engine: str) -> None:
+    env = lw.make(sensing(SENSING["no sensors"]), engine=engine, nworld=2, autoreset=False, seed=1)
+    rollout = lw.OpenLoop(env, 3)
+    rollout.state.copy_(env.get_state()[0])
+    rollout.actions.zero_()
+    rollout.run()
+    live = lw.make(sensing(SENSING["no sensors"]), engine=engine, nworld=2, autoreset=False)
+    live.set_state(rollout.state.expand(2, -1).contiguous())
+    for t in range(3):
+        live.step(torch.zeros_like(live.action))
+        assert torch.equal(rollout.reward[t], live.reward)
+    assert rollout.reward.abs().min() > 0
+
+
+# models without actuators, in tasks with actions of their own
+
+
+@wp.struct
+class PushedWorld:
+    qpos: Row[float]
+    qvel: Row[float]
+    qfrc_applied: Row[float]
+
+
+@wp.func
+def look(s: PushedWorld, p: Params, obs: Row[float]):
+    obs[0] = s.qpos[0]
+    obs[1] = s.qvel[0]
+
+
+@wp.func
+def push(s: PushedWorld, action: Row[float], p: Params, ctrl: Row[float]):
+    s.qfrc_applied[0] = action[0]
+
+
+@wp.func
+def start_pushed(s: PushedWorld, p: Params, rng: Row[wp.uint32]):
+    s.qvel[0] = lw.uniform(rng, -p.noise, p.noise)
+
+
+@wp.func
+def judge_pushed(s0: PushedWorld, action: Row[float], s1: PushedWorld, p: Params) -> float:
+    return s1.qvel[0]
+
+
+class Pushed(lw.Task):
+    """Pushes a joint of a model without actuators."""
+
+    World, observe, control = PushedWorld, look, push
+    randomize, reward = start_pushed, judge_pushed
+    model = mujoco.MjSpec.from_string(text(ARM, ""))
+    obs = {"position": 1, "velocity": 1}
+    actions = {"push": 1}
+    action_range = (-1.0, 1.0)
+    horizon = 15
+
+
+def test_a_model_without_actuators_keeps_the_rules_on_the_mujoco_engine() -> None:
+    check_task(Pushed, engine="mujoco", nworld=3, steps=20, frame_skip=2, checks=QUICK_CHECKS)
+
+
+def test_a_model_without_actuators_keeps_the_rules_on_the_warp_engine() -> None:
+    check_task(Pushed, engine="warp", nworld=2, steps=20, horizon=6, frame_skip=1, checks=MODEL_CHECKS)

@@ -1,0 +1,405 @@
+"""Model fields that differ between worlds, inputs, initial states and settling, on every engine."""
+
+import copy
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+import pytest
+import warp as wp
+from toy_engine import ToyEngine
+
+from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
+from lyceum_warp.engines.placement import bytes_per_world, open_engine
+from lyceum_warp.engines.warp.warp_engine import WarpEngine
+from lyceum_warp.fields import describe, state_columns
+from lyceum_warp.graphs.capture import Graphs, Phase
+from lyceum_warp.model_fields import describe_model_field
+
+XML = """<mujoco><option integrator="implicitfast" cone="elliptic" timestep=".004"/>
+<worldbody><geom name="floor" type="plane" size="5 5 .1" friction=".3"/>
+<body name="arm" pos="0 0 1"><joint name="h" axis="0 1 0" range="-60 60" damping=".1" armature=".01"/>
+<geom type="capsule" size=".1 .2" mass="1"/><site name="s" pos=".05 0 -.2"/>
+<body name="hand" pos="0 0 -.4"><joint name="k" axis="0 1 0"/><geom type="box" size=".05 .05 .2" mass=".5"/></body>
+</body>
+<body name="box" pos="1 0 .09"><freejoint/><geom size=".1 .1 .1" type="box" mass="1"/></body>
+<body name="target" mocap="true" pos="0 1 1"><geom size=".02" contype="0" conaffinity="0"/></body>
+<site name="w" pos=".3 0 1.5"/></worldbody>
+<tendon><fixed name="t"><joint joint="h" coef="1"/><joint joint="k" coef="-1"/></fixed>
+<spatial name="sp"><site site="w"/><site site="s"/></spatial></tendon>
+<actuator><motor joint="h"/><position joint="k" kp="10"/><motor tendon="sp" gear="2"/></actuator>
+<keyframe><key name="home" qpos=".2 -.1 1 0 .5 1 0 0 0" ctrl=".1 .2 .3"/></keyframe></mujoco>"""
+
+DRAWN = (
+    "body_mass body_inertia body_ipos geom_friction geom_size dof_damping dof_armature actuator_gainprm "
+    "actuator_biasprm gravity"
+).split()
+ENGINES = [MujocoEngine, WarpEngine, ToyEngine]
+CPU = wp.get_device("cpu")
+N = 3
+
+
+def compiled(spec: mujoco.MjSpec | None = None) -> mujoco.MjModel:
+    spec = spec or mujoco.MjSpec.from_string(XML)
+    for body in spec.bodies[1:]:
+        body.simple = 0  # so that inertial frames can move
+    return spec.compile()
+
+
+MODEL = compiled()
+STATE = ("time", "qpos", "qvel", "act", "ctrl")
+
+
+def make(
+    engine: type[Engine],
+    *names: str,
+    fields: tuple[str, ...] = (),
+    nworld: int = N,
+    model: mujoco.MjModel = MODEL,
+    initial: np.ndarray | None = None,
+    written: tuple[str, ...] = (),
+) -> Engine:
+    """An engine whose named model fields differ between worlds, after a reset."""
+    kept = [describe(model, name) for name in (*STATE, *fields)]
+    kept += [describe(model, name, written=True) for name in written]
+    dynamics = [describe_model_field(model, name) for name in names]
+    made = open_engine(engine, model, nworld, CPU, kept, dynamics, initial)
+    made.reset(worlds(nworld))
+    made.refresh(worlds(nworld))
+    return made
+
+
+def worlds(nworld: int = N, *chosen: int) -> wp.array:
+    """A mask of the chosen worlds; without any, of all."""
+    return wp.array([not chosen or w in chosen for w in range(nworld)], dtype=bool)
+
+
+def draw(engine: Engine, seed: int = 0, *chosen: int) -> None:
+    """Scale every model field of the chosen worlds, or of all, by random numbers, and apply them."""
+    rng = np.random.default_rng(seed)
+    for name in sorted(engine.dynamics):
+        array, own = engine.arrays[name].numpy(), engine.nominal[name].numpy()
+        shape = (*array.shape[:-1], 1) if name == "body_inertia" else array.shape  # it must stay one of a body
+        drawn = own * rng.uniform(0.8, 1.2, size=shape).astype(np.float32)
+        if name == "body_ipos":
+            drawn[:, 1:] += 0.01
+        for w in chosen or range(engine.nworld):
+            array[w] = drawn[w]
+    engine.apply_model(worlds(engine.nworld, *chosen))
+
+
+def run(engine: Engine, steps: int = 5, nstep: int = 2) -> np.ndarray:
+    """Coordinates and velocities after some steps under fixed controls, (nworld, nq + nv)."""
+    for _ in range(steps):
+        engine.ctrl.numpy()[:] = (0.5, -0.3, 0.2)
+        engine.step(nstep)
+    return shown(engine)
+
+
+def shown(engine: Engine) -> np.ndarray:
+    return np.hstack([engine.arrays[name].numpy() for name in ("qpos", "qvel")])
+
+
+def state_of(engine: Engine) -> wp.array:
+    state = wp.zeros((engine.nworld, engine.state_size), dtype=wp.float64)
+    engine.get_state(state)
+    return state
+
+
+# physics
+
+
+@pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
+def test_constants_equal_those_of_a_recompiled_model(engine: type[Engine]) -> None:
+    made = make(engine, "body_mass", "body_inertia", "body_ipos", "dof_armature", "actuator_gear", "geom_size")
+    draw(made)
+    for w in range(N):
+        spec = mujoco.MjSpec.from_string(XML)
+        arrays = {name: made.arrays[name].numpy()[w].astype(float) for name in made.dynamics}
+        for b, body in enumerate(spec.bodies):
+            if b:
+                body.mass, body.inertia = arrays["body_mass"][b], arrays["body_inertia"][b]
+                body.ipos, body.iquat, body.explicitinertial = arrays["body_ipos"][b], MODEL.body_iquat[b], True
+        for i, joint in enumerate(j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE):
+            joint.armature = arrays["dof_armature"][i]
+        for i, actuator in enumerate(spec.actuators):
+            actuator.gear = arrays["actuator_gear"][i]
+        for i, geom in enumerate(spec.geoms):
+            geom.size = arrays["geom_size"][i]
+        expected = compiled(spec)
+        names = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0", "geom_rbound")
+        names += ("tendon_invweight0",)
+        for name in names:
+            value = made.batch.expanded(name) if isinstance(made, MujocoEngine) else getattr(made.m, name).numpy()
+            np.testing.assert_allclose(value[w], getattr(expected, name), rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
+def test_worlds_run_as_plain_mujoco_does_on_their_models(engine: type[Engine]) -> None:
+    made, plain = make(engine, *DRAWN), make(ToyEngine, *DRAWN)
+    draw(made)
+    draw(plain)
+    steps = [(run(made, 1), run(plain, 1)) for _ in range(5)]
+    assert np.ptp(steps[-1][1], axis=0).max() > 0.01  # the models matter
+    for got, expected in steps:
+        if engine is MujocoEngine:
+            np.testing.assert_array_equal(got, expected)
+        np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)
+
+
+CHANGES: Mapping[str, float] = {
+    "actuator_damping": 0.3, "actuator_armature": 0.2, "tendon_damping": 0.5, "tendon_stiffness": 5.0,
+    "tendon_frictionloss": 0.3, "dof_frictionloss": 0.2, "density": 300.0, "viscosity": 1.0, "wind": 3.0,
+    "body_gravcomp": 0.7, "jnt_stiffness": 1.0, "geom_margin": 0.02, "site_pos": 0.03, "body_pos": 0.02,
+    "geom_quat": 0.1, "geom_pos": 0.02, "gravity": 2.0, "jnt_pos": 0.03,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
+def test_a_field_that_is_zero_in_the_model_acts_in_one_world_alone(engine: type[Engine], name: str) -> None:
+    model = copy.copy(MODEL)
+    if name == "wind":
+        model.opt.density = 100.0
+    results = []
+    for kind in (engine, ToyEngine):
+        made = make(kind, name, model=model)
+        made.arrays[name].numpy()[1] += np.float32(CHANGES[name])
+        if name == "geom_quat":
+            quat = made.arrays[name].numpy()[1]
+            quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+        made.apply_model(worlds(N, 1))
+        results.append(run(made))
+    got, expected = results
+    assert abs(expected[1] - expected[0]).max() > 1e-4
+    np.testing.assert_array_equal(got[0], got[2])
+    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=0 if engine is MujocoEngine else 2e-5)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_change_in_one_world_alters_no_other(engine: type[Engine]) -> None:
+    changed, untouched = make(engine, *DRAWN), make(engine, *DRAWN)
+    for made in (changed, untouched):
+        draw(made, 1)
+    run(changed, 2), run(untouched, 2)
+    draw(changed, 2, 1)
+    got, expected = run(changed), run(untouched)
+    np.testing.assert_array_equal(got[[0, 2]], expected[[0, 2]])
+    assert (got[1] != expected[1]).any()
+
+
+def test_worlds_of_the_nominal_model_are_those_of_an_engine_without_dynamics() -> None:
+    np.testing.assert_array_equal(run(make(MujocoEngine, *DRAWN)), run(make(MujocoEngine)))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_applying_what_was_applied_changes_nothing(engine: type[Engine]) -> None:
+    made, other = make(engine, *DRAWN), make(engine, *DRAWN)
+    for either in (made, other):
+        draw(either)
+        run(either, 2)
+    before = state_of(made).numpy().copy()
+    made.apply_model(worlds())
+    np.testing.assert_array_equal(state_of(made).numpy(), before)
+    np.testing.assert_array_equal(run(made), run(other))
+
+
+def test_a_mass_that_is_not_positive_is_a_fault_of_its_world() -> None:
+    for engine in (MujocoEngine, WarpEngine):
+        made = make(engine, "body_mass", "body_inertia")
+        for name in ("body_mass", "body_inertia"):
+            made.arrays[name].numpy()[1] *= -1
+        made.apply_model(worlds(N, 1))
+        run(made, 3)
+        made.find_faults(worlds())
+        np.testing.assert_array_equal(made.fault.numpy() != 0, [False, True, False])
+
+
+# states
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_restored_state_brings_its_model(engine: type[Engine]) -> None:
+    made, other = make(engine, *DRAWN), make(engine, *DRAWN)
+    draw(made, 1)
+    draw(other, 2)
+    run(made, 3), run(other, 2)
+    assert made.state_size > made.integration_size + sum(field.size for field in made.snapshots)
+    state = state_of(made)
+    other.set_state(state, worlds())
+    for name in made.dynamics:
+        np.testing.assert_array_equal(other.arrays[name].numpy(), made.arrays[name].numpy())
+    np.testing.assert_array_equal(state_of(other).numpy(), state.numpy())
+    np.testing.assert_array_equal(run(other), run(made))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_model_that_becomes_nominal_again_runs_as_before(engine: type[Engine]) -> None:
+    made, untouched = make(engine, *DRAWN), make(engine, *DRAWN)
+    draw(made)
+    for name, nominal in made.nominal.items():
+        made.arrays[name].numpy()[:] = nominal.numpy()
+    made.apply_model(worlds())
+    np.testing.assert_array_equal(run(made), run(untouched))
+
+
+@pytest.mark.parametrize(("integrator", "current"), [("implicitfast", ()), ("RK4", ("xpos",))])
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_rollout_honours_the_model_of_each_state(engine: type[Engine], integrator: str, current: tuple[str]) -> None:
+    """On the C engine the first case is one native call, and the second takes step after step."""
+    model = copy.copy(MODEL)
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    source, planner = (make(engine, *DRAWN, fields=current, model=model) for _ in range(2))
+    draw(source)
+    run(source, 2)
+    state = state_of(source)
+    controls = wp.array(np.full((4, N, MODEL.nu), 0.3), dtype=float)
+    names = ("qpos", "qvel", "body_mass", *current)
+    buffers = {name: wp.zeros((5, *source.arrays[name].shape), dtype=source.arrays[name].dtype) for name in names}
+    for _ in range(2):  # the second time no model changes
+        planner.rollout(state, controls, 2, buffers)
+        for t in range(4):
+            for name, buffer in buffers.items():
+                np.testing.assert_array_equal(buffer.numpy()[t], source.arrays[name].numpy())
+            source.ctrl.numpy()[:] = 0.3
+            source.step(2)
+        for name, buffer in buffers.items():
+            np.testing.assert_array_equal(buffer.numpy()[4], source.arrays[name].numpy())
+            if name in planner.dynamics or name in STATE:
+                np.testing.assert_array_equal(planner.arrays[name].numpy(), source.arrays[name].numpy())
+        source.reset(worlds())
+        source.set_state(state, worlds())
+
+
+# settling
+
+
+class WholeWarpEngine(WarpEngine):
+    """A Warp engine that cannot step a group of worlds alone, as the deterministic one."""
+
+    partial_refresh = False
+
+
+@pytest.mark.parametrize("engine", [*ENGINES, WholeWarpEngine])
+def test_settling_advances_the_masked_worlds_alone(engine: type[Engine]) -> None:
+    fields = ("xpos", "qfrc_constraint")
+    made, alone = make(engine, *DRAWN, fields=fields), make(engine, *DRAWN, fields=fields)
+    for either in (made, alone):
+        draw(either)
+        run(either, 2)
+    before = {name: made.arrays[name].numpy().copy() for name in (*STATE, *fields)}
+    state = state_of(made).numpy().copy()
+    made.settle(worlds(N, 0, 2), 7)
+    for name, values in before.items():
+        np.testing.assert_array_equal(made.arrays[name].numpy()[1], values[1])
+    np.testing.assert_array_equal(state_of(made).numpy()[1], state[1])
+    alone.step(7)
+    np.testing.assert_array_equal(shown(made)[[0, 2]], shown(alone)[[0, 2]])
+    assert made.arrays["time"].numpy()[[0, 2]].tolist() == [0.0, 0.0]
+    made.find_faults(worlds())
+    assert not made.fault.numpy().any()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_settling_no_world_changes_nothing(engine: type[Engine]) -> None:
+    made = make(engine, "body_mass")
+    run(made, 2)
+    before = state_of(made).numpy().copy()
+    made.settle(wp.zeros(N, dtype=bool), 3)
+    made.settle(worlds(), 0)
+    np.testing.assert_array_equal(state_of(made).numpy(), before)
+
+
+def test_models_are_applied_and_worlds_settled_within_graphs() -> None:
+    captured, direct = (make(WarpEngine, *DRAWN) for _ in range(2))
+    mask = worlds(N, 0, 2)
+
+    def phases(engine: Engine) -> list[Phase]:
+        return [
+            Phase("model", lambda: engine.apply_model(mask), engine=True),
+            Phase("settle", lambda: engine.settle(mask, 2), engine=True),
+            Phase("refresh", lambda: engine.refresh(mask), engine=True),
+            Phase("step", lambda: engine.step(1), engine=True),
+        ]
+
+    for engine, enabled in ((captured, True), (direct, False)):
+        calls = Graphs(CPU, enabled=enabled).sequence(phases(engine))
+        for seed in range(4):  # the first runs, the second captures
+            rng = np.random.default_rng(seed)
+            for name in engine.dynamics:
+                array = engine.arrays[name].numpy()
+                array[[0, 2]] *= rng.uniform(0.9, 1.1, size=array[[0, 2]].shape).astype(np.float32)
+            for call in calls:
+                call()
+    np.testing.assert_array_equal(shown(captured), shown(direct))
+
+
+# inputs and initial states
+
+
+@pytest.mark.parametrize("name", ["xfrc_applied", "qfrc_applied", "mocap_pos"])
+@pytest.mark.parametrize("engine", ENGINES)
+def test_written_inputs_act_from_the_next_step_on(engine: type[Engine], name: str) -> None:
+    made = make(engine, written=(name,), fields=("xpos",))
+    assert made.fields[name].written
+    index = MODEL.body("box").id if name == "xfrc_applied" else 0
+    made.arrays[name].numpy()[1, index] += np.float32(0.5)
+    run(made, 4)
+    data = mujoco.MjData(MODEL)
+    getattr(data, name)[index] += 0.5
+    data.ctrl[:] = (0.5, -0.3, 0.2)
+    for _ in range(8):
+        mujoco.mj_step(MODEL, data)
+    mujoco.mj_forward(MODEL, data)
+    np.testing.assert_allclose(made.arrays["qvel"].numpy()[1], data.qvel, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(made.arrays["xpos"].numpy()[1], data.xpos, rtol=1e-5, atol=1e-5)
+    assert (made.arrays["xpos"].numpy()[1] != made.arrays["xpos"].numpy()[0]).any()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("varied", [(), ("qpos0",)])
+def test_worlds_reset_to_the_given_initial_state(engine: type[Engine], varied: tuple[str, ...]) -> None:
+    data = mujoco.MjData(MODEL)
+    mujoco.mj_resetDataKeyframe(MODEL, data, 0)
+    spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
+    initial = np.empty(mujoco.mj_stateSize(MODEL, spec))
+    mujoco.mj_getState(MODEL, data, initial, spec)
+    made = make(engine, *varied, initial=initial)
+    run(made, 2)
+    made.reset(worlds(N, 1))
+    home = initial[state_columns(MODEL, "qpos")].astype(np.float32)
+    np.testing.assert_array_equal(made.arrays["qpos"].numpy()[1], home)
+    np.testing.assert_array_equal(made.ctrl.numpy()[1], np.float32([0.1, 0.2, 0.3]))
+    assert (made.arrays["qpos"].numpy()[0] != home).any()
+
+
+def test_an_initial_state_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"an initial state has the shape .*, not \(3,\)"):
+        make(MujocoEngine, initial=np.zeros(3))
+
+
+# placement
+
+
+class OldEngine(ToyEngine):
+    """An engine from before models could differ."""
+
+    name = "old"
+
+    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: list) -> None:  # type: ignore[type-arg]
+        super().__init__(model, nworld, device, fields)
+
+
+def test_engines_without_the_newer_arguments_run_where_these_are_not_used() -> None:
+    run(make(OldEngine))
+    with pytest.raises(ValueError, match="the old engine takes no model fields that differ between worlds"):
+        make(OldEngine, "body_mass")
+
+
+@pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
+def test_worlds_of_different_models_take_more_memory(engine: type[Engine]) -> None:
+    dynamics = [describe_model_field(MODEL, name) for name in DRAWN]
+    floats = sum(field.size for field in dynamics)
+    plain, varied = (bytes_per_world(engine, MODEL, CPU, [], fields) for fields in ((), dynamics))
+    assert plain + 8 * floats <= varied < plain + 40 * floats + 4000
