@@ -84,7 +84,7 @@ PUCK = """
     <geom name="floor" type="plane" size="9 9 .1" friction=".01"/>
     <body name="puck" pos="0 0 .1">
       <joint name="x" type="slide" axis="1 0 0"/>
-      <joint name="z" type="slide" axis="0 0 1"/>
+      <joint name="z" type="slide" axis="0 0 1" damping="50"/>
       <geom name="puck" size=".1" mass="1" friction=".2"/>
     </body>
   </worldbody>

@@ -88,8 +88,8 @@ class TaskSource:
         types = list(function.input_types.values())
         structs = [kind for kind in types if hasattr(kind, "vars") and hasattr(kind, "cls")]
         foreign = structs and self.world not in structs and self.params not in structs
-        if foreign and function.func.__module__ == self.task.__module__:
-            return None  # another task's, left over in a notebook
+        if foreign and function.func.__module__ in {owner.__module__ for owner in self.task.__mro__}:
+            return None  # another task's of the same module
         annotations = function.func.__annotations__
         if any(isinstance(annotation, str) for annotation in annotations.values()):
             raise ValueError(

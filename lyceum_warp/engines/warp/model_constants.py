@@ -9,7 +9,7 @@ import warp as wp
 from lyceum_warp.arrays import flat
 from lyceum_warp.engines.warp.group_turns import Turns, group_size
 from lyceum_warp.engines.warp.model_rows import OUTPUTS, ModelRows, constants_of, outputs_of, owner
-from lyceum_warp.engines.warp.partial_kernels import mark_changed
+from lyceum_warp.engines.warp.partial_kernels import correct_weights, mark_changed
 from lyceum_warp.model_fields import Constants, ModelField
 
 _GROUPS = {
@@ -48,6 +48,9 @@ class ModelConstants:
             self._given = [flat(getattr(owner(put, name), name)).view(wp.int32) for name in names]
             self._applied = [wp.full_like(given, -1) for given in self._given]  # the bits of no number
             self._changed = wp.zeros(nworld, dtype=bool)
+            # weights that are 0 in MuJoCo stay 0, and bodies with nothing but sliders have those of their mass
+            self._weighs = wp.array(model.body_invweight0 > 0, dtype=wp.vec2)
+            self._sliding: wp.array = wp.array(model.body_simple == 2, dtype=bool)
         self._turns = Turns(nworld, size, device)
 
     def __call__(self, mask: wp.array) -> None:
@@ -60,5 +63,11 @@ class ModelConstants:
 
     def _turn(self) -> None:
         self._rows.take(self._turns)
-        mjw.set_const(self._rows.model, self._scratch, self._flags, restore=False)
+        model = self._rows.model
+        mjw.set_const(model, self._scratch, self._flags, restore=False)
+        if "body_invweight0" in self._outputs:
+            dim = (self._scratch.nworld, len(self._sliding))
+            places = [self._weighs, self._sliding, model.body_dofadr, model.body_dofnum]
+            weights = [model.body_mass, model.body_invweight0, model.dof_invweight0]
+            wp.launch(correct_weights, dim, [*places, *weights], device=self._sliding.device)
         self._rows.give(self._turns, self._outputs)

@@ -81,3 +81,28 @@ def mark_changed(
             if bits != applied_inout[w, i]:
                 applied_inout[w, i] = bits
                 changed_inout[w] = True
+
+
+@wp.kernel(enable_backward=False)
+def correct_weights(
+    weighs_in: wp.array[wp.vec2],
+    sliding_in: wp.array[bool],
+    dofadr_in: wp.array[int],
+    dofnum_in: wp.array[int],
+    mass_in: wp.array2d[float],
+    body_inout: wp.array2d[wp.vec2],
+    dof_inout: wp.array2d[float],
+):
+    """Give inverse weights the values of mj_setConst where MuJoCo Warp's differ; launched over (nworld, nbody).
+
+    MuJoCo Warp replaces a weight of 0, of the translation or of the rotation, by the other one, and does not set apart
+    simple bodies that only slide.
+    """
+    w, body = wp.tid()
+    if sliding_in[body]:
+        weight = 1.0 / mass_in[w % mass_in.shape[0], body]
+        body_inout[w, body] = wp.vec2(weight, 0.0)
+        for i in range(dofadr_in[body], dofadr_in[body] + dofnum_in[body]):
+            dof_inout[w, i] = weight
+    elif body_inout[w, body][0] == body_inout[w, body][1]:
+        body_inout[w, body] = wp.cw_mul(body_inout[w, body], weighs_in[body])
