@@ -44,7 +44,7 @@ def check_groups(ctx: Context) -> None:
         good = _groups(a)
         a.action[0] = torch.nan
         a.step()
-        ctx.that(a.done[0], "an action of not-a-number is no fault")
+        ctx.that(a.done[0], "an action of not-a-number is not a fault")
         for name, final in a.final_obs_groups.items():
             ctx.equal(final[0], good[name][0], f"the final group {name} after a fault")
 
@@ -61,7 +61,7 @@ def check_noise(ctx: Context) -> None:
     ctx.equal(kept, env.obs, "the noise of a state")
     ctx.equal(env.get_obs(state), kept, "the noise of a state, a second time")
     parts = env.state_space.parts
-    # the same world in the same state, but for its place in the random stream
+    # the same world in the same state, except for its place in the random stream
     same = state[:1].expand_as(state).contiguous()
     noisy = [group for group, f in env.task.observers.items() if len(f.input_types) > len(FUNCTIONS["observe"].kinds)]
     changes: dict[str, torch.Tensor] = {"key": state[:, parts["key"]]}
@@ -96,7 +96,7 @@ def check_metrics(ctx: Context) -> None:
                 ctx.that((values[(a.done_reason & int(FAULTS)) != 0] == 0).all(), f"{name} of a fault: {values}")
                 sums[name][a.done] = 0.0
             if i == horizon + 1:
-                ctx.that(bool(a.done_reason[-1] & int(FAULTS)), "an action of not-a-number is no fault")
+                ctx.that(bool(a.done_reason[-1] & int(FAULTS)), "an action of not-a-number is not a fault")
         b.set_state(a.get_state())
         for name in a.metrics:
             ctx.equal(b.episode_metrics[name], sums[name], f"the sums of {name} after set_state")

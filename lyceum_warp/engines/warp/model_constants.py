@@ -31,16 +31,24 @@ class ModelConstants:
         fields: The fields that differ between worlds, with constants that follow.
         nworld: Number of worlds.
         device: Where they live.
+        loop: As for ``Turns``.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, put: mjw.Model, fields: Collection[ModelField], nworld: int, device: wp.Device
+        self,
+        model: mujoco.MjModel,
+        put: mjw.Model,
+        fields: Collection[ModelField],
+        nworld: int,
+        device: wp.Device,
+        *,
+        loop: bool = True,
     ) -> None:
         groups = constants_of(fields)
         self._outputs = outputs_of(fields)
         self._flags = int(sum(int(flag) for group, flag in _GROUPS.items() if group & groups))
         written = {name for group, names in OUTPUTS.items() if group & groups for name in names}
-        size = group_size(nworld, device)
+        size = group_size(nworld, device) if loop else nworld
         with wp.ScopedDevice(device):
             names = [field.name for field in fields]
             self._rows = ModelRows(put, [*names, *self._outputs], size, written - set(self._outputs))
@@ -51,7 +59,7 @@ class ModelConstants:
             # weights that are 0 in MuJoCo stay 0, and bodies with nothing but sliders have those of their mass
             self._weighs = wp.array(model.body_invweight0 > 0, dtype=wp.vec2)
             self._sliding: wp.array = wp.array(model.body_simple == 2, dtype=bool)
-        self._turns = Turns(nworld, size, device)
+        self._turns = Turns(nworld, size, device, loop=loop)
 
     def __call__(self, mask: wp.array) -> None:
         """Bring the masked worlds' constants up to date; made of launches."""

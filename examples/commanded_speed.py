@@ -1,0 +1,149 @@
+"""A cheetah that runs at a commanded speed: most of the task form in one file.
+
+``python examples/commanded_speed.py`` checks and steps it; ``lyceum-warp train examples/commanded_speed.py`` trains it.
+"""
+
+import mujoco
+import numpy as np
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+from lyceum_warp.testing import check_task
+
+GAIT = 0.4 * np.sin(np.pi * np.arange(20)[:, None] / 10 + np.array([0.0, 0.8, 1.6, 3.1, 3.9, 4.7]))  # rad
+
+
+def cheetah() -> mujoco.MjSpec:
+    """Gymnasium's model with a touch sensor under each foot and a crouched keyframe."""
+    spec = lw.gymnasium_model("half_cheetah.xml")
+    for foot in ("bfoot", "ffoot"):
+        spec.body(foot).add_site(name=foot, pos=[0.0, 0.0, -0.1], size=[0.15, 0.15, 0.15])
+        spec.add_sensor(name=foot, type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=foot)
+    spec.add_key(name="crouch", qpos=[0.0, -0.05, 0.0, 0.2, -0.2, 0.1, -0.2, 0.2, -0.1])
+    return spec
+
+
+@wp.struct
+class World:
+    time: float
+    qpos: Row[float]
+    qvel: Row[float]
+    sensordata: Row[float]
+    gravity: Row[float]  # these four belong to the model; what startup and randomize write differs between worlds
+    body_mass: Row[float]
+    geom_friction: Row[wp.vec3]
+    actuator_gainprm: Row[lw.vec10]
+    memory: Row[float]  # the command in m/s, and seconds since a foot touched the ground
+    lasting_memory: Row[float]  # level of the curriculum, 0 to 1
+
+
+@wp.struct
+class Params:
+    dt: float
+    substep_dt: float
+    noise: float = 0.02
+    fastest: float = 4.0  # command at level 1, m/s
+    push: float = 0.5  # standard deviation, m/s
+    gait: wp.array2d[float] = GAIT  # joint angles to imitate, a row for each phase
+    period: float = 0.4  # of the gait, s
+    weights: wp.vec4 = wp.vec4(1.0, 0.3, -0.02, -0.5)  # of the reward's terms
+    feet: int = lw.sensor("bfoot")  # followed by that of the other foot
+    floor: int = lw.geom("floor")
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):  # what the robot measures
+    for i in range(8):
+        obs[i] = s.qpos[i + 1] + p.noise * lw.normal(rng)
+    for i in range(9):
+        obs[8 + i] = s.qvel[i] + 10.0 * p.noise * lw.normal(rng)
+    obs[17] = s.memory[0]
+    obs[18] = wp.sin(wp.tau * s.time / p.period)
+    obs[19] = wp.cos(wp.tau * s.time / p.period)
+
+
+@wp.func
+def observe_critic(s: World, p: Params, obs: Row[float]):  # what only a simulator knows
+    for i in range(8):
+        obs[i] = s.qpos[i + 1]
+    for i in range(9):
+        obs[8 + i] = s.qvel[i]
+    for i in range(7):
+        obs[17 + i] = s.body_mass[i + 1]
+    obs[24] = s.geom_friction[p.floor][0]
+    obs[25] = s.gravity[2]
+
+
+@wp.func
+def terms(s0: World, action: Row[float], s1: World, p: Params) -> wp.vec4:
+    error = (s1.qpos[0] - s0.qpos[0]) / p.dt - s0.memory[0]
+    row = int(s1.time / p.period * float(p.gait.shape[0])) % p.gait.shape[0]
+    distance, effort = float(0.0), float(0.0)
+    for i in range(6):
+        distance += (s1.qpos[3 + i] - p.gait[row, i]) ** 2.0
+        effort += action[i] * action[i]
+    found = wp.vec4(wp.exp(-error * error), wp.exp(-2.0 * distance), effort, wp.min(s1.memory[1], 0.5))
+    return wp.cw_mul(p.weights, found)
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    return wp.dot(terms(s0, action, s1, p), wp.vec4(1.0))
+
+
+@wp.func
+def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):
+    for i in range(4):
+        metrics[i] = terms(s0, action, s1, p)[i]
+    metrics[4] = s1.lasting_memory[0]
+
+
+@wp.func
+def startup(s: World, p: Params, rng: Row[wp.uint32]):  # once for each world
+    s.gravity[2] = s.gravity[2] * lw.uniform(rng, 0.95, 1.05)
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):  # at every reset, from nominal values
+    for i in range(1, 8):
+        s.body_mass[i] = s.body_mass[i] * lw.uniform(rng, 0.8, 1.2)
+    for i in range(6):
+        s.actuator_gainprm[i][0] = lw.uniform(rng, 0.9, 1.1)
+    s.geom_friction[p.floor][0] = lw.uniform(rng, 0.3, 1.0)
+    s.memory[0] = lw.uniform(rng, 0.0, 1.0 + s.lasting_memory[0] * (p.fastest - 1.0))
+
+
+@wp.func
+def event(s: World, p: Params, rng: Row[wp.uint32]):  # between two steps, every 2 s and every second on average
+    if lw.uniform(rng, 0.0, 2.0) < p.dt:
+        s.memory[0] = lw.uniform(rng, 0.0, 1.0 + s.lasting_memory[0] * (p.fastest - 1.0))
+    if lw.uniform(rng, 0.0, 1.0) < p.dt:
+        s.qvel[0] += p.push * lw.normal(rng)
+
+
+@wp.func
+def substep(s: World, p: Params):
+    touching = s.sensordata[p.feet] + s.sensordata[p.feet + 1] > 0.0
+    s.memory[1] = wp.where(touching, 0.0, s.memory[1] + p.substep_dt)
+
+
+@wp.func
+def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
+    well = terms(s0, action, s1, p)[0] > 0.7 * p.weights[0]  # then faster commands come
+    s1.lasting_memory[0] = wp.clamp(s0.lasting_memory[0] + wp.where(well, 1e-3, -1e-3), 0.0, 1.0)
+
+
+@lw.register
+class CommandedSpeed(lw.Task):
+    model, frame_skip, horizon, keyframe, settle = staticmethod(cheetah), 5, 400, "crouch", 20
+    obs = {"policy": {"posture": 17, "command": 1, "phase": 2}, "critic": {"posture": 17, "dynamics": 9}}
+    metrics, memory, lasting_memory = ("tracking", "gait", "effort", "flight", "level"), 2, 1
+
+
+if __name__ == "__main__":
+    for engine in ("mujoco", "warp"):
+        print(check_task(CommandedSpeed, engine=engine, steps=50))
+    env = lw.make(CommandedSpeed)
+    env.step()
+    print("reward", env.reward.item(), "of", {name: metric.item() for name, metric in env.metrics.items()})
