@@ -403,3 +403,26 @@ def test_worlds_of_different_models_take_more_memory(engine: type[Engine]) -> No
     floats = sum(field.size for field in dynamics)
     plain, varied = (bytes_per_world(engine, MODEL, CPU, [], fields) for fields in ((), dynamics))
     assert plain + 8 * floats <= varied < plain + 40 * floats + 4000
+
+
+SLIDERS = """<mujoco><worldbody>
+<body><joint type="slide" axis="1 0 0" armature=".5"/><joint type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body>
+<body><joint axis="0 1 0"/><geom size=".1" mass="1"/></body>
+<body><joint type="slide" axis="1 0 0"/><geom size=".1" mass="1"/>
+<body><joint type="slide" axis="0 0 1"/><geom size=".1" mass="2"/></body></body>
+</worldbody></mujoco>"""
+
+
+def test_inverse_weights_of_bodies_that_only_slide_or_turn_are_those_of_a_compiled_model() -> None:
+    """MuJoCo gives a weight of 0 to what can't move, and MuJoCo Warp's ``set_const`` another one."""
+    model = mujoco.MjModel.from_xml_string(SLIDERS)
+    engine = make(WarpEngine, "body_mass", nworld=2, model=model)
+    for scale in (1.0, 2.0):
+        engine.arrays["body_mass"].numpy()[1] = scale * model.body_mass
+        engine.apply_model(worlds(2))
+        wanted = copy.copy(model)
+        wanted.body_mass[:] = (scale * model.body_mass).astype(np.float32)
+        mujoco.mj_setConst(wanted, mujoco.MjData(wanted))
+        for name in ("body_invweight0", "dof_invweight0"):
+            found = getattr(engine.m, name).numpy()[1]  # type: ignore[attr-defined]
+            np.testing.assert_allclose(found, getattr(wanted, name), rtol=1e-5, err_msg=name)
