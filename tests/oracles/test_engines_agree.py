@@ -257,7 +257,7 @@ def test_fifty_steps_leave_the_engines_a_rounding_apart_whatever_the_task_writes
         far = max(far, (positions_of(c) - start).abs().max().item())
     assert far > 0.02, "nothing moved"
     print(f"qpos {worst:.1e}")
-    assert worst <= 3e-6, f"qpos differs by {worst:.1e}"  # measured: 7.2e-7
+    assert worst <= 3e-6, f"qpos differs by {worst:.1e}"  # measured: 7.8e-7
 
 
 def positions_of(env: lw.Env) -> torch.Tensor:
