@@ -186,7 +186,7 @@ def test_a_table_that_does_not_fit_is_refused(given: dict[str, Any], message: st
         parameters(model, Tables, **given)
 
 
-def test_a_file_that_is_no_table_is_refused(model: mujoco.MjModel, tmp_path: Path) -> None:
+def test_a_file_without_a_table_is_refused(model: mujoco.MjModel, tmp_path: Path) -> None:
     (tmp_path / "text.npy").write_text("1 2 3")
     np.savez(tmp_path / "several.npz", a=1)
     for name, message in (("text.npy", "cannot be read"), ("several.npz", "a .npy file of numpy.save")):
