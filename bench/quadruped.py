@@ -1,8 +1,8 @@
 """Quadruped: dm_control's walking quadruped, observed through gyro, velocimeter and frame sensors.
 
 The model is that of dm_control's walk task, read from its files, with frame sensors added; its sensors of forces and
-accelerations stay, unread. Reward and first states are dm_control's, but for the height, from which every orientation
-is clear of the floor.
+accelerations stay, unread. Reward and first states are dm_control's, except for the height, from which every
+orientation is clear of the floor.
 """
 
 import importlib.util

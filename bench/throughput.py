@@ -63,6 +63,8 @@ class Options:
     """Device."""
     blocks: int = 50
     """Blocks of ten steps; medians over them are printed."""
+    apart: bool = False
+    """Whether the worlds are at different steps of their episodes, so that some restart in every step."""
     gymnasium: bool = True
     """Whether to measure Gymnasium's vector environments, too."""
     npg: bool = True
@@ -241,7 +243,13 @@ def refresh_seconds(env: lw.Env) -> float:
 def first_step(task: str, nworld: int, options: Options) -> tuple[lw.Env, float]:
     began = time.perf_counter()
     env = lw.make(FILES.get(task, task), nworld=nworld, engine=options.engine, device=options.device)
-    return env, time.perf_counter() - began + seconds(env, env.step)
+    first = time.perf_counter() - began + seconds(env, env.step)
+    if options.apart:
+        state = env.get_state()
+        step = env.state_space.split(state)["step"]
+        step.copy_(torch.randint(0, env.horizon, step.shape, device=state.device))
+        env.set_state(state)
+    return env, first
 
 
 def measure_env(task: str, nworld: int, options: Options) -> Row:

@@ -285,9 +285,9 @@ class Task:
 
     - ``control``: the inputs xfrc_applied, qfrc_applied, mocap_pos, mocap_quat and userdata. An input keeps its value
       until it is written again; a reset clears it.
-    - ``initialize``, ``randomize`` and ``event``: qpos, qvel, act, ctrl, the inputs, memory, lasting_memory and model
-      fields. At every reset these model fields get their nominal values back before ``initialize`` runs, so that draws
-      never add up. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
+    - ``initialize``, ``randomize`` and ``event``: qpos, qvel, act, ctrl, eq_active, the inputs, memory, lasting_memory
+      and model fields. At every reset these model fields get their nominal values back before ``initialize`` runs, so
+      that draws never add up. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
       ``sensordata``): these are computed afterwards.
     - ``startup``: model fields, which resets then leave as they are.
     - ``substep``: memory and lasting_memory. ``advance``: the same of ``s1``.

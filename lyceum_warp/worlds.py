@@ -304,7 +304,7 @@ class Worlds:
         """Put the masked worlds into an initial state of the task."""
         self.engine.reset(mask)
         self._clear(mask, "memory", *([] if again else ["metric_sums"]))
-        if self.task.kernels.reject_worlds is not None:  # a rejected draw leaves no trace
+        if self.task.kernels.reject_worlds is not None:  # a rejected draw changes nothing else
             kept, live = self._lasting_before, self.lasting_memory
             launch_rows(state.copy_rows, mask, *((kept, live) if again else (live, kept)))
         self._make_nominal(mask, self.task.reset_dynamics)

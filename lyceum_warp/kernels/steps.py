@@ -34,7 +34,7 @@ class Counters:
     episode: wp.array[int]
     """Number of the episode."""
     rng: wp.array2d[wp.uint32]
-    """The random stream that a task's function draws from, (nworld, 1); every kernel starts it anew."""
+    """The random stream that a task's function draws from, (nworld, 1); every kernel starts it again."""
 
 
 @wp.struct

@@ -18,6 +18,9 @@ from lyceum_warp.testing import bounds_rules as bounds
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import episode_rules as episodes
 from lyceum_warp.testing import fault_rules as faults
+from lyceum_warp.testing import form_rules as form
+from lyceum_warp.testing import physics_rules as physics
+from lyceum_warp.testing import reset_rules as resets
 from lyceum_warp.testing import state_rules as state
 from lyceum_warp.testing.context import OUTCOMES, Context
 
@@ -48,6 +51,18 @@ CHECKS: tuple[Callable[[Context], None], ...] = (
     faults.check_bad_state,
     faults.check_bad_action,
     faults.check_bad_warmstart,
+    faults.check_not_finite,
+    form.check_groups,
+    form.check_noise,
+    form.check_metrics,
+    form.check_events,
+    form.check_substep,
+    form.check_lasting_memory,
+    physics.check_inputs,
+    physics.check_dynamics,
+    resets.check_keyframe,
+    resets.check_rejection,
+    resets.check_settle,
 )
 """All checks, in the order in which ``check_task`` runs them."""
 

@@ -78,12 +78,19 @@ class Context:
         draws = torch.rand(steps, *env.action.shape, generator=generator)
         return (low + draws * (high - low)).to(env.action)
 
+    def calm(self, env: Env) -> torch.Tensor:
+        """The worlds that no event changed after the last step, (nworld,) bool."""
+        if env.task.functions["event"] is None:
+            return torch.ones_like(env.done)
+        return ~env.worlds.changed_view
+
     def run(self, env: Env, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         """Step through actions; returns the state and the outcome of every step, (steps, nworld, ...)."""
-        kept: dict[str, list[torch.Tensor]] = {name: [] for name in ("state", *OUTCOMES)}
+        kept: dict[str, list[torch.Tensor]] = {name: [] for name in ("state", "calm", *OUTCOMES)}
         for action in actions:
             env.step(action)
             kept["state"].append(env.get_state())
+            kept["calm"].append(self.calm(env))
             for name in OUTCOMES:
                 kept[name].append(getattr(env, name).clone())
         return {name: torch.stack(values) for name, values in kept.items()}

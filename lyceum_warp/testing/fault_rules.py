@@ -86,3 +86,40 @@ def check_bad_warmstart(ctx: Context) -> None:
         ctx.that(i == 0 or not int(a.done_reason[bad]) & int(FAULTS), f"the world has another fault at step {i}")
         ctx.equal(a.get_state()[bad + 1 :], b.get_state()[bad + 1 :], f"the state of other worlds at step {i}")
     ctx.finite(a, "after a warm start of not-a-number")
+
+
+def check_not_finite(ctx: Context) -> None:
+    """A reward or an observation that is not finite is a fault of its world, and changes no other.
+
+    Each parameter of the task in turn is infinite in one world.
+    """
+    a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
+    others = torch.arange(a.nworld, device=a.action.device) != bad
+    actions = ctx.actions(2)
+    names = [name for name, value in a.task.params.items() if name not in ("dt", "substep_dt") and _is_real(value)]
+    for name in names:
+        kept = a.task.params[name]
+        ctx.restart()
+        a.set_params(**{name: np.where(np.arange(a.nworld) == bad, np.inf, kept)})
+        try:
+            for i, action in enumerate(actions):
+                good = a.obs[bad].clone()
+                a.step(action)
+                b.step(action)
+                what = f"with {name}=inf in world {bad}, step {i}"
+                reason = Done(int(a.done_reason[bad]))
+                if reason & (Done.REWARD | Done.OBSERVATION):
+                    ctx.that(a.terminated[bad] and a.reward[bad] == 0, f"the reward is {a.reward[bad].item()} {what}")
+                    ctx.equal(a.final_obs[bad], good, f"final_obs against the last good observation {what}")
+                    ctx.that(a.time[bad] == 0, f"the world was not reset {what}")
+                for key in ("reward", "obs", "final_obs"):
+                    ctx.that(torch.isfinite(getattr(a, key)).all(), f"{key} is not finite {what}")
+                for key in OUTCOMES:
+                    ctx.equal(getattr(a, key)[others], getattr(b, key)[others], f"{key} of other worlds {what}")
+                ctx.equal(a.get_state()[others], b.get_state()[others], f"the state of other worlds {what}")
+        finally:
+            a.set_params(**{name: kept})
+
+
+def _is_real(value: object) -> bool:
+    return isinstance(value, float) and np.isfinite(value)

@@ -7,6 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from full_task import Full, Settled
 
 import lyceum_warp as lw
 import lyceum_warp.env
@@ -65,8 +66,75 @@ def narrow_positions(worlds: Worlds) -> None:
     del worlds._copies["qpos"]
 
 
-BREAKS: list[tuple[str, Any, str, Callable[[Function], Function]]] = [
-    ("spaces", Worlds, "_allocate", then(lambda worlds: setattr(worlds, "obs_space", worlds.action_space))),
+def spoil_rewards(env: lw.Env) -> None:
+    env.reward[(env.done_reason & int(lw.Done.REWARD)) != 0] = np.inf
+
+
+def count_steps_as_none(method: Function) -> Function:
+    """Judged states draw the noise of the reset."""
+
+    def judge(self: Worlds, *args: Any, **kwargs: Any) -> None:
+        kept = self.counters.step.numpy().copy()
+        self.counters.step.zero_()
+        method(self, *args, **kwargs)
+        self.counters.step.assign(kept)
+
+    return judge
+
+
+def clear_all_but(kept: str) -> Callable[[Function], Function]:
+    return lambda method: lambda self, mask, *names: method(self, mask, *(name for name in names if name != kept))
+
+
+def in_every_world(method: Function) -> Function:
+    def event(self: Worlds) -> None:
+        self.restarting.zero_()
+        method(self)
+
+    return event
+
+
+def unmarked(method: Function) -> Function:
+    return lambda self, before, after: None
+
+
+def once_a_step(method: Function) -> Function:
+    def phases(self: Worlds) -> list[Phase]:
+        return [Phase("physics", lambda: self.engine.step(self.task.frame_skip), engine=True), method(self)[-1]]
+
+    return phases
+
+
+def unheard(engine: MujocoEngine) -> None:
+    engine._written = []
+
+
+def from_the_default(engine: MujocoEngine) -> None:
+    data, size = mujoco.MjData(engine.model), mujoco.mjtState.mjSTATE_INTEGRATION.value
+    state = np.zeros(engine.integration_size)
+    mujoco.mj_getState(engine.model, data, state, size)
+    engine._initial.assign(state)
+
+
+def at_once(method: Function) -> Function:
+    def settle(self: MujocoEngine, mask: Any, nstep: int) -> None:
+        method(self, mask, 0)
+
+    return settle
+
+
+def everywhere(method: Function) -> Function:
+    return lambda self, mask, nstep: method(self, self._everyone, nstep)
+
+
+def another_critic(env: lw.Env) -> None:
+    env.final_obs_groups["critic"].copy_(env.obs_groups["critic"])
+
+
+Break = tuple[str, Any, str, Callable[[Function], Function]]
+
+BREAKS: list[Break] = [
+    ("spaces", Worlds, "_allocate", then(lambda worlds: worlds.obs_spaces.update(policy=worlds.action_space))),
     ("addresses", lw.Env, "step", then(lambda env: env.__dict__.update(obs=env.obs.clone()))),
     ("getters", lyceum_warp.env, "_copied", lambda function: lambda values, out: values),
     ("time", lw.Env, "__init__", then(lambda env: setattr(env, "timestep", 1.5 * env.timestep))),
@@ -92,22 +160,61 @@ BREAKS: list[tuple[str, Any, str, Callable[[Function], Function]]] = [
     ("bad_state", MujocoEngine, "find_faults", nothing),
     ("bad_action", Worlds, "_judge", without_action_faults),
     ("bad_warmstart", MujocoEngine, "__init__", then(keep_warm_start)),
+    ("not_finite", lw.Env, "step", then(spoil_rewards)),
 ]
-"""A rule, and the function whose change breaks it."""
+"""A rule, and the function whose change breaks it for hopper."""
+
+FULL_BREAKS: list[Break] = [
+    ("groups", lw.Env, "step", then(another_critic)),
+    ("noise", Worlds, "_judge_state", count_steps_as_none),
+    ("metrics", Worlds, "_clear", clear_all_but("metric_sums")),
+    ("metrics", Worlds, "_restore_counters", nothing),
+    ("events", Worlds, "_event", in_every_world),
+    ("events", Worlds, "_mark_changes", unmarked),
+    ("substep", Worlds, "physics_phases", once_a_step),
+    ("lasting_memory", Worlds, "_clear", clear_all_but("lasting_memory")),
+    ("inputs", MujocoEngine, "__init__", then(unheard)),
+    ("dynamics", Worlds, "_make_nominal", nothing),
+    ("dynamics", MujocoEngine, "apply_model", nothing),
+    ("keyframe", MujocoEngine, "__init__", then(from_the_default)),
+    ("rejection", Worlds, "_redraw", nothing),
+]
+"""The same for the task with every feature."""
+
+SETTLED_BREAKS: list[Break] = [
+    ("settle", MujocoEngine, "settle", at_once),
+    ("settle", MujocoEngine, "settle", everywhere),
+]
+"""The same for its variant that settles."""
+
+ALL_BREAKS = [
+    *(("hopper", *broken) for broken in BREAKS),
+    *((Full, *broken) for broken in FULL_BREAKS),
+    *((Settled, *broken) for broken in SETTLED_BREAKS),
+]
 
 
-@pytest.mark.parametrize(("rule", "owner", "name", "wrap"), BREAKS, ids=[f"{b[0]}-{b[2]}" for b in BREAKS])
+@pytest.mark.parametrize(
+    ("task", "rule", "owner", "name", "wrap"), ALL_BREAKS, ids=[f"{b[1]}-{b[3]}-{i}" for i, b in enumerate(ALL_BREAKS)]
+)
 def test_a_broken_rule_is_reported(
-    rule: str, owner: Any, name: str, wrap: Callable[[Function], Function], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    task: str | type[lw.Task], rule: str, owner: Any, name: str, wrap: Callable[[Function], Function],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     (check,) = (check for check in CHECKS if check.__name__ == f"check_{rule}")
     monkeypatch.setattr(owner, name, wrap(getattr(owner, name)))
-    with pytest.raises(AssertionError, match=f"hopper on the mujoco engine breaks the rule '{rule}': "):
-        check_task("hopper", engine="mujoco", steps=100, checks=[check])
+    with pytest.raises(AssertionError, match=rf"\w+ on the mujoco engine breaks the rule '{rule}': ") as caught:
+        check_task(task, engine="mujoco", steps=100, checks=[check])
+    print(caught.value)
+
+
+@pytest.mark.parametrize("task", [Full, Settled])
+def test_a_task_with_every_feature_keeps_the_rules(task: type[lw.Task]) -> None:
+    check_task(task, engine="mujoco", steps=60)
 
 
 def test_every_rule_is_broken_once() -> None:
-    rules = {f"check_{rule}" for rule, *_ in BREAKS}
+    rules = {f"check_{rule}" for _, rule, *_ in ALL_BREAKS}
     assert rules == {check.__name__ for check in CHECKS}
 
 

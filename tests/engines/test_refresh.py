@@ -43,7 +43,7 @@ SENSORS = {
 FIELDS = "site_xpos xpos xquat subtree_com cam_xpos cvel sensordata"
 
 
-def model_of(sensors: str, integrator: str = "Euler") -> mujoco.MjModel:
+def model_of(sensors: str, integrator: str = "Euler", equality: str = "") -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(f"""
     <mujoco>
       <option timestep="0.002" integrator="{integrator}"/>
@@ -74,6 +74,7 @@ def model_of(sensors: str, integrator: str = "Euler") -> mujoco.MjModel:
         <general name="pull" tendon="band" gainprm="5" dyntype="filter" dynprm=".05"/>
         <motor name="bend" joint="knee" gear="3"/>
       </actuator>
+      <equality>{equality}</equality>
       <sensor>{sensors}</sensor>
     </mujoco>""")
 
@@ -152,11 +153,11 @@ def kind(request: pytest.FixtureRequest) -> type[Engine]:
     return engine
 
 
-def make(kind: type[Engine], sensors: str, nworld: int = 4, integrator: str = "Euler", **options: Any) -> Engine:
-    model = model_of(SENSORS[sensors], integrator)
+def make(kind: type[Engine], sensors: str, integrator: str = "Euler", equality: str = "") -> Engine:
+    model = model_of(SENSORS[sensors], integrator, equality)
     fields = [describe(model, name) for name in ("qpos", "qvel", *FIELDS.split())]
     sizes = {"nconmax": 8, "njmax": 48} if kind is WarpEngine else {}
-    engine = kind(model, nworld, wp.get_device("cpu"), fields, **sizes, **options)
+    engine = kind(model, 4, wp.get_device("cpu"), fields, **sizes)
     begin(engine, everyone(engine), 0)
     return engine
 
@@ -265,10 +266,11 @@ def test_the_sensor_of_a_limit_that_ended_is_zero(kind: type[Engine]) -> None:
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
+@pytest.mark.parametrize("equality", ["", '<connect body1="torso" anchor=".1 0 .1"/>'], ids=["free", "connected"])
 @pytest.mark.parametrize("sensors", ["velocities of tendons", "mixed"])
-def test_a_step_goes_on_from_the_refresh_to_the_bit(sensors: str, integrator: str) -> None:
+def test_a_step_goes_on_from_the_refresh_to_the_bit(sensors: str, equality: str, integrator: str) -> None:
     """Its first substep takes over what the refresh after the last one computed, in worlds that restarted, too."""
-    one, other = (make(WarpEngine, sensors, integrator=integrator) for _ in range(2))
+    one, other = (make(WarpEngine, sensors, integrator, equality) for _ in range(2))
     assert isinstance(one, WarpEngine) and isinstance(other, WarpEngine)
     assert mjw.kinematics in one._shared and mjw.tendon in one._shared
     other._shared = ()

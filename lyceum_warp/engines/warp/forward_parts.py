@@ -154,7 +154,7 @@ _POSITION = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex, mjw.tendon)
 
 
 def step_after(done: Collection[Part], m: mjw.Model, d: mjw.Data) -> None:
-    """``mujoco_warp.step``, without those parts that are already done for the current state.
+    """``substep.step``, without those parts that are already done for the current state.
 
     A step begins with the parts that its state's fields and sensors needed after the last one.
 

@@ -24,14 +24,16 @@ class Turns:
         nworld: Number of worlds.
         size: Places in the group.
         device: Where they live.
+        loop: Whether turns are taken in a loop; if not, the group has a place for every world, and one turn is taken
+            whatever the mask. Deterministic launches need this: within a loop of a CUDA graph they find no memory.
     """
 
-    def __init__(self, nworld: int, size: int, device: wp.Device) -> None:
-        self.nworld, self.size, self.device = nworld, size, device
+    def __init__(self, nworld: int, size: int, device: wp.Device, *, loop: bool = True) -> None:
+        self.nworld, self.size, self.device, self._loop = nworld, size, device, loop
         with wp.ScopedDevice(device):
             self._rank, self._world = wp.zeros(nworld, dtype=int), wp.zeros(size, dtype=int)
             self._count, self._first, self._left = (wp.zeros(1, dtype=int) for _ in range(3))
-        self._arena = None if device.is_cpu else Arena(device)
+        self._arena = Arena(device) if device.is_cuda and loop else None
 
     def run(self, mask: wp.array, turn: Callable[[], None]) -> None:
         """Call ``turn`` for one group after another; it may use ``take`` and ``give``."""
@@ -48,6 +50,9 @@ class Turns:
                 turn()
                 wp.launch(kernels.next_group, 1, [self._count, self.size, self._first, self._left])
 
+            if not self._loop:
+                body()
+                return
             with self._reserved():
                 wp.capture_while(self._left, while_body=body)
 

@@ -31,16 +31,24 @@ class ModelConstants:
         fields: The fields that differ between worlds, with constants that follow.
         nworld: Number of worlds.
         device: Where they live.
+        loop: As for ``Turns``.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, put: mjw.Model, fields: Collection[ModelField], nworld: int, device: wp.Device
+        self,
+        model: mujoco.MjModel,
+        put: mjw.Model,
+        fields: Collection[ModelField],
+        nworld: int,
+        device: wp.Device,
+        *,
+        loop: bool = True,
     ) -> None:
         groups = constants_of(fields)
         self._outputs = outputs_of(fields)
         self._flags = int(sum(int(flag) for group, flag in _GROUPS.items() if group & groups))
         written = {name for group, names in OUTPUTS.items() if group & groups for name in names}
-        size = group_size(nworld, device)
+        size = group_size(nworld, device) if loop else nworld
         with wp.ScopedDevice(device):
             names = [field.name for field in fields]
             self._rows = ModelRows(put, [*names, *self._outputs], size, written - set(self._outputs))
@@ -48,7 +56,7 @@ class ModelConstants:
             self._given = [flat(getattr(owner(put, name), name)).view(wp.int32) for name in names]
             self._applied = [wp.full_like(given, -1) for given in self._given]  # the bits of no number
             self._changed = wp.zeros(nworld, dtype=bool)
-        self._turns = Turns(nworld, size, device)
+        self._turns = Turns(nworld, size, device, loop=loop)
 
     def __call__(self, mask: wp.array) -> None:
         """Bring the masked worlds' constants up to date; made of launches."""

@@ -169,7 +169,9 @@ class WarpEngine(Engine):
     def _model_constants(self) -> ModelConstants | None:
         """What keeps constants up to date, or None where none follow from the model fields."""
         fields = [field for field in self.dynamics.values() if field.size and constants_of([field])]
-        return ModelConstants(self.model, self.m, fields, self.nworld, self.device) if fields else None
+        if not fields:
+            return None
+        return ModelConstants(self.model, self.m, fields, self.nworld, self.device, loop=self.partial_refresh)
 
     def _alias(self, field: Field) -> wp.array:
         """The memory of a field under the types of ``fields``, which differ from MuJoCo Warp's in name alone."""
@@ -232,7 +234,7 @@ class WarpEngine(Engine):
             wp.launch(copy_columns, size, [mask, self._columns, own, kept], device=self.device)
 
     def apply_model(self, mask: wp.array) -> None:
-        with wp.ScopedDevice(self.device):
+        with self._on_device():
             if self._constants is not None:
                 self._constants(mask)
             self._static.place(self.m, self.d, mask)

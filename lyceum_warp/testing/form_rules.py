@@ -1,0 +1,212 @@
+"""Rules about what a task may have beside an observation and a reward: groups, noise, metrics, memory and events."""
+
+import torch
+import warp as wp
+
+from lyceum_warp.arrays import torch_view
+from lyceum_warp.done import FAULTS
+from lyceum_warp.env import Env
+from lyceum_warp.kernels import steps
+from lyceum_warp.task import FUNCTIONS
+from lyceum_warp.testing.context import SHORT, Context
+
+
+def _groups(env: Env, *, final: bool = False) -> dict[str, torch.Tensor]:
+    return {name: values.clone() for name, values in (env.final_obs_groups if final else env.obs_groups).items()}
+
+
+def check_groups(ctx: Context) -> None:
+    """Every group of observations is kept as the policy's is, through ends of episodes, faults and restored states."""
+    a, b, horizon = ctx.a, ctx.b, 4
+    ctx.that(a.obs is a.obs_groups["policy"], "the group policy is not env.obs")
+    ctx.that(a.final_obs is a.final_obs_groups["policy"], "the final group policy is not env.final_obs")
+    for name, space in a.obs_spaces.items():
+        for buffer in (a.obs_groups[name], a.final_obs_groups[name]):
+            ctx.that(buffer.shape == (a.nworld, space.size), f"the group {name} is {tuple(buffer.shape)}")
+    if len(a.obs_groups) == 1:
+        return
+    with ctx.changed(a, horizon=horizon, autoreset=True), ctx.changed(b, horizon=horizon, autoreset=False):
+        ctx.restart()
+        alive = torch.ones_like(a.done)
+        for action in ctx.actions(2 * horizon + 1):
+            a.step(action)
+            b.step(action)
+            going, state = ~a.done & ctx.calm(a), a.get_state()
+            for name, obs in a.obs_groups.items():
+                final = a.final_obs_groups[name]
+                ctx.equal(final[alive], b.final_obs_groups[name][alive], f"the final group {name} without resets")
+                ctx.equal(final[going], obs[going], f"the final group {name} of worlds that go on")
+                ctx.equal(a.get_obs(group=name), obs, f"get_obs of the group {name}")
+                ctx.equal(a.get_obs(state, group=name), obs, f"get_obs of the state, group {name}")
+            alive &= ~a.done
+        ctx.restart()
+        a.step(ctx.actions(1)[0])
+        good = _groups(a)
+        a.action[0] = torch.nan
+        a.step()
+        ctx.that(a.done[0], "an action of not-a-number is not a fault")
+        for name, final in a.final_obs_groups.items():
+            ctx.equal(final[0], good[name][0], f"the final group {name} after a fault")
+
+
+def check_noise(ctx: Context) -> None:
+    """A state always has the same noise in its observation; another world, episode or step has another."""
+    env = ctx.a
+    if not env.task.has_noise:
+        return
+    ctx.restart()
+    env.step(ctx.actions(1)[0])
+    state = env.get_state()
+    kept = env.get_obs(state)
+    ctx.equal(kept, env.obs, "the noise of a state")
+    ctx.equal(env.get_obs(state), kept, "the noise of a state, a second time")
+    parts = env.state_space.parts
+    # the same world in the same state, except for its place in the random stream
+    same = state[:1].expand_as(state).contiguous()
+    noisy = [group for group, f in env.task.observers.items() if len(f.input_types) > len(FUNCTIONS["observe"].kinds)]
+    changes: dict[str, torch.Tensor] = {"key": state[:, parts["key"]]}
+    for name in ("episode", "step"):
+        changes[name] = same[:, parts[name]] + torch.arange(env.nworld, device=state.device)[:, None].double()
+    differ = {}
+    for name, values in changes.items():
+        moved = same.clone()
+        moved[:, parts[name]] = values
+        shown = [env.get_obs(moved, group=group) for group in noisy]
+        differ[name] = any(bool((obs[1:] != obs[:1]).any(dim=1).all()) for obs in shown)
+    if any(differ.values()):  # its scale may be 0
+        for name, found in differ.items():
+            ctx.that(found, f"the noise is the same for every {'world' if name == 'key' else name}")
+
+
+def check_metrics(ctx: Context) -> None:
+    """``episode_metrics`` are the sums of ``metrics`` over an episode, belong to the state, and skip faults."""
+    a, b, horizon = ctx.a, ctx.b, 4
+    if not a.metrics:
+        return
+    with ctx.changed(a, b, horizon=horizon, autoreset=True):
+        ctx.restart()
+        sums = {name: torch.zeros_like(values) for name, values in a.metrics.items()}
+        for i, action in enumerate(ctx.actions(2 * horizon + 1)):
+            if i == horizon + 1:
+                action[-1] = torch.nan
+            a.step(action)
+            for name, values in a.metrics.items():
+                sums[name] += values
+                ctx.equal(a.episode_metrics[name], sums[name], f"the sums of {name} at step {i}")
+                ctx.that((values[(a.done_reason & int(FAULTS)) != 0] == 0).all(), f"{name} of a fault: {values}")
+                sums[name][a.done] = 0.0
+            if i == horizon + 1:
+                ctx.that(bool(a.done_reason[-1] & int(FAULTS)), "an action of not-a-number is not a fault")
+        b.set_state(a.get_state())
+        for name in a.metrics:
+            ctx.equal(b.episode_metrics[name], sums[name], f"the sums of {name} after set_state")
+        for env in (a, b):
+            env.step(ctx.actions(1, 1)[0])
+        for name in a.metrics:
+            ctx.equal(b.episode_metrics[name], a.episode_metrics[name], f"the sums of {name} a step after set_state")
+        for reset in (a.reset, a.rand_reset):
+            reset()
+            for name, values in a.episode_metrics.items():
+                ctx.that((values == 0).all(), f"the sums of {name} after {reset.__name__} are {values.tolist()}")
+
+
+def check_events(ctx: Context) -> None:
+    """An event happens after a step is judged: it changes the state and the next observation, in some worlds.
+
+    Worlds that restart have none, and worlds in which nothing changed keep every bit. The state repeats its events.
+    """
+    a, b = ctx.a, ctx.b
+    if a.task.functions["event"] is None:
+        return
+    with ctx.changed(a, b, horizon=5):
+        ctx.restart()
+        state, actions, found = a.get_state(), ctx.actions(2 * SHORT), []
+        for i, action in enumerate(actions):
+            b.set_state(a.get_state())
+            b.action.copy_(action)
+            for phase in b.worlds.step_phases():
+                if not phase.name.startswith("event") and phase.name != "observe":
+                    phase.run()
+            a.step(action)
+            for name in steps.OUTCOMES:
+                ctx.equal(getattr(a, name), getattr(b, name), f"{name} of step {i} without the event")
+            for name, final in a.final_obs_groups.items():
+                ctx.equal(final, b.final_obs_groups[name], f"the final group {name} of step {i} without the event")
+            calm = ctx.calm(a)
+            ctx.that(calm[a.done].all(), f"an event ran in worlds that restarted at step {i}")
+            now, without = a.get_state(), b.get_state()
+            ctx.equal(now[calm], without[calm], f"the state of worlds without an event at step {i}")
+            ctx.that((now != without)[~calm].any(dim=1).all(), f"an event of step {i} is not in the state")
+            for name, columns in a.state_space.parts.items():
+                if name in a.task.writes["event"] and name in a.worlds.fields:
+                    array = torch_view(a.worlds.fields[name]).reshape(a.nworld, -1)
+                    ctx.equal(
+                        now[:, columns].to(array.dtype), array, f"{name} in the state after the event of step {i}"
+                    )
+            for name, obs in a.obs_groups.items():
+                ctx.equal(a.get_obs(now, group=name), obs, f"the group {name} after the event of step {i}")
+            found.append(now)
+        a.set_state(state)
+        for i, (action, wanted) in enumerate(zip(actions, found, strict=True)):
+            a.step(action)
+            ctx.equal(a.get_state(), wanted, f"the events of step {i}, repeated from a state")
+
+
+def check_substep(ctx: Context) -> None:
+    """``substep`` runs after each substep, and leaves the numbers of the physics as they are."""
+    a, b = ctx.a, ctx.b
+    substep = a.task.kernels.substep_memory
+    if substep is None:
+        return
+    with ctx.changed(a, b, horizon=0, autoreset=False):
+        ctx.restart()
+        parts = a.state_space.parts
+        memory = [parts[name] for name in ("memory", "lasting_memory") if name in parts]
+
+        def start(state: torch.Tensor, action: torch.Tensor) -> None:
+            b.set_state(state)
+            b.action.copy_(action)
+            b.worlds.act()
+
+        for i, action in enumerate(ctx.actions(SHORT)):
+            state = a.get_state()
+            a.step(action)
+            wanted, calm = a.get_state(), ctx.calm(a) & ((a.done_reason & int(FAULTS)) == 0)
+            start(state, action)
+            for _ in range(a.task.frame_skip):
+                b.engine.step(1)
+                wp.launch(substep, b.nworld, [b.worlds.after, b.worlds.params], device=b.device)
+            b.worlds.advance_memory()
+            found = b.get_state()
+            for columns in memory:
+                ctx.equal(wanted[calm][:, columns], found[calm][:, columns], f"the memory of step {i}, by substeps")
+            start(state, action)
+            b.engine.step(a.task.frame_skip)
+            found = b.get_state()[:, : a.engine.integration_size]
+            wanted = wanted[:, : a.engine.integration_size]
+            ctx.equal(found[calm], wanted[calm], f"the physics of step {i} without substeps")
+
+
+def check_lasting_memory(ctx: Context) -> None:
+    """``lasting_memory`` outlives resets; ``rand_reset(seed)`` clears it."""
+    a, b = ctx.a, ctx.b
+    if a.task.task.lasting_memory == 0:
+        return
+    columns = a.state_space.parts["lasting_memory"]
+    ctx.restart()
+    state = a.get_state()
+    state[:, columns] = 3.25
+    writes = a.task.writes
+    a.set_state(state)
+    if "lasting_memory" not in writes.get("initialize", ()):
+        a.reset()
+        ctx.equal(a.get_state()[:, columns], state[:, columns], "lasting_memory after reset")
+        if "lasting_memory" not in writes.get("randomize", ()):
+            a.rand_reset()
+            ctx.equal(a.get_state()[:, columns], state[:, columns], "lasting_memory after rand_reset")
+    mask = torch.arange(a.nworld, device=a.obs.device) == 0
+    a.set_state(state)
+    a.rand_reset(ctx.seed, mask)
+    found, fresh = a.get_state()[:, columns], b.get_state()[:, columns]
+    ctx.equal(found[:1], fresh[:1], "lasting_memory after rand_reset with a seed")
+    ctx.equal(found[1:], state[1:, columns], "lasting_memory of other worlds")

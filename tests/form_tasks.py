@@ -1,0 +1,147 @@
+"""Tasks of small models whose physics both engines simulate to a rounding, with pushes, and with drawn dynamics."""
+
+import mujoco
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+ARM = """
+<mujoco model="pushed arm">
+  <option timestep="0.005"/>
+  <worldbody>
+    <body name="hand" mocap="true" pos=".5 0 .3"><site name="grip"/></body>
+    <body name="upper" pos="0 0 .3">
+      <joint name="shoulder" axis="0 1 0" damping=".1"/>
+      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/>
+      <body name="lower" pos=".3 0 0">
+        <joint name="elbow" axis="0 1 0" damping=".1"/>
+        <geom type="capsule" fromto="0 0 0 .2 0 0" size=".03"/>
+        <site name="tip" pos=".2 0 0"/>
+      </body>
+    </body>
+  </worldbody>
+  <tendon><spatial stiffness="50" damping="1"><site site="grip"/><site site="tip"/></spatial></tendon>
+  <actuator><motor name="elbow" joint="elbow" gear=".5"/></actuator>
+</mujoco>
+"""
+
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    qvel: Row[float]
+    xfrc_applied: Row[wp.spatial_vector]
+    qfrc_applied: Row[float]
+    mocap_pos: Row[wp.vec3]
+
+
+@wp.struct
+class Params:
+    dt: float
+    force: float = 4.0
+    reach: float = 0.1
+    lower: int = lw.body("lower")
+    hand: int = lw.mocap("hand")
+    elbow: int = lw.dof("elbow")
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    for i in range(2):
+        obs[i] = s.qpos[i]
+        obs[2 + i] = s.qvel[i]
+
+
+@wp.func
+def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
+    ctrl[0] = action[0]
+    s.xfrc_applied[p.lower] = wp.spatial_vector(0.0, 0.0, p.force * action[1], 0.0, 0.0, 0.0)
+    s.qfrc_applied[p.elbow] = 0.1 * action[1]
+    s.mocap_pos[p.hand] = wp.vec3(0.5 - p.reach * action[2], 0.0, 0.3 + p.reach * action[2])
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    return s1.qpos[0] - s0.qpos[0] - 0.01 * s1.qfrc_applied[p.elbow]
+
+
+class Pushed(lw.Task):
+    """Inputs that ``control`` writes: forces on a body and on a joint, and a body that is moved."""
+
+    model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
+    frame_skip = 3
+    obs = {"position": 2, "velocity": 2}
+    actions = {"elbow": 1, "push": 1, "hand": 1}
+    action_range = (-1.0, 1.0)
+    horizon = 0
+
+
+PUCK = """
+<mujoco model="puck">
+  <option timestep="0.005" cone="elliptic"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="9 9 .1" friction=".01"/>
+    <body name="puck" pos="0 0 .1">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="z" type="slide" axis="0 0 1"/>
+      <geom name="puck" size=".1" mass="1" friction=".2"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="x" gear="8" ctrllimited="true" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+@wp.struct
+class PuckWorld:
+    qpos: Row[float]
+    qvel: Row[float]
+    body_mass: Row[float]
+    geom_friction: Row[wp.vec3]
+    gravity: Row[float]
+
+
+@wp.struct
+class PuckParams:
+    dt: float
+    puck: int = lw.body("puck")
+    geom: int = lw.geom("puck")
+    spread: float = 0.5
+
+
+@wp.func
+def observe_puck(s: PuckWorld, p: PuckParams, obs: Row[float]):
+    for i in range(2):
+        obs[i] = s.qpos[i]
+        obs[2 + i] = s.qvel[i]
+    obs[4] = s.body_mass[p.puck]
+    obs[5] = s.geom_friction[p.geom][0]
+
+
+@wp.func
+def weigh_up(s0: PuckWorld, action: Row[float], s1: PuckWorld, p: PuckParams) -> float:
+    return s1.body_mass[p.puck] * (s1.qvel[0] - s0.qvel[0])
+
+
+@wp.func
+def draw_gravity(s: PuckWorld, p: PuckParams, rng: Row[wp.uint32]):
+    s.gravity[2] = s.gravity[2] * lw.uniform(rng, 0.9, 1.1)
+
+
+@wp.func
+def draw_puck(s: PuckWorld, p: PuckParams, rng: Row[wp.uint32]):
+    s.body_mass[p.puck] = s.body_mass[p.puck] * lw.uniform(rng, 1.0 - p.spread, 1.0 + p.spread)
+    s.geom_friction[p.geom][0] = s.geom_friction[p.geom][0] * lw.uniform(rng, 1.0 - p.spread, 1.0 + p.spread)
+
+
+class Drawn(lw.Task):
+    """A puck on the floor, whose mass and friction are drawn at every reset, and gravity once for each world."""
+
+    model = staticmethod(lambda: mujoco.MjSpec.from_string(PUCK))
+    frame_skip = 3
+    obs = {"position": 2, "velocity": 2, "dynamics": 2}
+    horizon = 25
+    World = PuckWorld
+    Params = PuckParams
+    observe, reward, startup, randomize = observe_puck, weigh_up, draw_gravity, draw_puck
