@@ -406,7 +406,8 @@ def test_worlds_of_different_models_take_more_memory(engine: type[Engine]) -> No
 
 
 SLIDERS = """<mujoco><worldbody>
-<body><joint type="slide" axis="1 0 0" armature=".5"/><joint type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body>
+<body><joint type="slide" axis="1 0 0" armature=".5"/><joint type="slide" axis="0 0 1"/>
+<geom size=".1" mass="1"/></body>
 <body><joint axis="0 1 0"/><geom size=".1" mass="1"/></body>
 <body><joint type="slide" axis="1 0 0"/><geom size=".1" mass="1"/>
 <body><joint type="slide" axis="0 0 1"/><geom size=".1" mass="2"/></body></body>
