@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 import pytest
 import torch
 import warp as wp
+from metered_task import Metered
+from table_task import Follow
 
 import lyceum_warp as lw
 from lyceum_warp.engines.deterministic.deterministic_engine import DeterministicEngine
@@ -244,3 +246,31 @@ def test_memory_of_a_world_is_as_estimated() -> None:
 def test_too_many_worlds_are_refused_at_once() -> None:
     with pytest.raises(ValueError, match=r"100000000 worlds of humanoid need about .* use nworld=\d+ at most"):
         lw.make("humanoid", nworld=100_000_000, device=CUDA)
+
+
+def test_tables_are_read_on_the_device_and_change_under_graphs() -> None:
+    env = lw.make(Follow, nworld=64, device=CUDA)
+    for motion in ([[0.0, 1.0], [0.5, 2.0]], [[4.0, 5.0], [6.0, 7.0]], [[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]):
+        env.set_params(motion=torch.tensor(motion, device=CUDA))
+        env.reset()
+        for row in [*motion, motion[-1]]:
+            assert env.obs[:, 1].unique().tolist() == [row[0]]
+            env.step()
+    env.set_params(gain=torch.arange(64))
+    env.step()
+    assert env.obs[:, 1].unique().tolist() == [3.0]
+
+
+def test_a_rollout_with_groups_and_metrics_does_not_wait() -> None:
+    env = lw.make(Metered, nworld=64, device=CUDA)
+    rollout = lw.Rollout(env, 50, groups=("critic",))
+    policy = lw.GaussianPolicy(1, 1).to(CUDA)
+    noise = torch.randn(rollout.action.shape, device=CUDA)
+    for _ in range(2):
+        rollout.collect(policy, noise)
+    with nothing_waits():
+        rollout.collect(policy, noise)
+    assert torch.equal(rollout.obs_groups["critic"][..., 0], rollout.obs[..., 0])
+    efforts, sums = rollout.action[..., 0].square(), rollout.episode_metrics["effort"]
+    goes_on = ~rollout.done[:-1]
+    torch.testing.assert_close((sums[1:] - sums[:-1])[goes_on], efforts[1:][goes_on], rtol=1e-4, atol=1e-4)

@@ -84,6 +84,7 @@ class WarpEngine(Engine):
             self.m = self._put_model()
             self.spare = _contacts_of_one_world(self.m) if nconmax is None else 0
             self.d = self._make_data(nworld)
+        self._needs_velocities = substep.needs_velocities(self.m)
         self.naconmax = self.d.naconmax
         with wp.ScopedDevice(device):
             self._state = wp.zeros((nworld, self.integration_size), dtype=float)
@@ -191,8 +192,10 @@ class WarpEngine(Engine):
             for i in range(nstep):
                 if i == 0 and self._shared:
                     step_after(self._shared, self.m, self.d)
-                else:
+                elif self._needs_velocities:
                     substep.step(self.m, self.d)
+                else:
+                    mjw.step(self.m, self.d)
         self._copy_snapshots(self._everyone)
         self.refresh_current(self._everyone)
 
