@@ -71,7 +71,8 @@ def test_a_replica_has_the_options_of_the_original_except_for_the_changes() -> N
     env = lw.make("hopper", nworld=2, horizon=5, integrator="euler", solver={"iterations": 4}, seed=3)
     replica = env.replicate(nworld=3, horizon=6)
     assert replica.options.given() == {
-        "nworld": 3, "horizon": 6, "integrator": "euler", "solver": {"iterations": 4}
+        "nworld": 3, "horizon": 6, "integrator": "euler", "solver": {"iterations": 4},
+        "model": env.task.spec,  # as it was read, whatever became of its file
     }  # fmt: skip
 
 

@@ -39,7 +39,8 @@ def test_help_shows_examples_and_every_setting(capsys: pytest.CaptureFixture[str
     out = capsys.readouterr().out
     assert "$ lyceum-warp plan reach" in out
     settings = [field.name for field in dataclasses.fields(lw.MPPIConfig)]
-    assert all(f"--{name} " in out for name in (*settings, "value", "rate", "integrator"))
+    for name in (*settings, "value", "rate", "integrator"):
+        assert f"--{name.replace('_', '-')}" in out, name
     assert "--real-time, --no-real-time" in out and "(default: the task's)" in out
 
 

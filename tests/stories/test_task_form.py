@@ -181,7 +181,7 @@ def test_a_rollout_takes_the_model_of_the_state_or_the_nominal_one(task: type[lw
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Drawn, DrawnWithControl])
-def test_a_planner_takes_the_model_of_the_state_unless_it_is_told_otherwise(task: type[lw.Task], engine: str) -> None:
+def test_a_planner_takes_the_model_of_the_state_unless_asked_otherwise(task: type[lw.Task], engine: str) -> None:
     env = lw.make(task, nworld=2, engine=engine)
     state = env.get_state()[:1].clone()
     heavy = state.clone()

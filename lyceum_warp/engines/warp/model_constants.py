@@ -56,7 +56,7 @@ class ModelConstants:
             self._given = [flat(getattr(owner(put, name), name)).view(wp.int32) for name in names]
             self._applied = [wp.full_like(given, -1) for given in self._given]  # the bits of no number
             self._changed = wp.zeros(nworld, dtype=bool)
-            # weights that are 0 in MuJoCo stay 0, and bodies with nothing but sliders have those of their mass
+            # weights that are 0 in MuJoCo stay 0, and bodies with sliders only have those of their mass
             self._weighs: wp.array = wp.array(model.body_invweight0 > 0, dtype=wp.vec2)
             self._sliding: wp.array = wp.array(model.body_simple == 2, dtype=bool)
         self._turns = Turns(nworld, size, device, loop=loop)
