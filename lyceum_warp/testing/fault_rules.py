@@ -97,28 +97,28 @@ def check_not_finite(ctx: Context) -> None:
     others = torch.arange(a.nworld, device=a.action.device) != bad
     actions = ctx.actions(2)
     names = [name for name, value in a.task.params.items() if name not in ("dt", "substep_dt") and _is_real(value)]
-    for name in names:
-        kept = a.task.params[name]
-        ctx.restart()
-        a.set_params(**{name: np.where(np.arange(a.nworld) == bad, np.inf, kept)})
-        try:
-            for i, action in enumerate(actions):
-                good = a.obs[bad].clone()
-                a.step(action)
-                b.step(action)
-                what = f"with {name}=inf in world {bad}, step {i}"
-                reason = Done(int(a.done_reason[bad]))
-                if reason & (Done.REWARD | Done.OBSERVATION):
-                    ctx.that(a.terminated[bad] and a.reward[bad] == 0, f"the reward is {a.reward[bad].item()} {what}")
-                    ctx.equal(a.final_obs[bad], good, f"final_obs against the last good observation {what}")
-                    ctx.that(a.time[bad] == 0, f"the world was not reset {what}")
-                for key in ("reward", "obs", "final_obs"):
-                    ctx.that(torch.isfinite(getattr(a, key)).all(), f"{key} is not finite {what}")
-                for key in OUTCOMES:
-                    ctx.equal(getattr(a, key)[others], getattr(b, key)[others], f"{key} of other worlds {what}")
-                ctx.equal(a.get_state()[others], b.get_state()[others], f"the state of other worlds {what}")
-        finally:
-            a.set_params(**{name: kept})
+    with ctx.changed(a, b, graphs=False):  # one value a world would make graphs of its own
+        for name in names:
+            kept = a.task.params[name]
+            ctx.restart()
+            a.set_params(**{name: np.where(np.arange(a.nworld) == bad, np.inf, kept)})
+            try:
+                for i, action in enumerate(actions):
+                    good = a.obs[bad].clone()
+                    a.step(action)
+                    b.step(action)
+                    what = f"with {name}=inf in world {bad}, step {i}"
+                    if int(a.done_reason[bad]) & int(Done.REWARD | Done.OBSERVATION):
+                        ctx.that(a.terminated[bad] and a.reward[bad] == 0, f"the reward is {a.reward[bad]} {what}")
+                        ctx.equal(a.final_obs[bad], good, f"final_obs against the last good observation {what}")
+                        ctx.that(a.time[bad] == 0, f"the world was not reset {what}")
+                    for key in ("reward", "obs", "final_obs"):
+                        ctx.that(torch.isfinite(getattr(a, key)).all(), f"{key} is not finite {what}")
+                    for key in OUTCOMES:
+                        ctx.equal(getattr(a, key)[others], getattr(b, key)[others], f"{key} of other worlds {what}")
+                    ctx.equal(a.get_state()[others], b.get_state()[others], f"the state of other worlds {what}")
+            finally:
+                a.set_params(**{name: kept})
 
 
 def _is_real(value: object) -> bool:

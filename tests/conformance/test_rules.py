@@ -213,6 +213,12 @@ def test_a_task_with_every_feature_keeps_the_rules(task: type[lw.Task]) -> None:
     check_task(task, engine="mujoco", steps=60)
 
 
+def test_a_task_with_every_feature_keeps_the_rules_of_the_form_on_the_warp_engine() -> None:
+    rules = ("groups", "events", "inputs", "dynamics", "rejection")
+    checks = [check for check in CHECKS if check.__name__.removeprefix("check_") in rules]
+    check_task(Full, engine="warp", nworld=2, frame_skip=1, checks=checks)
+
+
 def test_every_rule_is_broken_once() -> None:
     rules = {f"check_{rule}" for _, rule, *_ in ALL_BREAKS}
     assert rules == {check.__name__ for check in CHECKS}

@@ -142,6 +142,57 @@ def test_getters_judge_states_with_the_dynamics_of_the_state() -> None:
     assert torch.equal(obs[:, 4], mass(env, after).float())
 
 
+# faults and resets
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize(("name", "reason"), [("cost", lw.Done.REWARD), ("noise", lw.Done.OBSERVATION)])
+def test_a_number_that_is_not_finite_is_a_fault_of_its_world(name: str, reason: lw.Done, engine: str) -> None:
+    env, fine = (lw.make(Full, nworld=3, engine=engine, horizon=0) for _ in range(2))
+    others = torch.tensor([True, False, True])
+    value = env.task.params[name]
+    env.set_params(**{name: np.array([value, np.inf, value])})
+    before, good = env.get_state(), env.final_obs[1].clone()
+    for action in random_actions(env, 2):
+        env.step(action)
+        fine.step(action)
+        assert env.done_reason.tolist() == [0, int(reason), 0]
+        assert env.terminated[1] and env.reward[1] == 0 and (env.episode_metrics["cost"][1] == 0)
+        for obs in (*env.obs_groups.values(), *env.final_obs_groups.values()):
+            assert torch.isfinite(obs).all()  # no learner meets them, not even after the reset
+        if reason == lw.Done.OBSERVATION:
+            assert torch.equal(env.final_obs[1], good)
+        assert torch.equal(env.get_state()[others], fine.get_state()[others])
+        assert torch.equal(env.obs[others], fine.obs[others])
+    assert env.fault_counts[str(reason.name).lower()] == 2
+    after = env.get_state()
+    judged = env.get_reward(before, action, after)
+    assert torch.isfinite(judged).all()
+    env.set_params(**{name: value})
+    assert torch.equal(env.get_reward(before, action, after)[others], judged[others])
+    assert env.get_reward(before, action, after)[1] != 0  # no fault is left behind
+
+
+def test_a_rejected_draw_leaves_no_trace() -> None:
+    env = lw.make(Full, nworld=8)
+    tip = env.field("site_xpos")[:, 0, 0]
+    for count in range(2, 12):
+        env.rand_reset()
+        assert (tip >= 0.2).all()  # half of the draws are rejected
+        assert (env.obs_groups["critic"][:, 7] == count).all()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_model_fields_that_events_change_are_nominal_again_after_a_reset(engine: str) -> None:
+    env = lw.make(Full, nworld=4, engine=engine, horizon=0)
+    for action in random_actions(env, 4):
+        env.step(action)
+    damping = env.field("dof_damping")[:, 0]
+    assert (damping != np.float32(0.2)).any()
+    env.rand_reset()
+    assert (damping == np.float32(0.2)).all()
+
+
 # rollouts and planners
 
 
