@@ -32,6 +32,38 @@ class DrawnWithControl(Drawn):
     control = copied
 
 
+@wp.struct
+class WindyWorld:
+    qpos: Row[float]
+    qfrc_applied: Row[float]
+
+
+@wp.func
+def observe_windy(s: WindyWorld, p: PuckParams, obs: Row[float]):
+    obs[0] = s.qpos[0]
+    obs[1] = s.qfrc_applied[0]
+
+
+@wp.func
+def reward_windy(s0: WindyWorld, action: Row[float], s1: WindyWorld, p: PuckParams) -> float:
+    return s1.qpos[0] - s0.qpos[0]
+
+
+@wp.func
+def draw_wind(s: WindyWorld, p: PuckParams, rng: Row[wp.uint32]):
+    s.qfrc_applied[0] = lw.uniform(rng, 5.0, 9.0)
+
+
+class Windy(lw.Task):
+    """A force that is drawn at a reset and blows through the episode."""
+
+    model = Drawn.model
+    obs = {"x": 1, "wind": 1}
+    World = WindyWorld
+    Params = PuckParams
+    observe, reward, randomize = observe_windy, reward_windy, draw_wind
+
+
 def random_actions(env: lw.Env, steps: int, seed: int = 0) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
     return 2.0 * torch.rand(steps, *env.action.shape, generator=generator) - 1.0
@@ -247,6 +279,23 @@ def test_a_planner_takes_the_model_of_the_state_unless_asked_otherwise(task: typ
     assert not torch.equal(*returns[False])
     assert torch.equal(*returns[True])
     assert not torch.equal(returns[True][0], returns[False][0])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_inputs_that_a_reset_draws_act_in_steps_and_in_rollouts(engine: str) -> None:
+    env = lw.make(Windy, nworld=2, engine=engine, autoreset=False, horizon=0)
+    loop = OpenLoop(lw.make(Windy, nworld=2, engine=engine, autoreset=False, seed=3), 6)
+    state = env.get_state()[0].clone()
+    loop.state.copy_(state)
+    loop.actions.zero_()
+    for _ in range(3):
+        loop.run()
+    env.set_state(state.expand(2, -1).contiguous())
+    for t in range(6):
+        env.step(torch.zeros_like(env.action))
+        assert torch.equal(loop.reward[t], env.reward), f"step {t}"
+    assert torch.equal(loop.final_obs, env.obs)
+    assert (env.obs[:, 0] > 1e-4).all() and (env.obs[:, 1] >= 5.0).all()
 
 
 @pytest.mark.parametrize("engine", ENGINES)
