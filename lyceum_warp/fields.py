@@ -173,6 +173,15 @@ class Field:
         return int(np.prod(self.shape, dtype=int)) * max(1, wp.types.type_size_in_bytes(self.dtype) // 4)
 
 
+_KNOWN = (*STATE_FIELDS, *DERIVED_FIELDS, "sensordata")
+"""Names of fields of MjData that an environment keeps."""
+
+
+def similar_data_fields(name: str) -> list[str]:
+    """Names of fields of MjData that resemble a name, the nearest first."""
+    return difflib.get_close_matches(name, _KNOWN, 3)
+
+
 def is_data_field(name: str) -> bool:
     """Whether a name is that of a field of MjData that can be kept."""
     return name in STATE_FIELDS or name in DERIVED_FIELDS or name in SENSED
@@ -219,9 +228,8 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False, written:
         snapshot = lagged or reset == Stage.ACCELERATION
         refresh = Stage.NONE if snapshot else reset
     else:
-        known = [*STATE_FIELDS, *DERIVED_FIELDS, "sensordata"]
-        close = difflib.get_close_matches(name, known, 3)
-        hint = f"did you mean {' or '.join(close)}?" if close else f"the fields are {', '.join(sorted(known))}"
+        close = similar_data_fields(name)
+        hint = f"did you mean {' or '.join(close)}?" if close else f"the fields are {', '.join(sorted(_KNOWN))}"
         raise ValueError(f"there is no field {name!r}: {hint}")
     shape: tuple[int, ...] = np.shape(getattr(mujoco.MjData(model), name))
     if len(shape) == 2:

@@ -157,6 +157,11 @@ class ModelField:
         return np.asarray(getattr(model.opt if self.option else model, self.name))
 
 
+def similar_model_fields(name: str) -> list[str]:
+    """Names of fields that can differ between worlds and resemble a name, the nearest first."""
+    return difflib.get_close_matches(name, _FIELDS, 3)
+
+
 def is_model_field(name: str) -> bool:
     """Whether a name is that of a field of MjModel, or of one of its options that can differ between worlds."""
     return name in _FIELDS or hasattr(mujoco.MjModel, name)
@@ -180,7 +185,7 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
         return _described(name, value.shape, Constants.NONE)
     if name not in _FIELDS:
         if not isinstance(getattr(model, name, getattr(model.opt, name, None)), np.ndarray | float | int):
-            close = difflib.get_close_matches(name, _FIELDS, 3)
+            close = similar_model_fields(name)
             hint = f"did you mean {' or '.join(close)}?" if close else f"those are {', '.join(sorted(_FIELDS))}"
             raise ValueError(f"there is no model field {name!r} that can differ between worlds: {hint}")
         reason = _REASONS.get(name, "the engines share it between all worlds")

@@ -16,8 +16,8 @@ from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
 from lyceum_warp.binding.writes import Rights, check_writes, written_fields
-from lyceum_warp.fields import INITIAL, INPUTS, Field, describe, is_data_field, vec10
-from lyceum_warp.model_fields import describe_model_field, is_model_field
+from lyceum_warp.fields import INITIAL, INPUTS, Field, describe, is_data_field, similar_data_fields, vec10
+from lyceum_warp.model_fields import describe_model_field, is_model_field, similar_model_fields
 from lyceum_warp.options import ModelSource, PhysicsOptions
 from lyceum_warp.task import FUNCTIONS, MEMORIES, RESULTS, Task, TaskFunction, observer_name
 from lyceum_warp.validate import whole_number
@@ -80,6 +80,10 @@ class BoundTask:
         """The fields of World that each function writes, by the functions' names."""
         own = [name for name in named if is_data_field(name) or not is_model_field(name)]
         of_model = [name for name in named if name not in own]
+        for name in own:
+            if name != "sensordata" and not is_data_field(name) and (close := similar_model_fields(name)):
+                meant = " or ".join([*similar_data_fields(name), *close][:3])
+                raise ValueError(f"there is no field {name!r}: did you mean {meant}")
         self.spec = task_spec(task, model)
         """The model as it was read: other environments of the same task are made from it, not from its source."""
         self.model = models.compile_model(self.spec.copy(), own, physics, varied={*of_model, *dynamics})

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import SharedEnv
+from form_tasks import Drawn, Pushed
 
 import lyceum_warp as lw
 import lyceum_warp.tasks
@@ -233,3 +234,31 @@ def test_one_substep_leaves_the_engines_a_rounding_apart(engines: Engines) -> No
     print(f"{engines.task}: qpos {figures[0]:.1e}, {figures[1]:.1e}; qvel {figures[2]:.1e}, {figures[3]:.1e}")
     for name, figure in zip(("qpos_median", "qpos_p95", "qvel_median", "qvel_p95"), figures, strict=True):
         assert figure <= getattr(ONE_STEP[engines.task], name), f"{name} is {figure:.1e}"
+
+
+@pytest.mark.parametrize(
+    ("task", "params"),
+    [(Pushed, {}), (Pushed, {"reach": 0.0}), (Pushed, {"force": 0.0}), (Drawn, {}), (Drawn, {"spread": 0.0})],
+    ids=["pushes_and_moves", "pushes", "moves_a_mocap_body", "draws", "draws_gravity"],
+)
+def test_fifty_steps_leave_the_engines_a_rounding_apart_whatever_the_task_writes(
+    task: type[lw.Task], params: dict[str, float], device: str
+) -> None:
+    """Inputs that ``control`` writes, and masses, frictions and gravity that are drawn, in 150 substeps."""
+    c = lw.make(task, nworld=8, seed=1, **params)
+    warp = lw.make(task, nworld=8, seed=1, engine="warp", device=device, **params)
+    start, rng, worst, far = positions_of(c), np.random.default_rng(0), 0.0, 0.0
+    for i in range(50):
+        action = random_action(c, rng, 1.0)
+        c.step(action)
+        warp.step(action.to(warp.action.device))
+        assert torch.equal(c.truncated, warp.truncated.cpu()), f"step {i}"
+        worst = max(worst, (positions_of(c) - positions_of(warp)).abs().max().item())
+        far = max(far, (positions_of(c) - start).abs().max().item())
+    assert far > 0.02, "nothing moved"
+    print(f"qpos {worst:.1e}")
+    assert worst <= 3e-6, f"qpos differs by {worst:.1e}"  # measured: 7.8e-7
+
+
+def positions_of(env: lw.Env) -> torch.Tensor:
+    return env.state_space.split(env.get_state().cpu())["qpos"].clone()

@@ -1,0 +1,417 @@
+"""The whole task form through the public interface: dynamics that differ between worlds, groups, noise, own actions.
+
+The rules of ``check_task`` cover each feature for any task; here are the stories that need a task of their own.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tiny_task
+import torch
+import warp as wp
+from form_tasks import Drawn, PuckParams, PuckWorld, Pushed
+from full_task import Full
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+from lyceum_warp.openloop import OpenLoop
+
+ENGINES = ["mujoco", "warp"]
+
+
+@wp.func
+def copied(s: PuckWorld, action: Row[float], p: PuckParams, ctrl: Row[float]):
+    ctrl[0] = action[0]
+
+
+class DrawnWithControl(Drawn):
+    """The same with a ``control``, so that rollouts go step by step."""
+
+    control = copied
+
+
+def random_actions(env: lw.Env, steps: int, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return 2.0 * torch.rand(steps, *env.action.shape, generator=generator) - 1.0
+
+
+def mass(env: lw.Env, state: torch.Tensor | None = None) -> torch.Tensor:
+    """The puck's mass in every world."""
+    if state is None:
+        return env.field("body_mass")[:, 1].clone()
+    return state[:, env.state_space.parts["body_mass"]][:, 1]
+
+
+def step_without_events(env: lw.Env, action: torch.Tensor) -> None:
+    env.action.copy_(action)
+    for phase in env.worlds.step_phases():
+        if not phase.name.startswith("event"):
+            phase.run()
+
+
+# dynamics that differ between worlds
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_randomised_world_goes_on_in_another_environment(engine: str) -> None:
+    first, other = (lw.make(Drawn, nworld=3, engine=engine, seed=seed) for seed in (1, 2))
+    actions = random_actions(first, 12)
+    for action in actions[:4]:
+        first.step(action)
+    state = first.get_state()
+    other.set_state(state)
+    assert torch.equal(mass(other), mass(first))
+    for action in actions[4:]:
+        first.step(action)
+        other.step(action)
+        assert torch.equal(other.get_state(), first.get_state())
+        assert torch.equal(other.reward, first.reward)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_draws_do_not_compound_over_resets(engine: str) -> None:
+    env = lw.make(Drawn, nworld=4, engine=engine)
+    masses = []
+    for _ in range(1000 if engine == "mujoco" else 100):
+        env.rand_reset()
+        masses.append(mass(env))
+    drawn = torch.stack(masses)
+    assert 0.5 <= drawn.min() < 0.55 and 1.45 < drawn.max() <= 1.5
+    assert abs(drawn[-50:].mean().item() - 1.0) < 0.1
+    gravity = env.field("gravity").clone()
+    env.reset()
+    assert (mass(env) == 1.0).all()
+    assert torch.equal(env.field("gravity"), gravity) and len(gravity[:, 2].unique()) == 4
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_draw_of_a_world_changes_no_other(engine: str) -> None:
+    env, still = (lw.make(Drawn, nworld=3, engine=engine, horizon=0) for _ in range(2))
+    mask = torch.tensor([False, True, False])
+    for i, action in enumerate(random_actions(env, 8)):
+        if i == 3:
+            env.rand_reset(mask=mask)
+            assert not torch.equal(mass(env)[mask], mass(still)[mask])
+        env.step(action)
+        still.step(action)
+        assert torch.equal(env.get_state()[~mask], still.get_state()[~mask])
+    assert not torch.equal(env.get_state()[mask], still.get_state()[mask])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_model_fields_can_be_set_in_an_environment_of_any_task(engine: str) -> None:
+    env = lw.make("hopper", nworld=3, engine=engine, dynamics=["body_mass", "geom_friction"], horizon=0)
+    masses = env.field("body_mass").clone()
+    assert torch.equal(masses, torch.from_numpy(env.model.body_mass).float().expand(3, -1))
+    assert torch.equal(env.field("body_mass", "torso"), masses[:, 1:2])
+    env.reset()
+    masses[1, 1] *= 3.0
+    env.set_dynamics(body_mass=masses)
+    assert torch.equal(env.field("body_mass"), masses)
+    friction = torch.full((5, 3), 0.5)
+    env.set_dynamics(torch.tensor([False, False, True]), geom_friction=friction)
+    assert torch.equal(env.field("geom_friction")[2], friction)
+    assert torch.equal(env.field("geom_friction")[0], torch.from_numpy(env.model.geom_friction).float())
+    for _ in range(3):
+        env.step(torch.full((3, 3), 0.5))
+    qpos = env.field("qpos")
+    assert torch.equal(qpos[0, 1], qpos[2, 1])  # still in the air
+    assert not torch.equal(qpos[0], qpos[1])
+    env.rand_reset()
+    assert torch.equal(env.field("body_mass"), masses)  # no reset draws it again
+    state = env.get_state()
+    assert torch.equal(state[:, env.state_space.parts["body_mass"]].float(), masses)
+    other = env.replicate(nworld=3)
+    assert torch.equal(other.field("body_mass")[1], other.field("body_mass")[0])
+    other.set_state(state)
+    assert torch.equal(other.field("body_mass"), masses)
+
+
+def test_getters_judge_states_with_the_dynamics_of_the_state() -> None:
+    env = lw.make(Drawn, nworld=2, horizon=0)
+    before = env.get_state()
+    action = random_actions(env, 1)[0]
+    env.step(action)
+    after, reward, obs = env.get_state(), env.reward.clone(), env.obs.clone()
+    env.rand_reset()
+    assert not torch.equal(mass(env), mass(env, after).float())
+    assert torch.equal(env.get_reward(before, action, after), reward)
+    assert torch.equal(env.get_obs(after), obs)
+    assert torch.equal(obs[:, 4], mass(env, after).float())
+
+
+# rollouts and planners
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("task", [Drawn, DrawnWithControl])
+def test_a_rollout_takes_the_model_of_the_state_or_the_nominal_one(task: type[lw.Task], engine: str) -> None:
+    env = lw.make(task, nworld=3, engine=engine, autoreset=False, horizon=0, seed=4)
+    state, actions = env.get_state()[1], random_actions(env, 4)
+    nominal = env.state_space.split(state.clone())
+    for name in ("body_mass", "geom_friction", "gravity"):
+        own = env.model.opt.gravity if name == "gravity" else getattr(env.model, name)
+        nominal[name].copy_(torch.from_numpy(np.asarray(own, dtype=np.float32)).double().ravel())
+    plain = torch.cat(list(nominal.values()))
+    assert not torch.equal(plain, state)
+
+    def rewards(start: torch.Tensor, **options: Any) -> torch.Tensor:
+        loop = OpenLoop(lw.make(task, nworld=3, engine=engine, autoreset=False, seed=9), 4, **options)
+        for _ in range(3):  # the third replays graphs
+            loop.state.copy_(start)
+            loop.actions.copy_(actions)
+            loop.run()
+        assert not loop.fault.any()
+        return loop.reward.clone()
+
+    def stepped(start: torch.Tensor) -> torch.Tensor:
+        env.set_state(start.expand(3, -1).contiguous())
+        found = []
+        for action in actions:
+            env.step(action)
+            found.append(env.reward.clone())
+        return torch.stack(found)
+
+    assert torch.equal(rewards(state), stepped(state))
+    assert torch.equal(rewards(state, nominal_model=True), stepped(plain))
+    assert not torch.equal(stepped(plain), stepped(state))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("task", [Drawn, DrawnWithControl])
+def test_a_planner_takes_the_model_of_the_state_unless_it_is_told_otherwise(task: type[lw.Task], engine: str) -> None:
+    env = lw.make(task, nworld=2, engine=engine)
+    state = env.get_state()[:1].clone()
+    heavy = state.clone()
+    mass(env, heavy).mul_(1.5)
+    returns: dict[bool, list[torch.Tensor]] = {}
+    for nominal in (False, True):
+        plan = lw.MPPI(task, engine=engine, samples=8, horizon=4, nominal_model=nominal)
+        for given in (state, heavy):
+            plan.reset()
+            plan(given[0])
+            returns.setdefault(nominal, []).append(plan.returns.clone())
+    assert not torch.equal(*returns[False])
+    assert torch.equal(*returns[True])
+    assert not torch.equal(returns[True][0], returns[False][0])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_rollout_has_the_numbers_of_stepping_without_events(engine: str) -> None:
+    """With groups, noise, inputs, substeps, memory and drawn dynamics."""
+    env = lw.make(Full, nworld=3, engine=engine, autoreset=False, horizon=0)
+    loop = OpenLoop(lw.make(Full, nworld=3, engine=engine, autoreset=False, seed=5), 4)
+    for action in random_actions(env, 3, seed=1):
+        env.step(action)
+    state, actions = env.get_state()[1], random_actions(env, 4)
+    for _ in range(3):
+        loop.state.copy_(state)
+        loop.actions.copy_(actions)
+        loop.run()
+        env.set_state(state.expand(3, -1).contiguous())
+        for t, action in enumerate(actions):
+            step_without_events(env, action)
+            assert torch.equal(loop.reward[t], env.reward), f"step {t}"
+        assert loop.final_obs_groups.keys() == {"policy", "critic"}
+        for name, obs in loop.final_obs_groups.items():
+            assert torch.equal(obs, env.final_obs_groups[name]), name
+    changed = torch.zeros_like(env.done)
+    for action in random_actions(env, 12):
+        env.step(action)
+        changed |= env.worlds.changed_view
+    assert changed.any(), "there were no events to leave out"
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_planner_plans_for_a_task_with_every_feature(engine: str) -> None:
+    env = lw.make(Full, nworld=2, engine=engine)
+    plan = lw.MPPI(Full, engine=engine, samples=8, horizon=4)
+    for _ in range(3):
+        action = plan(env.get_state()[0])
+        env.step(action.expand(2, -1).contiguous())
+    assert action.shape == (3,) and action.abs().max() <= 1.0 and action.abs().max() > 0.0
+    assert torch.isfinite(plan.returns).all() and plan.summary["failed_samples"] == 0.0
+
+
+# actions of a task's own
+
+
+def test_actions_of_a_task_have_its_names_and_its_range() -> None:
+    env = lw.make(Pushed, nworld=2)
+    assert dict(env.action_space.parts) == {"elbow": slice(0, 1), "push": slice(1, 2), "hand": slice(2, 3)}
+    assert env.action_space.low.tolist() == [-1.0] * 3 and env.action.shape == (2, 3)
+    assert env.field("ctrl").shape == (2, 1)
+    env.step(torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]))
+    torch.testing.assert_close(env.field("xfrc_applied", "lower")[:, 2], torch.tensor([4.0, 0.0]))
+    torch.testing.assert_close(env.field("mocap_pos")[:, 0, 0], torch.tensor([0.5, 0.6]))
+    env.reset()
+    assert (env.field("xfrc_applied") == 0).all()
+    torch.testing.assert_close(env.field("mocap_pos")[:, 0], torch.tensor([[0.5, 0.0, 0.3]] * 2))
+
+
+PASSIVE = """<mujoco><worldbody><geom type="plane" size="3 3 .1"/>
+<body name="ball" pos="0 0 1"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_model_without_actuators_is_pushed_by_control(engine: str, tmp_path: Path) -> None:
+    (tmp_path / "ball.xml").write_text(PASSIVE)
+    source = tiny_task.changed(
+        ("    qpos: Row[float]", "    qpos: Row[float]\n    xfrc_applied: Row[wp.spatial_vector]"),
+        ("    dt: float", "    dt: float\n    ball: int = lw.body('ball')"),
+        ('"hopper.xml"', '"ball.xml"'),
+        ('obs = {"x": 1}', 'obs = {"x": 1}\n    actions = {"push": 1}\n    action_range = (-2.0, 2.0)'),
+        ("class Tiny", """@wp.func
+def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
+    s.xfrc_applied[p.ball] = wp.spatial_vector(20.0 * action[0], 0.0, 0.0, 0.0, 0.0, 0.0)
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    return s1.qpos[0]
+
+class Tiny"""),
+    )  # fmt: skip
+    file = tiny_task.write(tmp_path, source)
+    env = lw.make(file, nworld=2, engine=engine)
+    for _ in range(5):
+        env.step(torch.tensor([[1.0], [-1.0]]))
+    assert env.obs[0] > 0 > env.obs[1]
+    plan = lw.MPPI(file, engine=engine, samples=16, horizon=4, noise=1.0, temperature=1e-6)
+    assert plan(env.get_state()[0]).shape == (1,)
+    for _ in range(3):
+        action = plan(env.get_state()[0])
+    assert action[0] > 0.0
+
+
+# mistakes
+
+
+def line(text: str) -> tuple[str, str]:
+    """A line more in the class."""
+    return '    obs = {"x": 1}', f'    obs = {{"x": 1}}\n    {text}'
+
+
+def field(text: str) -> tuple[str, str]:
+    """A field more in World."""
+    return "    qpos: Row[float]", f"    qpos: Row[float]\n    {text}"
+
+
+def function(text: str) -> tuple[str, str]:
+    """A Warp function more before the class."""
+    return "class Tiny", f"@wp.func\n{text}\n\nclass Tiny"
+
+
+MASS = field("body_mass: Row[float]")
+RNG = "rng: Row[wp.uint32]"
+STEP = "s0: World, action: Row[float], s1: World, p: Params"
+MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
+    "an unknown model field": (
+        [field("body_maas: Row[float]")], "there is no field 'body_maas': did you mean body_mass",
+    ),
+    "a model field of another type": (
+        [field("geom_friction: Row[float]")],
+        r"World\.geom_friction of the task 'tiny' must be declared as Row\[wp\.vec3\]",
+    ),
+    "a field that cannot differ": (
+        [field("body_subtreemass: Row[float]"),
+         function(f"def randomize(s: World, p: Params, {RNG}):\n    s.body_subtreemass[0] = 1.0")],
+        "the model field 'body_subtreemass' cannot differ between worlds: MuJoCo computes it from other fields",
+    ),
+    "a negative mass": (
+        [MASS, function(f"def randomize(s: World, p: Params, {RNG}):\n    s.body_mass[1] = s.body_mass[1] - 9.0")],
+        r"'tiny': body_mass\[1\] of world 0 is -\S+ and must be positive \(its nominal value is 3\S*\)",
+    ),
+    "drawn twice": (
+        [MASS, function(f"def startup(s: World, p: Params, {RNG}):\n    s.body_mass[1] = 2.0"),
+         function(f"def randomize(s: World, p: Params, {RNG}):\n    s.body_mass[2] = 2.0")],
+        "the model field 'body_mass' of the task 'tiny' is written by startup and by resets or events",
+    ),
+    "a group that no function fills": (
+        [('obs = {"x": 1}', 'obs = {"policy": {"x": 1}, "critic": {"x": 1}}')],
+        r"observe_critic\(s: World, p: Params, obs: Row\[float\]\)",
+    ),
+    "a function without its group": (
+        [line("observe_critic = observe")],
+        "obs of the task 'tiny' has no group 'critic', which observe_critic writes",
+    ),
+    "groups without a policy": (
+        [('obs = {"x": 1}', 'obs = {"actor": {"x": 1}, "critic": {"x": 1}}')],
+        "must name parts with sizes, or groups of them, of which one is 'policy'",
+    ),
+    "a metric's name twice": (
+        [line('metrics = ("a", "b", "a")'),
+         function(f"def measure({STEP}, metrics: Row[float]):\n    metrics[0] = 1.0")],
+        "the task 'tiny' names the metric 'a' twice: give each one name",
+    ),
+    "metrics without measure": (
+        [line('metrics = ("a",)')], r"needs both, metrics = \(\.\.\.\) in the class and measure",
+    ),
+    "measure without metrics": (
+        [function(f"def measure({STEP}, metrics: Row[float]):\n    metrics[0] = 1.0")],
+        r"needs both, metrics = \(\.\.\.\) in the class and measure",
+    ),
+    "metrics as one name": ([line('metrics = "forward"')], r"metrics of the task 'tiny' must be names, as \('forward'"),
+    "a keyframe that is not there": ([line('keyframe = "home"')], "'home'"),
+    "actions without control": ([line('actions = {"speed": 1}')], "has actions of its own, so it needs control"),
+    "actions without sizes": ([line('actions = ("speed",)')], r"must be names with sizes, as \{'speed': 1\}"),
+    "lasting memory that World does not list": (
+        [line("lasting_memory = 1")], "needs both, lasting_memory = ... in the class and lasting_memory in World",
+    ),
+    "no draw": ([line("draws = 0")], "draws of the task 'tiny' must be a whole number from 1"),
+    "settling backwards": ([line("settle = -1")], "settle of the task 'tiny' must be a whole number from 0"),
+    "a reward that writes": (
+        [function(f"def reward({STEP}) -> float:\n    s1.qpos[0] = 1.0\n    return 0.0")],
+        r"reward of the task 'tiny' writes s1\.qpos \(.*tiny\.py, line 20\): ",
+    ),
+    "advance that writes an input": (
+        [field("xfrc_applied: Row[wp.spatial_vector]"),
+         function(f"def advance({STEP}, {RNG}):\n    s1.xfrc_applied[1] = wp.spatial_vector()")],
+        r"advance of the task 'tiny' writes s1\.xfrc_applied \(.*tiny\.py, line 21\): .* is written by control",
+    ),
+    "control that writes the state": (
+        [function("def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):\n    s.qpos[0] = 0.0")],
+        r"control of the task 'tiny' writes s\.qpos \(.*tiny\.py, line \d+\): .* is written by initialize or randomize",
+    ),
+    "a substep that writes the model": (
+        [MASS, function("def substep(s: World, p: Params):\n    s.body_mass[1] = 2.0")],
+        r"substep of the task 'tiny' writes s\.body_mass \(.*tiny\.py, line \d+\): .* is written by startup",
+    ),
+    "observe that writes": (
+        [("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0]\n    s.qpos[0] = 0.0")],
+        r"observe of the task 'tiny' writes s\.qpos \(.*tiny\.py, line \d+\): observe may write obs",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "message"), MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_in_the_form_is_one_line_that_names_it(
+    changes: list[tuple[str, str]], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        lw.make(tiny_task.write(tmp_path, tiny_task.changed(*changes)))
+    assert "\n" not in str(caught.value)
+
+
+def test_wrong_dynamics_are_refused_and_change_nothing() -> None:
+    with pytest.raises(
+        ValueError, match="there is no model field 'body_mas' that can differ .*: did you mean body_mass"
+    ):
+        lw.make("hopper", dynamics=["body_mas"])
+    env = lw.make("hopper", nworld=2, dynamics=["body_mass"])
+    state = env.get_state()
+    for fields, message in (
+        ({"body_mass": torch.ones(3)}, r"body_mass must be numbers of shape \(2, 5\), or \(5,\) for all worlds, not "),
+        ({"body_mass": "heavy"}, "body_mass must be numbers of shape"),
+        ({"body_mass": -torch.ones(2, 5)}, r"body_mass\[0\] of world 0 is -1 and must be 0 or more"),
+        ({"body_mass": torch.full((5,), torch.nan)}, r"body_mass\[0\] of world 0 is nan"),
+        ({"body_mas": 1.0}, "there is no model field 'body_mas'"),
+        ({"geom_friction": 1.0}, r"the model field 'geom_friction' is the same in every world .*dynamics=\['geom_fric"),
+    ):
+        with pytest.raises(ValueError, match=message) as caught:
+            env.set_dynamics(**fields)
+        assert "\n" not in str(caught.value)
+        assert torch.equal(env.get_state(), state)
+    with pytest.raises(ValueError, match="the task 'hopper' has no group 'critic' of observations: it has"):
+        env.get_obs(group="critic")
