@@ -85,10 +85,10 @@ def test_indices_out_of_range_are_found_and_named(task_file: TaskFile, engine: s
 @pytest.mark.parametrize("engine", ENGINES)
 def test_an_element_of_a_field_without_elements_is_named(task_file: TaskFile, engine: str) -> None:
     text = tiny_task.changed(
-        (FIELDS, f"{FIELDS}\n    cam_xpos: Row[wp.vec3]"), ("obs[0] = s.qpos[0]", "obs[0] = s.cam_xpos[1][0]")
+        (FIELDS, f"{FIELDS}\n    ten_length: Row[float]"), ("obs[0] = s.qpos[0]", "obs[0] = s.ten_length[1]")
     )
     file = task_file("without.py", text)
-    with pytest.raises(AssertionError, match=r"observe reads s\.cam_xpos\[1\] out of range .* there are no elements"):
+    with pytest.raises(AssertionError, match=r"observe reads s\.ten_length\[1\] out of range .* there are no elements"):
         check_task(file, engine=engine, steps=2, checks=[check_bounds])
 
 
