@@ -6,6 +6,9 @@ import numpy as np
 import torch
 import warp as wp
 
+_SPARE = 256
+"""Elements behind an array without elements."""
+
 
 def flat(array: wp.array) -> wp.array:
     """The same memory as a (nworld, n) array of float32, for copies that do not care about types."""
@@ -22,6 +25,19 @@ def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> 
     rows: Any = wp.array(ptr=single.ptr, dtype=dtype, shape=shape, strides=strides, device=device)
     rows.owner = single  # keeps the memory alive as long as the view
     return rows
+
+
+def with_memory(array: wp.array) -> wp.array:
+    """The array, or, if it has no elements, one of the same shape with memory behind it.
+
+    A kernel that reads an element of an array without elements by mistake would end the process.
+    """
+    if array.size:
+        return array
+    memory = wp.zeros(_SPARE, dtype=array.dtype, device=array.device)
+    padded: Any = wp.array(ptr=memory.ptr, dtype=array.dtype, shape=array.shape, device=array.device)
+    padded.owner = memory  # keeps the memory alive as long as the view
+    return padded
 
 
 def torch_view(array: wp.array) -> torch.Tensor:

@@ -6,7 +6,7 @@ from functools import partial
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import flat, launch_rows, shared_rows, torch_view
+from lyceum_warp.arrays import flat, launch_rows, shared_rows, torch_view, with_memory
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
@@ -95,7 +95,7 @@ class OpenLoop:
                     self._fields[name] = buffer.reshape((self.horizon + 1, *live.shape))
                 for batch, start in ((self._before, 0), (self._after, n), (self._last, rows)):
                     # of no numbers there is no slice
-                    part = buffer[start : min(start + rows, rows + n)] if buffer.size else buffer
+                    part = buffer[start : min(start + rows, rows + n)] if buffer.size else with_memory(buffer)
                     setattr(batch, name, part)
         self._memories = {name: self._fields.pop(name) for name in MEMORIES if name in self._fields}
         self._dynamics = {f.name: self._fields.pop(f.name) for f in task.dynamics if f.name in self._fields}

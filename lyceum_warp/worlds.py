@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import flat, launch_rows, shared_rows, torch_view
+from lyceum_warp.arrays import flat, launch_rows, shared_rows, torch_view, with_memory
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
@@ -90,8 +90,9 @@ class Worlds:
         for name in self.task.types:
             live: Any = getattr(self, name) if name in MEMORIES else constant.get(name, self.engine.arrays.get(name))
             self.task.check_field(name, live)
+            live = with_memory(live)
             setattr(self.after, name, live)
-            if name not in constant and name not in varied:  # no step changes the model
+            if live.size and name not in constant and name not in varied:  # no step changes the model
                 self._copies[name] = wp.zeros_like(live)
             setattr(self.before, name, self._copies.get(name, live))
         self.fields = {**self.engine.arrays, **constant}

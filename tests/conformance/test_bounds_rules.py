@@ -82,6 +82,16 @@ def test_indices_out_of_range_are_found_and_named(task_file: TaskFile, engine: s
     assert message.count("out of range") == len(MISTAKES)
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_element_of_a_field_without_elements_is_named(task_file: TaskFile, engine: str) -> None:
+    text = tiny_task.changed(
+        (FIELDS, f"{FIELDS}\n    ten_length: Row[float]"), ("obs[0] = s.qpos[0]", "obs[0] = s.ten_length[1]")
+    )
+    file = task_file("without.py", text)
+    with pytest.raises(AssertionError, match=r"observe reads s\.ten_length\[1\] out of range .* there are no elements"):
+        check_task(file, engine=engine, steps=2, checks=[check_bounds])
+
+
 def test_a_function_that_cannot_be_checked_breaks_the_rule(monkeypatch: pytest.MonkeyPatch) -> None:
     def unchecked(*args: object) -> None:
         raise Unchecked("observe uses last as a value (wrong.py, line 3): call it instead")
