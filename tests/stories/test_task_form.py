@@ -205,7 +205,7 @@ def test_a_number_that_is_not_finite_is_a_fault_of_its_world(name: str, reason: 
     assert env.get_reward(before, action, after)[1] != 0  # no fault is left behind
 
 
-def test_a_rejected_draw_leaves_no_trace() -> None:
+def test_a_rejected_draw_changes_no_lasting_memory() -> None:
     env = lw.make(Full, nworld=8)
     tip = env.field("site_xpos")[:, 0, 0]
     for count in range(2, 12):
