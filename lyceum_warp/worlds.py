@@ -372,11 +372,14 @@ class Worlds:
             self.restarting, self.after, self.params, self.counters, self._going_on, self._moved, self.changed,
         ], device=self.device)  # fmt: skip
         for name, array in (live | drawn).items():
-            masks = [self._going_on, self.changed if name in MEMORIES else self._moved]
-            args = [masks[0], flat(self._before_event(name)), flat(array), masks[1]]
-            wp.launch(steps.mark_changes, self.nworld, args, device=self.device)
+            self._mark_changes(self._before_event(name), array, self.changed if name in MEMORIES else self._moved)
         wp.launch(steps.merge_masks, self.nworld, [self._moved, self.changed], device=self.device)
         self.engine.commit(self._moved, [name for name in live if name not in MEMORIES])
+
+    def _mark_changes(self, before: wp.array, after: wp.array, changed: wp.array) -> None:
+        """Mark the worlds that go on and in which a field changed."""
+        args = [self._going_on, flat(before), flat(after), changed]
+        wp.launch(steps.mark_changes, self.nworld, args, device=self.device)
 
     def _before_event(self, name: str) -> wp.array:
         """Where the values of a field before an event are kept."""

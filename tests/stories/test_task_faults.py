@@ -70,7 +70,7 @@ def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uin
     s1.lasting_memory[0] = s0.lasting_memory[0] + p.lasting
 
 
-class Troubled(lw.Task):
+class Faulty(lw.Task):
     model, horizon = staticmethod(lambda: mujoco.MjSpec.from_string(XML)), 20
     obs = {"position": 1, "mass": 1}
     metrics, memory, lasting_memory = ("number", "early"), 2, 1
@@ -81,7 +81,7 @@ ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
 
 @ENGINES
 def test_a_metric_that_is_not_written_is_zero(engine: str) -> None:
-    env = lw.make(Troubled, nworld=2, engine=engine)
+    env = lw.make(Faulty, nworld=2, engine=engine)
     found = []
     for _ in range(4):
         env.step()
@@ -92,7 +92,7 @@ def test_a_metric_that_is_not_written_is_zero(engine: str) -> None:
 
 @ENGINES
 def test_a_metric_that_is_not_finite_stays_out_of_the_state(engine: str) -> None:
-    env = lw.make(Troubled, nworld=2, engine=engine, metric=[1.0, 1.0])
+    env = lw.make(Faulty, nworld=2, engine=engine, metric=[1.0, 1.0])
     env.step()
     env.set_params(metric=[float("inf"), 1.0])
     env.step()
@@ -105,7 +105,7 @@ def test_a_metric_that_is_not_finite_stays_out_of_the_state(engine: str) -> None
 @ENGINES
 @pytest.mark.parametrize("name", ["remembered", "lasting"])
 def test_memory_that_is_not_finite_is_a_fault_of_its_world(name: str, engine: str) -> None:
-    env = lw.make(Troubled, nworld=3, engine=engine)
+    env = lw.make(Faulty, nworld=3, engine=engine)
     env.step()
     env.set_params(**{name: [1.0, float("inf"), 1.0]})
     env.step()
@@ -117,9 +117,9 @@ def test_memory_that_is_not_finite_is_a_fault_of_its_world(name: str, engine: st
 
 @ENGINES
 def test_a_draw_that_cannot_be_simulated_is_a_fault_of_its_world(engine: str) -> None:
-    env = lw.make(Troubled, nworld=3, engine=engine, damping=[1.0, 1.0, 1.0])
+    env = lw.make(Faulty, nworld=3, engine=engine, damping=[1.0, 1.0, 1.0])
     with pytest.raises(ValueError, match="dof_damping of world 1 is -1 and must be 0 or more"):
-        lw.make(Troubled, nworld=3, engine=engine, damping=[1.0, -1.0, 1.0])
+        lw.make(Faulty, nworld=3, engine=engine, damping=[1.0, -1.0, 1.0])
     env.set_params(damping=[1.0, -1.0, 1.0])
     env.rand_reset()
     state = env.get_state()
@@ -135,14 +135,14 @@ def test_a_draw_that_cannot_be_simulated_is_a_fault_of_its_world(engine: str) ->
 
 
 def test_a_robots_state_has_the_nominal_model_unless_it_is_given() -> None:
-    plan = lw.MPPI(Troubled, samples=2, horizon=2)
+    plan = lw.MPPI(Faulty, samples=2, horizon=2)
     columns = plan.env.state_space.parts["body_mass"]
     assert plan.state_of(qpos=[0.0])[columns].tolist() == [0.0, 1.0]
     assert plan.state_of(body_mass=[0.0, 2.0])[columns].tolist() == [0.0, 2.0]
 
 
 def test_an_event_in_memory_leaves_the_physics_in_double_precision() -> None:
-    env = lw.make(Troubled, nworld=1, engine="mujoco", horizon=0)
+    env = lw.make(Faulty, nworld=1, engine="mujoco", horizon=0)
     time = env.state_space.parts["time"]
     for _ in range(1000):
         env.step()
