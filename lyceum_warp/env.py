@@ -11,7 +11,7 @@ import torch
 import warp as wp
 
 from lyceum_warp.arrays import torch_view
-from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.bound_task import BoundTask, check_field_name
 from lyceum_warp.binding.read_only_model import read_only
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.docstrings import document_attributes
@@ -418,7 +418,8 @@ class Env:
             ValueError: The environment does not keep this field, or the model has no such element.
         """
         if name not in self._fields:
-            (describe_model_field if is_model_field(name) else describe)(self.task.model, name)  # names a misspelt one
+            check_field_name(name)
+            (describe_model_field if is_model_field(name) else describe)(self.task.model, name)
             kept = ", ".join(sorted(self._fields))
             raise ValueError(
                 f"this environment of {self.task.name!r} does not keep the field {name!r}: make it with "

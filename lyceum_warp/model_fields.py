@@ -43,7 +43,7 @@ _FIELDS = (
         "tendon_solref_lim tendon_solimp_lim tendon_solref_fri tendon_solimp_fri tendon_range tendon_actfrcrange "
         "tendon_margin tendon_frictionloss tendon_lengthspring "
         # actuators and options
-        "actuator_dynprm actuator_gainprm actuator_biasprm actuator_actrange actuator_forcerange actuator_ctrlrange "
+        "actuator_dynprm actuator_gainprm actuator_biasprm actuator_actrange actuator_forcerange "
         "gravity magnetic".split(),
         Constants.NONE,
     )
@@ -77,9 +77,11 @@ _REASONS = (
         _COMPUTED,
         "MuJoCo computes it from other fields; write those instead",
     )
-    | {"timestep": "all worlds share the parameter dt", "impratio": "MuJoCo Warp keeps another number instead of it"}
+    | {"timestep": "all worlds share it; the parameters dt and substep_dt have the seconds of a step and a substep",
+       "impratio": "MuJoCo Warp keeps another number instead of it"}
     | dict.fromkeys(("geom_surfacevel", "geom_adhesion", "pair_adhesion"),
                     "MuJoCo Warp decides on the host whether any geom has it")
+    | dict.fromkeys(("actuator_ctrlrange", "actuator_ctrllimited"), "controls are clipped to the model's own ranges")
 )  # fmt: skip
 
 _POSITIVE = {"body_mass", "body_inertia", "geom_size"}
@@ -163,8 +165,8 @@ def similar_model_fields(name: str) -> list[str]:
 
 
 def is_model_field(name: str) -> bool:
-    """Whether a name is that of a field of MjModel, or of one of its options that can differ between worlds."""
-    return name in _FIELDS or hasattr(mujoco.MjModel, name)
+    """Whether a name is that of an attribute of MjModel or of its options."""
+    return name in _FIELDS or hasattr(mujoco.MjModel, name) or hasattr(mujoco.MjOption, name)
 
 
 def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = True) -> ModelField:
@@ -178,10 +180,12 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
     Raises:
         ValueError: There is no such field, it does not hold real numbers, or all worlds share it.
     """
-    value = getattr(model, name, None)
-    if not varies and name not in _FIELDS and isinstance(value, np.ndarray):
-        if value.dtype != np.float64 or value.ndim > 2 or (value.ndim == 2 and value.shape[1] not in _TYPES):
-            raise ValueError(f"the model field {name!r} cannot be read in World: it has no rows of real numbers")
+    if not varies and name not in _FIELDS:
+        value = getattr(model, name, None)
+        numbers = isinstance(value, np.ndarray) and value.dtype == np.float64
+        if not numbers or value.ndim > 2 or (value.ndim == 2 and value.shape[1] not in _TYPES):
+            reason = _REASONS[name] if name == "timestep" else "it has no rows of real numbers; make it a parameter"
+            raise ValueError(f"the model field {name!r} cannot be read in World: {reason}")
         return _described(name, value.shape, Constants.NONE)
     if name not in _FIELDS:
         if not isinstance(getattr(model, name, getattr(model.opt, name, None)), np.ndarray | float | int):

@@ -145,3 +145,53 @@ class Drawn(lw.Task):
     World = PuckWorld
     Params = PuckParams
     observe, reward, startup, randomize = observe_puck, weigh_up, draw_gravity, draw_puck
+
+
+@wp.func
+def observe_gravity(s: PuckWorld, p: PuckParams, obs: Row[float]):
+    obs[0] = s.qpos[0]
+    obs[1] = s.gravity[2]
+
+
+class Weighed(Drawn):
+    """The same with an observation of what is drawn once for each world."""
+
+    obs = {"x": 1, "gravity": 1}
+    World = PuckWorld
+    Params = PuckParams
+    observe, reward, startup, randomize = observe_gravity, weigh_up, draw_gravity, draw_puck
+
+
+@wp.struct
+class PracticedWorld:
+    qpos: Row[float]
+    lasting_memory: Row[float]
+
+
+@wp.func
+def observe_practice(s: PracticedWorld, p: PuckParams, obs: Row[float]):
+    obs[0] = s.qpos[0]
+    obs[1] = s.lasting_memory[0]
+
+
+@wp.func
+def start_further(s: PracticedWorld, p: PuckParams):
+    s.qpos[0] = 0.001 * s.lasting_memory[0]
+
+
+@wp.func
+def count_steps(s0: PracticedWorld, action: Row[float], s1: PracticedWorld, p: PuckParams, rng: Row[wp.uint32]):
+    s1.lasting_memory[0] = s0.lasting_memory[0] + lw.uniform(rng, 0.0, 2.0)
+
+
+class Practiced(lw.Task):
+    """The puck starts further away, and observes it, the longer its world has practiced."""
+
+    model = Drawn.model
+    frame_skip = 3
+    obs = {"position": 1, "practice": 1}
+    lasting_memory = 1
+    horizon = 25
+    World = PracticedWorld
+    Params = PuckParams
+    observe, initialize, advance = observe_practice, start_further, count_steps

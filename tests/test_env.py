@@ -73,6 +73,8 @@ def test_a_field_that_is_not_kept_is_refused_with_the_way_to_get_it() -> None:
     assert env.state_space.size == size
     with pytest.raises(ValueError, match="there is no field 'site_xpoz': did you mean site_xpos"):
         env.field("site_xpoz")
+    with pytest.raises(ValueError, match=r"there is no field 'body_masses': did you mean body_mass\b"):
+        env.field("body_masses")
     assert lw.make("reach", fields=["xpos"]).field("xpos").shape[2] == 3
 
 

@@ -54,11 +54,23 @@ def test_an_unknown_model_field_is_refused_with_close_names() -> None:
 
 @pytest.mark.parametrize(
     ("name", "reason"),
-    [("timestep", "parameter dt"), ("body_invweight0", "computes it from other fields"), ("geom_type", "share")],
+    [
+        ("timestep", "the parameters dt and substep_dt"),
+        ("body_invweight0", "computes it from other fields"),
+        ("geom_type", "share"),
+        ("actuator_ctrlrange", "controls are clipped to the model's own ranges"),
+    ],
 )
 def test_a_field_that_all_worlds_share_is_refused(name: str, reason: str) -> None:
     with pytest.raises(ValueError, match=f"{name!r} cannot differ between worlds: .*{reason}"):
         describe_model_field(ANT, name)
+
+
+def test_a_field_that_all_worlds_share_is_read_where_it_has_rows_of_numbers() -> None:
+    assert describe_model_field(ANT, "actuator_ctrlrange", varies=False).dtype is wp.vec2
+    for name, reason in (("nq", "make it a parameter"), ("opt", "rows"), ("timestep", "dt"), ("geom_type", "rows")):
+        with pytest.raises(ValueError, match=f"{name!r} cannot be read in World: .*{reason}"):
+            describe_model_field(ANT, name, varies=False)
 
 
 def test_geoms_with_wrapped_tendons_have_constants() -> None:

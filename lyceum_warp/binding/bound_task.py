@@ -1,5 +1,6 @@
 """A task bound to its model and its parameters, with its kernels."""
 
+import difflib
 import math
 import re
 from collections.abc import Collection, Mapping
@@ -40,6 +41,19 @@ def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSp
     return models.load_spec(task.model() if callable(task.model) else task.model, task)
 
 
+def check_field_name(name: str) -> None:
+    """Refuse a name that neither MjData nor MjModel has.
+
+    Raises:
+        ValueError: There is no such field; the message names those that resemble it.
+    """
+    if is_data_field(name) or is_model_field(name):
+        return
+    close = difflib.get_close_matches(name, [*similar_data_fields(name), *similar_model_fields(name)], 3)
+    hint = f"did you mean {' or '.join(close)}?" if close else "fields have MuJoCo's names, of MjData and MjModel"
+    raise ValueError(f"there is no field {name!r}: {hint}")
+
+
 class BoundTask:
     """A task with its compiled model, its parameters and its kernels.
 
@@ -76,14 +90,12 @@ class BoundTask:
         self.types = {name: variable.type for name, variable in self.source.world.vars.items()}
         self._check_class(model)
         named = [name for name in dict.fromkeys([*self.types, *fields]) if name not in MEMORIES]
+        for name in named:
+            check_field_name(name)
         self.writes = self._checked_writes()
         """The fields of World that each function writes, by the functions' names."""
-        own = [name for name in named if is_data_field(name) or not is_model_field(name)]
+        own = [name for name in named if is_data_field(name)]
         of_model = [name for name in named if name not in own]
-        for name in own:
-            if name != "sensordata" and not is_data_field(name) and (close := similar_model_fields(name)):
-                meant = " or ".join([*similar_data_fields(name), *close][:3])
-                raise ValueError(f"there is no field {name!r}: did you mean {meant}")
         self.spec = task_spec(task, model)
         """The model as it was read: other environments of the same task are made from it, not from its source."""
         self.model = models.compile_model(self.spec.copy(), own, physics, varied={*of_model, *dynamics})

@@ -7,6 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from form_tasks import Practiced, Weighed
 from full_task import Full, Settled
 
 import lyceum_warp as lw
@@ -211,6 +212,13 @@ def test_a_broken_rule_is_reported(
 @pytest.mark.parametrize("task", [Full, Settled])
 def test_a_task_with_every_feature_keeps_the_rules(task: type[lw.Task]) -> None:
     check_task(task, engine="mujoco", steps=60)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+@pytest.mark.parametrize("task", [Weighed, Practiced])
+def test_a_task_that_observes_what_outlives_resets_keeps_the_rules(task: type[lw.Task], engine: str) -> None:
+    checks = [check for check in CHECKS if engine == "mujoco" or check.__name__ == "check_reset"]
+    check_task(task, engine=engine, nworld=3, steps=60, frame_skip=1, checks=checks)
 
 
 def test_a_task_with_every_feature_keeps_the_rules_of_the_form_on_the_warp_engine() -> None:

@@ -410,6 +410,27 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "an unknown model field": (
         [field("body_maas: Row[float]")], "there is no field 'body_maas': did you mean body_mass",
     ),
+    "an unknown model field among fields of MjData": (
+        [field("body_masses: Row[float]")], r"there is no field 'body_masses': did you mean body_mass\b",
+    ),
+    "a name like no field": ([field("wheels: Row[float]")], "there is no field 'wheels': .*MuJoCo's names"),
+    "the seconds of a substep": (
+        [field("timestep: float")],
+        "the model field 'timestep' cannot be read in World: all worlds share it; the parameters dt and substep_dt",
+    ),
+    "a drawn timestep": (
+        [field("timestep: Row[float]"), function(f"def startup(s: World, p: Params, {RNG}):\n    s.timestep[0] = 0.1")],
+        "the model field 'timestep' cannot differ between worlds: all worlds share it; the parameters dt",
+    ),
+    "a number of the model": (
+        [field("nq: int")], "the model field 'nq' cannot be read in World: .* make it a parameter",
+    ),
+    "the options": ([field("opt: float")], "the model field 'opt' cannot be read in World"),
+    "drawn ranges of controls": (
+        [field("actuator_ctrlrange: Row[wp.vec2]"),
+         function(f"def randomize(s: World, p: Params, {RNG}):\n    s.actuator_ctrlrange[0] = wp.vec2(-3.0, 3.0)")],
+        "the model field 'actuator_ctrlrange' cannot differ between worlds: controls are clipped to the model's own",
+    ),
     "a model field of another type": (
         [field("geom_friction: Row[float]")],
         r"World\.geom_friction of the task 'tiny' must be declared as Row\[wp\.vec3\]",
