@@ -179,7 +179,7 @@ class Env:
             self.rand_reset(options.seed)
             if self.task.dynamics:
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
-            self.task.check_observations(worlds.after, worlds.params, worlds.counters)
+            self.task.check_results(worlds.after, worlds.params, worlds.counters)
         except Exception as error:
             if (explained := self.task.explained(error)) is error:
                 raise
