@@ -1,6 +1,7 @@
 """A task bound to its model and its parameters, with its kernels."""
 
 import difflib
+import keyword
 import math
 import re
 from collections.abc import Collection, Mapping
@@ -203,6 +204,11 @@ class BoundTask:
                 raise ValueError(f"the task {self.name!r} needs both, {name} = ... in the class and {name} in World")
         whole_number(f"draws of the task {self.name!r}", task.draws, low=1)
         whole_number(f"settle of the task {self.name!r}", task.settle, low=0)
+        if not isinstance(task.keyframe, str | None):
+            raise ValueError(
+                f"keyframe of the task {self.name!r} must be the name of one of the model's keyframes, as 'home', not "
+                f"{task.keyframe!r}"
+            )
         self._check_metrics()
         for name in task.lagged:
             if name not in self.types:
@@ -224,9 +230,14 @@ class BoundTask:
 
     def _check_metrics(self) -> None:
         metrics: Any = self.task.metrics
-        if isinstance(metrics, str) or not all(isinstance(name, str) and name for name in metrics):
+        if not isinstance(metrics, tuple | list) or not all(isinstance(name, str) and name for name in metrics):
             raise ValueError(
                 f"metrics of the task {self.name!r} must be names, as ('forward', 'cost'), not {metrics!r}"
+            )
+        if bad := [name for name in metrics if not name.isprintable() or not set(name).isdisjoint(",'\"")]:
+            raise ValueError(
+                f"the task {self.name!r} has the metric {bad[0]!r}: a metric's name, which is a column of metrics.csv, "
+                "must have no comma, quote or line break"
             )
         if twice := [name for name in metrics if list(metrics).count(name) > 1]:
             raise ValueError(f"the task {self.name!r} names the metric {twice[0]!r} twice: give each one name")
@@ -269,6 +280,12 @@ class BoundTask:
                 f"obs of the task {self.name!r} must name parts with sizes, or groups of them, of which one is "
                 f"'policy', not {given!r}"
             )
+        for group in given:
+            if not (isinstance(group, str) and group.isidentifier()) or keyword.iskeyword(group):
+                raise ValueError(
+                    f"obs of the task {self.name!r} has the group {group!r}: a group's name must be a Python name, as "
+                    "'critic', which observe_critic writes"
+                )
         return {group: self._layout(layout) for group, layout in given.items()}
 
     def _layout(self, layout: Mapping[str, Any]) -> dict[str, int]:
