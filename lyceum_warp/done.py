@@ -17,7 +17,7 @@ class Done(enum.IntFlag):
     TRUNCATED = 2
     """The time limit was reached."""
     NAN = 4
-    """The state became not-a-number or absurd (beyond 1e10)."""
+    """The state became not-a-number or absurd (beyond 1e10), or task memory not finite."""
     CONTACT_OVERFLOW = 8
     """More contacts than the engine had room for."""
     CONSTRAINT_OVERFLOW = 16
@@ -30,6 +30,8 @@ class Done(enum.IntFlag):
     """The reward was not finite."""
     OBSERVATION = 256
     """A number of the observation was not finite."""
+    MODEL = 512
+    """A model field was drawn that cannot be simulated, such as a negative mass."""
 
 
 FAULTS = ~(Done.TERMINATED | Done.TRUNCATED)

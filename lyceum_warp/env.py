@@ -140,7 +140,9 @@ class Env:
     eval_space: Space
     """A scalar."""
 
-    def __init__(self, task: str | type[Task], options: EnvOptions | None = None, **words: Any) -> None:
+    def __init__(
+        self, task: str | type[Task], options: EnvOptions | None = None, *, _replica: bool = False, **words: Any
+    ) -> None:
         check_kind("options", options, EnvOptions | None, "as lw.EnvOptions(nworld=64)")
         self.options, params = EnvOptions.split(words, options)
         options = self.options
@@ -178,7 +180,7 @@ class Env:
                 if options.graphs:
                     self.engine.prepare_capture()
             self.rand_reset(options.seed)
-            if self.task.dynamics:
+            if self.task.dynamics and not _replica:  # later, and in a replica, a bad draw is a fault of its world
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
             self.task.check_results(worlds.after, worlds.params, worlds.counters)
         except Exception as error:
@@ -512,7 +514,7 @@ class Env:
         nworld = self.nworld if nworld is None else nworld
         known, params = EnvOptions.split(changes, self._own_options())
         given = self._params_for(nworld, self._given_params)
-        return Env(self.task.task, known.changed({"nworld": nworld}), **(given | params))
+        return Env(self.task.task, known.changed({"nworld": nworld}), _replica=True, **(given | params))
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
         """``replicate`` for a few worlds, such as an evaluation's.
@@ -557,7 +559,8 @@ class Env:
     def bytes_per_world(self) -> float:
         """An estimate of the memory that a world takes, in bytes, without the model, which all worlds share."""
         physics = self.options.engine, self.task.model, self.device, self.task.fields
-        return bytes_per_world(*physics, **self.options.for_engine()) + own_bytes_per_world(self.task)
+        engine = bytes_per_world(*physics, dynamics=self.task.dynamics, **self.options.for_engine())
+        return engine + own_bytes_per_world(self.task)
 
     @property
     def fault_counts(self) -> dict[str, int]:

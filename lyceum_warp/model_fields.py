@@ -88,7 +88,7 @@ _REASONS = (
 _POSITIVE = {"body_mass", "body_inertia", "geom_size"}
 """Fields whose numbers must stay positive where the nominal value is."""
 
-_NOT_NEGATIVE = _POSITIVE | set(
+NOT_NEGATIVE = _POSITIVE | set(
     "geom_friction pair_friction jnt_stiffness dof_damping dof_armature dof_frictionloss tendon_stiffness "
     "tendon_damping tendon_armature tendon_frictionloss actuator_damping actuator_armature density viscosity".split()
 )
@@ -136,7 +136,7 @@ class ModelField:
         """
         nominal = self.value(model).ravel()
         bad = ~np.isfinite(rows)
-        if self.name in _NOT_NEGATIVE:
+        if self.name in NOT_NEGATIVE:
             bad |= (rows < 0) | ((rows == 0) & (nominal > 0) & (self.name in _POSITIVE))
         if not bad.any():
             return None
@@ -147,7 +147,7 @@ class ModelField:
             "positive"
             if self.name in _POSITIVE and nominal[column] > 0
             else "0 or more"
-            if self.name in _NOT_NEGATIVE
+            if self.name in NOT_NEGATIVE
             else "finite"
         )
         return (

@@ -137,7 +137,7 @@ class Worlds:
         self.fault_count = wp.zeros(int(FAULTS).bit_length(), dtype=int)
         self.everyone, self.mask = wp.full(n, True, dtype=bool), wp.zeros(n, dtype=bool)
         self.restarting, self._drawing = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
-        self._going_on, self.changed = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
+        self._going_on, self._moved, self.changed = (wp.zeros(n, dtype=bool) for _ in range(3))
         self.changed_view = torch_view(self.changed)
         """The worlds that the events of the last step changed, (nworld,) bool."""
         self.state = wp.zeros((n, self.state_space.size), dtype=wp.float64)
@@ -172,32 +172,46 @@ class Worlds:
 
     def step_phases(self) -> list[Phase]:
         """One step, in order."""
-        return [*self._transition_phases(), *self._between_phases()]
+        return [
+            *self._transition_phases(),
+            *self._restart_phases(self.restarting, randomly=True),
+            *self._event_phases(),
+            *self._moved_phases(),
+            *self._refresh_phases(self.restarting),
+            *self._observe_phases(),
+        ]
+
+    def _phases_of_a_graph(self) -> list[Phase]:
+        """The same where a step is one graph: parts of it are left out in a step in which they concern no world."""
+        if not self.engine.capturable or self._nvtx:
+            return self.step_phases()
+        restart = self._restart_phases(self.restarting, randomly=True)
+        show = self._refresh_phases(self.restarting), self._observe_phases()
+        if not (events := self._event_phases()):
+            return [*self._transition_phases(), self._only_for(self.restarting, restart, *show)]
+        moved = self._moved_phases()
+        return [
+            *self._transition_phases(),
+            self._only_for(self.restarting, restart),
+            *events,
+            *([self._only_for(self._moved, moved)] if moved else []),
+            *([self._only_for(self.restarting, show[0])] if show[0] else []),
+            *show[1],
+        ]
+
+    def _only_for(self, mask: wp.array, *phases: list[Phase]) -> Phase:
+        """Phases as one that is left out where the mask holds no world."""
+        every = [phase for part in phases for phase in part]
+
+        def run() -> None:
+            for phase in every:
+                phase.run()
+
+        return Phase(every[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
     def _transition_phases(self) -> list[Phase]:
         """From a state to the next one, and what it is worth."""
         return [Phase("act", self.act), *self.physics_phases(), Phase("judge", self._judge_step)]
-
-    def _between_phases(self) -> list[Phase]:
-        """What happens between two transitions."""
-        return [
-            *self._restart_phases(self.restarting, randomly=True),
-            *self._event_phases(),
-            *self._refresh_phases(self.restarting),
-            Phase("observe", self._observe_restarted),
-        ]
-
-    def _phases_of_a_graph(self) -> list[Phase]:
-        """One step where all of it is one graph: restarts are left out where no world restarts."""
-        if not self.engine.capturable or self._nvtx or self.task.kernels.run_events is not None:
-            return self.step_phases()
-
-        def run() -> None:
-            for phase in self._between_phases():
-                phase.run()
-
-        restarts = Phase("restart", partial(self.engine.run_for, self.restarting, run), engine=True)
-        return [*self._transition_phases(), restarts]
 
     def physics_phases(self) -> list[Phase]:
         """The substeps of a step."""
@@ -228,13 +242,24 @@ class Worlds:
 
     def _event_phases(self) -> list[Phase]:
         """What happens between two steps, in worlds that go on."""
+        return [] if self.task.kernels.run_events is None else [Phase("event", self._event)]
+
+    def _moved_phases(self) -> list[Phase]:
+        """What follows in the worlds whose physics an event changed."""
         if self.task.kernels.run_events is None:
             return []
-        phases = [Phase("event", self._event)]
+        phases = []
         if any(field.name in self.task.writes["event"] for field in self.task.dynamics):
-            phases.append(Phase("event dynamics", partial(self.engine.apply_model, self.changed), engine=True))
+            phases.append(Phase("event dynamics", partial(self.engine.apply_model, self._moved), engine=True))
         if self.engine.stage > Stage.NONE:
-            phases.append(Phase("event refresh", partial(self.engine.refresh_current, self.changed), engine=True))
+            phases.append(Phase("event refresh", partial(self.engine.refresh_current, self._moved), engine=True))
+        return phases
+
+    def _observe_phases(self) -> list[Phase]:
+        """Observations of the worlds that changed since they were judged."""
+        phases = [Phase("observe", partial(self._observe, self.restarting))]
+        if self.task.kernels.run_events is not None:
+            phases.append(Phase("event observe", partial(self._observe, self.changed)))
         return phases
 
     def _refresh_phases(self, mask: wp.array) -> list[Phase]:
@@ -340,32 +365,33 @@ class Worlds:
                 self.engine.apply_model(self._drawing)
 
     def _event(self) -> None:
-        """Run the events, and find the worlds that they changed."""
-        written = [name for name in self._copies if name in self.task.writes["event"]]
-        live = {name: getattr(self.after, name) for name in written}
-        varied = [field.name for field in self.task.dynamics if field.name in self.task.writes["event"]]
-        for name in written:
-            wp.copy(self._copies[name], live[name])
-        for name in varied:
-            wp.copy(self._model_copies[name], self.engine.arrays[name])
+        """Run the events, and find the worlds that they changed: their physics, or anything."""
+        written = self.task.writes["event"]
+        live = {name: getattr(self.after, name) for name in self._copies if name in written}
+        drawn = {name: self.engine.arrays[name] for name in self._model_copies}
+        for name, array in (live | drawn).items():
+            wp.copy(self._before_event(name), array)
         wp.launch(self.task.kernels.run_events, self.nworld, [
-            self.restarting, self.after, self.params, self.counters, self._going_on, self.changed,
+            self.restarting, self.after, self.params, self.counters, self._going_on, self._moved, self.changed,
         ], device=self.device)  # fmt: skip
-        for name in written:
-            self._mark_changes(self._copies[name], live[name])
-        for name in varied:
-            self._mark_changes(self._model_copies[name], self.engine.arrays[name])
-        self.engine.commit(self.changed)
+        for name, array in (live | drawn).items():
+            self._mark_changes(self._before_event(name), array, self.changed if name in MEMORIES else self._moved)
+        wp.launch(steps.merge_masks, self.nworld, [self._moved, self.changed], device=self.device)
+        self.engine.commit(self._moved, [name for name in live if name not in MEMORIES])
 
-    def _mark_changes(self, before: wp.array, after: wp.array) -> None:
-        args = [self._going_on, flat(before), flat(after), self.changed]
+    def _mark_changes(self, before: wp.array, after: wp.array, changed: wp.array) -> None:
+        """Mark the worlds that go on and in which a field changed."""
+        args = [self._going_on, flat(before), flat(after), changed]
         wp.launch(steps.mark_changes, self.nworld, args, device=self.device)
 
-    def _observe_restarted(self) -> None:
-        """Observe the worlds that restarted or that an event changed; the others were observed when judged."""
-        for mask in (self.restarting, self.changed) if self.task.kernels.run_events is not None else (self.restarting,):
-            args = [mask, self.after, self.params, self.counters, self.final_obs, self.obs]
-            wp.launch(self.task.kernels.observe_worlds, self.nworld, args, device=self.device)
+    def _before_event(self, name: str) -> wp.array:
+        """Where the values of a field before an event are kept."""
+        return self._model_copies[name] if name in self._model_copies else self._copies[name]
+
+    def _observe(self, mask: wp.array) -> None:
+        """Observe the masked worlds; the others were observed when they were judged."""
+        args = [mask, self.after, self.params, self.counters, self.final_obs, self.obs]
+        wp.launch(self.task.kernels.observe_worlds, self.nworld, args, device=self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Observe and judge the states of the masked worlds, without a transition."""

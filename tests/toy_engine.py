@@ -1,7 +1,7 @@
 """A third engine, written against the contract in ``lyceum_warp.engines.base`` alone: plain MuJoCo, world by world."""
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import mujoco
 import numpy as np
@@ -129,9 +129,10 @@ class ToyEngine(Engine):
         for name, column in self._columns.items():
             launch_rows(state.narrow, mask, column, flat(self.arrays[name]))
 
-    def commit(self, mask: wp.array) -> None:
+    def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
         for name, column in self._columns.items():
-            launch_rows(state.widen, mask, flat(self.arrays[name]), column)
+            if names is None or name in names:
+                launch_rows(state.widen, mask, flat(self.arrays[name]), column)
 
     def refresh(self, mask: wp.array) -> None:
         self._forward(mask, self.reset_stage, list(self.fields.values()))

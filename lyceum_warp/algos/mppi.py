@@ -27,7 +27,7 @@ from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.planner_state import checked_state, state_from_parts
 from lyceum_warp.algos.value import ValueFunction
-from lyceum_warp.arrays import torch_view
+from lyceum_warp.arrays import flat, torch_view
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
@@ -115,6 +115,8 @@ class MPPI:
         self.env.reset()
         self.timestep = self.env.timestep
         self._initial = self.env.get_state()[0]
+        for name, nominal in self.env.engine.nominal.items():  # a robot is not a world that startup has drawn
+            self._initial[self.env.state_space.parts[name]] = torch_view(flat(nominal))[0].double()
         with wp.ScopedDevice(self.env.device):
             self._keys = wp.zeros(self.samples, dtype=wp.uint32)
         self._loop = OpenLoop(self.env, self.horizon, keys=self._keys, nominal_model=self.config.nominal_model)
@@ -264,6 +266,8 @@ class MPPI:
 
     def state_of(self, **parts: Any) -> torch.Tensor:
         """A state from its parts, as a robot knows them; the rest is as the task's fixed reset leaves it.
+
+        Model fields have their nominal values unless they are given, as ``body_mass=...``.
 
         The rest includes fields that a task reads as the last substep left them: they affect only the first transition
         of a plan. A ``time`` sets the step counter, too, unless ``step`` is given.

@@ -10,10 +10,13 @@ from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from lyceum_warp.binding.functions import TaskSource
+from lyceum_warp.binding.writes import written_fields
 from lyceum_warp.kernels import random, steps
+from lyceum_warp.model_fields import NOT_NEGATIVE
 from lyceum_warp.task import FUNCTIONS, Row, Task, TaskFunction
 
 _BATCH = """
@@ -49,6 +52,20 @@ def all_finite(out: Observations, w: int) -> bool:
 @wp.func
 def copy_observations(source: Observations, target: Observations, w: int):
 {copy}
+
+
+@wp.func
+def finite_memory(s0: World, s1: World) -> bool:
+    finite = bool(True)
+{memory}
+    return finite
+
+
+@wp.func
+def valid_model(s: World) -> bool:
+    valid = bool(True)
+{model}
+    return valid
 """
 
 _kernels: dict[Any, Any] = {}
@@ -91,6 +108,7 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
         batch.append(f"    {name}: type_{name}")
         rows.append(f"    s.{name} = batch.{name}[w]")
     scope |= {"substream": random.substream, "finite_row": steps.finite_row, "copy_row": steps.copy_row}
+    scope["restored_row"] = steps.restored_row
     observe = []
     for number, (group, function) in enumerate(groups.items()):
         scope[f"observe_{number}"] = function
@@ -106,6 +124,7 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
         "finite": [f"    finite = finite and finite_row(out.{group}[w])" for group in groups],
         "copy": [f"    copy_row(source.{group}[w], target.{group}[w])" for group in groups],
     }
+    blocks["memory"], blocks["model"] = _memory_checks(source), _model_checks(source)
     scope["type_group"] = wp.array2d(dtype=float)
     parts = [_BATCH.format(**{name: "\n".join(lines) for name, lines in blocks.items()})]
     parts += [_default(function) for function in FUNCTIONS.values() if function.default is not None]
@@ -116,6 +135,28 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
     scope["__name__"] = f"lyceum_warp.generated.{source.name}"
     exec(compile(text, file, "exec"), scope)
     return scope
+
+
+def _memory_checks(source: TaskSource) -> list[str]:
+    """Lines that find memory that is not finite. What outlives episodes is put back; the rest ends with its episode."""
+    checks = {"memory": "finite_row(s1.memory)", "lasting_memory": "restored_row(s0.lasting_memory, s1.lasting_memory)"}
+    found = [check for name, check in checks.items() if name in source.world.vars]
+    return [f"    if not {check}:\n        finite = False" for check in found]
+
+
+def _model_checks(source: TaskSource) -> list[str]:
+    """Lines that find a negative number, or not-a-number, in model fields that the task writes."""
+    written = frozenset[str]().union(*(written_fields(function) for function in source.functions.values() if function))
+    lines = []
+    for name, variable in source.world.vars.items():
+        if name in written & NOT_NEGATIVE:
+            size = int(np.prod(getattr(variable.type.dtype, "_shape_", ()), dtype=int))
+            elements = (
+                [f"s.{name}[i]"] if variable.type.dtype is wp.float32 else [f"s.{name}[i][{j}]" for j in range(size)]
+            )
+            bad = " or ".join(f"not ({element} >= 0.0)" for element in elements)
+            lines += [f"    for i in range(s.{name}.shape[0]):", f"        if {bad}:", "            valid = False"]
+    return lines
 
 
 def _default(function: TaskFunction) -> str:

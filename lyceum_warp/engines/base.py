@@ -1,7 +1,7 @@
 """The contract between an environment and the physics behind it."""
 
 import abc
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 import mujoco
@@ -169,8 +169,11 @@ class Engine(abc.ABC):
         """
 
     @abc.abstractmethod
-    def commit(self, mask: wp.array) -> None:
-        """Copy the masked worlds' state fields into the engine. Made of Warp launches."""
+    def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
+        """Copy the masked worlds' state fields, by default all that are kept, into the engine.
+
+        Made of Warp launches.
+        """
 
     def apply_model(self, mask: wp.array) -> None:
         """Take over the masked worlds' model fields, and recompute the constants that follow from them.

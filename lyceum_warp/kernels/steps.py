@@ -15,6 +15,8 @@ TRUNCATED = wp.constant(int(Done.TRUNCATED))
 ACTION = wp.constant(int(Done.ACTION))
 REWARD = wp.constant(int(Done.REWARD))
 OBSERVATION = wp.constant(int(Done.OBSERVATION))
+MODEL = wp.constant(int(Done.MODEL))
+NAN = wp.constant(int(Done.NAN))
 
 # streams that begin at the place of one step; ``advance`` draws from that place itself
 OBSERVE = wp.constant(-1)
@@ -74,6 +76,17 @@ def finite_row(row: wp.array[float]) -> bool:
 
 
 @wp.func
+def restored_row(before: wp.array[float], after: wp.array[float]) -> bool:
+    """Put back the numbers that are not finite any more; returns whether there are none."""
+    finite = bool(True)
+    for i in range(after.shape[0]):
+        if not wp.isfinite(after[i]):
+            finite = False
+            after[i] = wp.where(wp.isfinite(before[i]), before[i], 0.0)
+    return finite
+
+
+@wp.func
 def copy_row(source: wp.array[float], target: wp.array[float]):
     """Copy a row."""
     for i in range(source.shape[0]):
@@ -103,6 +116,13 @@ def mark_changes(
                 changed_inout[w] = True
 
 
+@wp.kernel(enable_backward=False)
+def merge_masks(mask_in: wp.array[bool], mask_inout: wp.array[bool]):
+    """Add the worlds of one mask to another; launched over (nworld,)."""
+    w = wp.tid()
+    mask_inout[w] = mask_inout[w] or mask_in[w]
+
+
 def make_kernels(
     generated: SimpleNamespace,
     functions: Mapping[str, wp.Function],
@@ -115,7 +135,8 @@ def make_kernels(
     Args:
         generated: ``World`` and ``Params``, the structs of the task; ``Batch``, a struct of the task's fields for all
             worlds, and ``view``, the function from (batch, world) to ``World``; ``Observations``, a struct of the
-            groups of observations, with ``observe_groups``, ``all_finite`` and ``copy_observations``.
+            groups of observations, with ``observe_groups``, ``all_finite`` and ``copy_observations``;
+            ``finite_memory`` and ``valid_model``, which look for faults in what the task itself wrote.
         functions: The task's functions by name, with defaults for those that it does not have.
         written: Names of the functions that the task has. Without ``control`` a scale and an offset map actions to
             controls; without ``evaluate`` the evaluation is the reward; without ``advance`` memory stays as it is.
@@ -125,6 +146,7 @@ def make_kernels(
     World = generated.World  # noqa: N806
     view, observe_groups = generated.view, generated.observe_groups
     all_finite, copy_observations = generated.all_finite, generated.copy_observations
+    finite_memory, valid_model = generated.finite_memory, generated.valid_model
     control, reward, measure = functions["control"], functions["reward"], functions["measure"]
     evaluate, terminated, success = functions["evaluate"], functions["terminated"], functions["success"]
     initialize, randomize, startup = functions["initialize"], functions["randomize"], functions["startup"]
@@ -168,6 +190,8 @@ def make_kernels(
         fault_out[w] = fault
         for i in range(action_in.shape[1]):
             safe_action_out[w, i] = wp.where(fault == 0, action_in[w, i], 0.0)
+        if not valid_model(view(batch, w)):
+            fault_out[w] = fault | MODEL
         if wp.static(has_control):
             control(view(batch, w), safe_action_out[w], params[w % params.shape[0]], ctrl_out[w])
         else:
@@ -230,6 +254,8 @@ def make_kernels(
         s0 = view(before, w)
         s1 = view(after, w)
         fault = fault_inout[w] | action_fault_in[w]
+        if not finite_memory(s0, s1):
+            fault = fault | NAN
         gain = float(0.0)
         if fault == 0:
             if transition:
@@ -256,13 +282,13 @@ def make_kernels(
             out.eval[w] = gain
         out.reward[w] = gain
         if wp.static(has_measure):
+            for i in range(out.metrics.shape[1]):
+                out.metrics[w, i] = 0.0
             if fault == 0 and transition:
                 measure(s0, action_in[w], s1, p, out.metrics[w])
-            else:
-                for i in range(out.metrics.shape[1]):
-                    out.metrics[w, i] = 0.0
             for i in range(out.metrics.shape[1]):
-                metric_sum_inout[w, i] = metric_sum_inout[w, i] + out.metrics[w, i]
+                if wp.isfinite(out.metrics[w, i]):  # the sum belongs to the state, which is finite
+                    metric_sum_inout[w, i] = metric_sum_inout[w, i] + out.metrics[w, i]
                 out.episode_metrics[w, i] = metric_sum_inout[w, i]
         reason = fault
         if fault == 0:
@@ -330,11 +356,13 @@ def make_kernels(
         params: wp.array[Params],
         counters: Counters,
         mask_out: wp.array[bool],
+        moved_out: wp.array[bool],
         changed_out: wp.array[bool],
     ):
         """Run the events of the worlds that do not restart, ``mask_out``; launched over (nworld,)."""
         w = wp.tid()
         mask_out[w] = not restarting_in[w]
+        moved_out[w] = False
         changed_out[w] = False
         if not restarting_in[w]:
             at = stream(counters.key[w], counters.episode[w], counters.step[w])

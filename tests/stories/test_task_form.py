@@ -136,7 +136,7 @@ def test_the_draw_of_a_world_changes_no_other(engine: str) -> None:
 def test_model_fields_can_be_set_in_an_environment_of_any_task(engine: str) -> None:
     env = lw.make("hopper", nworld=3, engine=engine, dynamics=["body_mass", "geom_friction"], horizon=0)
     masses = env.field("body_mass").clone()
-    assert torch.equal(masses, torch.from_numpy(env.model.body_mass).float().expand(3, -1))
+    assert torch.equal(masses, torch.tensor(env.model.body_mass).float().expand(3, -1))
     assert torch.equal(env.field("body_mass", "torso"), masses[:, 1:2])
     env.reset()
     masses[1, 1] *= 3.0

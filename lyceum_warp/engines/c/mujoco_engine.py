@@ -1,7 +1,7 @@
 """The C engine: MuJoCo itself, many worlds on a pool of threads (mujoco.batch), float64 inside."""
 
 import copy
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import mujoco
@@ -227,8 +227,10 @@ class MujocoEngine(Engine):
             else:
                 launch_rows(narrow, mask, column, flat(array))
 
-    def commit(self, mask: wp.array) -> None:
+    def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
         for name, column in self._columns.items():
+            if names is not None and name not in names:
+                continue
             array = self.arrays[name]
             if array.dtype is wp.bool:
                 launch_rows(widen_bool, mask, array, column)

@@ -279,7 +279,7 @@ class WarpEngine(Engine):
                 launch_rows(fill_rows, mask, self._start, self._state)
                 mjw.set_state(self.m, self.d, self._state, _SPEC, mask)
 
-    def commit(self, mask: wp.array) -> None:
+    def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
         """Nothing to do: the fields are the engine's own arrays."""
 
     def run_for(self, mask: wp.array, run: Callable[[], None]) -> None:

@@ -1,0 +1,154 @@
+"""What a task writes wrongly while it runs stays in its world, is named, and never makes a state that cannot be set."""
+
+import mujoco
+import pytest
+import torch
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+XML = """
+<mujoco><option timestep="0.01"/><worldbody>
+<body name="box"><joint name="x" type="slide" axis="1 0 0" damping="1"/><geom size=".1" mass="1"/></body>
+</worldbody><actuator><motor name="push" joint="x" ctrllimited="true" ctrlrange="-1 1"/></actuator></mujoco>
+"""
+
+
+@wp.struct
+class World:
+    time: float
+    qpos: Row[float]
+    qvel: Row[float]
+    memory: Row[float]
+    lasting_memory: Row[float]
+    body_mass: Row[float]
+    dof_damping: Row[float]
+
+
+@wp.struct
+class Params:
+    dt: float
+    metric: float = 1.0
+    remembered: float = 1.0
+    lasting: float = 1.0
+    damping: float = 1.0
+    box: int = lw.body("box")
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    obs[0] = s.qpos[0]
+    obs[1] = s.body_mass[p.box]
+
+
+@wp.func
+def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):
+    metrics[0] = p.metric
+    if s1.time < 0.025:
+        metrics[1] = 1.0
+
+
+@wp.func
+def startup(s: World, p: Params, rng: Row[wp.uint32]):
+    s.body_mass[p.box] = lw.uniform(rng, 3.0, 5.0)
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    s.dof_damping[0] = p.damping
+
+
+@wp.func
+def event(s: World, p: Params, rng: Row[wp.uint32]):
+    s.memory[0] += 1.0
+
+
+@wp.func
+def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
+    s1.memory[1] = p.remembered
+    s1.lasting_memory[0] = s0.lasting_memory[0] + p.lasting
+
+
+class Faulty(lw.Task):
+    model, horizon = staticmethod(lambda: mujoco.MjSpec.from_string(XML)), 20
+    obs = {"position": 1, "mass": 1}
+    metrics, memory, lasting_memory = ("number", "early"), 2, 1
+
+
+ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
+
+
+@ENGINES
+def test_a_metric_that_is_not_written_is_zero(engine: str) -> None:
+    env = lw.make(Faulty, nworld=2, engine=engine)
+    found = []
+    for _ in range(4):
+        env.step()
+        found.append(env.metrics["early"][0].item())
+    assert found == [1.0, 1.0, 0.0, 0.0]
+    assert env.episode_metrics["early"].tolist() == [2.0, 2.0]
+
+
+@ENGINES
+def test_a_metric_that_is_not_finite_stays_out_of_the_state(engine: str) -> None:
+    env = lw.make(Faulty, nworld=2, engine=engine, metric=[1.0, 1.0])
+    env.step()
+    env.set_params(metric=[float("inf"), 1.0])
+    env.step()
+    assert torch.isinf(env.metrics["number"]).tolist() == [True, False]
+    assert env.episode_metrics["number"].tolist() == [1.0, 2.0]
+    env.set_state(env.get_state())
+    assert not any(env.fault_counts.values())
+
+
+@ENGINES
+@pytest.mark.parametrize("name", ["remembered", "lasting"])
+def test_memory_that_is_not_finite_is_a_fault_of_its_world(name: str, engine: str) -> None:
+    env = lw.make(Faulty, nworld=3, engine=engine)
+    env.step()
+    env.set_params(**{name: [1.0, float("inf"), 1.0]})
+    env.step()
+    assert [lw.Done(reason) for reason in env.done_reason.tolist()] == [0, lw.Done.NAN, 0]
+    columns = env.state_space.parts["lasting_memory"]
+    assert env.get_state()[:, columns].flatten().tolist() == [2.0, 1.0 if name == "lasting" else 2.0, 2.0]
+    env.set_state(env.get_state())
+
+
+@ENGINES
+def test_a_draw_that_cannot_be_simulated_is_a_fault_of_its_world(engine: str) -> None:
+    env = lw.make(Faulty, nworld=3, engine=engine, damping=[1.0, 1.0, 1.0])
+    with pytest.raises(ValueError, match="dof_damping of world 1 is -1 and must be 0 or more"):
+        lw.make(Faulty, nworld=3, engine=engine, damping=[1.0, -1.0, 1.0])
+    env.set_params(damping=[1.0, -1.0, 1.0])
+    env.rand_reset()
+    state = env.get_state()
+    assert torch.equal(env.get_obs(state), env.obs)  # scratch worlds take the same states
+    env.step()
+    assert [lw.Done(reason) for reason in env.done_reason.tolist()] == [0, lw.Done.MODEL, 0]
+    assert env.reward[1] == 0.0
+    env.set_params(damping=[1.0, 1.0, 1.0])
+    env.step()  # this episode began with the bad draw
+    env.step()
+    assert env.done_reason.tolist() == [0, 0, 0]
+    assert env.fault_counts["model"] == 2
+
+
+def test_a_robots_state_has_the_nominal_model_unless_it_is_given() -> None:
+    plan = lw.MPPI(Faulty, samples=2, horizon=2)
+    columns = plan.env.state_space.parts["body_mass"]
+    assert plan.state_of(qpos=[0.0])[columns].tolist() == [0.0, 1.0]
+    assert plan.state_of(body_mass=[0.0, 2.0])[columns].tolist() == [0.0, 2.0]
+
+
+def test_an_event_in_memory_leaves_the_physics_in_double_precision() -> None:
+    env = lw.make(Faulty, nworld=1, engine="mujoco", horizon=0)
+    time = env.state_space.parts["time"]
+    for _ in range(1000):
+        env.step()
+    assert env.get_state()[0, time].item() == pytest.approx(10.0, abs=1e-9)
+
+
+def test_the_memory_of_a_world_counts_its_model_fields() -> None:
+    drawn, plain = lw.make("hopper", dynamics=["body_mass", "geom_friction"]), lw.make("hopper")
+    assert drawn.bytes_per_world > plain.bytes_per_world
