@@ -108,7 +108,7 @@ class Env:
     done_reason: torch.Tensor
     """Bits of ``Done``, (nworld,), int32."""
     action: torch.Tensor
-    """Actions of the next step, (nworld, nu), float32. One that is not finite is a fault and is applied as zero."""
+    """Actions of the next step, (nworld, nact), float32. One that is not finite is a fault and is applied as zero."""
     episode_step: torch.Tensor
     """Steps since the reset, (nworld,), int32."""
     time: torch.Tensor
@@ -169,7 +169,8 @@ class Env:
             self.obs_spaces, self.obs_space = worlds.obs_spaces, worlds.obs_spaces["policy"]
             self.action_space, self.state_space = worlds.action_space, worlds.state_space
             self.metrics, self.episode_metrics = (
-                dict(zip(self.task.task.metrics, torch_view(array).unbind(1), strict=True)) for array in worlds.metrics
+                dict(zip(self.task.task.metrics, torch_view(array).unbind(1), strict=True))
+                for array in (worlds.metrics, worlds.episode_metrics)
             )
             self.reward_space = self.eval_space = Space()
             self._fields = {name: torch_view(array) for name, array in worlds.fields.items()}
@@ -181,7 +182,7 @@ class Env:
             self.rand_reset(options.seed)
             if self.task.dynamics and not _replica:  # later, and in a replica, a bad draw is a fault of its world
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
-            self.task.check_observations(worlds.after, worlds.params, worlds.counters)
+            self.task.check_results(worlds.after, worlds.params, worlds.counters)
         except Exception as error:
             if (explained := self.task.explained(error)) is error:
                 raise
@@ -231,7 +232,7 @@ class Env:
         ``Worlds.step_phases`` lists what happens, in order.
 
         Args:
-            action: Copied into ``env.action`` first, if given; (nworld, nu).
+            action: Copied into ``env.action`` first, if given; (nworld, nact).
 
         Raises:
             ValueError: The action has another shape or type.
@@ -276,8 +277,9 @@ class Env:
     def get_state(self, out: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> torch.Tensor:
         """Everything that the future depends on, (nworld, state_space.size), float64.
 
-        The engine's integration state, fields that are as the last substep left them, the step counter, the
-        random stream and the task's memory; ``state_space.parts`` gives the place of each.
+        The engine's integration state, fields that are as the last substep left them, model fields that differ
+        between worlds, the step counter, the random stream, the task's memory and lasting memory, and the sums of
+        the metrics over the episode; ``state_space.parts`` gives the place of each.
 
         Args:
             out: Where to write the states.
@@ -365,7 +367,7 @@ class Env:
 
         Args:
             before: States before, (nworld, state_space.size).
-            action: Actions, (nworld, nu).
+            action: Actions, (nworld, nact).
             after: States after.
             out: Where to write the rewards.
 
@@ -386,7 +388,7 @@ class Env:
         return _copied(scratch.reward, out)
 
     def get_action(self, out: torch.Tensor | None = None) -> torch.Tensor:
-        """The actions of the next step, (nworld, nu)."""
+        """The actions of the next step, (nworld, nact)."""
         return _copied(self.action, out)
 
     def set_action(self, action: torch.Tensor) -> None:
@@ -406,8 +408,9 @@ class Env:
         """A live view of a field of the simulation or of the model, by MuJoCo's name.
 
         An environment keeps the fields that its task reads, ``time`` and ``ctrl``; name further ones when making it,
-        as in ``make("hopper", fields=["site_xpos", "body_mass"])``. On the C engine the view is a copy that every step
-        renews: read it, and write through ``set_state`` or ``set_dynamics``.
+        as in ``make("hopper", fields=["site_xpos", "body_mass"])``. The view is for reading: write through
+        ``set_state`` or ``set_dynamics``. A number that is written into the view has no effect or gives wrong results
+        on either engine.
 
         Args:
             name: Attribute of MjData or MjModel, for instance "qpos", "site_xpos" or "body_mass".
@@ -435,8 +438,9 @@ class Env:
     def set_dynamics(self, mask: torch.Tensor | None = None, **fields: Any) -> None:
         """Set model fields that differ between worlds: those that the task draws, and those named by ``dynamics=``.
 
-        Derived constants follow. A reset draws the fields that the task's ``initialize`` or ``randomize`` writes again;
-        the others keep these values until ``rand_reset(seed=...)``.
+        Derived constants follow. Fields that the task's ``initialize``, ``randomize`` or ``event`` writes go back to
+        their nominal values at a reset, which then draws them again; the others keep these values until
+        ``rand_reset(seed=...)``.
 
         Args:
             mask: Which worlds, (nworld,) bool; all by default.

@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import enum
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -181,7 +182,7 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
         ValueError: There is no such field, it does not hold real numbers, or all worlds share it.
     """
     if not varies and name not in _FIELDS:
-        value = getattr(model, name, None)
+        value: Any = getattr(model, name, None)
         numbers = isinstance(value, np.ndarray) and value.dtype == np.float64
         if not numbers or value.ndim > 2 or (value.ndim == 2 and value.shape[1] not in _TYPES):
             reason = _REASONS[name] if name == "timestep" else "it has no rows of real numbers; make it a parameter"

@@ -23,8 +23,8 @@ class OpenLoop:
 
     Write ``state`` and ``actions``, call ``run``, read the rest; every tensor stays the same object. Episodes do not
     end on the way: the caller decides what a task's termination means. The engine takes the whole horizon at once: on
-    the C engine as a single native call where its results are exact and the task maps no actions itself, on the Warp
-    engine as launches that become one graph.
+    the C engine as a single native call where its results are exact and the task has neither ``control`` nor
+    ``substep``, which run step by step, on the Warp engine as launches that become one graph.
 
     Args:
         env: Worlds to roll out in; they belong to the rollouts from then on.
@@ -42,7 +42,7 @@ class OpenLoop:
     state: torch.Tensor
     """Where every world starts, (state_space.size,) float64."""
     actions: torch.Tensor
-    """Actions of each step, (horizon, nworld, nu); one that is not finite is set to zero."""
+    """Actions of each step, (horizon, nworld, nact); one that is not finite is set to zero."""
     reward: torch.Tensor
     """Reward of each step, (horizon, nworld)."""
     terminated: torch.Tensor
@@ -61,7 +61,7 @@ class OpenLoop:
             raise ValueError("open-loop rollouts need worlds that do not reset: make(..., autoreset=False)")
         self.env, self.worlds = env, env.worlds
         self.horizon = whole_number("horizon", horizon, low=1)
-        n, nu, task = env.nworld, env.action_space.size, env.task
+        n, nact, task = env.nworld, env.action_space.size, env.task
         if keys is not None and (keys.shape, keys.dtype, keys.device) != ((n,), wp.uint32, env.device):
             raise ValueError(
                 f"keys must be a wp.array of shape ({n},) and type uint32 on {env.device}, not of shape {keys.shape} "
@@ -73,7 +73,7 @@ class OpenLoop:
         check_fit(self._bytes_per_world(env, self.horizon), n, env.device)
         with wp.ScopedDevice(env.device):
             self._state = wp.zeros(env.state_space.size, dtype=wp.float64)
-            self._actions = wp.zeros((self.horizon, n, nu), dtype=float)
+            self._actions = wp.zeros((self.horizon, n, nact), dtype=float)
             # step by step, controls are made when their step comes
             self._controls = wp.zeros((self.horizon, n, 0 if stepwise else task.model.nu), dtype=float)
             self._reward = wp.zeros(rows, dtype=float)

@@ -278,8 +278,9 @@ class Task:
 
     ``s``, ``s0`` and ``s1`` are one world's fields: now, before the step, and after it. Fields of the position and
     velocity stages belong to that state; fields of the acceleration stage (forces, accelerations) are those of the last
-    substep. Controls are clipped to the model's ranges; costs see the action as given. ``rng`` is the world's random
-    stream: pass it to ``lw.uniform`` and ``lw.normal``.
+    substep. Each sensor follows its own stage; acceleration-stage sensors are those of the last substep. Controls are
+    clipped to the model's ranges; costs see the action as given. ``rng`` is the world's random stream: pass it to
+    ``lw.uniform`` and ``lw.normal``.
 
     A function may write the following fields where ``World`` lists them; any other write is refused:
 
@@ -291,6 +292,8 @@ class Task:
       ``sensordata``): these are computed afterwards.
     - ``startup``: model fields, which resets then leave as they are.
     - ``substep``: memory and lasting_memory. ``advance``: the same of ``s1``.
+
+    ``reject`` sees an initial state before it settles. While a new episode settles, no ``substep`` runs.
 
     An event belongs to the environment's randomness: the transition that was judged ends before it, the observation
     that follows shows it. It does not run in worlds that restart. Open-loop rollouts and planners leave events out.
@@ -332,8 +335,8 @@ class Task:
     draws: ClassVar[int] = 10
     """The most random initial states that a reset draws while ``reject`` returns True; the last is kept."""
     settle: ClassVar[int] = 0
-    """Substeps in which a new episode settles before its first observation, under the controls of its initial state;
-    its time then starts from 0."""
+    """Substeps in which a new episode, drawn and not rejected, settles before its first observation, under the
+    controls of its initial state and without ``substep``; its time then starts from 0."""
     planning: ClassVar[Planning] = Planning()
     """The task's settings for MPPI: those of the planner, and options and parameters of its worlds, as
     ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""

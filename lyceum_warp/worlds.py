@@ -110,9 +110,12 @@ class Worlds:
         for name, dtype in steps.OUTCOMES.items():
             setattr(self.outcome, name, wp.zeros(n, dtype=dtype))
             self.buffers[name] = torch_view(getattr(self.outcome, name))
-        self.metrics: list[Any] = [wp.zeros((n, len(task.metrics)), dtype=float) for _ in range(2)]
-        """The metrics of the last step, and their sums over its episode."""
-        self.outcome.metrics, self.outcome.episode_metrics = self.metrics
+        self.metrics: wp.array = wp.zeros((n, len(task.metrics)), dtype=float)
+        """The metrics of the last step, (nworld, number of metrics)."""
+        self.episode_metrics: wp.array = wp.zeros_like(self.metrics)
+        """Their sums over the episode of that step."""
+        self.outcome.metrics = self.metrics  # type: ignore[assignment]
+        self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
         self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
         self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
         self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}

@@ -4,6 +4,7 @@ import pytest
 import torch
 import warp as wp
 from conftest import SharedEnv
+from metered_task import Metered
 
 import lyceum_warp as lw
 from lyceum_warp.kernels import steps
@@ -23,6 +24,14 @@ def test_phases_run_by_hand_have_the_numbers_of_a_step(engine: str) -> None:
         for name in steps.OUTCOMES:
             assert torch.equal(getattr(env, name), getattr(by_hand, name)), f"{name} at step {i}"
     assert torch.equal(env.get_state(), by_hand.get_state())
+
+
+def test_metrics_of_a_step_and_of_its_episode_are_two_arrays() -> None:
+    env = lw.make(Metered, nworld=3)
+    for name in ("metrics", "episode_metrics"):
+        array = getattr(env.worlds, name)
+        assert array.shape == (3, 2)
+        assert [values.data_ptr() - array.ptr for values in getattr(env, name).values()] == [0, 4]
 
 
 def test_resets_and_restored_states_are_lists_of_phases(shared_env: SharedEnv) -> None:

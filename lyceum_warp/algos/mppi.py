@@ -79,13 +79,13 @@ class MPPI:
     settings: dict[str, Any]
     """The same settings with the options and parameters of the planner's worlds, as JSON can hold them."""
     actions: torch.Tensor
-    """The plan, (horizon, nu); the first row is what the last call returned."""
+    """The plan, (horizon, nact); the first row is what the last call returned."""
     nominal: torch.Tensor
-    """The plan that the last improvement started from, (horizon, nu)."""
+    """The plan that the last improvement started from, (horizon, nact)."""
     standard_noise: torch.Tensor
-    """The last improvement's standard normal numbers, (horizon, samples, nu)."""
+    """The last improvement's standard normal numbers, (horizon, samples, nact)."""
     sampled: torch.Tensor
-    """The last improvement's actions, (horizon, samples, nu)."""
+    """The last improvement's actions, (horizon, samples, nact)."""
     returns: torch.Tensor
     """The samples' returns, (samples,); minus infinity for those that failed."""
     weights: torch.Tensor

@@ -35,7 +35,7 @@ class MPPIConfig:
     """Temperature of the weights, in units of reward: a low one follows the best sample, a high one averages all."""
     noise: Numbers = 0.5
     """Noise around the plan, in units of the action: its standard deviation, as one number or one for each action, or
-    its covariance, (nu, nu)."""
+    its covariance, (nact, nact)."""
     smoothing: tuple[float, float, float] = (0.25, 0.8, 0.0)
     """Weights (b0, b1, b2) that smooth the noise n over time: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) from the third
     step on. (1, 0, 0) is white noise."""
@@ -71,19 +71,19 @@ class MPPIConfig:
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 
-    def noise_factor(self, nu: int) -> np.ndarray:
-        """The lower Cholesky factor of the noise's covariance, (nu, nu).
+    def noise_factor(self, nact: int) -> np.ndarray:
+        """The lower Cholesky factor of the noise's covariance, (nact, nact).
 
         Raises:
-            ValueError: ``noise`` is not for ``nu`` actions.
+            ValueError: ``noise`` is not for ``nact`` actions.
         """
         noise = np.asarray(self.noise)
-        if noise.shape in ((), (nu,)):
-            return np.diag(np.broadcast_to(noise, nu))
-        if noise.shape == (nu, nu):
+        if noise.shape in ((), (nact,)):
+            return np.diag(np.broadcast_to(noise, nact))
+        if noise.shape == (nact, nact):
             return np.linalg.cholesky(noise)
         raise ValueError(
-            f"noise must be a standard deviation, {nu} of them, or a positive definite covariance ({nu}, {nu}), "
+            f"noise must be a standard deviation, {nact} of them, or a positive definite covariance ({nact}, {nact}), "
             f"not {self.noise!r}"
         )
 

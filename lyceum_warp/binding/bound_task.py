@@ -1,6 +1,7 @@
 """A task bound to its model and its parameters, with its kernels."""
 
 import difflib
+import keyword
 import math
 import re
 from collections.abc import Collection, Mapping
@@ -30,6 +31,9 @@ _SPELLED = {
 
 _UNWRITTEN = 7.25e33
 """A number that no observation is likely to be."""
+
+_SPARE = 64
+"""Places after the end of a row in which a write that goes too far is found."""
 
 _MISSING = {"obs": 'the parts of its observation, as obs = {"position": 5}', "model": 'a model, as model = "robot.xml"'}
 
@@ -200,6 +204,11 @@ class BoundTask:
                 raise ValueError(f"the task {self.name!r} needs both, {name} = ... in the class and {name} in World")
         whole_number(f"draws of the task {self.name!r}", task.draws, low=1)
         whole_number(f"settle of the task {self.name!r}", task.settle, low=0)
+        if not isinstance(task.keyframe, str | None):
+            raise ValueError(
+                f"keyframe of the task {self.name!r} must be the name of one of the model's keyframes, as 'home', not "
+                f"{task.keyframe!r}"
+            )
         self._check_metrics()
         for name in task.lagged:
             if name not in self.types:
@@ -221,9 +230,14 @@ class BoundTask:
 
     def _check_metrics(self) -> None:
         metrics: Any = self.task.metrics
-        if isinstance(metrics, str) or not all(isinstance(name, str) and name for name in metrics):
+        if not isinstance(metrics, tuple | list) or not all(isinstance(name, str) and name for name in metrics):
             raise ValueError(
                 f"metrics of the task {self.name!r} must be names, as ('forward', 'cost'), not {metrics!r}"
+            )
+        if bad := [name for name in metrics if not name.isprintable() or not set(name).isdisjoint(",'\"")]:
+            raise ValueError(
+                f"the task {self.name!r} has the metric {bad[0]!r}: a metric's name, which is a column of metrics.csv, "
+                "must have no comma, quote or line break"
             )
         if twice := [name for name in metrics if list(metrics).count(name) > 1]:
             raise ValueError(f"the task {self.name!r} names the metric {twice[0]!r} twice: give each one name")
@@ -266,6 +280,12 @@ class BoundTask:
                 f"obs of the task {self.name!r} must name parts with sizes, or groups of them, of which one is "
                 f"'policy', not {given!r}"
             )
+        for group in given:
+            if not (isinstance(group, str) and group.isidentifier()) or keyword.iskeyword(group):
+                raise ValueError(
+                    f"obs of the task {self.name!r} has the group {group!r}: a group's name must be a Python name, as "
+                    "'critic', which observe_critic writes"
+                )
         return {group: self._layout(layout) for group, layout in given.items()}
 
     def _layout(self, layout: Mapping[str, Any]) -> dict[str, int]:
@@ -310,24 +330,61 @@ class BoundTask:
             wanted = _SPELLED.get(element, element) if array.ndim == 1 else f"Row[{_SPELLED.get(element, element)}]"
             raise ValueError(f"World.{name} of the task {self.name!r} must be declared as {wanted}")
 
-    def check_observations(self, batch: Any, params: wp.array, counters: Any) -> None:
-        """Let every group of observations be written into a row with room to spare, where no mistake can do damage.
+    def check_results(self, batch: Any, params: wp.array, counters: Any) -> None:
+        """Let functions write their rows with room to spare, where no mistake can do damage, for the first world.
 
         Raises:
-            ValueError: A function writes more or fewer numbers than ``obs`` declares, or writes not-a-number.
+            ValueError: An observation has more or fewer numbers than ``obs`` declares, or is not-a-number, or
+                ``control`` or ``measure`` writes past the end of its row.
         """
+        self._check_observations(batch, params, counters)
+        if self.kernels.control_worlds is not None:
+            inputs = self._with_copies(batch, self.writes["control"])
+            last = self._last_written(self.kernels.control_worlds, inputs, params, self.model.nu)
+            if last > self.model.nu:
+                raise ValueError(
+                    f"control of the task {self.name!r} writes {last} numbers into ctrl, but the model has "
+                    f"{self.model.nu}"
+                )
+        if self.kernels.measure_worlds is not None:
+            names = list(self.task.metrics)
+            last = self._last_written(self.kernels.measure_worlds, batch, params, len(names))
+            if last > len(names):
+                raise ValueError(f"measure of the task {self.name!r} writes {last} numbers, but metrics names {names}")
+
+    def _with_copies(self, batch: Any, names: Collection[str]) -> Any:
+        """A batch in which some fields are copies of the first world's."""
+        copied = self.kernels.Batch()
+        for name in self.types:
+            array = getattr(batch, name)
+            setattr(copied, name, wp.clone(array[:1]) if name in names and array.size else array)
+        return copied
+
+    def _last_written(self, kernel: wp.Kernel, batch: Any, params: wp.array, size: int) -> int:
+        """The number of places up to the last one that a function writes in a row of some size, with room to spare."""
+        naction = sum(self.task.actions.values()) if self.task.actions else self.model.nu
+        action = wp.zeros((1, naction), dtype=float, device=params.device)
+        last = 0
+        for unwritten in (math.nan, _UNWRITTEN):
+            row = wp.full((1, size + _SPARE), unwritten, dtype=float, device=params.device)
+            wp.launch(kernel, 1, [batch, params, action, row], device=params.device)
+            written = np.flatnonzero(_is_written(row.numpy()[0], unwritten))
+            last = max(last, int(written.max(initial=-1)) + 1)
+        return last
+
+    def _check_observations(self, batch: Any, params: wp.array, counters: Any) -> None:
         device = params.device
         mask = wp.full(1, True, dtype=bool, device=device)
         sizes = {group: sum(layout.values()) for group, layout in self.obs_layouts.items()}
-        written = {group: np.zeros(size + 64, dtype=bool) for group, size in sizes.items()}
+        written = {group: np.zeros(size + _SPARE, dtype=bool) for group, size in sizes.items()}
         for unwritten in (math.nan, _UNWRITTEN):
             rows = self.kernels.Observations()
             for group, size in sizes.items():
-                setattr(rows, group, wp.full((1, size + 64), unwritten, dtype=float, device=device))
+                setattr(rows, group, wp.full((1, size + _SPARE), unwritten, dtype=float, device=device))
             wp.launch(self.kernels.observe_worlds, 1, [mask, batch, params, counters, rows, rows], device=device)
             found = {group: getattr(rows, group).numpy()[0] for group in sizes}
             for group, row in found.items():
-                written[group] |= ~np.isnan(row) if math.isnan(unwritten) else row != np.float32(unwritten)
+                written[group] |= _is_written(row, unwritten)
         for group, size in sizes.items():
             self._check_written(observer_name(group), written[group], size, np.isnan(found[group][:size]))
 
@@ -341,3 +398,8 @@ class BoundTask:
         if bad.any():
             places = np.flatnonzero(bad).tolist()
             raise ValueError(f"{name} of the task {self.name!r} writes not-a-number into the places {places} of obs")
+
+
+def _is_written(row: np.ndarray, unwritten: float) -> np.ndarray:
+    """Which places no longer hold the number that says unwritten."""
+    return ~np.isnan(row) if math.isnan(unwritten) else row != np.float32(unwritten)

@@ -6,7 +6,7 @@ import difflib
 import inspect
 import sys
 import textwrap
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import warp as wp
@@ -59,7 +59,25 @@ class TaskSource:
                 group = name.removeprefix(GROUP_PREFIX)
                 if group not in groups:
                     raise ValueError(f"obs of the task {self.name!r} has no group {group!r}, which {name} writes")
+        self._check_module_groups(groups)
         return found
+
+    def _check_module_groups(self, groups: Collection[str]) -> None:
+        """Refuse a function of the module that looks like that of a group, where nothing in the module uses it."""
+        module = vars(sys.modules[self.task.__module__])
+        functions = {name: value for name, value in module.items() if isinstance(value, wp.Function)}
+        tasks = [kind for kind in (self.task, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
+        attributes = [value for task in tasks for value in vars(task).values()]
+        codes = [getattr(function.func, "__code__", None) for function in functions.values()]  # Warp's own have none
+        called = {name for code in codes if code is not None for name in code.co_names}
+        for name, function in functions.items():
+            group = name.removeprefix(GROUP_PREFIX)
+            if group == name or group in groups or name in called or any(function is value for value in attributes):
+                continue
+            kinds = tuple(map(self._kind, function.input_types.values()))
+            own = kinds in (FUNCTIONS["observe"].kinds, FUNCTIONS["observe"].all_kinds)  # not another task's
+            if own and not any(_may_list(task, group) for task in tasks):
+                raise ValueError(f"obs of the task {self.name!r} has no group {group!r}, which {name} writes")
 
     def _written(self, name: str) -> Any:
         """The value of a name in the class, in its module, or in those of the classes that it extends."""
@@ -144,6 +162,12 @@ class TaskSource:
                 close = difflib.get_close_matches(name, [f for f in FUNCTIONS if self.functions[f] is None], 1, 0.85)
                 if own and close:
                     raise ValueError(f"the task {self.name!r} has a function {name!r}: did you mean {close[0]}?")
+
+
+def _may_list(task: type[Task], group: str) -> bool:
+    """Whether a class lists a group of observations, or may do so, where ``obs`` is a method."""
+    obs = getattr(task, "obs", None)
+    return callable(obs) or (isinstance(obs, Mapping) and isinstance(obs.get(group), Mapping))
 
 
 def _origin(struct: Any) -> str:

@@ -48,7 +48,7 @@ class CheckedController:
             step: Step of the plant, for error messages.
 
         Returns:
-            The plan, (horizon, nu) float32, a copy on the CPU. A controller without a plan returns one action, which
+            The plan, (horizon, nact) float32, a copy on the CPU. A controller without a plan returns one action, which
             is a plan of horizon 1.
 
         Raises:

@@ -58,7 +58,7 @@ class PlanningController(Controller, Protocol):
 
     @property
     def actions(self) -> torch.Tensor:
-        """The last plan, (horizon, nu), finite. The first row is the action for the given state."""
+        """The last plan, (horizon, nact), finite. The first row is the action for the given state."""
         ...
 
     @property

@@ -48,7 +48,7 @@ class TimedPlan:
     step: int  # of the state from which it was made
     begun: float  # by the clock of the run
     seconds: float
-    actions: torch.Tensor  # (horizon, nu)
+    actions: torch.Tensor  # (horizon, nact)
 
 
 def step_limit(env: Env, steps: int | None) -> int:

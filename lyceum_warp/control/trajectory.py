@@ -52,7 +52,7 @@ class Trajectory:
     obs: torch.Tensor
     """Observations of the states, (steps + 1, nobs) float32. After a fault the last one is the last good one."""
     actions: torch.Tensor
-    """Actions that were applied, (steps, nu) float32."""
+    """Actions that were applied, (steps, nact) float32."""
     rewards: torch.Tensor
     """Rewards, (steps,) float32."""
     evals: torch.Tensor

@@ -1,6 +1,6 @@
 """Planning by sampling: controls of open-loop rollouts, noise around a plan, weights, and the weighted mean.
 
-Actions of samples are (horizon, nsample, nu), plans (horizon, nu).
+Actions of samples are (horizon, nsample, nact), plans (horizon, nact).
 """
 
 import warp as wp
@@ -81,7 +81,7 @@ def shift_plan(
     plan_in: wp.array2d[float], steps_in: wp.array[int], fill_in: wp.array[float], repeat: bool,
     nominal_out: wp.array2d[float],
 ):  # fmt: skip
-    """Move a plan forward in time and fill its end; launched over (horizon, nu)."""
+    """Move a plan forward in time and fill its end; launched over (horizon, nact)."""
     t, i = wp.tid()
     last = plan_in.shape[0] - 1
     source = t + steps_in[0]
@@ -93,7 +93,7 @@ def shift_plan(
 
 @wp.kernel(enable_backward=False)
 def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.array3d[float]):
-    """Draw standard normal numbers by (seed, sample, count, action, step); launched over (nsample, nu)."""
+    """Draw standard normal numbers by (seed, sample, count, action, step); launched over (nsample, nact)."""
     k, i = wp.tid()
     key = stream(world_key(seed_in[0], k), NOISE, 0)
     rng = stream(key, count_in[0], i)
@@ -122,7 +122,7 @@ def perturb(
     high_in: wp.array[float],
     action_out: wp.array3d[float],
 ):
-    """Add coloured, smoothed noise to a plan and clip the sum to the bounds; launched over (nsample, nu).
+    """Add coloured, smoothed noise to a plan and clip the sum to the bounds; launched over (nsample, nact).
 
     ``scale_in`` is the lower Cholesky factor L of the noise's covariance: n_t = L z_t for standard normal z_t.
     Smoothing follows trajopt: e_t = n_t in the first two steps, then e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2).

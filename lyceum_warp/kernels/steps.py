@@ -388,6 +388,23 @@ def make_kernels(
             if not all_finite(obs_out, w):
                 copy_observations(good_in, obs_out, w)
 
+    @kernel_for("control")
+    def control_worlds(
+        batch: Batch, params: wp.array[Params], action_in: wp.array2d[float], ctrl_out: wp.array2d[float]
+    ):
+        """Turn actions into controls and inputs, and nothing else; launched over (nworld,)."""
+        w = wp.tid()
+        control(view(batch, w), action_in[w], params[w % params.shape[0]], ctrl_out[w])
+
+    @kernel_for("measure")
+    def measure_worlds(
+        batch: Batch, params: wp.array[Params], action_in: wp.array2d[float], metrics_out: wp.array2d[float]
+    ):
+        """Measure transitions from states to themselves; launched over (nworld,)."""
+        w = wp.tid()
+        s = view(batch, w)
+        measure(s, action_in[w], s, params[w % params.shape[0]], metrics_out[w])
+
     # An open-loop rollout keeps its fields for all steps: row t * nworld + w is world w after t steps. The
     # transition of that row leads to the one nworld further, so `before` and `after` are the same arrays, shifted.
 
@@ -440,6 +457,8 @@ def make_kernels(
         reject_worlds=reject_worlds,
         run_events=run_events,
         observe_worlds=observe_worlds,
+        control_worlds=control_worlds,
+        measure_worlds=measure_worlds,
         judge_rows=judge_rows,
         advance_rows=advance_rows,
     )

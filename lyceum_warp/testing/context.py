@@ -69,7 +69,7 @@ class Context:
             env.rand_reset(self.seed if seed is None else seed)
 
     def actions(self, steps: int, salt: int = 0) -> torch.Tensor:
-        """Random actions within their bounds (-1 to 1 where there are none), (steps, nworld, nu)."""
+        """Random actions within their bounds (-1 to 1 where there are none), (steps, nworld, nact)."""
         env = self.a
         assert env.action_space.low is not None and env.action_space.high is not None
         low = torch.as_tensor(np.where(np.isfinite(env.action_space.low), env.action_space.low, -1.0))

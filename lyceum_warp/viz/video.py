@@ -32,7 +32,7 @@ def episode(env: Env, policy: Callable[[torch.Tensor], torch.Tensor], *, seed: i
 
     Args:
         env: An environment of one world, made with ``autoreset=False`` so that the last state is kept.
-        policy: Called with observations, (1, nobs); returns actions, (1, nu).
+        policy: Called with observations, (1, nobs); returns actions, (1, nact).
         seed: Seed of the initial state.
 
     Raises:

@@ -88,6 +88,41 @@ def test_an_observation_that_does_not_fit_obs_is_refused(case: str, task_file: T
         lw.make(file)
 
 
+CONTROL = "def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):\n"
+LONG_ROWS = {
+    "metrics": (
+        "def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):\n"
+        "    for i in range(3):\n        metrics[i] = s1.qpos[0]",
+        '    metrics = ("a", "b")\n',
+        r"measure of the task 'tiny' writes 3 numbers, but metrics names \['a', 'b'\]",
+    ),
+    "controls": (
+        f"{CONTROL}    for i in range(4):\n        ctrl[i] = wp.sqrt(-1.0)",
+        "",
+        "control of the task 'tiny' writes 4 numbers into ctrl, but the model has 3",
+    ),
+}
+
+
+@pytest.mark.parametrize(("function", "line", "message"), LONG_ROWS.values(), ids=LONG_ROWS)
+def test_a_function_that_writes_past_its_row_is_refused(function: str, line: str, message: str, tmp_path: Path) -> None:
+    file = tiny_task.write(tmp_path, tiny_task.with_function(function) + line)
+    with pytest.raises(ValueError, match=message) as caught:
+        lw.make(file, nworld=2)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_check_of_a_control_leaves_the_inputs_as_they_are(tmp_path: Path) -> None:
+    source = tiny_task.changed(
+        ("qpos: Row[float]", "qpos: Row[float]\n    qfrc_applied: Row[float]"),
+        ("class Tiny", f"@wp.func\n{CONTROL}    s.qfrc_applied[0] = 1.0\n\nclass Tiny"),
+    )
+    env = lw.make(tiny_task.write(tmp_path, source))
+    assert (env.field("qfrc_applied") == 0).all()
+    env.step()
+    assert env.field("qfrc_applied")[0, 0] == 1
+
+
 REWARD = "def reward(s0: World, action: Row[float], s1: World, p: Params)"
 NOT_COMPILED = {
     "unknown field": (f"{REWARD} -> float:\n    return s1.qvel[0]", "can't compile the functions of the task .*qvel"),

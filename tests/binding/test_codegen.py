@@ -43,6 +43,8 @@ def test_the_batch_has_every_field_of_world_with_one_more_axis(tmp_path: Path) -
 
 
 OPTIONAL = {
+    "control": ("control_worlds",),
+    "measure": ("measure_worlds",),
     "advance": ("advance_memory", "advance_rows"),
     "substep": ("substep_memory",),
     "startup": ("start_worlds",),

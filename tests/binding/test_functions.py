@@ -143,3 +143,27 @@ def test_a_subclass_inherits_functions_and_structs(tmp_path: Path) -> None:
 def test_every_function_of_the_table_is_in_the_help_of_task() -> None:
     assert all(function.signature in str(Task.__doc__) for function in FUNCTIONS.values())
     assert lw.Task is Task
+
+
+CRITIC = "@wp.func\ndef observe_critic(s: World, p: Params, obs: Row[float]):\n    obs[0] = s.qpos[0]\n\n"
+OBSERVE = "def observe(s: World, p: Params, obs: Row[float]):\n"
+USERS = {
+    "a class that lists the group": "\nclass Other(lw.Task):\n    obs = {'policy': {'x': 1}, 'critic': {'x': 1}}\n",
+    "a class that may list it": "\nclass Other(lw.Task):\n    obs = staticmethod(lambda p: {'x': 1})\n",
+    "a class that has it as observe": "\nclass Other(lw.Task):\n    observe = observe_critic\n",
+    "a function that calls it": f"\n@wp.func\n{OBSERVE.replace('observe', 'all')}    observe_critic(s, p, obs)\n",
+    "none": "",
+}
+
+
+@pytest.mark.parametrize("user", USERS)
+def test_a_function_that_looks_like_that_of_a_group_must_be_used_in_its_module(user: str, tmp_path: Path) -> None:
+    file = tiny_task.write(tmp_path, tiny_task.changed(("class Tiny", f"{CRITIC}class Tiny")) + USERS[user])
+    task = find_task(f"{file}:Tiny")
+    source = TaskSource(task, task_name(task))
+    if user == "none":
+        with pytest.raises(ValueError, match="no group 'critic', which observe_critic writes"):
+            source.group_functions(["policy"])
+    else:
+        assert list(source.group_functions(["policy"])) == ["policy"]
+    assert list(source.group_functions(["policy", "critic"])) == ["policy", "critic"]

@@ -457,10 +457,28 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
         [line("observe_critic = observe")],
         "obs of the task 'tiny' has no group 'critic', which observe_critic writes",
     ),
+    "a function of the module without its group": (
+        [function("def observe_critic(s: World, p: Params, obs: Row[float]):\n    obs[0] = 1.0")],
+        "obs of the task 'tiny' has no group 'critic', which observe_critic writes",
+    ),
+    "a group of two words": (
+        [('obs = {"x": 1}', 'obs = {"policy": {"x": 1}, "my group": {"x": 1}}')],
+        "obs of the task 'tiny' has the group 'my group': a group's name must be a Python name, as 'critic'",
+    ),
+    "a group with the name of a keyword": (
+        [('obs = {"x": 1}', 'obs = {"policy": {"x": 1}, "class": {"x": 1}}')],
+        "obs of the task 'tiny' has the group 'class': a group's name must be a Python name",
+    ),
     "groups without a policy": (
         [('obs = {"x": 1}', 'obs = {"actor": {"x": 1}, "critic": {"x": 1}}')],
         "must name parts with sizes, or groups of them, of which one is 'policy'",
     ),
+    "metrics as a number": ([line("metrics = 5")], r"metrics of the task 'tiny' must be names, .*, not 5"),
+    "a comma in a metric's name": (
+        [line('metrics = ("a,b",)')], "the task 'tiny' has the metric 'a,b': .* no comma, quote or line break",
+    ),
+    "a quote in a metric's name": ([line("""metrics = ("a'", 'b"')""")], r"""has the metric "a'": """),
+    "a line break in a metric's name": ([line(r'metrics = ("a\nb",)')], r"has the metric 'a\\nb': "),
     "a metric's name twice": (
         [line('metrics = ("a", "b", "a")'),
          function(f"def measure({STEP}, metrics: Row[float]):\n    metrics[0] = 1.0")],
@@ -475,6 +493,9 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     ),
     "metrics as one name": ([line('metrics = "forward"')], r"metrics of the task 'tiny' must be names, as \('forward'"),
     "a keyframe that is not there": ([line('keyframe = "home"')], "'home'"),
+    "a keyframe by its number": (
+        [line("keyframe = 0")], "keyframe of the task 'tiny' must be the name of .* keyframes, as 'home', not 0",
+    ),
     "actions without control": ([line('actions = {"speed": 1}')], "has actions of its own, so it needs control"),
     "actions without sizes": ([line('actions = ("speed",)')], r"must be names with sizes, as \{'speed': 1\}"),
     "lasting memory that World does not list": (
