@@ -198,7 +198,8 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
     constants = _FIELDS[name]
     if name in _WRAPPED and np.isin(model.wrap_type, _WRAPS).any():
         constants |= _POSES
-    shape: tuple[int, ...] = np.shape(getattr(model.opt if name in _OPTIONS else model, name))
+    # a single number is a row of one element, so that a task can write it
+    shape: tuple[int, ...] = np.shape(getattr(model.opt if name in _OPTIONS else model, name)) or (1,)
     return _described(name, shape, constants)
 
 

@@ -19,7 +19,7 @@ ANT = gymnasium_model("ant.xml").compile()
         ("body_quat", (ANT.nbody,), wp.vec4, 4 * ANT.nbody),
         ("actuator_gainprm", (ANT.nu,), vec10, 10 * ANT.nu),
         ("gravity", (3,), wp.float32, 3),
-        ("density", (), wp.float32, 1),
+        ("density", (1,), wp.float32, 1),
         ("tendon_stiffness", (0,), wp.float32, 0),
     ],
 )
