@@ -28,6 +28,9 @@ _BATCH_BYTES = 150
 _MJDATA_BYTES = 165_000
 """An MjData without its buffer and arena, most of it statistics of the solver (measured with MuJoCo 4.0)."""
 
+_MOST_MASKS = 16
+"""Masks whose views are kept; an environment has fewer."""
+
 
 class MujocoEngine(Engine):
     """Worlds as rows of float64 state in ``mujoco.batch.Batch``, with float32 copies of the fields.
@@ -87,12 +90,24 @@ class MujocoEngine(Engine):
         self._early_columns = np.isin(np.arange(model.nsensordata), early_sensor_columns(model))
         self._written = [field for field in kept if field.written]
         self._rollouts: dict[Any, NativeRollout | None] = {}
+        self._masks: dict[int, tuple[wp.array, np.ndarray]] = {}
         self._values: dict[str, np.ndarray] = {}
         for name, varied in self.dynamics.items():
             self.arrays[name] = self._nominal_rows(varied, nworld)
             self._values[name] = flat(self.arrays[name]).numpy()
         self._models = WorldModels(self.batch, self.dynamics.values())
         self._models.apply(self._values)
+
+    def _on_host(self, mask: wp.array) -> np.ndarray:
+        """A mask's memory for NumPy. To make such a view takes longer than to look at it, so it is kept."""
+        kept, view = self._masks.get(id(mask), (None, None))
+        if kept is mask:
+            assert view is not None
+            return view
+        made: np.ndarray = mask.numpy()
+        if len(self._masks) < _MOST_MASKS:
+            self._masks[id(mask)] = mask, made
+        return made
 
     def _alias(self, rows: np.ndarray) -> wp.array:
         return wp.array(rows, dtype=wp.float64, device=self.device, copy=False)
@@ -199,10 +214,10 @@ class MujocoEngine(Engine):
         return NativeRollout(batch, steps, nstep, fields, self.snapshots, self.dynamics.values())
 
     def apply_model(self, mask: wp.array) -> None:
-        self._models.apply(self._values, mask.numpy())
+        self._models.apply(self._values, self._on_host(mask))
 
     def settle(self, mask: wp.array, nstep: int) -> None:
-        chosen = mask.numpy()
+        chosen = self._on_host(mask)
         if nstep == 0 or not chosen.any():
             return
         with errors_as_warnings(self.batch):
@@ -246,7 +261,7 @@ class MujocoEngine(Engine):
         self._read_state_fields(mask)
 
     def _forward(self, mask: wp.array, stage: Stage, fields: list[Field], *, early: bool = False) -> None:
-        chosen = mask.numpy()
+        chosen = self._on_host(mask)
         if stage > Stage.NONE and chosen.any():
             with errors_as_warnings(self.batch):
                 self.batch.forward(ids=chosen, stage=stage)

@@ -43,20 +43,22 @@ class WorldModels:
             values: By name, (nworld, size) float32.
             mask: Which worlds; None for all.
         """
-        derive = self._stale if mask is None else self._stale & mask
+        worlds = np.arange(self.batch.nsim) if mask is None else np.flatnonzero(mask)
+        if not worlds.size:  # as in most steps of few worlds
+            return
+        derive = np.zeros(self.batch.nsim, dtype=bool)
+        derive[worlds] = self._stale[worlds]
         for name, rows in self._rows.items():
-            given, applied, own = values[name], self._applied[name], self._own[name]
-            different = given.view(np.int32) != applied.view(np.int32)  # bits, so that NaN equals itself
+            given, applied = values[name][worlds], self._applied[name]
+            # bits, so that NaN equals itself
+            different = (given.view(np.int32) != applied[worlds].view(np.int32)).any(axis=1)
             if not different.any():
                 continue
-            changed = different.any(axis=1)
-            if mask is not None:
-                changed &= mask
-            new = given[changed]
+            changed, new, own = worlds[different], given[different], self._own[name]
             applied[changed] = new
             rows[changed] = np.where(new == own.astype(np.float32), own, new)
             if name in self._follows:
-                derive = derive | changed
+                derive[changed] = True
         if derive.any():
             self._set_const(derive)
 
