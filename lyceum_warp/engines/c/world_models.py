@@ -27,12 +27,15 @@ class WorldModels:
         self._follows = {field.name for field in self.fields if field.constants}
         self._rows: dict[str, np.ndarray] = {}
         self._own: dict[str, np.ndarray] = {}
+        self._rounded: dict[str, np.ndarray] = {}
         self._applied: dict[str, np.ndarray] = {}
         for field in self.fields:
             rows = batch.expand(f"opt.{field.name}" if field.option else field.name)
             self._rows[field.name] = rows.reshape(batch.nsim, field.size)
             self._own[field.name] = field.value(batch.model).reshape(field.size).copy()
-            self._applied[field.name] = self._rows[field.name].astype(np.float32)
+            self._rounded[field.name] = self._own[field.name].astype(np.float32)
+            if field.name in self._follows:
+                self._applied[field.name] = self._rows[field.name].astype(np.float32)
         # constants that were computed once are computed by the same code for every value, also for the model's own
         self._stale = np.full(batch.nsim, bool(self._follows))
 
@@ -43,24 +46,22 @@ class WorldModels:
             values: By name, (nworld, size) float32.
             mask: Which worlds; None for all.
         """
-        worlds = np.arange(self.batch.nsim) if mask is None else np.flatnonzero(mask)
-        if not worlds.size:  # as in most steps of few worlds
+        if mask is not None and 1 not in mask.tobytes():  # as in most steps; faster than NumPy's own search
             return
-        derive = np.zeros(self.batch.nsim, dtype=bool)
-        derive[worlds] = self._stale[worlds]
+        worlds = np.arange(self.batch.nsim) if mask is None else np.flatnonzero(mask)
+        derive = self._stale[worlds]
         for name, rows in self._rows.items():
-            given, applied = values[name][worlds], self._applied[name]
-            # bits, so that NaN equals itself
-            different = (given.view(np.int32) != applied[worlds].view(np.int32)).any(axis=1)
-            if not different.any():
-                continue
-            changed, new, own = worlds[different], given[different], self._own[name]
-            applied[changed] = new
-            rows[changed] = np.where(new == own.astype(np.float32), own, new)
+            given, own = values[name][worlds], self._own[name]
+            rows[worlds] = np.where(given == self._rounded[name], own, given)
             if name in self._follows:
-                derive[changed] = True
+                applied = self._applied[name]
+                # bits, so that NaN equals itself
+                derive = derive | (given.view(np.int32) != applied[worlds].view(np.int32)).any(axis=1)
+                applied[worlds] = given
         if derive.any():
-            self._set_const(derive)
+            chosen = np.zeros(self.batch.nsim, dtype=bool)
+            chosen[worlds[derive]] = True
+            self._set_const(chosen)
 
     def _set_const(self, worlds: np.ndarray) -> None:
         """Recompute constants; a world where MuJoCo refuses to gets a warning, and is tried again next time."""
