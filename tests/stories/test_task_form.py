@@ -145,7 +145,7 @@ def test_model_fields_can_be_set_in_an_environment_of_any_task(engine: str) -> N
     friction = torch.full((5, 3), 0.5)
     env.set_dynamics(torch.tensor([False, False, True]), geom_friction=friction)
     assert torch.equal(env.field("geom_friction")[2], friction)
-    assert torch.equal(env.field("geom_friction")[0], torch.from_numpy(env.model.geom_friction).float())
+    assert torch.equal(env.field("geom_friction")[0], torch.tensor(env.model.geom_friction).float())
     for _ in range(3):
         env.step(torch.full((3, 3), 0.5))
     qpos = env.field("qpos")
