@@ -101,6 +101,8 @@ class Env:
     """The task's metrics of the last step by their names, each (nworld,), float32."""
     episode_metrics: dict[str, torch.Tensor]
     """The sums of the metrics over the episode that the last step belongs to, each (nworld,), float32."""
+    episode_metric_sums: torch.Tensor
+    """The same as one tensor, (nworld, number of metrics), in the order of their names."""
     success: torch.Tensor
     """Whether the task's goal is met, (nworld,), bool."""
     done: torch.Tensor
@@ -172,6 +174,7 @@ class Env:
                 dict(zip(self.task.task.metrics, torch_view(array).unbind(1), strict=True))
                 for array in (worlds.metrics, worlds.episode_metrics)
             )
+            self.episode_metric_sums = torch_view(worlds.episode_metrics)
             self.reward_space = self.eval_space = Space()
             self._fields = {name: torch_view(array) for name, array in worlds.fields.items()}
             self.time, self.episode_step = self._fields["time"], torch_view(worlds.counters.step)

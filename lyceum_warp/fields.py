@@ -103,7 +103,7 @@ _KINDS = {
     "subtree_angmom".split(),
     _Kind.mjOBJ_BODY,
 ) | dict.fromkeys(("xanchor", "xaxis"), _Kind.mjOBJ_JOINT)  # fmt: skip
-"""The objects of which each has one row in a field, by the field's name or by what it begins with."""
+"""The kind of object that has one row in a field, by the field's name or its prefix."""
 
 _QPOS = (_Kind.mjOBJ_JOINT, "jnt_qposadr", "nq")
 _DOFS = (_Kind.mjOBJ_JOINT, "jnt_dofadr", "nv")

@@ -94,7 +94,7 @@ class OpenLoop:
                     buffer = wp.zeros((rows + n, *live.shape[1:]), dtype=live.dtype)
                     self._fields[name] = buffer.reshape((self.horizon + 1, *live.shape))
                 for batch, start in ((self._before, 0), (self._after, n), (self._last, rows)):
-                    # of no numbers there is no slice
+                    # Warp cannot slice an array without elements
                     part = buffer[start : min(start + rows, rows + n)] if buffer.size else with_memory(buffer)
                     setattr(batch, name, part)
         self._memories = {name: self._fields.pop(name) for name in MEMORIES if name in self._fields}

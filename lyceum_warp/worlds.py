@@ -210,7 +210,7 @@ class Worlds:
         return Phase(every[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
     def _transition_phases(self) -> list[Phase]:
-        """From a state to the next one, and what it is worth."""
+        """The transition to the next state, and its judgement."""
         return [Phase("act", self.act), *self.physics_phases(), Phase("judge", self._judge_step)]
 
     def physics_phases(self) -> list[Phase]:

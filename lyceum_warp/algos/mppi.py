@@ -50,8 +50,8 @@ class MPPI:
     The planner simulates in worlds of its own, one for each sample. It controls a plant: an environment, with
     ``plan(env.get_state()[0])``, or a robot, with ``plan(plan.state_of(qpos=..., qvel=..., time=...))``. The plant's
     model, time step and parameters may differ from the planner's. Randomness is counted: a plan depends on the seed,
-    on the number of plans before it, and on the plan to start from. What a task draws in its functions, every sample
-    draws for itself, from the planner's seed: a plan does not know what the plant will draw.
+    on the number of plans before it, and on the plan to start from. A task's functions draw from streams of each
+    sample's own, seeded by the planner: a plan cannot know what the plant will draw.
 
     A task's ``planning`` (see ``lw.Planning``) gives settings of the planner, and options and parameters of its
     worlds. Arguments replace what the task gives.
@@ -115,7 +115,10 @@ class MPPI:
         self.env.reset()
         self.timestep = self.env.timestep
         self._initial = self.env.get_state()[0]
-        for name, nominal in self.env.engine.nominal.items():  # a robot is not a world that startup has drawn
+        for (
+            name,
+            nominal,
+        ) in self.env.engine.nominal.items():  # a robot has the nominal model, not one that startup drew
             self._initial[self.env.state_space.parts[name]] = torch_view(flat(nominal))[0].double()
         with wp.ScopedDevice(self.env.device):
             self._keys = wp.zeros(self.samples, dtype=wp.uint32)

@@ -89,10 +89,10 @@ class Rollout:
             if group != "policy":
                 self.obs_groups[group] = self._stored(env.obs_groups[group], self._rows_before)
                 self.final_obs_groups[group] = self._stored(env.final_obs_groups[group], self._rows_after)
-        self.episode_metrics = {
-            name: self._stored(sums.unsqueeze(-1), self._rows_after).squeeze(-1)
-            for name, sums in env.episode_metrics.items()
-        }
+        self.episode_metrics = {}
+        if env.episode_metrics:
+            stored = self._stored(env.episode_metric_sums, self._rows_after)
+            self.episode_metrics = dict(zip(env.episode_metrics, stored.unbind(-1), strict=True))
         inputs = (env.obs, env.action, env.episode_step)
         outputs = (env.final_obs, env.reward, env.eval, env.terminated, env.done, env.success, env.done_reason)
         self._inputs, self._outputs = [wp.from_torch(t) for t in inputs], [wp.from_torch(t) for t in outputs]

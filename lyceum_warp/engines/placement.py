@@ -217,7 +217,7 @@ def _options_of(factory: EngineFactory) -> list[str] | None:
 def _contract(
     factory: EngineFactory, name: str, dynamics: list[ModelField], initial: np.ndarray | None
 ) -> dict[str, Any]:
-    """Those of the contract's later arguments that are used; engines that know nothing of them do without."""
+    """The arguments ``dynamics`` and ``initial`` where they are used, so that an engine needs them only then."""
     used = {"dynamics": dynamics or None, "initial": initial}
     contract = {key: value for key, value in used.items() if value is not None}
     parameters = inspect.signature(factory).parameters.values()

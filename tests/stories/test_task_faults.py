@@ -151,4 +151,6 @@ def test_an_event_in_memory_leaves_the_physics_in_double_precision() -> None:
 
 def test_the_memory_of_a_world_counts_its_model_fields() -> None:
     drawn, plain = lw.make("hopper", dynamics=["body_mass", "geom_friction"]), lw.make("hopper")
-    assert drawn.bytes_per_world > plain.bytes_per_world
+    state = 8 * (drawn.state_space.shape[0] - plain.state_space.shape[0])
+    assert state == 8 * 20  # a number of the state takes eight bytes
+    assert drawn.bytes_per_world > plain.bytes_per_world + state

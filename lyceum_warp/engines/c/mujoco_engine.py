@@ -99,15 +99,13 @@ class MujocoEngine(Engine):
         self._models.apply(self._values)
 
     def _on_host(self, mask: wp.array) -> np.ndarray:
-        """A mask's memory for NumPy. To make such a view takes longer than to look at it, so it is kept."""
-        kept, view = self._masks.get(id(mask), (None, None))
-        if kept is mask:
-            assert view is not None
-            return view
-        made: np.ndarray = mask.numpy()
+        """A mask's memory as a NumPy array. The view is kept, because making it takes longer than reading it."""
+        if (kept := self._masks.get(id(mask))) is not None:  # the dict keeps the mask, so that no other has its id
+            return kept[1]
+        view: np.ndarray = mask.numpy()
         if len(self._masks) < _MOST_MASKS:
-            self._masks[id(mask)] = mask, made
-        return made
+            self._masks[id(mask)] = mask, view
+        return view
 
     def _alias(self, rows: np.ndarray) -> wp.array:
         return wp.array(rows, dtype=wp.float64, device=self.device, copy=False)

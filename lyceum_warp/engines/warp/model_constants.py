@@ -54,7 +54,8 @@ class ModelConstants:
             self._rows = ModelRows(put, [*names, *self._outputs], size, written - set(self._outputs))
             self._scratch = mjw.make_data(model, nworld=size, nconmax=1, njmax=1)
             self._given = [flat(getattr(owner(put, name), name)).view(wp.int32) for name in names]
-            self._applied = [wp.full_like(given, -1) for given in self._given]  # the bits of no number
+            # the bits of a NaN, from which every value differs
+            self._applied = [wp.full_like(given, -1) for given in self._given]
             self._changed = wp.zeros(nworld, dtype=bool)
             # weights that are 0 in MuJoCo stay 0, and bodies with sliders only have those of their mass
             self._weighs: wp.array = wp.array(model.body_invweight0 > 0, dtype=wp.vec2)

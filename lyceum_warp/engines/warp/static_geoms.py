@@ -34,6 +34,8 @@ class StaticGeoms:
         """Compute their poses in the masked worlds of a data; made of launches."""
         if self._geoms.size:
             fields = [model.geom_bodyid, model.body_parentid]
-            fields += [model.geom_pos, model.geom_quat, model.body_pos, model.body_quat]
+            # quaternions as numbers in MuJoCo's order, which Warp's type would take for another
+            geom_quat, body_quat = model.geom_quat.view(wp.vec4), model.body_quat.view(wp.vec4)
+            fields += [model.geom_pos, geom_quat, model.body_pos, body_quat]
             args = [mask, self._geoms, *fields, data.geom_xpos, data.geom_xmat]
             wp.launch(place_geoms, (data.nworld, self._geoms.size), args, device=mask.device)

@@ -377,7 +377,7 @@ def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> muj
 
 
 def _check_sdf_plugins(model: mujoco.MjModel) -> None:
-    """Refuse plugins whose distance function MuJoCo Warp leaves to its user, who has not written it."""
+    """Refuse SDF plugins unless their distance function was registered with MuJoCo Warp, which has none itself."""
     if (model.geom_plugin >= 0).any() and collision_sdf.user_sdf.func.__module__ == collision_sdf.__name__:
         raise NotImplementedError("it has no functions of SDF plugins")
 
