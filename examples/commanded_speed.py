@@ -16,7 +16,7 @@ GAIT = 0.4 * np.sin(np.pi * np.arange(20)[:, None] / 10 + np.array([0.0, 0.8, 1.
 
 def cheetah() -> mujoco.MjSpec:
     """Gymnasium's model with a touch sensor under each foot and a crouched keyframe."""
-    spec = lw.gymnasium_model("half_cheetah.xml")
+    spec = lw.gymnasium_model("half_cheetah.xml").spec()
     for foot in ("bfoot", "ffoot"):
         spec.body(foot).add_site(name=foot, pos=[0.0, 0.0, -0.1], size=[0.15, 0.15, 0.15])
         spec.add_sensor(name=foot, type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=foot)

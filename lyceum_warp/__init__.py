@@ -14,7 +14,6 @@ from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.value import ValueFunction
-from lyceum_warp.binding.models import gymnasium_model, gymnasium_robotics_model
 from lyceum_warp.binding.registry import register, task_names
 from lyceum_warp.control.control_report import ControlReport, control_report
 from lyceum_warp.control.controller import Controller, PlanningController
@@ -40,6 +39,18 @@ from lyceum_warp.kernels.rotations import (
     quat_to_mat,
     quat_to_rotvec,
 )
+from lyceum_warp.kernels.terms import (
+    Sigmoid,
+    all_inside,
+    angle_between,
+    body_velocity,
+    inside,
+    local_velocity,
+    put,
+    sum_squares,
+    tolerance,
+)
+from lyceum_warp.model_files import ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, package_model
 from lyceum_warp.openloop import OpenLoop
 from lyceum_warp.options import EnvOptions, PhysicsOptions
 from lyceum_warp.runs import load, load_value
@@ -78,6 +89,7 @@ __all__ = [
     "GaussianPolicy",
     "Iteration",
     "MPPIConfig",
+    "ModelFile",
     "NPGConfig",
     "OpenLoop",
     "PhysicsOptions",
@@ -85,12 +97,16 @@ __all__ = [
     "PlanningController",
     "Rollout",
     "Row",
+    "Sigmoid",
     "Task",
     "Trajectory",
     "ValueFunction",
     "act",
     "actuator",
+    "all_inside",
+    "angle_between",
     "body",
+    "body_velocity",
     "camera",
     "control",
     "control_async",
@@ -102,12 +118,17 @@ __all__ = [
     "geom",
     "gymnasium_model",
     "gymnasium_robotics_model",
+    "inside",
     "joint",
     "load",
     "load_value",
+    "local_velocity",
     "make",
+    "menagerie_model",
     "mocap",
     "normal",
+    "package_model",
+    "put",
     "qpos",
     "quat",
     "quat_angle",
@@ -125,8 +146,10 @@ __all__ = [
     "register",
     "sensor",
     "site",
+    "sum_squares",
     "task_names",
     "tendon",
+    "tolerance",
     "uniform",
     "vec10",
 ]

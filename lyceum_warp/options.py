@@ -14,9 +14,10 @@ from typing import Any, TypeAlias
 import mujoco
 
 from lyceum_warp.docstrings import attribute_docs, document_attributes, listed
+from lyceum_warp.model_files import ModelFile
 from lyceum_warp.validate import check_kind, whole_number
 
-ModelSource: TypeAlias = str | Path | mujoco.MjSpec
+ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
 """Where a model comes from: a file, or an MjSpec."""
 
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}

@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
+import mujoco
 import warp as wp
 
 from lyceum_warp.docstrings import document_attributes
@@ -303,8 +304,8 @@ class Task:
     """
 
     model: ClassVar[Any]
-    """The model: a file (relative to the task's own file, or one that gymnasium ships), an MjSpec, or a static method
-    without arguments that returns one."""
+    """The model: a file (relative to the task's own file, or one that gymnasium ships), a file of another package as
+    ``lw.package_model(...)`` names it, an MjSpec, or a static method without arguments that returns one of these."""
     frame_skip: ClassVar[int] = 1
     """Substeps in a step."""
     obs: ClassVar[Any]
@@ -337,12 +338,19 @@ class Task:
     settle: ClassVar[int] = 0
     """Substeps in which a new episode, drawn and not rejected, settles before its first observation, under the
     controls of its initial state and without ``substep``; its time then starts from 0."""
+    gymnasium: ClassVar[str | None] = None
+    """Id of the Gymnasium environment whose model, observation, reward, termination, reset and parameters the task
+    has, as "Hopper-v5"; None where there is no such environment."""
     planning: ClassVar[Planning] = Planning()
     """The task's settings for MPPI: those of the planner, and options and parameters of its worlds, as
     ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
 
     # World, Params and functions of the class's module when the class was made; each subclass has its own
     scope: ClassVar[dict[str, Any]]
+
+    @staticmethod
+    def edit_model(spec: mujoco.MjSpec) -> None:
+        """Change the model before it is compiled; also a model that ``make`` was given. Default: keeps it."""
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)

@@ -70,7 +70,7 @@ def test_too_little_memory_of_the_c_engine_is_a_fault() -> None:
     """
     found = Done(0)
     for memory in range(3000, 14_000, 1000):
-        spec = lw.gymnasium_model("hopper.xml")
+        spec = lw.gymnasium_model("hopper.xml").spec()
         spec.memory = memory
         env, clean = hopper("mujoco", model=spec), hopper("mujoco")
         lay_down(env, BAD)
@@ -111,7 +111,7 @@ def test_any_other_overflow_of_the_warp_engine_is_an_engine_warning() -> None:
     """Here a contact sensor has more matches than room."""
 
     def make() -> lw.Env:
-        spec = lw.gymnasium_model("hopper.xml")
+        spec = lw.gymnasium_model("hopper.xml").spec()
         sensor = spec.add_sensor(
             name="touch", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=mujoco.mjtObj.mjOBJ_GEOM, objname="floor"
         )
@@ -252,11 +252,11 @@ def test_a_model_that_mujoco_refuses_is_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="MuJoCo refuses the model .*mass"):
         lw.make("hopper", model=spec)
     with pytest.raises(ValueError, match="not a compiled MjModel: give its MjSpec"):
-        lw.make("hopper", model=lw.gymnasium_model("hopper.xml").compile())
+        lw.make("hopper", model=lw.gymnasium_model("hopper.xml").spec().compile())
 
 
 def test_a_model_that_mujoco_warp_refuses_runs_on_the_c_engine() -> None:
-    spec = lw.gymnasium_model("hopper.xml")
+    spec = lw.gymnasium_model("hopper.xml").spec()
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     for i in range(60):
         bead = spec.worldbody.add_body(pos=(0, 3, 1 + i))
@@ -271,7 +271,7 @@ def test_a_missing_gymnasium_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "gymnasium" else find(name, *a))
     with pytest.raises(FileNotFoundError, match="not installed: pip install 'gymnasium"):
-        lw.gymnasium_model("hopper.xml")
+        lw.gymnasium_model("hopper.xml").spec()
 
 
 @pytest.fixture(scope="module")

@@ -4,11 +4,11 @@ import mujoco
 import pytest
 import warp as wp
 
-from lyceum_warp.binding.models import gymnasium_model
 from lyceum_warp.fields import vec10
 from lyceum_warp.model_fields import Constants, ModelField, check_simple, describe_model_field
+from lyceum_warp.model_files import gymnasium_model
 
-ANT = gymnasium_model("ant.xml").compile()
+ANT = gymnasium_model("ant.xml").spec().compile()
 
 
 @pytest.mark.parametrize(

@@ -39,10 +39,33 @@ _MISSING = {"obs": 'the parts of its observation, as obs = {"position": 5}', "mo
 
 
 def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSpec:
-    """A task's model, or another one that is given for it, editable; see ``models.load_spec``."""
+    """A task's model, or another one that is given for it, as the task edits it; see ``models.load_spec``."""
+    return _edited(task, _read_spec(task, model))
+
+
+def _read_spec(task: type[Task], model: ModelSource | None) -> mujoco.MjSpec:
+    """The model before the task's ``edit_model``."""
     if model is not None:
         return models.load_spec(model)
     return models.load_spec(task.model() if callable(task.model) else task.model, task)
+
+
+def _edited(task: type[Task], spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """A copy of a model after the task's ``edit_model``."""
+    copy = spec.copy()
+    try:
+        changed: Any = task.edit_model(copy)
+    except Exception as error:
+        raise ValueError(
+            f"edit_model of the task {task_name(task)!r} fails on the model {spec.modelname!r}: "
+            f"{type(error).__name__}: {error}"
+        ) from error
+    if changed is not None:
+        raise ValueError(
+            f"edit_model of the task {task_name(task)!r} returns {type(changed).__name__}: it must change the spec in "
+            "place and return None"
+        )
+    return copy
 
 
 def check_field_name(name: str) -> None:
@@ -100,9 +123,9 @@ class BoundTask:
         """The fields of World that each function writes, by the functions' names."""
         own = [name for name in named if is_data_field(name)]
         of_model = [name for name in named if name not in own]
-        self.spec = task_spec(task, model)
+        self.spec = _read_spec(task, model)
         """The model as it was read: other environments of the same task are made from it, not from its source."""
-        self.model = models.compile_model(self.spec.copy(), own, physics, varied={*of_model, *dynamics})
+        self.model = models.compile_model(_edited(task, self.spec), own, physics, varied={*of_model, *dynamics})
         self._check_actions()
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.frame_skip = whole_number(f"frame_skip of the task {self.name!r}", skip, low=1)

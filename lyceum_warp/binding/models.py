@@ -1,8 +1,6 @@
 """Where a task's model comes from, and what is changed in it so that both engines run the same physics."""
 
-import dataclasses
 import difflib
-import importlib.util
 import logging
 import sys
 import warnings
@@ -14,58 +12,11 @@ import numpy as np
 
 from lyceum_warp.fields import ON_DEMAND, SENSED
 from lyceum_warp.model_fields import MOVED_INERTIA
+from lyceum_warp.model_files import ModelFile, gymnasium_model, read_spec
 from lyceum_warp.mujoco_log import quiet
 from lyceum_warp.options import CONES, INTEGRATORS, ModelSource, PhysicsOptions
 
 log = logging.getLogger(__name__)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Shipped:
-    """A package that is there for the model files in it, and is never imported."""
-
-    package: str
-    folder: str
-    tasks: str
-    """Whose tasks have these models, for a message."""
-    install: str
-
-    def path(self, name: str) -> Path:
-        """Where a model file lies; FileNotFoundError if it is not there."""
-        package = importlib.util.find_spec(self.package)
-        if package is None or not package.submodule_search_locations:
-            raise FileNotFoundError(
-                f"the models of {self.tasks} tasks come with the package {self.package}, which is not installed: "
-                f"pip install '{self.install}'"
-            )
-        folder = Path(package.submodule_search_locations[0], self.folder)
-        if not (folder / name).is_file():
-            files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.xml"))
-            close = difflib.get_close_matches(name, files, 3) or files
-            raise FileNotFoundError(f"there is no model file {name!r} in {folder}; it has {', '.join(close)}")
-        return folder / name
-
-
-_GYMNASIUM = _Shipped("gymnasium", "envs/mujoco/assets", "Gymnasium's", "gymnasium>=1.0,<2")
-_GYMNASIUM_ROBOTICS = _Shipped("gymnasium_robotics", "envs/assets", "Gymnasium-Robotics'", "lyceum-warp[hand]")
-
-
-def gymnasium_model(name: str) -> mujoco.MjSpec:
-    """A model that the gymnasium package ships, for changing; gymnasium itself is not imported.
-
-    Raises:
-        FileNotFoundError: gymnasium is not installed or has no such model.
-    """
-    return mujoco.MjSpec.from_file(str(_GYMNASIUM.path(name)))
-
-
-def gymnasium_robotics_model(name: str) -> mujoco.MjSpec:
-    """A model that the gymnasium-robotics package ships, as "adroit_hand/adroit_pen.xml"; it is not imported.
-
-    Raises:
-        FileNotFoundError: gymnasium-robotics is not installed or has no such model.
-    """
-    return mujoco.MjSpec.from_file(str(_GYMNASIUM_ROBOTICS.path(name)))
 
 
 def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
@@ -73,7 +24,7 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
 
     Args:
         source: A path, absolute or relative to the current folder, or to the file that defines ``owner``;
-            otherwise the name of a model that gymnasium ships; or an MjSpec, which is copied.
+            otherwise the name of a model that gymnasium ships; or a ModelFile; or an MjSpec, which is copied.
         owner: The task class whose own model it is: its path is then relative to the task's file alone.
 
     Returns:
@@ -89,6 +40,8 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         spec = source.copy()
         spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # where its meshes are
         return spec
+    if isinstance(source, ModelFile):
+        return source.spec()
     if isinstance(source, str) and source.lstrip().startswith("<"):
         raise ValueError(f"the model {_start(source)} is XML, not a file: give mujoco.MjSpec.from_string(...) of it")
     folder = Path()
@@ -99,17 +52,14 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         if Path(source).name != str(source):
             raise FileNotFoundError(f"there is no model file {str(source)!r}")
         try:
-            path = _GYMNASIUM.path(str(source))
+            path = gymnasium_model(str(source)).path()
         except FileNotFoundError as error:
             close = difflib.get_close_matches(path.name, [file.name for file in path.parent.glob("*.xml")], 3)
             hint = f" (did you mean {' or '.join(close)}?)" if close else ""
             raise FileNotFoundError(
                 f"there is no model file {path}{hint}, and of Gymnasium's models: {error}"
             ) from None
-    try:
-        return mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise ValueError(f"MuJoCo can't read the model {path}: {error}") from error
+    return read_spec(path)
 
 
 def _start(text: str) -> str:

@@ -115,22 +115,10 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     )
 
 
-def hand_and_pen() -> mujoco.MjSpec:
-    """The model that Gymnasium-Robotics ships, with a target that can be turned in each world and touches nothing."""
-    spec = lw.gymnasium_robotics_model("adroit_hand/adroit_pen.xml")
-    target = spec.body("target")
-    target.mocap = True
-    for geom in target.geoms:
-        geom.contype = geom.conaffinity = 0
-    tips = ("C_rfdistal", "C_lfdistal")
-    for pair in [pair for pair in spec.pairs if (pair.geomname1, pair.geomname2) == tips][1:]:
-        spec.delete(pair)  # else the C engine would count a contact of theirs twice, and MuJoCo Warp once
-    return spec
-
-
 @lw.register
 class AdroitPen(lw.Task):
-    model = staticmethod(hand_and_pen)
+    model = lw.gymnasium_robotics_model("adroit_hand/adroit_pen.xml")
+    gymnasium = "AdroitHandPen-v1"
     frame_skip = 5
     obs = {
         "joints": 24,
@@ -146,3 +134,14 @@ class AdroitPen(lw.Task):
     memory = 1
     action_range = (-1.0, 1.0)
     planning = lw.Planning(settings={"horizon": 32, "samples": 160, "temperature": 1.0, "noise": 1.0})  # the paper's
+
+    @staticmethod
+    def edit_model(spec: mujoco.MjSpec) -> None:
+        """Let the target be turned in each world and touch nothing, and pair fingertips once."""
+        target = spec.body("target")
+        target.mocap = True
+        for geom in target.geoms:
+            geom.contype = geom.conaffinity = 0
+        tips = ("C_rfdistal", "C_lfdistal")
+        for pair in [pair for pair in spec.pairs if (pair.geomname1, pair.geomname2) == tips][1:]:
+            spec.delete(pair)  # else the C engine would count a contact of theirs twice, and MuJoCo Warp once

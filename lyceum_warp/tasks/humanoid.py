@@ -42,44 +42,26 @@ class Params:
 
 @wp.func
 def healthy(s: World, p: Params) -> bool:
-    return p.healthy_z_range[0] < s.qpos[2] and s.qpos[2] < p.healthy_z_range[1]
+    return lw.inside(s.qpos[2], p.healthy_z_range)
 
 
 @wp.func
 def observe(s: World, p: Params, obs: Row[float]):
-    k = int(0)
-    for i in range(2 * int(p.exclude_current_positions_from_observation), 24):
-        obs[k] = s.qpos[i]
-        k += 1
-    for i in range(23):
-        obs[k] = s.qvel[i]
-        k += 1
+    k = lw.put(obs, 0, s.qpos, 2 * int(p.exclude_current_positions_from_observation), 24)
+    k = lw.put(obs, k, s.qvel)
     if p.include_cinert_in_observation:
-        for i in range(1, 14):
-            for j in range(10):
-                obs[k] = s.cinert[i][j]
-                k += 1
+        k = lw.put(obs, k, s.cinert, 1, 14)
     if p.include_cvel_in_observation:
-        for i in range(1, 14):
-            for j in range(6):
-                obs[k] = s.cvel[i][j]
-                k += 1
+        k = lw.put(obs, k, s.cvel, 1, 14)
     if p.include_qfrc_actuator_in_observation:
-        for i in range(6, 23):
-            obs[k] = s.qfrc_actuator[i]
-            k += 1
+        k = lw.put(obs, k, s.qfrc_actuator, 6, 23)
     if p.include_cfrc_ext_in_observation:
-        for i in range(1, 14):
-            for j in range(6):
-                obs[k] = s.cfrc_ext[i][j]
-                k += 1
+        lw.put(obs, k, s.cfrc_ext, 1, 14)
 
 
 @wp.func
 def contact_cost(s: World, p: Params) -> float:
-    cost = float(0.0)
-    for i in range(14):
-        cost += p.contact_cost_weight * wp.dot(s.cfrc_ext[i], s.cfrc_ext[i])
+    cost = p.contact_cost_weight * lw.sum_squares(s.cfrc_ext)
     return wp.clamp(cost, p.contact_cost_range[0], p.contact_cost_range[1])
 
 
@@ -89,9 +71,7 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
     r = p.forward_reward_weight * (s1.subtree_com[0][0] - s0.subtree_com[0][0]) / p.dt
     if healthy(s1, p):
         r += p.healthy_reward
-    for i in range(17):
-        r -= p.ctrl_cost_weight * action[i] * action[i]
-    return r - contact_cost(s1, p)
+    return r - p.ctrl_cost_weight * lw.sum_squares(action) - contact_cost(s1, p)
 
 
 @wp.func
@@ -116,6 +96,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class Humanoid(lw.Task):
     model = "humanoid.xml"
     frame_skip = 5
+    gymnasium = "Humanoid-v5"
     lagged = ("subtree_com", "cinert", "cvel")
 
     @staticmethod

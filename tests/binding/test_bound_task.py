@@ -169,7 +169,7 @@ def test_actions_are_scaled_only_to_controls_with_ranges(tmp_path: Path) -> None
 
 
 def test_a_model_without_actuators_is_refused(tmp_path: Path) -> None:
-    spec = lw.gymnasium_model("hopper.xml")
+    spec = lw.gymnasium_model("hopper.xml").spec()
     for actuator in list(spec.actuators):
         spec.delete(actuator)
     with pytest.raises(ValueError, match="the model of the task 'tiny' has no actuators"):

@@ -41,14 +41,14 @@ def test_a_compiled_model_is_refused() -> None:
 def test_a_name_alone_is_one_of_gymnasiums_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert load_spec("hopper.xml").modelname == "hopper"
-    assert lw.gymnasium_model("hopper.xml").modelname == "hopper"
+    assert lw.gymnasium_model("hopper.xml").spec().modelname == "hopper"
 
 
 def test_a_relative_path_belongs_to_the_tasks_file_not_to_the_current_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "models").mkdir()
-    (tmp_path / "models" / "robot.xml").write_text(lw.gymnasium_model("hopper.xml").to_xml())
+    (tmp_path / "models" / "robot.xml").write_text(lw.gymnasium_model("hopper.xml").spec().to_xml())
     file = tiny_task.write(tmp_path, tiny_task.changed(("hopper.xml", "models/robot.xml")))
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
@@ -59,7 +59,7 @@ def test_a_relative_path_belongs_to_the_tasks_file_not_to_the_current_folder(
 def test_the_current_folder_is_searched_only_for_the_option_model(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    spec = lw.gymnasium_model("hopper.xml")
+    spec = lw.gymnasium_model("hopper.xml").spec()
     spec.geom("torso_geom").density = 5000
     (tmp_path / "hopper.xml").write_text(spec.to_xml())
     own = lw.make("hopper").model.body_mass
@@ -92,13 +92,13 @@ def test_a_file_that_mujoco_cannot_read_is_named(tmp_path: Path) -> None:
 def test_a_missing_gymnasium_robotics_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if "robotics" in name else find(name, *a))
-    with pytest.raises(FileNotFoundError, match=r"gymnasium_robotics, .*: pip install 'lyceum-warp\[hand\]'"):
+    with pytest.raises(FileNotFoundError, match=r"gymnasium-robotics, .*: pip install 'lyceum-warp\[hand\]'"):
         lw.make("adroit_pen", engine="mujoco")
 
 
 def test_a_model_that_gymnasium_robotics_lacks_is_refused_with_similar_names() -> None:
     with pytest.raises(FileNotFoundError, match=r"no model file 'adroit_hand/adroit_pan.xml'.* adroit_hand/adroit_pen"):
-        lw.gymnasium_robotics_model("adroit_hand/adroit_pan.xml")
+        lw.gymnasium_robotics_model("adroit_hand/adroit_pan.xml").spec()
 
 
 # changes before compiling
@@ -153,13 +153,13 @@ def test_a_model_that_mujoco_refuses_is_named() -> None:
 
 def test_a_replica_has_the_model_of_its_original(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also after a caller edits the MjSpec, and where a task's model is drawn again each time it is called."""
-    spec = lw.gymnasium_model("hopper.xml")
+    spec = lw.gymnasium_model("hopper.xml").spec()
     env = lw.make("hopper", model=spec)
     spec.geom("torso_geom").density = 5000
     masses = iter((1000, 2000, 3000))
 
     def drawn() -> mujoco.MjSpec:
-        spec = lw.gymnasium_model("hopper.xml")
+        spec = lw.gymnasium_model("hopper.xml").spec()
         spec.geom("torso_geom").density = next(masses)
         return spec
 

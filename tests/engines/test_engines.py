@@ -146,7 +146,7 @@ def test_additional_fields_leave_the_numbers_unchanged(file: Path) -> None:
 
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine, ToyEngine])
 def test_an_engine_keeps_the_described_fields_and_the_controls(engine: type[Engine]) -> None:
-    model = lw.gymnasium_model("hopper.xml").compile()
+    model = lw.gymnasium_model("hopper.xml").spec().compile()
     lagged, current = describe(model, "xpos", lagged=True), describe(model, "qpos")
     made = engine(model, 3, wp.get_device("cpu"), [lagged, current, current])
     assert made.fields == {"ctrl": describe(model, "ctrl"), "xpos": lagged, "qpos": current}

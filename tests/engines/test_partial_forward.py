@@ -45,7 +45,7 @@ def test_an_overflow_in_the_first_state_of_an_episode_is_reported(
 ) -> None:
     """After a reset at once, within a step with the next one; here a world starts in more contacts than have room."""
     monkeypatch.setattr(WarpEngine, "partial_refresh", partial)
-    spec = lw.gymnasium_model("humanoid.xml")
+    spec = lw.gymnasium_model("humanoid.xml").spec()
     spec.body("torso").pos[2] = 0.1
     env = lw.make("humanoid", engine="warp", nworld=2, model=spec, nconmax=1, njmax=128, reset_noise_scale=0.0,
                   autoreset=False)  # fmt: skip

@@ -21,7 +21,7 @@ ON_CPU = {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None}
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    return lw.gymnasium_model("hopper.xml").compile()
+    return lw.gymnasium_model("hopper.xml").spec().compile()
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import pytest
 import warp as wp
 from test_gpu import nothing_waits
 
-from lyceum_warp.binding.models import gymnasium_model
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.deterministic.deterministic_engine import DeterministicEngine
@@ -14,6 +13,7 @@ from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import describe
 from lyceum_warp.graphs.capture import Graphs, Phase
 from lyceum_warp.model_fields import describe_model_field
+from lyceum_warp.model_files import gymnasium_model
 
 pytestmark = pytest.mark.gpu
 
@@ -46,7 +46,7 @@ def write(engine: Engine, name: str, factors: np.ndarray) -> None:
 
 @pytest.mark.parametrize("kind", [WarpEngine, DeterministicEngine])
 def test_graphs_apply_models_and_settle_as_the_c_engine_does(kind: type[Engine]) -> None:
-    spec = gymnasium_model("hopper.xml")
+    spec = gymnasium_model("hopper.xml").spec()
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     model = spec.compile()

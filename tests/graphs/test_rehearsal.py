@@ -24,7 +24,7 @@ import lyceum_warp as lw
 from lyceum_warp.graphs.rehearsal import rehearse
 
 wp.config.log_level = wp.LOG_INFO  # Warp then prints each module that it loads
-compiled = lw.gymnasium_model("hopper.xml").compile()
+compiled = lw.gymnasium_model("hopper.xml").spec().compile()
 model, data = mjw.put_model(compiled), mjw.make_data(compiled, nworld=2)
 mask = wp.full(2, True, dtype=bool)
 

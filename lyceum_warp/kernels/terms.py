@@ -1,0 +1,217 @@
+"""Terms that tasks share, as Warp functions: what rewards, observations and ends of episodes are made of."""
+
+import enum
+from typing import Any
+
+import warp as wp
+
+from lyceum_warp.kernels.rotations import quat_rotate_inverse
+
+
+class Sigmoid(enum.IntEnum):
+    """How ``tolerance`` falls from 1 to ``value_at_margin`` over the margin, as in dm_control's ``rewards.py``."""
+
+    GAUSSIAN = 0
+    HYPERBOLIC = 1
+    LONG_TAIL = 2
+    RECIPROCAL = 3
+    COSINE = 4
+    LINEAR = 5
+    QUADRATIC = 6
+    TANH_SQUARED = 7
+
+
+@wp.func
+def put(row: wp.array[float], at: int, value: float) -> int:
+    """Write a value into a row from the index ``at`` on; returns the index after it.
+
+    The value is a number, a vector, a matrix (row by row), or a row of any of these; of a row, ``first`` and ``last``
+    choose the elements with first <= i < last. An observation is written as a chain: ``k = lw.put(obs, 0, s.qpos)``,
+    then ``k = lw.put(obs, k, s.qvel)``.
+    """
+    row[at] = value
+    return at + 1
+
+
+@wp.func
+def put(row: wp.array[float], at: int, value: wp.mat33) -> int:
+    for i in range(3):
+        for j in range(3):
+            row[at + 3 * i + j] = value[i, j]
+    return at + 9
+
+
+@wp.func
+def put(row: wp.array[float], at: int, value: wp.array[float], first: int, last: int) -> int:
+    for i in range(first, last):
+        row[at + i - first] = value[i]
+    return at + last - first
+
+
+@wp.func
+def put(row: wp.array[float], at: int, value: wp.array[float]) -> int:
+    return put(row, at, value, 0, value.shape[0])
+
+
+@wp.func
+def put(row: wp.array[float], at: int, value: wp.array[Any], first: int, last: int) -> int:
+    k = int(at)
+    for i in range(first, last):
+        k = put(row, k, value[i])
+    return k
+
+
+@wp.func
+def put(row: wp.array[float], at: int, value: wp.array[Any]) -> int:
+    return put(row, at, value, 0, value.shape[0])
+
+
+# the last, because Warp takes the first overload that fits
+@wp.func
+def put(row: wp.array[float], at: int, value: Any) -> int:
+    for i in range(len(value)):
+        row[at + i] = value[i]
+    return at + len(value)
+
+
+@wp.func
+def sum_squares(row: wp.array[float], first: int, last: int) -> float:
+    """Add the squares of a row's elements with first <= i < last; without these two, of all elements.
+
+    The elements are numbers or vectors.
+    """
+    total = float(0.0)
+    for i in range(first, last):
+        total += row[i] * row[i]
+    return total
+
+
+@wp.func
+def sum_squares(row: wp.array[Any], first: int, last: int) -> float:
+    total = float(0.0)
+    for i in range(first, last):
+        total += wp.dot(row[i], row[i])
+    return total
+
+
+@wp.func
+def sum_squares(row: wp.array[float]) -> float:
+    return sum_squares(row, 0, row.shape[0])
+
+
+@wp.func
+def sum_squares(row: wp.array[Any]) -> float:
+    return sum_squares(row, 0, row.shape[0])
+
+
+@wp.func
+def inside(x: float, bounds: wp.vec2) -> bool:
+    """Whether a number lies strictly between two bounds, (low, high); a NaN does not."""
+    return bounds[0] < x and x < bounds[1]
+
+
+@wp.func
+def all_inside(row: wp.array[float], first: int, last: int, bounds: wp.vec2) -> bool:
+    """Whether every element of a row with first <= i < last lies strictly between two bounds, (low, high)."""
+    ok = bool(True)
+    for i in range(first, last):
+        ok = ok and inside(row[i], bounds)
+    return ok
+
+
+@wp.func
+def angle_between(a: wp.vec3, b: wp.vec3) -> float:
+    """The angle between two vectors of any length but 0, in radians, 0 to pi: atan2(|a x b|, a . b)."""
+    return wp.atan2(wp.length(wp.cross(a, b)), wp.dot(a, b))
+
+
+@wp.func
+def body_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3) -> wp.spatial_vector:
+    """The velocity of a body at a point, as (angular, linear) in the world's axes, in rad/s and m/s.
+
+    w, v + w x (point - com) for cvel = (w, v); as mj_objectVelocity in the world's axes.
+
+    Args:
+        cvel: The body's row of ``cvel``, (angular, linear), which MuJoCo gives at the centre of mass of its tree.
+        com: That centre of mass: the row of ``subtree_com`` of the body at the tree's root.
+        point: A point of the body, in the world's frame, such as its row of ``xpos`` or ``xipos``.
+    """
+    w = wp.spatial_top(cvel)
+    return wp.spatial_vector(w, wp.spatial_bottom(cvel) + wp.cross(w, point - com))
+
+
+@wp.func
+def local_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3, quat: wp.vec4) -> wp.spatial_vector:
+    """The velocity of a body at a point, as (angular, linear) in the axes of a frame, such as the body's own.
+
+    As mj_objectVelocity with flg_local.
+
+    Args:
+        cvel: As of ``body_velocity``.
+        com: As of ``body_velocity``.
+        point: As of ``body_velocity``.
+        quat: The orientation of the frame (w, x, y, z), such as the body's row of ``xquat``.
+    """
+    v = body_velocity(cvel, com, point)
+    return wp.spatial_vector(
+        quat_rotate_inverse(quat, wp.spatial_top(v)), quat_rotate_inverse(quat, wp.spatial_bottom(v))
+    )
+
+
+@wp.func
+def tolerance(
+    x: float,
+    bounds: wp.vec2,
+    margin: float = 0.0,
+    sigmoid: int = int(Sigmoid.GAUSSIAN),
+    value_at_margin: float = 0.1,
+) -> float:
+    """1 where a number lies within bounds, falling towards 0 outside them, as dm_control's ``tolerance``.
+
+    With d, the distance from the nearer bound divided by the margin, and v, the value at the margin:
+
+    ============  =======================================  =================
+    GAUSSIAN      exp(-(d s)^2 / 2), s = sqrt(-2 log v)    0 < v < 1
+    HYPERBOLIC    1 / cosh(d s), s = arccosh(1 / v)        0 < v < 1
+    LONG_TAIL     1 / ((d s)^2 + 1), s = sqrt(1 / v - 1)   0 < v < 1
+    RECIPROCAL    1 / (d s + 1), s = 1 / v - 1             0 < v < 1
+    COSINE        (1 + cos(pi d s)) / 2 where d s < 1      0 <= v < 1, s = arccos(2 v - 1) / pi
+    LINEAR        1 - d s where d s < 1, s = 1 - v         0 <= v < 1
+    QUADRATIC     1 - (d s)^2 where d s < 1, s^2 = 1 - v   0 <= v < 1
+    TANH_SQUARED  1 - tanh(d s)^2, s = arctanh(sqrt(1-v))  0 < v < 1
+    ============  =======================================  =================
+
+    Args:
+        x: The number.
+        bounds: The lowest and the highest number whose value is 1; either may be infinite.
+        margin: The distance outside the bounds at which the value is ``value_at_margin``; with 0 the value falls to 0
+            at the bounds.
+        sigmoid: The shape, an ``lw.Sigmoid``.
+        value_at_margin: The value at the margin.
+    """
+    outside = wp.max(bounds[0] - x, x - bounds[1])
+    if outside <= 0.0:
+        return 1.0
+    if margin <= 0.0:
+        return 0.0
+    d, v = outside / margin, value_at_margin
+    if sigmoid == wp.static(int(Sigmoid.GAUSSIAN)):
+        return wp.exp(d * d * wp.log(v))
+    if sigmoid == wp.static(int(Sigmoid.HYPERBOLIC)):
+        # arccosh(y) = log(y + sqrt(y^2 - 1))
+        return 1.0 / wp.cosh(d * wp.log(1.0 / v + wp.sqrt(1.0 / (v * v) - 1.0)))
+    if sigmoid == wp.static(int(Sigmoid.LONG_TAIL)):
+        return 1.0 / (d * d * (1.0 / v - 1.0) + 1.0)
+    if sigmoid == wp.static(int(Sigmoid.RECIPROCAL)):
+        return 1.0 / (d * (1.0 / v - 1.0) + 1.0)
+    if sigmoid == wp.static(int(Sigmoid.COSINE)):
+        scaled = d * wp.acos(2.0 * v - 1.0)
+        return wp.where(scaled < wp.pi, 0.5 * (1.0 + wp.cos(scaled)), 0.0)
+    if sigmoid == wp.static(int(Sigmoid.LINEAR)):
+        return wp.max(0.0, 1.0 - d * (1.0 - v))
+    if sigmoid == wp.static(int(Sigmoid.QUADRATIC)):
+        return wp.max(0.0, 1.0 - d * d * (1.0 - v))
+    # arctanh(y) = log((1 + y) / (1 - y)) / 2
+    root = wp.sqrt(1.0 - v)
+    t = wp.tanh(0.5 * d * wp.log((1.0 + root) / (1.0 - root)))
+    return 1.0 - t * t

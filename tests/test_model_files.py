@@ -1,0 +1,96 @@
+"""Model files of packages and of a local folder: found when they are needed, never imported."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import lyceum_warp as lw
+from lyceum_warp.binding.bound_task import task_spec
+from lyceum_warp.binding.registry import find_task
+
+
+@pytest.fixture
+def menagerie(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A checkout with one robot."""
+    (tmp_path / "leg").mkdir()
+    (tmp_path / "leg" / "scene.xml").write_text(lw.gymnasium_model("hopper.xml").spec().to_xml())
+    monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
+    return tmp_path
+
+
+def test_a_model_of_menagerie_is_read_from_a_checkout(menagerie: Path) -> None:
+    assert lw.menagerie_model("leg/scene.xml").path() == menagerie / "leg" / "scene.xml"
+    env = lw.make("hopper", model=lw.menagerie_model("leg/scene.xml"))
+    assert env.model.nu == 3
+
+
+def test_a_missing_file_of_menagerie_is_named_with_those_that_resemble_it(menagerie: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no model file 'leg/scone\.xml' in .*; it has leg/scene\.xml$"):
+        lw.menagerie_model("leg/scone.xml").spec()
+
+
+def test_a_wrong_menagerie_root_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = lw.menagerie_model("leg/scene.xml")
+    monkeypatch.delenv("MENAGERIE_ROOT", raising=False)
+    with pytest.raises(FileNotFoundError, match=r"leg/scene\.xml .*: set MENAGERIE_ROOT to .* git clone https"):
+        model.spec()
+    monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path / "nowhere"))
+    with pytest.raises(FileNotFoundError, match=r"MENAGERIE_ROOT is '.*nowhere', which is not a folder"):
+        model.spec()
+    monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
+    with pytest.raises(FileNotFoundError, match=r"MENAGERIE_ROOT is '.*', which holds no models"):
+        model.spec()
+
+
+def test_a_model_of_another_package_is_read_without_importing_it() -> None:
+    code = (
+        "import sys, lyceum_warp as lw\n"
+        "spec = lw.package_model('gymnasium', 'envs/mujoco/assets/ant.xml').spec()\n"
+        "assert spec.body('torso') is not None and 'gymnasium' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_missing_package_is_named_with_the_command_that_installs_it() -> None:
+    with pytest.raises(FileNotFoundError, match=r"the package no-robots, which .*: pip install 'no-robots==3'$"):
+        lw.package_model("no_robots", "arm.xml", install="no-robots==3").path()
+
+
+def test_a_model_that_is_broken_is_named(menagerie: Path) -> None:
+    (menagerie / "leg" / "scene.xml").write_text("<mujoco>")
+    with pytest.raises(ValueError, match=r"can't read the model .*leg/scene\.xml"):
+        lw.menagerie_model("leg/scene.xml").spec()
+
+
+class Light(find_task("hopper")):  # type: ignore[misc]
+    """A hopper of half the weight."""
+
+    @staticmethod
+    def edit_model(spec):
+        for body in spec.bodies[1:]:
+            for geom in body.geoms:
+                geom.density /= 2
+
+
+def test_a_task_edits_its_model_once_whatever_it_is_made_from() -> None:
+    light, whole = lw.make(Light), lw.make("hopper")
+    half = 0.5 * whole.model.body_mass[1:].sum()
+    copy = light.replicate(nworld=2)
+    for env in (light, copy, lw.make(Light, model=lw.gymnasium_model("hopper.xml"))):
+        assert env.model.body_mass[1:].sum() == pytest.approx(half)
+    assert task_spec(Light).geoms[1].density == 0.5 * task_spec(find_task("hopper")).geoms[1].density
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda spec: spec, "edit_model of the task 'light' returns MjSpec: it must change the spec in place"),
+        (lambda spec: spec.body("tail").pos, "edit_model of the task 'light' fails on the model 'hopper': Attribute"),
+    ],
+)
+def test_a_wrong_edit_is_named(edit, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Light, "edit_model", staticmethod(edit))
+    with pytest.raises(ValueError, match=message):
+        lw.make(Light)
