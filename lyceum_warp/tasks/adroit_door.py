@@ -2,8 +2,8 @@
 
 The hand's model comes with the extra "hand". The door's frame is a mocap body here, so that its place belongs to the
 state. The tips of ring and little finger, which the model pairs twice, are paired once. As in the original, positions
-of sites are those that ``mj_step`` leaves, and the reward grows with the palm's distance from the handle; the
-original's documentation subtracts that distance, as ``palm_weight=-0.1`` does.
+of sites are those that ``mj_step`` leaves. The reward grows with the palm's distance from the handle, as in
+gymnasium-robotics 1.2.1 to 1.4.2, by mistake; ``palm_weight=-0.1`` subtracts it, as in version 1.2.0.
 """
 
 import mujoco

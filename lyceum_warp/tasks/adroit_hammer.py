@@ -1,9 +1,9 @@
 """AdroitHammer: pick up a hammer and drive a nail into a board (Gymnasium-Robotics' AdroitHandHammer-v1).
 
 The hand's model comes with the extra "hand". The board is a mocap body here, so that its height belongs to the state.
-The tips of ring and little finger, which the model pairs twice, are paired once. As in the original, positions and
-the force on the nail are those that ``mj_step`` leaves, and the reward grows with the palm's distance from the
-hammer; the original's documentation subtracts that distance, as ``palm_weight=-0.1`` does.
+The tips of ring and little finger, which the model pairs twice, are paired once. As in the original, positions and the
+force on the nail are those that ``mj_step`` leaves. The reward grows with the palm's distance from the hammer, as in
+gymnasium-robotics 1.2.1 to 1.4.2, by mistake; ``palm_weight=-0.1`` subtracts it, as in version 1.2.0.
 """
 
 import mujoco

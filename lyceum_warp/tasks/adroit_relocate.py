@@ -2,8 +2,9 @@
 
 The hand's model comes with the extra "hand". The target is a mocap body here, and a reset moves the ball by its own
 joints, so that both places belong to the state. The tips of ring and little finger, which the model pairs twice, are
-paired once. As in the original, positions are those that ``mj_step`` leaves, and the reward grows with the palm's
-distance from the ball; the original's documentation subtracts that distance, as ``palm_weight=-0.1`` does.
+paired once. As in the original, positions are those that ``mj_step`` leaves. The reward grows with the palm's distance
+from the ball, as in gymnasium-robotics 1.2.1 to 1.4.2, by mistake; ``palm_weight=-0.1`` subtracts it, as in version
+1.2.0.
 """
 
 import mujoco
