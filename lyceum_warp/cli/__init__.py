@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with signals():
             command = _parse(argv)
             if isinstance(command, Tasks):
-                return list_tasks()
+                return list_tasks(command)
             if isinstance(command, Eval):
                 return evaluate_run(command)
             if isinstance(command, Plan):
