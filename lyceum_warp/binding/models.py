@@ -42,24 +42,35 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         return spec
     if isinstance(source, ModelFile):
         return source.spec()
+    found = find_model(source, owner)
+    return found.spec() if isinstance(found, ModelFile) else read_spec(found)
+
+
+def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFile:
+    """The file that a model's path or name stands for, or the model of gymnasium; see ``load_spec``.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The source is the text of a model.
+    """
     if isinstance(source, str) and source.lstrip().startswith("<"):
         raise ValueError(f"the model {_start(source)} is XML, not a file: give mujoco.MjSpec.from_string(...) of it")
     folder = Path()
     if owner is not None and (file := getattr(sys.modules.get(owner.__module__), "__file__", None)):
         folder = Path(file).parent
     path = (folder / Path(source).expanduser()).absolute()
-    if not path.is_file():
-        if Path(source).name != str(source):
-            raise FileNotFoundError(f"there is no model file {str(source)!r}")
-        try:
-            path = gymnasium_model(str(source)).path()
-        except FileNotFoundError as error:
-            close = difflib.get_close_matches(path.name, [file.name for file in path.parent.glob("*.xml")], 3)
-            hint = f" (did you mean {' or '.join(close)}?)" if close else ""
-            raise FileNotFoundError(
-                f"there is no model file {path}{hint}, and of Gymnasium's models: {error}"
-            ) from None
-    return read_spec(path)
+    if path.is_file():
+        return path
+    if Path(source).name != str(source):
+        raise FileNotFoundError(f"there is no model file {str(source)!r}")
+    shipped = gymnasium_model(str(source))
+    try:
+        shipped.path()
+    except FileNotFoundError as error:
+        close = difflib.get_close_matches(path.name, [file.name for file in path.parent.glob("*.xml")], 3)
+        hint = f" (did you mean {' or '.join(close)}?)" if close else ""
+        raise FileNotFoundError(f"there is no model file {path}{hint}, and of Gymnasium's models: {error}") from None
+    return shipped
 
 
 def _start(text: str) -> str:
