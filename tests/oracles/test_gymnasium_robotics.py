@@ -3,6 +3,7 @@
 A task names it in its attribute ``gymnasium``. A new one needs nothing here; entries in SPECIAL reach its bonuses.
 """
 
+import dataclasses
 import functools
 import inspect
 from collections.abc import Callable
@@ -31,11 +32,6 @@ ENTRIES = {
 }
 TASKS = sorted(ENTRIES)
 
-PARAMETERS: dict[str, dict[str, dict[str, Any]]] = {
-    "reward_type": {"dense": {}, "sparse": {"sparse": True}},
-}
-"""Values of the parameters of their environments, and the task's parameters with the same meaning."""
-
 
 def relative_error(ours: np.ndarray | float, theirs: np.ndarray | float) -> float:
     """Largest difference, relative to the larger of 1 and the value."""
@@ -57,6 +53,11 @@ def oracle_class(name: str) -> type[MujocoEnv]:
     return Oracle
 
 
+def registered(name: str) -> Any:
+    """Their environment as it is."""
+    return gymnasium.make(str(IDS[name]), disable_env_checker=True).unwrapped
+
+
 class Pair:
     """One world and their environment, in the same states and under the same controls.
 
@@ -67,6 +68,8 @@ class Pair:
 
     def __init__(self, ours: lw.Env, theirs: Any) -> None:
         self.ours, self.theirs = ours, theirs
+        self.places = {field: getattr(theirs.model, field).copy() for field in ("body_pos", "body_quat", "site_pos")}
+        """Their model before a reset draws some of it."""
         self.theirs.reset(seed=0)
         self.rng = np.random.default_rng(0)
         self.goals = 0
@@ -90,6 +93,8 @@ class Pair:
     def put(self, **values: np.ndarray) -> None:
         """Put both into our state, some of whose fields are replaced first."""
         model, data = self.theirs.model, self.theirs.data
+        for field, own in self.places.items():
+            getattr(model, field)[:] = own
         mujoco.mj_resetData(model, data)
         state = self.ours.get_state()
         parts = self.ours.state_space.split(state[0])
@@ -97,9 +102,9 @@ class Pair:
             parts[field].copy_(torch.from_numpy(np.float32(np.ravel(value))))
         for field in ("qpos", "qvel"):
             getattr(data, field)[:] = parts[field].numpy()
-        for body in moved_bodies(self.ours.model):
-            i = self.ours.model.body(body).mocapid[0]
-            self._move(body, parts["mocap_pos"].numpy()[3 * i :][:3], parts["mocap_quat"].numpy()[4 * i :][:4])
+        pos, quat = parts["mocap_pos"].numpy().reshape(-1, 3), parts["mocap_quat"].numpy().reshape(-1, 4)
+        for body, i in mocap_bodies(self.ours.model).items():
+            self._move(body, pos[i], quat[i])
         mujoco.mj_forward(model, data)
         # the fields that a task reads as the engine's last step left them
         for field, part in parts.items():
@@ -115,33 +120,83 @@ class Pair:
         elif (mocap := model.body_mocapid[id]) < 0:
             model.body_pos[id], model.body_quat[id] = pos, quat
         else:
-            # what their own reset has drawn for the model
-            model.site_pos[:], model.body_pos[:] = self.ours.model.site_pos, self.ours.model.body_pos
             data.mocap_pos[mocap], data.mocap_quat[mocap] = pos, quat
 
-    def step(self, action: np.ndarray, check: bool = True) -> float:
-        """Step both and compare, to the rounding of float32; returns the reward."""
+    def step(self, action: np.ndarray) -> None:
+        """Step both."""
         action = action.astype(np.float32)
         self.ours.step(torch.from_numpy(action[None]))
-        obs, reward, terminated, truncated, info = self.theirs.step(action.astype(np.float64))
+        self.obs, self.reward, self.terminated, truncated, info = self.theirs.step(action.astype(np.float64))
         assert not truncated and not self.ours.truncated.any()
-        self.goals += bool(info["success"])
-        if check:
-            assert relative_error(self.ours.obs[0].numpy().astype(np.float64), obs) <= 1e-5
-            assert relative_error(self.ours.reward.item(), float(reward)) <= 1e-5
-            assert self.ours.terminated.item() == terminated
-            # a task may ask for several steps at the goal
-            needed = getattr(self.ours.task.params, "goal_steps", None)
-            assert self.ours.success.item() == (info["success"] if needed is None else self.goals > needed)
-        return float(reward)
+        self.success = bool(info["success"])
+        self.goals += self.success
+
+    def check(self) -> None:
+        """Compare the results of the step, to the rounding of float32."""
+        assert relative_error(self.ours.obs[0].numpy().astype(np.float64), self.obs) <= 1e-5
+        assert relative_error(self.ours.reward.item(), float(self.reward)) <= 1e-5
+        assert self.ours.terminated.item() == self.terminated
+        # a task may ask for several steps at their goal
+        steps = self.ours.task.params.get("goal_steps")
+        assert self.ours.success.item() == (self.success if steps is None else self.goals > steps)
 
     def random_action(self, reach: float) -> np.ndarray:
         return self.rng.uniform(-reach, reach, self.theirs.model.nu)
 
 
-def moved_bodies(model: mujoco.MjModel) -> list[str]:
-    """The names of the mocap bodies."""
-    return [model.body(i).name for i in range(model.nbody) if model.body_mocapid[i] >= 0]
+def mocap_bodies(model: mujoco.MjModel) -> dict[str, int]:
+    """Which mocap body each name is."""
+    return {model.body(i).name: int(mocap) for i, mocap in enumerate(model.body_mocapid) if mocap >= 0}
+
+
+@dataclasses.dataclass
+class Special:
+    """A state that random actions do not reach."""
+
+    reward: float
+    """Their reward of the next step, within 0.1."""
+    joints: dict[str, float]
+    """Coordinates of some joints."""
+    moved: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
+    """Positions and orientations of some mocap bodies."""
+
+    def fields(self, env: lw.Env) -> dict[str, np.ndarray]:
+        """The fields of this state that differ from the environment's own."""
+        parts = env.state_space.split(env.get_state()[0])
+        fields = {name: parts[name].numpy().copy() for name in ("qpos", "mocap_pos", "mocap_quat")}
+        for joint, value in self.joints.items():
+            fields["qpos"][env.model.joint(joint).qposadr] = value
+        for body, pose in self.moved.items():
+            i = mocap_bodies(env.model)[body]
+            fields["mocap_pos"][3 * i :][:3], fields["mocap_quat"][4 * i :][:4] = pose[:3], pose[3:]
+        return fields
+
+
+def pen(reward: float, angle: float, up: float) -> Special:
+    """The pen at a height above the palm, its axis at an angle to the target's; its first joint moves it down."""
+    turn = (np.pi / 2 - angle) / 2
+    return Special(reward, {"OBJTx": -up}, {"target": (0.2, 0.2, 0.2, np.cos(turn), 0.0, np.sin(turn), 0.0)})
+
+
+def ball(reward: float, up: float, aside: float) -> Special:
+    """The ball at a height and at a distance to the side of the target, which is 0.2 m above the table."""
+    joints = {"OBJTx": aside, "OBJTy": 0.0, "OBJTz": up - 0.035}
+    return Special(reward, joints, {"target": (0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0)})
+
+
+SPECIAL = {
+    "adroit_door": [
+        Special(reward, {"door_hinge": angle}) for reward, angle in ((-0.2, 0.1), (1.9, 0.3), (10.0, 1.1), (20.0, 1.4))
+    ],
+    "adroit_hammer": [
+        Special(0.7, {"OBJTy": 0.15}),
+        Special(24.4, {"nail_dir": 0.08}),
+        Special(99.4, {"nail_dir": 0.09}),
+    ],
+    "adroit_pen": [pen(61.0, 0.1, 0.0), pen(10.9, 0.38, 0.0), pen(0.8, 0.1, 0.2), pen(-5.6, 2.0, -0.2)],
+    "adroit_relocate": [ball(0.0, 0.035, 0.15), ball(0.8, 0.2, 0.15), ball(10.9, 0.2, 0.08), ball(30.9, 0.2, 0.01)],
+}
+"""States that reach the bonuses of the rewards, and success."""
 
 
 @pytest.fixture(params=TASKS)
@@ -154,9 +209,11 @@ MakePair = Callable[..., Pair]
 
 @pytest.fixture
 def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
-    def make(theirs: type[MujocoEnv] | None = None, keywords: dict[str, Any] | None = None, **params: Any) -> Pair:
+    """``make_pair(theirs, sparse=True)``: our environment and theirs, by default the oracle."""
+
+    def make(theirs: Any = None, **params: Any) -> Pair:
         ours = shared_env(task, autoreset=False, horizon=0, nthread=1, **params)
-        return Pair(ours, (theirs or oracle_class(task))(**keywords or {}))
+        return Pair(ours, theirs or oracle_class(task)())
 
     return make
 
@@ -170,3 +227,129 @@ def test_random_actions_lead_to_the_same_numbers(make_pair: MakePair) -> None:
             if i % 4 == 0:
                 action = pair.random_action(1.3)
             pair.step(action)
+            pair.check()
+
+
+def pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
+    """The pairs of geoms that the model lists."""
+    return list(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
+
+
+def test_the_registered_environment_agrees_until_contacts_differ(make_pair: MakePair, task: str) -> None:
+    """Their model as it is, until geoms touch that collide only there, or whose contact is counted twice there."""
+    pair = make_pair(registered(task))
+    ours, theirs = pair.ours.model, pair.theirs.model
+    ghosts = set(np.flatnonzero(ours.geom_contype != theirs.geom_contype))
+    doubled, checked = {pair for pair in pairs(theirs) if pairs(theirs).count(pair) > pairs(ours).count(pair)}, 0
+    for _ in range(4):
+        pair.reset()
+        for i in range(50):
+            if i % 4 == 0:
+                action = pair.random_action(1.0)
+            pair.step(action)
+            touching = {(int(a), int(b)) for a, b in pair.theirs.data.contact.geom}
+            if touching & doubled or any(ghosts.intersection(geoms) for geoms in touching):
+                break
+            pair.check()
+            checked += 1
+    assert checked >= 50
+
+
+@pytest.mark.parametrize("reward_type", ["dense", "sparse"])
+def test_bonuses_and_success_are_theirs(make_pair: MakePair, task: str, reward_type: str) -> None:
+    pair = make_pair(oracle_class(task)(reward_type=reward_type), sparse=reward_type == "sparse")
+    assert task in SPECIAL, "add states that reach the bonuses and success"
+    rewards, successes = set(), 0
+    for special in SPECIAL[task]:
+        pair.reset()
+        pair.put(**special.fields(pair.ours))
+        for i in range(30):
+            pair.step(pair.random_action(0.2))
+            pair.check()
+            if i == 0 and reward_type == "dense":
+                assert pair.reward == pytest.approx(special.reward, abs=0.1)
+            rewards.add(pair.reward)
+            successes += pair.ours.success.item()
+    assert 0 < successes < 30 * len(SPECIAL[task])
+    assert reward_type == "dense" or rewards == {10.0, -0.1}
+
+
+# models and spaces
+
+
+def test_spaces_and_parameters_are_theirs(shared_env: SharedEnv, task: str) -> None:
+    ours, theirs = shared_env(task, autoreset=False, horizon=0, nthread=1), registered(task)
+    low, high = theirs.action_space.low, theirs.action_space.high
+    assert ours.obs.shape == (1, *theirs.observation_space.shape)
+    assert np.array_equal(ours.action_space.low, low) and np.array_equal(ours.action_space.high, high)
+    assert list(ours.action_space.parts) == [theirs.model.actuator(i).name for i in range(theirs.model.nu)]
+    assert ours.timestep == pytest.approx(theirs.dt, rel=1e-12)
+    assert find_task(task).horizon == gymnasium.spec(str(IDS[task])).max_episode_steps
+    assert set(inspect.signature(type(theirs).__init__).parameters) == {"self", "reward_type", "kwargs"}
+
+
+KINDS = {
+    "body": mujoco.mjtObj.mjOBJ_BODY, "jnt": mujoco.mjtObj.mjOBJ_JOINT, "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "site": mujoco.mjtObj.mjOBJ_SITE, "tendon": mujoco.mjtObj.mjOBJ_TENDON,
+    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR, "sensor": mujoco.mjtObj.mjOBJ_SENSOR, "dof": None, "wrap": None,
+}  # fmt: skip
+"""The kinds of elements, and how their names are found."""
+
+
+def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, str]]:
+    """Fields of elements of their model that differ from ours, with the elements' names."""
+    found = set()
+    for kind, named in KINDS.items():
+        fields = [name for name in dir(theirs) if name.startswith(f"{kind}_")]
+        for i in range(len(getattr(theirs, fields[0]))):
+            name = mujoco.mj_id2name(theirs, named, i) if named else None
+            k = mujoco.mj_name2id(ours, named, name) if name else i
+            assert k >= 0, f"the model has no {kind} {name!r}"
+            found |= {(f, name) for f in fields if not np.array_equal(getattr(ours, f)[k], getattr(theirs, f)[i])}
+    return found
+
+
+def test_model_is_theirs_except_for_edits(shared_env: SharedEnv, task: str) -> None:
+    """Only what a reset moves may differ, and pairs that they list twice. Sensors count sites in another order."""
+    ours, theirs = shared_env(task, autoreset=False, horizon=0, nthread=1).model, registered(task).model
+    moved = mocap_bodies(ours)
+    others = {(field, name) for field, name in differences(ours, theirs) if name not in moved}
+    assert {field for field, _ in others} <= {"sensor_objid"}, others
+    first = {pair: i for i, pair in reversed(list(enumerate(pairs(theirs))))}
+    assert ours.npair == len(first)
+    for field in ("solref", "solimp", "margin", "gap", "friction", "dim"):
+        assert np.array_equal(
+            getattr(ours, f"pair_{field}"), getattr(theirs, f"pair_{field}")[[first[pair] for pair in pairs(ours)]]
+        )
+    for name in ("timestep", "integrator", "cone", "solver", "iterations", "noslip_iterations", "tolerance"):
+        assert getattr(ours.opt, name) == getattr(theirs.opt, name), name
+
+
+# resets
+
+
+def test_fixed_resets_put_everything_where_the_model_does(make_pair: MakePair, task: str) -> None:
+    """Their model before any reset has the same places."""
+    pair = make_pair(registered(task))
+    pair.ours.reset()
+    pair.put()
+    for field, own in pair.places.items():
+        np.testing.assert_allclose(getattr(pair.theirs.model, field), own, atol=1e-7)
+    assert np.array_equal(pair.theirs.data.qpos, pair.theirs.init_qpos)
+    assert np.array_equal(pair.theirs.data.qvel, pair.theirs.init_qvel)
+
+
+def test_random_resets_are_distributed_as_theirs(task: str) -> None:
+    """Each number of the first observations by a Kolmogorov-Smirnov test, and the correlations between them."""
+    n, m = 400, 1000
+    env, original = lw.make(task, engine="mujoco", nworld=m, nthread=1), registered(task)
+    ours = env.obs.numpy().astype(np.float64)
+    theirs = np.array([original.reset(seed=None if i else 0)[0] for i in range(n)])
+    still = theirs.std(axis=0) < 1e-6
+    np.testing.assert_allclose(ours[:, still], np.tile(theirs[0, still], (m, 1)), atol=1e-5)
+    for a, b in zip(ours[:, ~still].T, theirs[:, ~still].T, strict=True):
+        both = np.sort(np.concatenate([a, b]))
+        shares = [np.searchsorted(np.sort(x), both, side="right") / len(x) for x in (a, b)]
+        assert np.abs(shares[0] - shares[1]).max() < 2.0 * np.sqrt(1 / n + 1 / m)
+    correlations = [np.atleast_2d(np.corrcoef(x[:, ~still].T)) for x in (ours, theirs)]
+    assert np.abs(correlations[0] - correlations[1]).max() < 5.0 * np.sqrt(1 / n + 1 / m)
