@@ -44,15 +44,22 @@ def relative_error(ours: np.ndarray | float, theirs: np.ndarray | float) -> floa
     return float(np.max(np.abs(ours - theirs) / np.maximum(1.0, np.abs(theirs))))
 
 
+def geoms(pair: mujoco.MjsPair) -> set[str]:
+    """The names of the two geoms of a pair."""
+    return {pair.geomname1, pair.geomname2}
+
+
 @functools.cache
 def oracle_class(name: str) -> type[MujocoEnv]:
-    """Their environment, on their model with the changes that the task makes."""
+    """Their environment, on their model with the task's changes, and without pairs that it lists a second time."""
     registered: Any = load_env_creator(ENTRIES[name])
 
     class Oracle(registered):  # type: ignore[misc]
         def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
             spec = mujoco.MjSpec.from_file(self.fullpath)
             find_task(name).edit_model(spec)
+            for pair in [pair for i, pair in enumerate(spec.pairs) if geoms(pair) in map(geoms, spec.pairs[:i])]:
+                spec.delete(pair)
             model = spec.compile()
             return model, mujoco.MjData(model)
 
