@@ -43,8 +43,11 @@ ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median
     # the worst 5 % are pens that lie on the palm's boxes
     "adroit_pen": Bounds(1.5e-7, 4e-6, 5e-6, 2e-3),  # 4.1e-8, 1.2e-6; 1.4e-6, 5.8e-4
     "ant": Bounds(1.5e-7, 3e-7, 1.5e-6, 2e-5),  # 5.2e-8, 9.8e-8; 4.4e-7, 6.5e-6
+    "cartpole": Bounds(7e-9, 4e-8, 5e-8, 2e-7),  # 2.0e-9, 1.1e-8; 1.3e-8, 5.3e-8
     "cartpole_swingup": Bounds(2e-7, 4e-7, 4e-8, 1e-7),  # 6.2e-8, 1.1e-7; 1.2e-8, 2.9e-8
     "half_cheetah": Bounds(1e-7, 1e-6, 1e-5, 1e-4),  # 3.2e-8, 2.9e-7; 3.0e-6, 2.9e-5
+    # contacts of arms and fingers are rare; MuJoCo Warp finds fewer points than C where two boxes touch
+    "herb_reach": Bounds(4e-7, 8e-7, 5e-5, 2e-4),  # 1.1e-7, 2.2e-7; 1.3e-5, 4.8e-5
     "hopper": Bounds(1e-7, 2e-7, 1e-6, 5e-6),  # 3.0e-8, 5.5e-8; 2.9e-7, 1.6e-6
     "humanoid": Bounds(2e-7, 4e-7, 3e-5, 1.2e-4),  # 5.6e-8, 1.1e-7; 8.8e-6, 3.9e-5
     "humanoid_standup": Bounds(2e-7, 4e-7, 2e-5, 8e-5),  # 5.3e-8, 1.0e-7; 6.1e-6, 2.3e-5
