@@ -1,5 +1,6 @@
-# make demo: install, train Hopper and show the result         make test: install and run every test
-# make lint: ruff and mypy                                     make clean: remove what these made
+# make demo: install, train Hopper and show the result         make test: install and run the tests
+# make lint: ruff and mypy                                     make test-all: the same with the longest lists
+# make clean: remove what these made
 #
 # Another Python: make demo PYTHON=python3.12
 
@@ -8,13 +9,19 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test lint clean
+.PHONY: demo test test-all lint clean
 
 demo: $(VENV)/installed-viz
 	$(BIN)/lyceum-warp train hopper --iterations 80 --out runs/demo-$$(date +%Y%m%d-%H%M%S) --require-return 1000
 
+# Two processes at least: while one compiles a kernel or waits, the other runs.
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadgroup
+
 test: $(VENV)/installed-dev
-	$(BIN)/python -m pytest
+	$(PYTEST)
+
+test-all: $(VENV)/installed-dev
+	$(PYTEST) -m "long or not long"
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .

@@ -94,11 +94,21 @@ def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
     return made
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests marked ``gpu`` on machines without a GPU."""
+    """Keep what shares environments in one process, and skip tests marked ``gpu`` on machines without a GPU."""
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group(_group(item)))
     if wp.is_cuda_available():
         return
     skip = pytest.mark.skip(reason="needs a CUDA device")
     for item in items:
         if "gpu" in item.keywords:
             item.add_marker(skip)
+
+
+def _group(item: pytest.Item) -> str:
+    """The tests that one process runs one after another: those of a file, and within it those of one task."""
+    callspec = getattr(item, "callspec", None)
+    task = callspec.params.get("task", callspec.params.get("engines")) if callspec else None
+    return f"{item.path.stem}:{task}" if isinstance(task, str) else item.path.stem

@@ -63,7 +63,7 @@ def test_own_task_keeps_the_rules_and_steps() -> None:
     assert numbers(r": (-[\d.]+)", [last])[0] == pytest.approx(-1.025, abs=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_commanded_speed_keeps_the_rules_on_both_engines() -> None:
     command = [sys.executable, str(EXAMPLES / "commanded_speed.py")]
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}

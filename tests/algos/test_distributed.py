@@ -158,7 +158,7 @@ sys.exit(main())
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
     """While they learn, they complete the iteration together; before that, the run leaves nothing behind."""
     program, run = tmp_path / "interrupted.py", tmp_path / "learning"
@@ -177,7 +177,7 @@ def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
     assert "lyceum_warp/" not in error + early_error, (error, early_error)  # no traceback
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_error_in_one_process_ends_all_and_two_processes_continue_the_run_of_one(tmp_path: Path) -> None:
     """The error is one that only the first process can see: the folder is taken."""
     launch = ["--standalone", "--nproc-per-node=2"]

@@ -437,7 +437,7 @@ def test_half_cheetah_runs() -> None:
     assert evals[-1] - evals[0] > 2.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_hopper_hops_without_falling() -> None:
     """With the settings of its planning; with those of other tasks it falls after some 100 steps."""
     plant, rewards, evals = drive("hopper", 130, 1)

@@ -9,7 +9,7 @@ NWORLD, STEPS = 16384, 10_000
 
 
 @pytest.mark.gpu
-@pytest.mark.slow
+@pytest.mark.long
 def test_worlds_with_faults_restart_and_leave_others_unchanged() -> None:
     env = lw.make("half_cheetah", nworld=NWORLD, device="cuda", seed=0)
     generator = torch.Generator("cuda").manual_seed(0)
