@@ -63,8 +63,13 @@ def _file(task: type[Task]) -> str | None:
 
 
 def task_name(task: type[Task]) -> str:
-    """The name under which a task is registered: HalfCheetah is half_cheetah."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", task.__name__).lower()
+    """The name under which a task is registered."""
+    return snake_case(task.__name__)
+
+
+def snake_case(name: str) -> str:
+    """The name of a task from that of its class: HalfCheetah is half_cheetah."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
 
 
 def task_names() -> list[str]:
