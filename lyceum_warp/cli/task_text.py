@@ -3,6 +3,7 @@
 import json
 
 import mujoco
+import numpy as np
 
 _STEP = 0.02
 """Seconds that a step should take, all its substeps together."""
@@ -106,13 +107,13 @@ def _sensor_places(model: mujoco.MjModel) -> list[tuple[int, int]]:
     places: list[tuple[int, int]] = []
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
         return places
-    for kind, start, size in zip(model.sensor_type, model.sensor_adr, model.sensor_dim, strict=True):
+    for kind, start, size in np.stack([model.sensor_type, model.sensor_adr, model.sensor_dim], axis=1).tolist():
         if kind in _UNOBSERVED or not size:
             continue
         if places and places[-1][1] == start:
-            places[-1] = places[-1][0], int(start + size)
+            places[-1] = places[-1][0], start + size
         else:
-            places.append((int(start), int(start + size)))
+            places.append((start, start + size))
     return places
 
 
