@@ -108,7 +108,8 @@ def compile_model(
     the same accelerations. Sleep is turned off, because a saved state does not hold which bodies are asleep. Fields
     that MuJoCo computes only where a sensor needs them get such a sensor, after the model's own, and the energy is
     turned on where it is read: without that a task would read zeros. Where no field needs a sensor, the model's own
-    are turned off.
+    are turned off. Of a pair of geoms that is listed twice under ``contact``, the first entry stays: MuJoCo would make
+    the contact twice, MuJoCo Warp once.
 
     Args:
         spec: The model; changed in place.
@@ -125,6 +126,7 @@ def compile_model(
     if spec.option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
         spec.option.enableflags &= ~mujoco.mjtEnableBit.mjENBL_SLEEP.value
         log.info("%s asks for sleep, which is not part of MuJoCo's state: no body falls asleep", spec.modelname)
+    _remove_repeated_pairs(spec)
     if "energy" in fields:
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
     if physics.cone is not None:
@@ -153,3 +155,14 @@ def compile_model(
     for warning in caught:  # most are about Gymnasium's own XML, where a user can change nothing
         log.info("%s: %s", spec.modelname, warning.message)
     return model
+
+
+def _remove_repeated_pairs(spec: mujoco.MjSpec) -> None:
+    """Keep the first of several entries for the same two geoms."""
+    known: set[frozenset[str]] = set()
+    for pair in list(spec.pairs):
+        geoms = frozenset((pair.geomname1, pair.geomname2))
+        if geoms in known:
+            spec.delete(pair)
+            log.info("%s lists a pair of %s twice: the second entry is left out", spec.modelname, " and ".join(sorted(geoms)))
+        known.add(geoms)

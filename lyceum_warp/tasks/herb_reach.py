@@ -1,0 +1,117 @@
+"""HerbReach: move both hands of HERB, two 7-joint Barrett arms with hands, to targets in space (the paper's HERB).
+
+The paper counts the throughput of a HERB whose model is not published; this one is made from published numbers (see
+herb.xml). An action is a share of each motor's peak torque, fingers included, on top of gravity compensation, as the
+robot's own controller takes torques. The targets are mocap bodies, and so belong to the state; they are drawn from two
+boxes in front of the shoulders, within reach of HERB's home position, from which an episode starts. An episode is a
+success while both palms have been within 5 cm of their targets for ten steps, 0.2 s. It never terminates.
+"""
+
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+
+@wp.struct
+class World:
+    qpos: Row[float]  # 15 joints of the left arm and hand, then those of the right
+    qvel: Row[float]
+    site_xpos: Row[wp.vec3]
+    mocap_pos: Row[wp.vec3]
+    memory: Row[float]  # steps in a row with both palms at their targets
+
+
+@wp.struct
+class Params:
+    dt: float
+    success_distance: float = 0.05
+    success_steps: float = 10.0
+    precision_weight: float = 0.5
+    ctrl_cost_weight: float = 0.01
+    target_low: wp.vec3 = wp.vec3(0.6, 0.1, 0.7)  # of the left target; the right one's box is its mirror image in y
+    target_high: wp.vec3 = wp.vec3(0.95, 0.6, 1.3)
+    reset_noise_scale: float = 0.1  # of the arms' joints
+    left_arm: int = lw.qpos("left/j1")
+    right_arm: int = lw.qpos("right/j1")
+    left_palm: int = lw.site("left/palm")
+    right_palm: int = lw.site("right/palm")
+    left_target: int = lw.mocap("left_target")
+    right_target: int = lw.mocap("right_target")
+
+
+@wp.func
+def left_error(s: World, p: Params) -> wp.vec3:
+    return s.mocap_pos[p.left_target] - s.site_xpos[p.left_palm]
+
+
+@wp.func
+def right_error(s: World, p: Params) -> wp.vec3:
+    return s.mocap_pos[p.right_target] - s.site_xpos[p.right_palm]
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    k = lw.put(obs, 0, s.qpos)
+    k = lw.put(obs, k, s.qvel)
+    k = lw.put(obs, k, s.site_xpos[p.left_palm])
+    k = lw.put(obs, k, s.site_xpos[p.right_palm])
+    k = lw.put(obs, k, left_error(s, p))
+    lw.put(obs, k, right_error(s, p))
+
+
+@wp.func
+def terms(action: Row[float], s: World, p: Params) -> wp.vec3:
+    left, right = wp.length(left_error(s, p)), wp.length(right_error(s, p))
+    at = wp.vec2(0.0, 0.4 * p.success_distance)
+    precision = lw.tolerance(left, at, margin=0.1) + lw.tolerance(right, at, margin=0.1)
+    return wp.vec3(-left - right, p.precision_weight * precision, -p.ctrl_cost_weight * lw.sum_squares(action))
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    r = terms(action, s1, p)
+    return r[0] + r[1] + r[2]
+
+
+@wp.func
+def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):
+    lw.put(metrics, 0, terms(action, s1, p))
+
+
+@wp.func
+def evaluate(s: World, p: Params) -> float:  # metres: the larger of the two distances
+    return wp.max(wp.length(left_error(s, p)), wp.length(right_error(s, p)))
+
+
+@wp.func
+def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
+    s1.memory[0] = wp.where(evaluate(s1, p) < p.success_distance, s0.memory[0] + 1.0, 0.0)
+
+
+@wp.func
+def success(s: World, p: Params) -> bool:
+    return s.memory[0] >= p.success_steps
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    for i in range(7):
+        s.qpos[p.left_arm + i] += lw.uniform(rng, -p.reset_noise_scale, p.reset_noise_scale)
+        s.qpos[p.right_arm + i] += lw.uniform(rng, -p.reset_noise_scale, p.reset_noise_scale)
+    for i in range(3):
+        s.mocap_pos[p.left_target][i] = lw.uniform(rng, p.target_low[i], p.target_high[i])
+        s.mocap_pos[p.right_target][i] = lw.uniform(rng, p.target_low[i], p.target_high[i])
+    s.mocap_pos[p.right_target][1] = -s.mocap_pos[p.right_target][1]
+
+
+@lw.register
+class HerbReach(lw.Task):
+    model = "herb.xml"
+    keyframe = "home"
+    frame_skip = 10
+    obs = {"position": 30, "velocity": 30, "palms": 6, "errors": 6}
+    metrics = ("reaching", "precision", "effort")
+    horizon = 150
+    memory = 1
+    planning = lw.Planning(settings={"horizon": 16, "samples": 64, "temperature": 0.1, "noise": 0.25})
