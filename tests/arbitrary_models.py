@@ -1,4 +1,20 @@
-"""Models of every kind of element, as XML, for what must work with any model."""
+"""Models of every kind of element, as XML, for what must work with any model, and the rules that depend on a model."""
+
+from lyceum_warp.testing import buffer_rules as buffers
+from lyceum_warp.testing import episode_rules as episodes
+from lyceum_warp.testing import fault_rules as faults
+from lyceum_warp.testing import state_rules as state
+
+# those rules that depend on the model, where an engine is slow on the CPU, or a model slow to compile
+MODEL_CHECKS = (
+    buffers.check_spaces,
+    state.check_restoring,
+    state.check_masked_restoring,
+    state.check_purity,
+    state.check_masked_reset,
+    episodes.check_graphs,
+    faults.check_bad_state,
+)
 
 BALL = '<body pos="0 0 {z}"><freejoint/><geom size=".1"/></body>'
 ARM = """

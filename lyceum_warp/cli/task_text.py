@@ -83,7 +83,8 @@ def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list
     """
     fields = ["qpos: Row[float]", "qvel: Row[float]"]
     sensed = _sensor_places(model)
-    parts, rows = {}, []
+    parts: dict[str, int] = {}
+    rows: list[str] = []
     if not (sensed and _all_joints_are_sensed(model)):
         parts |= {"position": model.nq, "velocity": model.nv}
         rows += ["s.qpos", "s.qvel"]

@@ -45,7 +45,7 @@ def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, 
         a.step(action)
         b.step(action)
         ctx.finite(a, f"{i + 1} steps after {what}")
-        again = again or _faulty(a)[bad].item()
+        again = again or bool(_faulty(a)[bad])
     diverges = b.fault_counts != healthy  # a model may have faults without a cause from outside
     ctx.that(not again or diverges, f"{what}: the world has another fault")
 

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from arbitrary_models import ARM, BALL, MOVING, PLUGINS, SENSING, actuated, text
+from arbitrary_models import ARM, BALL, MODEL_CHECKS, MOVING, PLUGINS, SENSING, actuated, text
 from training_runs import refused
 
 import lyceum_warp as lw
@@ -67,7 +67,7 @@ def new(name: str, xml: str) -> Path:
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_a_new_task_keeps_the_rules_on_both_engines(engine: str, folder: Path) -> None:
     file = new("everything", RICH)
-    check_task(str(file), engine=engine, nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
+    check_task(str(file), engine=engine, nworld=2, horizon=6, frame_skip=1, checks=MODEL_CHECKS)
 
 
 def test_a_new_task_observes_the_state_and_those_sensors_that_measure_it(folder: Path) -> None:

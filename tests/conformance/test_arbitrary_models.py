@@ -7,28 +7,15 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from arbitrary_models import ARM, MOVING, PLUGINS, SENSING, actuated, text
+from arbitrary_models import ARM, MODEL_CHECKS, MOVING, PLUGINS, SENSING, actuated, text
 
 import lyceum_warp as lw
 from lyceum_warp import Row
 from lyceum_warp.testing import CHECKS, check_task
-from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import episode_rules as episodes
-from lyceum_warp.testing import fault_rules as faults
-from lyceum_warp.testing import state_rules as state
 
 # without the one that looks through all objects, whatever the model
 QUICK_CHECKS = tuple(check for check in CHECKS if check is not episodes.check_memory)
-# those rules that depend on the model, where an engine is slow on the CPU, or a model slow to compile
-MODEL_CHECKS = (
-    buffers.check_spaces,
-    state.check_restoring,
-    state.check_masked_restoring,
-    state.check_purity,
-    state.check_masked_reset,
-    episodes.check_graphs,
-    faults.check_bad_state,
-)
 
 
 @wp.struct
