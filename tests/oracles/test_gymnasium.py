@@ -251,9 +251,7 @@ def evaluation(info: Mapping[str, Any]) -> float | None:
         ("inverted_double_pendulum", lambda data: data.site("tip").xpos[2]),
     ],
 )
-def test_a_pendulum_is_evaluated_by_its_angle_or_height(
-    task: str, metric: Callable[[mujoco.MjData], float]
-) -> None:
+def test_a_pendulum_is_evaluated_by_its_angle_or_height(task: str, metric: Callable[[mujoco.MjData], float]) -> None:
     pair = Pair(make_ours(task), make_theirs(task))
     pair.put()
     for _ in range(20):
@@ -438,7 +436,7 @@ IGNORED = {("humanoid_standup", "uph_cost_weight")}
 def keywords(task: str) -> dict[str, Any]:
     """The keyword parameters of Gymnasium's class with their defaults, without those that are about files and videos."""
     parameters = inspect.signature(unchanged(task)).parameters.values()
-    return {p.name: p.default for p in parameters if p.kind is not p.VAR_KEYWORD}
+    """Keyword parameters of Gymnasium's class with their defaults, without those of files and videos."""
 
 
 FILES = ("xml_file", "default_camera_config")
