@@ -1,4 +1,4 @@
-"""HerbReach: move both hands of HERB, two 7-joint Barrett arms with hands, to targets in space (the paper's HERB).
+"""HerbReach: move the hands of two 7-joint Barrett arms to targets in space (the paper's HERB).
 
 The paper counts the throughput of a HERB whose model is not published; this one is made from published numbers (see
 herb.xml). An action is a share of each motor's peak torque, fingers included, on top of gravity compensation, as the
