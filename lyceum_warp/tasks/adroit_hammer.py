@@ -108,8 +108,5 @@ class AdroitHammer(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Let each world move its board, and pair fingertips once."""
+        """Let each world move its board."""
         spec.body("nail_board").mocap = True
-        tips = ("C_rfdistal", "C_lfdistal")
-        for pair in [pair for pair in spec.pairs if (pair.geomname1, pair.geomname2) == tips][1:]:
-            spec.delete(pair)  # else the C engine would count a contact of theirs twice, and MuJoCo Warp once

@@ -109,10 +109,7 @@ class AdroitPen(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Let the target be turned in each world and touch nothing, and pair fingertips once."""
+        """Let the target be turned in each world and touch nothing."""
         spec.body("target").mocap = True
         for geom in spec.body("target").geoms:
             geom.contype = geom.conaffinity = 0
-        tips = ("C_rfdistal", "C_lfdistal")
-        for pair in [pair for pair in spec.pairs if (pair.geomname1, pair.geomname2) == tips][1:]:
-            spec.delete(pair)  # else the C engine would count a contact of theirs twice, and MuJoCo Warp once

@@ -1,10 +1,9 @@
 """AdroitRelocate: pick up a ball and carry it to a target (Gymnasium-Robotics' AdroitHandRelocate-v1).
 
-The hand's model comes with the extra "hand". The target is a mocap body here, and a reset moves the ball by its own
-joints, so that both places belong to the state. The tips of ring and little finger, which the model pairs twice, are
-paired once. As in the original, positions are those that ``mj_step`` leaves. The reward grows with the palm's distance
-from the ball, as in gymnasium-robotics 1.2.1 to 1.4.2, by mistake; ``palm_weight=-0.1`` subtracts it, as in version
-1.2.0.
+The hand's model comes with the extra "hand". The target is a mocap body here, and resets move the ball by its own
+joints: both places belong to the state. The tips of ring and little finger, which the model pairs twice, are paired
+once. As in the original, positions are those that ``mj_step`` leaves. The reward grows with the palm's distance from
+the ball, as in gymnasium-robotics 1.2.1 to 1.4.2, by mistake; ``palm_weight=-0.1`` subtracts it, as in version 1.2.0.
 """
 
 import mujoco
@@ -106,12 +105,9 @@ class AdroitRelocate(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Let each world move its target, and pair fingertips once."""
+        """Let each world move its target."""
         fixed = spec.site("target")
         target = spec.worldbody.add_body(name="target", mocap=True, pos=fixed.pos)
         looks = {"size": fixed.size.copy(), "rgba": fixed.rgba.copy()}
         spec.delete(fixed)
         target.add_site(name="target", **looks)
-        tips = ("C_rfdistal", "C_lfdistal")
-        for pair in [pair for pair in spec.pairs if (pair.geomname1, pair.geomname2) == tips][1:]:
-            spec.delete(pair)  # else the C engine would count a contact of theirs twice, and MuJoCo Warp once
