@@ -134,6 +134,7 @@ class AlohaLift(lw.Task):
                 geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
             elif geom.name.startswith(POT):
                 geom.rgba = (0.75, 0.77, 0.8, 1.0)
+        spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK  # so that videos take it
         child = mujoco.MjSpec.from_file(__file__.replace(".py", ".xml"))
         for part in child.worldbody.bodies:
             spec.body(part.name).add_frame().attach_body(part, "lift/", "")
