@@ -105,7 +105,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 
 # the wrist's motors turn little: a large share of their torque would only shake the hand
-ARM_NOISE, FINGER_NOISE = (0.2, 0.1, 0.05, 0.15, 0.03, 0.03, 0.03), (0.0, 0.0, 0.0, 0.0)
+ARM_NOISE, FINGER_NOISE = (0.14, 0.07, 0.035, 0.1, 0.02, 0.02, 0.02), (0.0, 0.0, 0.0, 0.0)
 
 
 @lw.register
