@@ -40,8 +40,11 @@ class Bounds:
 # Each bound is three to four times the difference measured with mujoco and mujoco_warp 4.0.0 on the CPU, over 320
 # states along random rollouts. A float32 position of about 1 is exact to 6e-8.
 ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median, 95 %
+    "adroit_door": Bounds(1.5e-7, 7e-7, 2e-5, 3.5e-4),  # 4.1e-8, 1.9e-7; 6.2e-6, 9.6e-5
+    "adroit_hammer": Bounds(6e-7, 8e-7, 3e-4, 4e-4),  # 1.6e-7, 2.2e-7; 8.0e-5, 1.1e-4
     # the worst 5 % are pens that lie on the palm's boxes
     "adroit_pen": Bounds(1.5e-7, 4e-6, 5e-6, 2e-3),  # 4.1e-8, 1.2e-6; 1.4e-6, 5.8e-4
+    "adroit_relocate": Bounds(2e-7, 4.5e-7, 8e-5, 2.5e-4),  # 5.1e-8, 1.2e-7; 2.0e-5, 6.2e-5
     "cartpole_swingup": Bounds(2e-7, 4e-7, 4e-8, 1e-7),  # 6.2e-8, 1.1e-7; 1.2e-8, 2.9e-8
     "half_cheetah": Bounds(1e-7, 1e-6, 1e-5, 1e-4),  # 3.2e-8, 2.9e-7; 3.0e-6, 2.9e-5
     "hopper": Bounds(1e-7, 2e-7, 1e-6, 5e-6),  # 3.0e-8, 5.5e-8; 2.9e-7, 1.6e-6
