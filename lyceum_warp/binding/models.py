@@ -164,5 +164,7 @@ def _remove_repeated_pairs(spec: mujoco.MjSpec) -> None:
         geoms = frozenset((pair.geomname1, pair.geomname2))
         if geoms in known:
             spec.delete(pair)
-            log.info("%s lists a pair of %s twice: the second entry is left out", spec.modelname, " and ".join(sorted(geoms)))
+            log.info(
+                "%s lists a pair of %s twice: the second entry is left out", spec.modelname, " and ".join(sorted(geoms))
+            )
         known.add(geoms)

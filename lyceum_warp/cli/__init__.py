@@ -42,7 +42,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The program ``lyceum-warp``.
 
     Returns:
-        0; 1 if --require-return was not met or check found a broken rule; 2 for bad input; 130 or 143 after Ctrl-C or SIGTERM.
+        0; 1 if --require-return was not met, or if check found a broken rule; 2 for bad input; 130 or 143 after
+        Ctrl-C or SIGTERM.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv == ["--version"]:

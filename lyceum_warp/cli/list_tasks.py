@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Callable
 from typing import Annotated, Any
 
+import mujoco
 import tyro
 from rich.markup import escape
 
@@ -25,6 +26,9 @@ _RIGHT = slice(1, 6)
 """The columns of numbers."""
 
 _UNKNOWN = "-"
+
+_WIDTH = 100
+"""Columns that a description may take."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,7 +78,7 @@ def list_tasks(options: Tasks) -> int:
 
     def show(text: str, style: str = "", indent: str = "") -> None:
         if indent:
-            text = textwrap.fill(text, console.width, initial_indent=indent, subsequent_indent=indent)
+            text = textwrap.fill(text, min(console.width, _WIDTH), initial_indent=indent, subsequent_indent=indent)
         console.print(escape(text.rstrip()), style=style, soft_wrap=True)
 
     show(heading, "bold")
@@ -110,14 +114,24 @@ def _row(entry: _Entry) -> tuple[tuple[str, ...], str]:
     actions = _UNKNOWN if task.actions is None else str(sum(task.actions.values()))
     timestep = _UNKNOWN
     try:
-        model = compile_model(task_spec(task), (), PhysicsOptions())
+        spec = task_spec(task)
+        actions = str(_controls(spec)) if task.actions is None else actions
+        timestep = f"{spec.option.timestep * task.frame_skip:g} s"
     except (ImportError, OSError, ValueError) as error:  # such as a package that is not installed, with a model's files
         note = note or _reason(error)
-    else:
-        actions = str(model.nu) if task.actions is None else actions
-        timestep = f"{model.opt.timestep * task.frame_skip:g} s"
     numbers = (str(obs), actions, str(task.frame_skip), timestep, str(task.horizon or "none"))
     return (entry.name, *numbers, entry.source), note
+
+
+def _controls(spec: mujoco.MjSpec) -> int:
+    """The number of a model's controls; the model is compiled only where its actuators may have several controls each.
+
+    To compile the meshes of a robot takes up to a second.
+    """
+    plain = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT, mujoco.mjtTrn.mjTRN_TENDON)
+    if all(actuator.trntype in plain and actuator.ctrlspec in (0, 1) for actuator in spec.actuators):
+        return len(spec.actuators)
+    return compile_model(spec, (), PhysicsOptions()).nu
 
 
 def _source(task: type[Task]) -> str:

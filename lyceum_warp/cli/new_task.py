@@ -11,12 +11,12 @@ from typing import Annotated
 import mujoco
 import tyro
 
-from lyceum_warp.binding.models import compile_model, read_spec
-from lyceum_warp.binding.registry import find_task, snake_case, task_names
+from lyceum_warp.binding.models import compile_model
+from lyceum_warp.binding.registry import find_task, package_task_names, snake_case
 from lyceum_warp.cli.display import make_console
 from lyceum_warp.cli.task_text import literal, task_text
 from lyceum_warp.files import replaced
-from lyceum_warp.model_files import ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model
+from lyceum_warp.model_files import ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, read_spec
 from lyceum_warp.options import PhysicsOptions
 
 _SOURCES: dict[str, Callable[[str], ModelFile]] = {
@@ -95,7 +95,7 @@ def _class_name(path: Path) -> str:
         raise ValueError(f"a task can't be named {name!r}: use {snake_case(class_name)!r}, for the class {class_name}")
     if class_name in _TAKEN:
         raise ValueError(f"a task can't be named {name!r}: its file uses {class_name} for something else")
-    if name in task_names():
+    if name in package_task_names():
         raise ValueError(f"the task name {name!r} is taken by a task of the package: choose another")
     module = importlib.util.find_spec(name)
     if module is not None and module.origin is not None and Path(module.origin).parent != path.absolute().parent:
@@ -126,7 +126,7 @@ def _model(text: str, path: Path) -> tuple[str, str, mujoco.MjSpec]:
 
 def _title(file: str) -> str:
     """What the docstring of a task file calls a model."""
-    plain = file.isprintable() and not set(file) & set("\\\"") and len(file) <= 50
+    plain = file.isprintable() and not set(file) & set('\\"') and len(file) <= 50
     return f"the model {file}" if plain else "a model"
 
 

@@ -3,6 +3,7 @@
 import json
 
 import mujoco
+import numpy as np
 
 _STEP = 0.02
 """Seconds that a step should take, all its substeps together."""
@@ -82,7 +83,8 @@ def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list
     """
     fields = ["qpos: Row[float]", "qvel: Row[float]"]
     sensed = _sensor_places(model)
-    parts, rows = {}, []
+    parts: dict[str, int] = {}
+    rows: list[str] = []
     if not (sensed and _all_joints_are_sensed(model)):
         parts |= {"position": model.nq, "velocity": model.nv}
         rows += ["s.qpos", "s.qvel"]
@@ -106,13 +108,13 @@ def _sensor_places(model: mujoco.MjModel) -> list[tuple[int, int]]:
     places: list[tuple[int, int]] = []
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
         return places
-    for kind, start, size in zip(model.sensor_type, model.sensor_adr, model.sensor_dim, strict=True):
+    for kind, start, size in np.stack([model.sensor_type, model.sensor_adr, model.sensor_dim], axis=1).tolist():
         if kind in _UNOBSERVED or not size:
             continue
         if places and places[-1][1] == start:
-            places[-1] = places[-1][0], int(start + size)
+            places[-1] = places[-1][0], start + size
         else:
-            places.append((int(start), int(start + size)))
+            places.append((start, start + size))
     return places
 
 

@@ -49,18 +49,22 @@ def test_tasks_are_listed_with_their_sizes_and_models(capsys: pytest.CaptureFixt
     assert "    hop forward on one leg (Gymnasium's Hopper-v5)" in out.splitlines()
 
 
-def test_rows_fit_into_100_columns(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "100")
+def test_lines_fit_into_100_columns(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["tasks"]) == 0
     assert max(map(len, capsys.readouterr().out.splitlines())) <= 100
 
 
-@pytest.mark.parametrize("name", ["humanoid", "reach", "adroit_pen"])
+@pytest.mark.parametrize("name", task_names())
 def test_listed_sizes_are_those_of_an_environment(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     cli.main(["tasks", name])
-    task = BoundTask(find_task(name))
-    sizes = [sum(task.obs_layout.values()), task.model.nu, task.frame_skip, f"{task.timestep:g}"]
-    assert rows(capsys.readouterr().out)[name][:4] == list(map(str, sizes))
+    row = rows(capsys.readouterr().out)[name]
+    try:
+        task = BoundTask(find_task(name))
+    except FileNotFoundError as error:
+        pytest.skip(str(error))
+    actions = sum(task.task.actions.values()) if task.task.actions else task.model.nu
+    sizes = [sum(task.obs_layout.values()), actions, task.frame_skip, f"{task.timestep:g}"]
+    assert row[:4] == list(map(str, sizes))
 
 
 @pytest.mark.parametrize(

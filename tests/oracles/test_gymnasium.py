@@ -1,8 +1,8 @@
 """Tasks that name an environment of Gymnasium's own, against that environment, on the C engine.
 
 Both run the same C code in float64. From the same state, warm start included, their numbers differ only by the
-rounding of observations and rewards to float32. Everything here follows from the tasks' attribute ``gymnasium`` and from
-Gymnasium's registry and signatures: a new task is compared without a change of this file.
+rounding of observations and rewards to float32. Everything here follows from the tasks' attribute ``gymnasium`` and
+from Gymnasium's registry and signatures: a new task is compared without a change of this file.
 """
 
 import dataclasses
@@ -133,11 +133,12 @@ class Pair:
         self.middle, self.reach = (low + high) / 2, (high - low) / 2
         self.held = self.action()
 
-    def put(self) -> None:
-        """Put both into a state of Gymnasium's reset, with a warm start; every number is one of float32."""
+    def put(self, change: Callable[[mujoco.MjData], None] = lambda data: None) -> None:
+        """Put both into a state of Gymnasium's reset, changed, with a warm start; every number is one of float32."""
         data = self.theirs.data
         mujoco.mj_resetData(self.theirs.model, data)
         self.theirs.reset_model()
+        change(data)
         data.time = 0.5
         data.qpos[:], data.qvel[:] = np.float32(data.qpos), np.float32(data.qvel)
         mujoco.mj_forward(self.theirs.model, data)
@@ -250,13 +251,49 @@ def evaluation(info: Mapping[str, Any]) -> float | None:
         ("inverted_double_pendulum", lambda data: data.site("tip").xpos[2]),
     ],
 )
-def test_a_pendulum_is_evaluated_by_its_angle_or_height(
-    task: str, metric: Callable[[mujoco.MjData], float]
-) -> None:
+def test_a_pendulum_is_evaluated_by_its_angle_or_height(task: str, metric: Callable[[mujoco.MjData], float]) -> None:
     pair = Pair(make_ours(task), make_theirs(task))
     pair.put()
     for _ in range(20):
         assert pair.step().eval == pytest.approx(metric(pair.theirs.data), abs=1e-6)
+
+
+def test_the_force_at_the_end_of_the_rail_is_gymnasiums() -> None:
+    """A pole that is upright falls before random actions have brought its cart there."""
+    pair = Pair(make_ours("inverted_double_pendulum"), make_theirs("inverted_double_pendulum"))
+
+    def drive_to_the_end(data: mujoco.MjData) -> None:
+        data.qpos[0], data.qvel[0] = pair.rng.choice([-1.0, 1.0]) * np.array([0.99, 0.05])
+
+    forces = []
+    for _ in range(20):
+        pair.put(drive_to_the_end)
+        steps = [pair.step() for _ in range(5)]
+        check(steps)
+        forces += [step.obs[8] for step in steps]
+    assert min(forces) < 0.0 < max(forces) and np.mean(np.equal(forces, 0.0)) < 0.9
+    assert any(0.0 < abs(force) < 10.0 for force in forces), "every force is clipped"
+
+
+def test_a_cylinder_is_pushed_as_in_gymnasium() -> None:
+    """Random actions hardly ever bring the hand to the cylinder, so the cylinder is put beside the hand."""
+    pair = Pair(make_ours("pusher"), make_theirs("pusher"))
+    model, (low, high) = pair.theirs.model, pair.theirs.model.jnt_range[:7].T
+
+    def bring_together(data: mujoco.MjData) -> None:
+        tips, cylinder = data.body("tips_arm").xpos, data.body("object").xpos
+        while abs(tips[2] - cylinder[2]) > 0.03:
+            data.qpos[:7] = pair.rng.uniform(low, high)
+            mujoco.mj_kinematics(model, data)
+        data.qpos[7:9] += (tips - cylinder)[1::-1]
+
+    moved = []
+    for _ in range(10):
+        pair.put(bring_together)
+        start = pair.theirs.data.qpos[7:9].copy()
+        check([pair.step() for _ in range(10)])
+        moved.append(np.linalg.norm(pair.theirs.data.qpos[7:9] - start))
+    assert min(moved) > 5e-4  # m; a cylinder that nothing touches stays where it is
 
 
 @pytest.mark.parametrize("task", WITH_FORCES)
@@ -397,12 +434,10 @@ IGNORED = {("humanoid_standup", "uph_cost_weight")}
 
 @functools.cache
 def keywords(task: str) -> dict[str, Any]:
-    """The keyword parameters of Gymnasium's class with their defaults, without those that are about files and videos."""
+    """Keyword parameters of Gymnasium's class with their defaults, without those of the model file and of videos."""
     parameters = inspect.signature(unchanged(task)).parameters.values()
-    return {p.name: p.default for p in parameters if p.kind is not p.VAR_KEYWORD}
-
-
-FILES = ("xml_file", "default_camera_config")
+    others = ("xml_file", "default_camera_config")
+    return {p.name: p.default for p in parameters if p.kind is not p.VAR_KEYWORD and p.name not in others}
 
 
 def variants(default: Any) -> list[Any]:
@@ -424,8 +459,8 @@ def cases() -> list[Any]:
     found = []
     for task in TASKS:
         for name, default in keywords(task).items():
-            if name in (*FILES, "reset_noise_scale"):
-                continue
+            if name == "reset_noise_scale":
+                continue  # compared by the distributions above
             for i, variant in enumerate(variants(default)):
                 marks = pytest.mark.long if i and not isinstance(default, tuple) else ()
                 found.append(pytest.param(task, name, variant, marks=marks))
@@ -486,7 +521,7 @@ def test_every_parameter_of_gymnasium_is_there_with_its_default(task: str) -> No
     for name, default in keywords(task).items():
         if name == "frame_skip":
             assert find_task(task).frame_skip == default
-        elif name not in FILES:
+        else:
             value = ours.task.parameters.values[name]
             np.testing.assert_array_equal(np.float32(value), np.float32(default), err_msg=name)
             assert isinstance(value, bool) == isinstance(default, bool), name
