@@ -1,6 +1,7 @@
-"""A task of your own in one file: swing up a pendulum whose motor is too weak to lift it directly.
+"""A task and its model in one Python file: swing up a pendulum whose motor is too weak to lift it directly.
 
-``python examples/own_task.py`` checks and steps it, ``lyceum-warp train examples/own_task.py`` trains it.
+``python examples/own_task.py`` checks and steps it from Python, ``lyceum-warp train examples/own_task.py`` trains it.
+docs/own_task.md writes a task whose model is a file, and goes through the command line.
 """
 
 import mujoco
