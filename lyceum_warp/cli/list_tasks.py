@@ -26,7 +26,7 @@ _HEADINGS = ("task", "obs", "act", "skip", "dt", "horizon", "model")
 _RIGHT = slice(1, 6)
 """The columns of numbers."""
 
-_LEGEND = """obs, act: numbers in an observation and in an action; skip: substeps in a step; dt: seconds in a step.
+_LEGEND = """obs, act: numbers in an observation and an action; skip: substeps in a step; dt: seconds in a step.
 A task of your own: lyceum-warp new --help"""
 
 _UNKNOWN = "-"
