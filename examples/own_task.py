@@ -1,7 +1,6 @@
 """A task and its model in one Python file: swing up a pendulum whose motor is too weak to lift it directly.
 
-``python examples/own_task.py`` checks and steps it from Python, ``lyceum-warp train examples/own_task.py`` trains it.
-docs/own_task.md writes a task whose model is a file, and goes through the command line.
+``python examples/own_task.py`` checks and steps it; docs/own_task.md shows the command line, and a model in a file.
 """
 
 import mujoco
