@@ -36,7 +36,7 @@ def joints_at(
 
 def follow(env: lw.Env, targets: np.ndarray, steps: int) -> None:
     """Lead the servos' targets to the given ones, (nworld, nu), at their greatest speed."""
-    speed = torch.from_numpy(env.model.actuator_ctrlrange[:, 1])
+    speed = torch.tensor(env.model.actuator_ctrlrange[:, 1])
     for _ in range(steps):
         act = env.state_space.split(env.get_state())["act"]
         velocity = (torch.from_numpy(targets) - act) / (speed * env.timestep)

@@ -33,7 +33,7 @@ class Params:
     dt: float
     goal_height: float = 0.1
     goal_steps: float = 10.0
-    rest_height: float = 0.066  # of the pot on the table
+    rest_height: float = 0.0658  # of the pot on the table
     place: wp.vec3 = wp.vec3(0.03, 0.03, 0.25)  # of the pot at the start: x, y and yaw, each plus or minus this
     pot: int = lw.body(POT)
     pot_qpos: int = lw.qpos(POT)
@@ -134,8 +134,9 @@ class AlohaLift(lw.Task):
                 geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
             elif geom.name.startswith(POT):
                 geom.rgba = (0.75, 0.77, 0.8, 1.0)
+        spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK  # so that videos take it
         child = mujoco.MjSpec.from_file(__file__.replace(".py", ".xml"))
         for part in child.worldbody.bodies:
             spec.body(part.name).add_frame().attach_body(part, "lift/", "")
-        pot = (0.0, 0.0, 0.066, 0.7071068, 0.0, 0.0, 0.7071068, 0.0)
+        pot = (0.0, 0.0, 0.0658, 0.7071068, 0.0, 0.0, 0.7071068, 0.0)
         spec.add_key(name="start", qpos=[*ARM, *ARM, *pot], act=[*ARM[:7], *ARM[:7]])

@@ -92,7 +92,7 @@ def success(s: World, p: Params) -> bool:
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     x, y = lw.uniform(rng, p.area[0], p.area[1]), lw.uniform(rng, p.area[2], p.area[3])
-    k = lw.put(s.qpos, p.cube_qpos, wp.vec3(x, y, p.half_size))
+    k = lw.put(s.qpos, p.cube_qpos, wp.vec3(x, y, p.half_size - 1e-4))  # at rest, its weight presses it into the table
     lw.put(s.qpos, k, lw.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), lw.uniform(rng, -wp.pi, wp.pi)))
 
 
@@ -119,4 +119,4 @@ class PandaLift(lw.Task):
         for name, prefix, parent in (("hand", "hand/", "attachment"), ("lift", "table/", "world")):
             child = mujoco.MjSpec.from_file(__file__.replace("lift.py", f"{name}.xml"))
             spec.attach(child, prefix=prefix, frame=spec.body(parent).add_frame())
-        spec.add_key(name="start", qpos=[*HOME, 0.55, 0.0, 0.02, 1.0, 0.0, 0.0, 0.0], act=HOME[:8])
+        spec.add_key(name="start", qpos=[*HOME, 0.55, 0.0, 0.0199, 1.0, 0.0, 0.0, 0.0], act=HOME[:8])

@@ -39,10 +39,10 @@ def test_robot_is_a_panda_with_the_published_hand(shared_env: SharedEnv) -> None
 
 def test_only_simple_shapes_collide(shared_env: SharedEnv) -> None:
     model = shared_env("panda_lift").model
-    shape = mujoco.mjtGeom
     solid = (model.geom_contype | model.geom_conaffinity) > 0
-    assert set(model.geom_type[solid]) <= {shape.mjGEOM_PLANE, shape.mjGEOM_CAPSULE, shape.mjGEOM_BOX}
-    assert model.nmesh > 0 and (model.geom_type == shape.mjGEOM_MESH).any(), "meshes are drawn"
+    shapes = [mujoco.mjtGeom(kind) for kind in np.unique(model.geom_type[solid])]
+    assert shapes == [mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX]
+    assert (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).any(), "meshes are drawn"
 
 
 def test_arm_without_commands_stands_still(shared_env: SharedEnv) -> None:
@@ -66,9 +66,8 @@ def test_a_scripted_grasp_lifts_the_cube_in_every_world(shared_env: SharedEnv) -
     for world in range(4):
         yaw = 2.0 * np.arctan2(at[world, 6], at[world, 3])
         yaw -= np.round(yaw / (0.5 * np.pi)) * 0.5 * np.pi  # the edge that is nearest to the fingers
-        axes = np.array([[np.sin(yaw), np.cos(yaw), 0], [-np.cos(yaw), np.sin(yaw), 0], [0, 0, -1.0]]).T
-        axes[:, 0], axes[:, 1] = -np.cross(axes[:, 2], [-np.sin(yaw), np.cos(yaw), 0]), [-np.sin(yaw), np.cos(yaw), 0]
-        axes[:, 0] = np.cross(axes[:, 1], axes[:, 2])
+        y, z = np.array([-np.sin(yaw), np.cos(yaw), 0.0]), np.array([0.0, 0.0, -1.0])
+        axes = np.stack([np.cross(y, z), y, z], axis=1)
         for i, height in enumerate((0.12, 0.02, 0.2)):
             place = np.array([*at[world, :2], height])
             waypoints[i, world, :7] = joints_at(env.model, start[world], "hand/grip", place, axes, ARM)[:7]
@@ -122,7 +121,7 @@ def test_random_resets_draw_the_cubes_place_and_yaw(area: tuple[float, ...] | No
     yaw = 2.0 * np.arctan2(found[:, 6], found[:, 3])
     middle = [(2 * found[:, 0] - x0 - x1) / (x1 - x0), (2 * found[:, 1] - y0 - y1) / (y1 - y0), yaw / np.pi]
     check_uniform(np.stack(middle, axis=1) / (1.0 + 1e-6))
-    np.testing.assert_allclose(found[:, 2], 0.02, atol=1e-7)
+    np.testing.assert_allclose(found[:, 2], 0.0199, atol=1e-7)
     assert not found[:, 4:6].any()
     qpos, qvel = positions(env)
     np.testing.assert_allclose(qpos[:, :9], np.tile(env.model.key("start").qpos[:9], (2000, 1)), atol=1e-6)
