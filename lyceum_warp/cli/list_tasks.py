@@ -5,6 +5,7 @@ import inspect
 import sys
 import textwrap
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any
 
 import mujoco
@@ -21,11 +22,14 @@ from lyceum_warp.model_files import ModelFile, PackageFile
 from lyceum_warp.options import PhysicsOptions
 from lyceum_warp.task import Task
 
-_HEADINGS = ("task", "obs", "action", "substeps", "timestep", "horizon", "model")
+_HEADINGS = ("task", "obs", "action", "substeps", "dt", "horizon", "model")
 _RIGHT = slice(1, 6)
 """The columns of numbers."""
 
 _UNKNOWN = "-"
+
+_ONE_CONTROL = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE, mujoco.mjtGain.mjGAIN_MUSCLE)
+"""Types of actuators that have one control each."""
 
 _WIDTH = 100
 """Columns that a description may take."""
@@ -88,7 +92,7 @@ def list_tasks(options: Tasks) -> int:
         if note:
             show(note, "yellow", "    ")
     show("")
-    show("timestep: seconds in a step, all its substeps together. A task of your own: lyceum-warp new --help", "dim")
+    show("dt: seconds in a step, all its substeps together. A task of your own: lyceum-warp new --help", "dim")
     return 0
 
 
@@ -124,12 +128,11 @@ def _row(entry: _Entry) -> tuple[tuple[str, ...], str]:
 
 
 def _controls(spec: mujoco.MjSpec) -> int:
-    """The number of a model's controls; the model is compiled only where its actuators may have several controls each.
+    """The number of a model's controls; the model is compiled only where an actuator may have several.
 
     To compile the meshes of a robot takes up to a second.
     """
-    plain = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT, mujoco.mjtTrn.mjTRN_TENDON)
-    if all(actuator.trntype in plain and actuator.ctrlspec in (0, 1) for actuator in spec.actuators):
+    if all(actuator.gaintype in _ONE_CONTROL for actuator in spec.actuators):
         return len(spec.actuators)
     return compile_model(spec, (), PhysicsOptions()).nu
 
@@ -143,7 +146,7 @@ def _source(task: type[Task]) -> str:
     if not isinstance(found, ModelFile):
         return found.name
     extra = found.install.partition("[")[2].partition("]")[0] if isinstance(found, PackageFile) else ""
-    return f"{found.source} [{extra}]" if extra else f"{found.source}: {found.file}"
+    return f"{found.source} [{extra}]" if extra else f"{found.source}: {Path(found.file).name}"
 
 
 def _reason(error: Exception) -> str:

@@ -98,7 +98,7 @@ class AdroitDoor(lw.Task):
     lagged = ("site_xpos",)
     action_range = (-1.0, 1.0)
     planning = lw.Planning(
-        settings={"horizon": 32, "samples": 160, "temperature": 1.0, "noise": 1.0}, params={"palm_weight": -0.1}
+        settings={"horizon": 32, "samples": 160, "temperature": 0.1, "noise": 1.0}, params={"palm_weight": -1.0}
     )
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""HerbReach: move both hands of HERB, two 7-joint Barrett arms with hands, to targets in space (the paper's HERB).
+"""HerbReach: move the hands of two 7-joint Barrett arms to targets in space (the paper's HERB).
 
 The paper counts the throughput of a HERB whose model is not published; this one is made from published numbers (see
 herb.xml). An action is a share of each motor's peak torque, fingers included, on top of gravity compensation, as the
@@ -105,7 +105,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 
 # the wrist's motors turn little: a large share of their torque would only shake the hand
-ARM_NOISE, FINGER_NOISE = (0.2, 0.1, 0.05, 0.15, 0.03, 0.03, 0.03), (0.0, 0.0, 0.0, 0.0)
+ARM_NOISE, FINGER_NOISE = (0.14, 0.07, 0.035, 0.1, 0.02, 0.02, 0.02), (0.0, 0.0, 0.0, 0.0)
 
 
 @lw.register

@@ -20,9 +20,9 @@ INSTALL = "pip install 'lyceum-warp[hand]'"
 def rows(out: str) -> dict[str, list[str]]:
     """The words of each task's row by its name; descriptions and notes are indented."""
     table, _, legend = out.partition("\n\n")
-    assert legend.startswith("timestep: ")
+    assert legend.startswith("dt: ")
     heading, *lines = table.splitlines()
-    assert heading.split() == ["task", "obs", "action", "substeps", "timestep", "horizon", "model"]
+    assert heading.split() == ["task", "obs", "action", "substeps", "dt", "horizon", "model"]
     return {line.split()[0]: line.split()[1:] for line in lines if not line.startswith(" ")}
 
 

@@ -40,9 +40,12 @@ class Bounds:
 # Each bound is three to four times the difference measured with mujoco and mujoco_warp 4.0.0 on the CPU, over 320
 # states along random rollouts. A float32 position of about 1 is exact to 6e-8.
 ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median, 95 %
+    "adroit_door": Bounds(1.5e-7, 7e-7, 2e-5, 3.5e-4),  # 4.1e-8, 1.9e-7; 6.2e-6, 9.6e-5
+    "adroit_hammer": Bounds(6e-7, 8e-7, 3e-4, 4e-4),  # 1.6e-7, 2.2e-7; 8.0e-5, 1.1e-4
     # the worst 5 % are pens that lie on the palm's boxes
     "adroit_pen": Bounds(1.5e-7, 4e-6, 5e-6, 2e-3),  # 4.1e-8, 1.2e-6; 1.4e-6, 5.8e-4
     "aloha_lift": Bounds(2e-7, 2e-7, 1.5e-6, 4e-6),  # 5.2e-8, 5.9e-8; 4.3e-7, 9.2e-7
+    "adroit_relocate": Bounds(2e-7, 4.5e-7, 8e-5, 2.5e-4),  # 5.1e-8, 1.2e-7; 2.0e-5, 6.2e-5
     "ant": Bounds(1.5e-7, 3e-7, 1.5e-6, 2e-5),  # 5.2e-8, 9.8e-8; 4.4e-7, 6.5e-6
     "cartpole": Bounds(7e-9, 4e-8, 5e-8, 2e-7),  # 2.0e-9, 1.1e-8; 1.3e-8, 5.3e-8
     "cartpole_swingup": Bounds(2e-7, 4e-7, 4e-8, 1e-7),  # 6.2e-8, 1.1e-7; 1.2e-8, 2.9e-8

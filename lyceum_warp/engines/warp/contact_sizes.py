@@ -12,6 +12,10 @@ log = logging.getLogger(__name__)
 
 _WORLDS, _HOLDS, _SUBSTEPS = 32, 25, 20
 
+_LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
+"""The smallest sizes. Contacts of a flex come in bursts that a probe may miss: a geom that is pressed into it touches
+up to 50 of its elements. Those with a flex are MuJoCo Warp's own defaults."""
+
 _known: dict[str, tuple[int, int]] = {}
 
 
@@ -22,7 +26,7 @@ def probe_sizes(model: mujoco.MjModel) -> tuple[int, int]:
     500 substeps on the C engine under random controls held for 20. The result is remembered for each model.
 
     Returns:
-        (nconmax, njmax), each at least 8 and a multiple of 8.
+        (nconmax, njmax), multiples of 8: each at least 8, with a flex at least 256 and 512.
     """
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
@@ -48,6 +52,7 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
             with contextlib.suppress(SimulationError):
                 batch.step()
             contacts, constraints = max(contacts, int(ncon.max())), max(constraints, int(nefc.max()))
-    sizes = tuple(max(8, -(-2 * peak // 8) * 8) for peak in (contacts, constraints))
+    least = _LEAST_WITH_FLEX if model.nflex else _LEAST
+    sizes = tuple(max(low, -(-2 * peak // 8) * 8) for low, peak in zip(least, (contacts, constraints), strict=True))
     log.info("probed peaks of %d contacts and %d constraints: nconmax=%d, njmax=%d", contacts, constraints, *sizes)
     return sizes[0], sizes[1]

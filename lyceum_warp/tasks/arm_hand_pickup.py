@@ -1,0 +1,133 @@
+"""ArmHandPickup: pick up a ball with an arm and a hand, and hold it at a goal (Lyceum's ArmHandPickup).
+
+The arm and its hand of three fingers are Kinova's Jaco, from the extra "jaco"; in Lyceum, a hand of five fingers. Goal,
+distances, reward and the ball's start are Lyceum's, but for an error of it: its reward takes the ball's distance from
+(ball - goal), which is |goal| everywhere and tells nothing. Here it is the distance from the goal. Actions are speeds
+of joints, which are observed, too. Arm and hand touch the table and the ball, not each other. An episode is a success
+once the ball has stayed within 5 cm of the goal for 0.2 s.
+"""
+
+from pathlib import Path
+
+import mujoco
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+HAND = lw.package_model("dm_control", "third_party/kinova/jaco_hand.xml", install="lyceum-warp[jaco]")
+HOME = (1.775, 3.682, 1.303, 3.395, 5.351, 3.133, 0.2, 0.2, 0.2)  # the hand points down, open, above the table
+JOINTS = 9
+
+
+@wp.struct
+class World:
+    qpos: Row[float]  # 6 joints of the arm, 3 of the fingers, the ball's position and quaternion
+    qvel: Row[float]
+    xpos: Row[wp.vec3]
+    geom_xpos: Row[wp.vec3]
+    site_xpos: Row[wp.vec3]
+    memory: Row[float]  # seconds that the ball has spent at the goal without a break
+
+
+@wp.struct
+class Params:
+    dt: float
+    far: float = 0.5  # m; longer distances count as this
+    near: float = 0.03  # m from the palm to the ball, from which on the goal counts
+    finger_weight: float = 0.1
+    success_distance: float = 0.05
+    success_time: float = 0.2
+    ball: int = lw.body("table/ball")
+    goal: int = lw.site("table/goal")
+    palm: int = lw.site("hand/pinchsite")
+    finger: int = lw.geom("hand/finger_tip_1")  # those of the other two lie 2 and 4 geoms further on
+
+
+@wp.func
+def distance(s: World, p: Params, point: wp.vec3) -> float:
+    return wp.min(wp.length(point - s.xpos[p.ball]), p.far)
+
+
+@wp.func
+def distances(s: World, p: Params) -> wp.vec3:
+    """From the ball to the palm, to the goal, and to the fingers in all."""
+    fingers = float(0.0)
+    for i in range(3):
+        fingers += distance(s, p, s.geom_xpos[p.finger + 2 * i])
+    return wp.vec3(distance(s, p, s.site_xpos[p.palm]), distance(s, p, s.site_xpos[p.goal]), fingers)
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    ball = s.xpos[p.ball]
+    k = lw.put(obs, 0, s.qpos, 0, JOINTS)
+    k = lw.put(obs, k, s.qvel, 0, JOINTS + 3)
+    k = lw.put(obs, k, ball)
+    k = lw.put(obs, k, s.site_xpos[p.palm] - ball)
+    k = lw.put(obs, k, s.site_xpos[p.goal] - ball)
+    for i in range(3):
+        k = lw.put(obs, k, s.geom_xpos[p.finger + 2 * i] - ball)
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    d = distances(s1, p)
+    return wp.where(d[0] < p.near, 2.0 - 2.0 * d[1] / p.far - p.finger_weight * d[2], -d[0] / p.far)
+
+
+@wp.func
+def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):
+    lw.put(metrics, 0, distances(s1, p))
+
+
+@wp.func
+def evaluate(s: World, p: Params) -> float:
+    return s.xpos[p.ball][2]
+
+
+@wp.func
+def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
+    s1.memory[0] = wp.where(distances(s1, p)[1] < p.success_distance, s0.memory[0] + p.dt, 0.0)
+
+
+@wp.func
+def success(s: World, p: Params) -> bool:
+    return s.memory[0] > p.success_time - 0.5 * p.dt
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    s.qpos[JOINTS] = lw.uniform(rng, -0.15, 0.15)
+    s.qpos[JOINTS + 1] = lw.uniform(rng, -0.1, 0.1)
+
+
+@lw.register
+class ArmHandPickup(lw.Task):
+    model = lw.package_model("dm_control", "third_party/kinova/jaco_arm.xml", install="lyceum-warp[jaco]")
+    keyframe, frame_skip, horizon, memory = "home", 4, 300, 1
+    obs = {"joints": 9, "velocity": 9, "ball_velocity": 3, "ball": 3, "palm": 3, "goal": 3, "fingers": 9}
+    metrics = ("palm_distance", "goal_distance", "finger_distances")
+    action_range = (-1.0, 1.0)
+    planning = lw.Planning(
+        settings={"horizon": 32, "samples": 64, "temperature": 0.1, "noise": 0.8, "fill": "repeat"},
+        params={"far": 1.0, "finger_weight": 2.0},  # the goal counts from anywhere, and closing the hand counts more
+    )
+
+    @staticmethod
+    def edit_model(spec: mujoco.MjSpec) -> None:
+        """Give the arm a hand, a table and motors that hold the speeds of joints."""
+        spec.attach(HAND.spec(), site=spec.site("wristsite"), prefix="hand/")
+        for geom in spec.geoms:
+            geom.contype, geom.conaffinity = 0, 1
+        for i, joint in enumerate(spec.joints):  # of large joints, small joints, fingers: gain, rad/s and N m at most
+            gain, speed, torque = ((500, 0.628, 30.5), (500, 0.838, 6.8), (100, 1.0, 1.0))[i // 3]
+            motor = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            motor.set_to_velocity(kv=gain)
+            motor.ctrlrange, motor.forcerange = (-speed, speed), (-torque, torque)
+        spec.body("b_base").pos = (0, -0.4, 0)
+        scene = mujoco.MjSpec.from_file(str(Path(__file__).with_name("arm_hand_pickup.xml")))
+        for name in ("timestep", "integrator", "cone", "impratio", "disableflags"):
+            setattr(spec.option, name, getattr(scene.option, name))
+        spec.attach(scene, frame=spec.worldbody.add_frame(), prefix="table/")
+        spec.add_key(name="home", qpos=[*HOME, 0, 0, 0.035, 1, 0, 0, 0])
