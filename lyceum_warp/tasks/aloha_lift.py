@@ -135,6 +135,8 @@ class AlohaLift(lw.Task):
             elif geom.name.startswith(POT):
                 geom.rgba = (0.75, 0.77, 0.8, 1.0)
         spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK  # so that videos take it
+        for light in spec.lights:
+            light.castshadow = False  # drawing a frame without a GPU took 17 times as long
         child = mujoco.MjSpec.from_file(__file__.replace(".py", ".xml"))
         for part in child.worldbody.bodies:
             spec.body(part.name).add_frame().attach_body(part, "lift/", "")
