@@ -42,6 +42,7 @@ GYMNASIUM = {
     "walker2d": "Walker2d-v5",
     "half_cheetah": "HalfCheetah-v5",
     "swimmer": "Swimmer-v5",
+    "ant": "Ant-v5",
     "humanoid": "Humanoid-v5",
 }
 
@@ -53,7 +54,7 @@ FILES = {"quadruped": Path(__file__).with_name("quadruped.py")}
 class Options:
     """Throughput of environments, as a table and as JSON."""
 
-    tasks: tuple[str, ...] = (*GYMNASIUM, "cartpole_swingup", "point_mass")
+    tasks: tuple[str, ...] = (*GYMNASIUM, "cartpole", "herb_reach", "cartpole_swingup", "point_mass")
     """Tasks to measure."""
     nworld: tuple[int, ...] = (256,)
     """Numbers of worlds."""

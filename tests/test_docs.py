@@ -2,15 +2,23 @@
 
 import re
 import runpy
+import shlex
+import shutil
 from pathlib import Path
 
 import pytest
 from conftest import TaskFile
+from training_runs import TINY
 
 import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.runs import Run
+from lyceum_warp.viz.video import NoVideoError, check_video
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
+WALKTHROUGHS = [page for page in PAGES if "\n```sh\n" in page.read_text()]
+"""Pages with commands. Their blocks run in one folder, in order; a block with a title is the file of that name."""
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 
 
@@ -30,12 +38,106 @@ def python_of(page: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
+@pytest.mark.parametrize("page", sorted({*PAGES} - {*WALKTHROUGHS}), ids=name_of)
 def test_python_of_a_page_runs_in_order(page: Path, task_file: TaskFile) -> None:
     source = python_of(page)
     assert source.strip(), f"{page.name} has no Python"
     # a file, because Warp compiles the source of functions
     runpy.run_path(str(task_file(f"page_{page.stem}.py", source)), run_name=f"page_{page.stem}")
+
+
+BLOCK = re.compile(r"^```(\w+)(?: title=(\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+QUICK = {
+    "check": ["--nworld", "2", "--steps", "5"],
+    "train": ["--iterations", "2", *TINY, "--no-video"],
+    "eval": ["--episodes", "2"],
+    "plan": ["--steps", "3", "--samples", "4"],
+}
+"""Options that make a command quick, in place of those on the page."""
+
+
+class Walkthrough:
+    """The blocks of a page, run one after another in a folder.
+
+    Args:
+        folder: The current folder, empty.
+        quick: Whether commands get the options of QUICK; a check on the Warp engine, which is slow, is then left out.
+    """
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, *, quick: bool) -> None:
+        self.folder, self.monkeypatch, self.quick = folder, monkeypatch, quick
+        monkeypatch.chdir(folder)
+        monkeypatch.syspath_prepend(folder)
+
+    def run(self, page: Path) -> None:
+        for i, (language, title, text) in enumerate(BLOCK.findall(page.read_text())):
+            if title:
+                (self.folder / title).write_text(text)
+            elif language == "sh":
+                for line in text.splitlines():
+                    self.command(shlex.split(line))
+            elif language == "python":
+                script = self.folder / f"block_{i}.py"
+                script.write_text(text)
+                runpy.run_path(str(script), run_name=f"block_{i}")
+
+    def command(self, words: list[str]) -> None:
+        match words:
+            case ["git", "clone", address]:  # a checkout with one robot, which is another one's model
+                robot = self.folder / Path(address).name / "unitree_go1" / "scene.xml"
+                robot.parent.mkdir(parents=True)
+                robot.write_text(lw.gymnasium_model("ant.xml").spec().to_xml())
+            case ["export", setting]:
+                name, _, value = setting.partition("=")
+                self.monkeypatch.setenv(name, value.replace("$PWD", str(self.folder)))
+            case ["lyceum-warp", command, *options]:
+                if self.quick and "warp" in options:
+                    return
+                more = QUICK.get(command, []) if self.quick else []
+                assert cli.main([command, *options, *more]) == 0, words
+            case _:
+                pytest.fail(f"{words} is a command that this test does not know")
+
+
+@pytest.fixture
+def empty_folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
+    """An empty folder, the same in every run of the tests, so that Warp finds compiled kernels in its cache."""
+    cache = getattr(pytestconfig, "cache", None)
+    folder = Path(cache.mkdir("walkthrough")) if cache else tmp_path / "walkthrough"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
+
+
+@pytest.mark.parametrize("page", WALKTHROUGHS, ids=name_of)
+def test_commands_and_python_of_a_page_run_in_order(
+    page: Path, empty_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    try:
+        check_video()
+    except NoVideoError as error:
+        pytest.skip(str(error))
+    Walkthrough(empty_folder, monkeypatch, quick=True).run(page)
+
+
+@pytest.mark.long
+def test_the_page_on_a_task_of_your_own_keeps_its_promises(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    try:
+        check_video()
+    except NoVideoError as error:
+        pytest.skip(str(error))
+    Walkthrough(empty_folder, monkeypatch, quick=False).run(ROOT / "docs" / "own_task.md")
+    returns = [row["return_mean"] for row in Run.open(empty_folder / "runs" / "balance").rows()]
+    assert returns[-1] > 150 > 50 > returns[0]
+    for video in ("balance/video.mp4", "balance/eval.mp4", "near/video.mp4", "plan/video.mp4"):
+        assert (empty_folder / "runs" / video).stat().st_size > 10_000
+
+
+def test_the_task_of_the_page_has_under_fifty_lines() -> None:
+    blocks = BLOCK.findall((ROOT / "docs" / "own_task.md").read_text())
+    (source,) = (text for _, title, text in blocks if title.endswith(".py"))
+    assert len(source.splitlines()) < 50
 
 
 def anchors(document: Path) -> set[str]:

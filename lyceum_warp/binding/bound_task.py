@@ -81,6 +81,39 @@ def check_field_name(name: str) -> None:
     raise ValueError(f"there is no field {name!r}: {hint}")
 
 
+def obs_layouts(task: type[Task], params: Mapping[str, Any]) -> dict[str, dict[str, int]]:
+    """The parts of each group of a task's observations and their sizes, for values of its parameters.
+
+    Raises:
+        ValueError: The task does not say them as it must.
+    """
+    name = task_name(task)
+    given = task.obs(SimpleNamespace(**params)) if callable(task.obs) else task.obs
+    if not isinstance(given, Mapping) or not given:
+        raise ValueError(f"obs of the task {name!r} is {given!r}: add {_MISSING['obs']}")
+    grouped = [isinstance(part, Mapping) for part in given.values()]
+    if not any(grouped):
+        given = {"policy": given}
+    elif not all(grouped) or "policy" not in given:
+        raise ValueError(
+            f"obs of the task {name!r} must name parts with sizes, or groups of them, of which one is 'policy', not "
+            f"{given!r}"
+        )
+    for group in given:
+        if not (isinstance(group, str) and group.isidentifier()) or keyword.iskeyword(group):
+            raise ValueError(
+                f"obs of the task {name!r} has the group {group!r}: a group's name must be a Python name, as 'critic', "
+                "which observe_critic writes"
+            )
+    return {group: _layout(name, layout) for group, layout in given.items()}
+
+
+def _layout(task: str, layout: Mapping[str, Any]) -> dict[str, int]:
+    if per_world := [name for name, size in layout.items() if np.ndim(size)]:
+        raise ValueError(f"obs of the task {task!r} differs between worlds in {per_world}: give one value")
+    return {name: int(size) for name, size in layout.items() if size}
+
+
 class BoundTask:
     """A task with its compiled model, its parameters and its kernels.
 
@@ -291,30 +324,7 @@ class BoundTask:
 
     def _layouts(self) -> dict[str, dict[str, int]]:
         """The parts of each group of observations and their sizes, for the parameters as they are."""
-        params = SimpleNamespace(**self.params)
-        given = self.task.obs(params) if callable(self.task.obs) else self.task.obs
-        if not isinstance(given, Mapping) or not given:
-            raise ValueError(f"obs of the task {self.name!r} is {given!r}: add {_MISSING['obs']}")
-        grouped = [isinstance(part, Mapping) for part in given.values()]
-        if not any(grouped):
-            given = {"policy": given}
-        elif not all(grouped) or "policy" not in given:
-            raise ValueError(
-                f"obs of the task {self.name!r} must name parts with sizes, or groups of them, of which one is "
-                f"'policy', not {given!r}"
-            )
-        for group in given:
-            if not (isinstance(group, str) and group.isidentifier()) or keyword.iskeyword(group):
-                raise ValueError(
-                    f"obs of the task {self.name!r} has the group {group!r}: a group's name must be a Python name, as "
-                    "'critic', which observe_critic writes"
-                )
-        return {group: self._layout(layout) for group, layout in given.items()}
-
-    def _layout(self, layout: Mapping[str, Any]) -> dict[str, int]:
-        if per_world := [name for name, size in layout.items() if np.ndim(size)]:
-            raise ValueError(f"obs of the task {self.name!r} differs between worlds in {per_world}: give one value")
-        return {name: int(size) for name, size in layout.items() if size}
+        return obs_layouts(self.task, self.params)
 
     def explained(self, error: Exception) -> Exception:
         """An error in one line, where Warp could not compile the task's functions; other errors as they are."""

@@ -42,24 +42,35 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         return spec
     if isinstance(source, ModelFile):
         return source.spec()
+    found = find_model(source, owner)
+    return found.spec() if isinstance(found, ModelFile) else read_spec(found)
+
+
+def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFile:
+    """The file that a model's path or name stands for, or the model of gymnasium; see ``load_spec``.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The source is the text of a model.
+    """
     if isinstance(source, str) and source.lstrip().startswith("<"):
         raise ValueError(f"the model {_start(source)} is XML, not a file: give mujoco.MjSpec.from_string(...) of it")
     folder = Path()
     if owner is not None and (file := getattr(sys.modules.get(owner.__module__), "__file__", None)):
         folder = Path(file).parent
     path = (folder / Path(source).expanduser()).absolute()
-    if not path.is_file():
-        if Path(source).name != str(source):
-            raise FileNotFoundError(f"there is no model file {str(source)!r}")
-        try:
-            path = gymnasium_model(str(source)).path()
-        except FileNotFoundError as error:
-            close = difflib.get_close_matches(path.name, [file.name for file in path.parent.glob("*.xml")], 3)
-            hint = f" (did you mean {' or '.join(close)}?)" if close else ""
-            raise FileNotFoundError(
-                f"there is no model file {path}{hint}, and of Gymnasium's models: {error}"
-            ) from None
-    return read_spec(path)
+    if path.is_file():
+        return path
+    if Path(source).name != str(source):
+        raise FileNotFoundError(f"there is no model file {str(source)!r}")
+    shipped = gymnasium_model(str(source))
+    try:
+        shipped.path()
+    except FileNotFoundError as error:
+        close = difflib.get_close_matches(path.name, [file.name for file in path.parent.glob("*.xml")], 3)
+        hint = f" (did you mean {' or '.join(close)}?)" if close else ""
+        raise FileNotFoundError(f"there is no model file {path}{hint}, and of Gymnasium's models: {error}") from None
+    return shipped
 
 
 def _start(text: str) -> str:
@@ -97,7 +108,8 @@ def compile_model(
     the same accelerations. Sleep is turned off, because a saved state does not hold which bodies are asleep. Fields
     that MuJoCo computes only where a sensor needs them get such a sensor, after the model's own, and the energy is
     turned on where it is read: without that a task would read zeros. Where no field needs a sensor, the model's own
-    are turned off.
+    are turned off. Of a pair of geoms that is listed twice under ``contact``, the first entry stays: MuJoCo would make
+    the contact twice, MuJoCo Warp once.
 
     Args:
         spec: The model; changed in place.
@@ -114,6 +126,7 @@ def compile_model(
     if spec.option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
         spec.option.enableflags &= ~mujoco.mjtEnableBit.mjENBL_SLEEP.value
         log.info("%s asks for sleep, which is not part of MuJoCo's state: no body falls asleep", spec.modelname)
+    _remove_repeated_pairs(spec)
     if "energy" in fields:
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
     if physics.cone is not None:
@@ -142,3 +155,16 @@ def compile_model(
     for warning in caught:  # most are about Gymnasium's own XML, where a user can change nothing
         log.info("%s: %s", spec.modelname, warning.message)
     return model
+
+
+def _remove_repeated_pairs(spec: mujoco.MjSpec) -> None:
+    """Keep the first of several entries for the same two geoms."""
+    known: set[frozenset[str]] = set()
+    for pair in list(spec.pairs):
+        geoms = frozenset((pair.geomname1, pair.geomname2))
+        if geoms in known:
+            spec.delete(pair)
+            log.info(
+                "%s lists a pair of %s twice: the second entry is left out", spec.modelname, " and ".join(sorted(geoms))
+            )
+        known.add(geoms)

@@ -16,6 +16,13 @@ _FILLED_IN = ("dt", "substep_dt")
 """Fields of ``Params`` that follow from the model and the task."""
 
 
+def defaults(struct: Any) -> dict[str, Any]:
+    """The defaults of a task's ``Params`` as they are written there; those that are filled in have none."""
+    # Warp's structs ignore defaults: they are read from the class behind the struct
+    names = [name for name in struct.vars if name not in _FILLED_IN and hasattr(struct.cls, name)]
+    return {name: getattr(struct.cls, name) for name in names}
+
+
 class Parameters:
     """Values for every field of a task's ``Params``: scalars and vectors, arrays with one value a world, or tables.
 
@@ -54,13 +61,8 @@ class Parameters:
                 f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), so that no "
                 "value would reach it: rename it in Params"
             )
-        self.values: dict[str, Any] = {}
-        for name in struct.vars:
-            # Warp's structs ignore defaults: they are read from the class behind the struct
-            if name in _FILLED_IN:
-                self.values[name] = timestep if name == "dt" else float(model.opt.timestep)
-            elif hasattr(struct.cls, name):
-                self.values[name] = getattr(struct.cls, name)
+        found = defaults(struct) | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
+        self.values: dict[str, Any] = {name: found[name] for name in struct.vars if name in found}
         self.values = self.checked(given)
 
     @property

@@ -35,7 +35,7 @@ def register(task: type[Task]) -> type[Task]:
         raise ValueError(f"@lw.register takes a subclass of lw.Task, not {name}: write class {name}(lw.Task)")
     name = task_name(task)
     known = _tasks.get(name)
-    if known is None and not task.__module__.startswith(_PACKAGE) and name in _package_tasks():
+    if known is None and not task.__module__.startswith(_PACKAGE) and name in package_task_names():
         owner = f"{_PACKAGE}{name}"
     elif task.__module__.startswith(_FILE) and (known is None or known.__module__.startswith(_FILE)):
         _tasks[name] = task  # two files may hold tasks of one name
@@ -52,7 +52,8 @@ _PACKAGE = "lyceum_warp.tasks."
 _FILE = "lyceum_task_"
 
 
-def _package_tasks() -> list[str]:
+def package_task_names() -> list[str]:
+    """Names of the tasks that come with the package."""
     package = importlib.import_module("lyceum_warp.tasks")
     return [module.name for module in pkgutil.iter_modules(package.__path__)]
 
@@ -63,13 +64,18 @@ def _file(task: type[Task]) -> str | None:
 
 
 def task_name(task: type[Task]) -> str:
-    """The name under which a task is registered: HalfCheetah is half_cheetah."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", task.__name__).lower()
+    """The name under which a task is registered."""
+    return snake_case(task.__name__)
+
+
+def snake_case(name: str) -> str:
+    """The name of a task from that of its class: HalfCheetah is half_cheetah."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
 
 
 def task_names() -> list[str]:
     """Names of all tasks: those of the package and those registered by the user."""
-    return sorted({*_tasks, *_package_tasks()})
+    return sorted({*_tasks, *package_task_names()})
 
 
 def find_task(task: str | Path | type[Task]) -> type[Task]:
@@ -90,7 +96,7 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
     path, _, attribute = task.partition(":")
     if path.endswith(".py"):
         return _task_of_file(Path(path), attribute)
-    if task not in _tasks and task in _package_tasks():
+    if task not in _tasks and task in package_task_names():
         importlib.import_module(f"lyceum_warp.tasks.{task}")
     if task not in _tasks:
         close = difflib.get_close_matches(task, task_names(), 3)

@@ -1,4 +1,4 @@
-"""The command line: tasks, train, eval, plan, warmup."""
+"""The command line: tasks, new, check, train, eval, plan, warmup."""
 
 import importlib.metadata
 import os
@@ -8,15 +8,19 @@ from typing import Annotated, Any
 
 import tyro
 
+from lyceum_warp.cli.check import Check, check
 from lyceum_warp.cli.evaluate import Eval, evaluate_run
 from lyceum_warp.cli.interrupts import Interrupted, signals
 from lyceum_warp.cli.list_tasks import Tasks, list_tasks
+from lyceum_warp.cli.new_task import New, new_task
 from lyceum_warp.cli.plan import Plan, plan
 from lyceum_warp.cli.train import Train, resume, saved_options, train
 from lyceum_warp.cli.warmup import Warmup, warm_up
 from lyceum_warp.viz.video import NoVideoError
 
 _Command = Annotated[Tasks, tyro.conf.subcommand("tasks")] \
+    | Annotated[New, tyro.conf.subcommand("new")] \
+    | Annotated[Check, tyro.conf.subcommand("check")] \
     | Annotated[Train, tyro.conf.subcommand("train")] \
     | Annotated[Eval, tyro.conf.subcommand("eval")] \
     | Annotated[Plan, tyro.conf.subcommand("plan")] \
@@ -25,6 +29,8 @@ _Command = Annotated[Tasks, tyro.conf.subcommand("tasks")] \
 _DESCRIPTION = """Batched MuJoCo worlds for robot learning.
 
 $ lyceum-warp tasks
+$ lyceum-warp new my_task --model robot.xml
+$ lyceum-warp check my_task.py
 $ lyceum-warp train hopper --iterations 100
 $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
 $ lyceum-warp plan reach --real-time
@@ -36,7 +42,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The program ``lyceum-warp``.
 
     Returns:
-        0; 1 if --require-return was not met; 2 for bad input; 130 or 143 after Ctrl-C or SIGTERM.
+        0; 1 if --require-return was not met, or if check found a broken rule; 2 for bad input; 130 or 143 after
+        Ctrl-C or SIGTERM.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv == ["--version"]:
@@ -46,7 +53,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         with signals():
             command = _parse(argv)
             if isinstance(command, Tasks):
-                return list_tasks()
+                return list_tasks(command)
+            if isinstance(command, New):
+                return new_task(command)
+            if isinstance(command, Check):
+                return check(command)
             if isinstance(command, Eval):
                 return evaluate_run(command)
             if isinstance(command, Plan):

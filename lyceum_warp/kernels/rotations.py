@@ -142,6 +142,34 @@ def quat_from_mat(m: wp.mat33) -> wp.vec4:
 
 
 @wp.func
+def quat_from_euler(angles: wp.vec3) -> wp.vec4:
+    """Make the rotation by three angles, in radians: about x, then about the new y, then about the new z.
+
+    As mju_euler2Quat with the sequence "xyz", and as models give ``euler`` unless they name another ``eulerseq``.
+    """
+    h = 0.5 * angles
+    x = wp.vec4(wp.cos(h[0]), wp.sin(h[0]), 0.0, 0.0)
+    y = wp.vec4(wp.cos(h[1]), 0.0, wp.sin(h[1]), 0.0)
+    z = wp.vec4(wp.cos(h[2]), 0.0, 0.0, wp.sin(h[2]))
+    return quat_mul(quat_mul(x, y), z)
+
+
+@wp.func
+def quat_to_euler(q: wp.vec4) -> wp.vec3:
+    """Turn a rotation into the angles of ``quat_from_euler``, the second from -pi / 2 to pi / 2.
+
+    With the matrix R: atan2(-R12, R22), atan2(R02, sqrt(R12^2 + R22^2)), atan2(-R01, R00). Where the second angle is
+    a right one, only the sum or the difference of the others is known, and the first is given as 0.
+    """
+    m = quat_to_mat(q)
+    cosine = wp.sqrt(m[1, 2] * m[1, 2] + m[2, 2] * m[2, 2])
+    y = wp.atan2(m[0, 2], cosine)
+    if cosine < 1e-6:  # rounding alone
+        return wp.vec3(0.0, y, wp.atan2(m[1, 0], m[1, 1]))
+    return wp.vec3(wp.atan2(-m[1, 2], m[2, 2]), y, wp.atan2(-m[0, 1], m[0, 0]))
+
+
+@wp.func
 def quat_random(rng: wp.array[wp.uint32]) -> wp.vec4:
     """Draw a rotation, all of them equally likely, and advance the stream.
 

@@ -23,19 +23,14 @@ class Params:
 
 @wp.func
 def observe(s: World, p: Params, obs: Row[float]):
-    skip = int(p.exclude_current_positions_from_observation)
-    for i in range(skip, 9):
-        obs[i - skip] = s.qpos[i]
-    for i in range(9):
-        obs[9 - skip + i] = s.qvel[i]
+    k = lw.put(obs, 0, s.qpos, int(p.exclude_current_positions_from_observation), 9)
+    lw.put(obs, k, s.qvel)
 
 
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    r = p.forward_reward_weight * (s1.qpos[0] - s0.qpos[0]) / p.dt
-    for i in range(6):
-        r -= p.ctrl_cost_weight * action[i] * action[i]
-    return r
+    forward = p.forward_reward_weight * (s1.qpos[0] - s0.qpos[0]) / p.dt
+    return forward - p.ctrl_cost_weight * lw.sum_squares(action)
 
 
 @wp.func
@@ -52,7 +47,6 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @lw.register
 class HalfCheetah(lw.Task):
-    model = "half_cheetah.xml"
-    frame_skip = 5
+    model, frame_skip, gymnasium = "half_cheetah.xml", 5, "HalfCheetah-v5"
     obs = staticmethod(lambda p: {"position": 9 - p.exclude_current_positions_from_observation, "velocity": 9})
     planning = lw.Planning(settings={"temperature": 1.0, "noise": 0.5, "smoothing": (1.0, 0.0, 0.0)})

@@ -27,34 +27,24 @@ class Params:
 
 
 @wp.func
-def inside(x: float, bounds: wp.vec2) -> bool:
-    return bounds[0] < x and x < bounds[1]
-
-
-@wp.func
 def healthy(s: World, p: Params) -> bool:
-    ok = inside(s.qpos[1], p.healthy_z_range) and inside(s.qpos[2], p.healthy_angle_range)
-    for i in range(6):
-        ok = ok and inside(s.qvel[i], p.healthy_state_range) and (i < 2 or inside(s.qpos[i], p.healthy_state_range))
-    return ok
+    ok = lw.inside(s.qpos[1], p.healthy_z_range) and lw.inside(s.qpos[2], p.healthy_angle_range)
+    ok = ok and lw.all_inside(s.qpos, 2, 6, p.healthy_state_range)
+    return ok and lw.all_inside(s.qvel, 0, 6, p.healthy_state_range)
 
 
 @wp.func
 def observe(s: World, p: Params, obs: Row[float]):
-    skip = int(p.exclude_current_positions_from_observation)
-    for i in range(skip, 6):
-        obs[i - skip] = s.qpos[i]
+    k = lw.put(obs, 0, s.qpos, int(p.exclude_current_positions_from_observation), 6)
     for i in range(6):
-        obs[6 - skip + i] = wp.clamp(s.qvel[i], -10.0, 10.0)
+        obs[k + i] = wp.clamp(s.qvel[i], -10.0, 10.0)
 
 
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    r = p.forward_reward_weight * (s1.qpos[0] - s0.qpos[0]) / p.dt
-    r += wp.where(healthy(s1, p), p.healthy_reward, 0.0)
-    for i in range(3):
-        r -= p.ctrl_cost_weight * action[i] * action[i]
-    return r
+    forward = p.forward_reward_weight * (s1.qpos[0] - s0.qpos[0]) / p.dt
+    alive = wp.where(healthy(s1, p), p.healthy_reward, 0.0)
+    return forward + alive - p.ctrl_cost_weight * lw.sum_squares(action)
 
 
 @wp.func
@@ -76,8 +66,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @lw.register
 class Hopper(lw.Task):
-    model = "hopper.xml"
-    frame_skip = 4
+    model, frame_skip, gymnasium = "hopper.xml", 4, "Hopper-v5"
     obs = staticmethod(lambda p: {"position": 6 - p.exclude_current_positions_from_observation, "velocity": 6})
     # with a short horizon the planner falls over; a higher healthy_reward prevents this
     planning = lw.Planning(

@@ -68,10 +68,9 @@ def contact_cost(s: World, p: Params) -> float:
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
     # the subtree of the world body is everything: its centre of mass is the robot's
-    r = p.forward_reward_weight * (s1.subtree_com[0][0] - s0.subtree_com[0][0]) / p.dt
-    if healthy(s1, p):
-        r += p.healthy_reward
-    return r - p.ctrl_cost_weight * lw.sum_squares(action) - contact_cost(s1, p)
+    forward = p.forward_reward_weight * (s1.subtree_com[0][0] - s0.subtree_com[0][0]) / p.dt
+    alive = wp.where(healthy(s1, p), p.healthy_reward, 0.0)
+    return forward + alive - p.ctrl_cost_weight * lw.sum_squares(action) - contact_cost(s1, p)
 
 
 @wp.func
@@ -94,9 +93,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @lw.register
 class Humanoid(lw.Task):
-    model = "humanoid.xml"
-    frame_skip = 5
-    gymnasium = "Humanoid-v5"
+    model, frame_skip, gymnasium = "humanoid.xml", 5, "Humanoid-v5"
     lagged = ("subtree_com", "cinert", "cvel")
 
     @staticmethod

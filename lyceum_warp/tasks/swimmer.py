@@ -23,19 +23,14 @@ class Params:
 
 @wp.func
 def observe(s: World, p: Params, obs: Row[float]):
-    skip = 2 * int(p.exclude_current_positions_from_observation)
-    for i in range(skip, 5):
-        obs[i - skip] = s.qpos[i]
-    for i in range(5):
-        obs[5 - skip + i] = s.qvel[i]
+    k = lw.put(obs, 0, s.qpos, 2 * int(p.exclude_current_positions_from_observation), 5)
+    lw.put(obs, k, s.qvel)
 
 
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    r = p.forward_reward_weight * (s1.qpos[0] - s0.qpos[0]) / p.dt
-    for i in range(2):
-        r -= p.ctrl_cost_weight * action[i] * action[i]
-    return r
+    forward = p.forward_reward_weight * (s1.qpos[0] - s0.qpos[0]) / p.dt
+    return forward - p.ctrl_cost_weight * lw.sum_squares(action)
 
 
 @wp.func
@@ -52,6 +47,5 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @lw.register
 class Swimmer(lw.Task):
-    model = "swimmer.xml"
-    frame_skip = 4
+    model, frame_skip, gymnasium = "swimmer.xml", 4, "Swimmer-v5"
     obs = staticmethod(lambda p: {"position": 5 - 2 * p.exclude_current_positions_from_observation, "velocity": 5})

@@ -27,27 +27,21 @@ class Params:
 
 @wp.func
 def healthy(s: World, p: Params) -> bool:
-    z, angle = s.qpos[1], s.qpos[2]
-    upright = p.healthy_angle_range[0] < angle and angle < p.healthy_angle_range[1]
-    return upright and p.healthy_z_range[0] < z and z < p.healthy_z_range[1]
+    return lw.inside(s.qpos[1], p.healthy_z_range) and lw.inside(s.qpos[2], p.healthy_angle_range)
 
 
 @wp.func
 def observe(s: World, p: Params, obs: Row[float]):
-    skip = int(p.exclude_current_positions_from_observation)
-    for i in range(skip, 9):
-        obs[i - skip] = s.qpos[i]
+    k = lw.put(obs, 0, s.qpos, int(p.exclude_current_positions_from_observation), 9)
     for i in range(9):
-        obs[9 - skip + i] = wp.clamp(s.qvel[i], -10.0, 10.0)
+        obs[k + i] = wp.clamp(s.qvel[i], -10.0, 10.0)
 
 
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    r = p.forward_reward_weight * (s1.qpos[0] - s0.qpos[0]) / p.dt
-    r += wp.where(healthy(s1, p), p.healthy_reward, 0.0)
-    for i in range(6):
-        r -= p.ctrl_cost_weight * action[i] * action[i]
-    return r
+    forward = p.forward_reward_weight * (s1.qpos[0] - s0.qpos[0]) / p.dt
+    alive = wp.where(healthy(s1, p), p.healthy_reward, 0.0)
+    return forward + alive - p.ctrl_cost_weight * lw.sum_squares(action)
 
 
 @wp.func
@@ -69,6 +63,5 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @lw.register
 class Walker2d(lw.Task):
-    model = "walker2d_v5.xml"
-    frame_skip = 4
+    model, frame_skip, gymnasium = "walker2d_v5.xml", 4, "Walker2d-v5"
     obs = staticmethod(lambda p: {"position": 9 - p.exclude_current_positions_from_observation, "velocity": 9})

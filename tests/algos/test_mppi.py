@@ -3,6 +3,7 @@
 The planner's own arithmetic is float32; the plain version's is float64, and so the two drift apart by roundings.
 """
 
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -15,8 +16,8 @@ from plain_mppi import Plain, PlainReach
 from rail_task import Picky, rail
 
 import lyceum_warp as lw
+import lyceum_warp.tasks
 from lyceum_warp import MPPI, Row
-from lyceum_warp.tasks.reach import arm
 
 ENGINES = ["mujoco", "warp"]
 BUFFERS = ("actions", "nominal", "standard_noise", "sampled", "returns", "weights")
@@ -42,7 +43,7 @@ def falling_hopper(plant: lw.Env) -> torch.Tensor:
 
 
 def heavy_arm() -> mujoco.MjSpec:
-    spec = arm()
+    spec = mujoco.MjSpec.from_file(str(Path(lyceum_warp.tasks.__path__[0], "reach.xml")))
     for geom in spec.body("forearm").geoms:
         geom.density = 5000
     return spec

@@ -116,6 +116,21 @@ def test_sleep_is_turned_off_with_a_line_in_the_log(caplog: pytest.LogCaptureFix
     assert "ball asks for sleep, which is not part of MuJoCo's state" in caplog.text
 
 
+PAIRS = """<mujoco model="pairs"><worldbody>
+  <geom name="floor" type="plane" size="1 1 1" contype="0" conaffinity="0"/>
+  <body><freejoint/><geom name="ball" size=".1" contype="0" conaffinity="0"/></body></worldbody>
+  <contact><pair geom1="floor" geom2="ball" friction="2"/><pair geom1="ball" geom2="floor"/></contact></mujoco>"""
+
+
+def test_a_pair_that_is_listed_twice_makes_one_contact(caplog: pytest.LogCaptureFixture) -> None:
+    """MuJoCo would make it twice, and MuJoCo Warp once."""
+    assert mujoco.MjModel.from_xml_string(PAIRS).npair == 2
+    with caplog.at_level("INFO"):
+        model = compile_model(mujoco.MjSpec.from_string(PAIRS), (), PHYSICS)
+    assert model.npair == 1 and model.pair_friction[0, 0] == 2.0
+    assert "pairs lists a pair of ball and floor twice" in caplog.text
+
+
 def test_the_energy_is_turned_on_where_it_is_read() -> None:
     assert compile_model(ball(), ["energy"], PHYSICS).opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY
     assert not compile_model(ball(), ["qpos"], PHYSICS).opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY

@@ -1,36 +1,121 @@
 """lyceum-warp tasks."""
 
 import importlib.util
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
+from training_runs import refused
 
+import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.binding.registry import task_names
+from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.registry import find_task, task_names
+
+INSTALL = "pip install 'lyceum-warp[hand]'"
 
 
-def test_tasks_are_listed_with_their_sizes(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["tasks"]) == 0
-    out = capsys.readouterr().out
-    line = next(line for line in out.splitlines() if "hopper" in line)
-    assert line.split()[:7] == ["hopper", "11", "3", "4", "0.008", "s", "1000"]
-    assert "hop forward on one leg" in line
-    assert all(name in out for name in task_names())
+def rows(out: str) -> dict[str, list[str]]:
+    """The words of each task's row by its name; descriptions and notes are indented."""
+    table, _, legend = out.partition("\n\n")
+    assert legend.startswith("dt: ")
+    heading, *lines = table.splitlines()
+    assert heading.split() == ["task", "obs", "action", "substeps", "dt", "horizon", "model"]
+    return {line.split()[0]: line.split()[1:] for line in lines if not line.startswith(" ")}
 
 
-def test_a_task_whose_extra_is_missing_is_listed_with_the_command_that_installs_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def without_the_hand(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """The extra "hand" is not installed; the current folder is empty."""
     find = importlib.util.find_spec
 
     def find_others(name: str, *args: Any) -> Any:
         return None if name == "gymnasium_robotics" else find(name, *args)
 
     monkeypatch.setattr(importlib.util, "find_spec", find_others)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_tasks_are_listed_with_their_sizes_and_models(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["tasks"]) == 0
+    out = capsys.readouterr().out
+    found = rows(out)
+    assert sorted(found) == task_names()
+    assert found["hopper"] == ["11", "3", "4", "0.008", "s", "1000", "gymnasium:", "hopper.xml"]
+    assert found["adroit_pen"][-2:] == ["gymnasium-robotics", "[hand]"]
+    assert "    hop forward on one leg (Gymnasium's Hopper-v5)" in out.splitlines()
+
+
+def test_lines_fit_into_100_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["tasks"]) == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 100
+
+
+@pytest.mark.parametrize("name", task_names())
+def test_listed_sizes_are_those_of_an_environment(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    cli.main(["tasks", name])
+    row = rows(capsys.readouterr().out)[name]
+    try:
+        task = BoundTask(find_task(name))
+    except FileNotFoundError as error:
+        pytest.skip(str(error))
+    actions = sum(task.task.actions.values()) if task.task.actions else task.model.nu
+    sizes = [sum(task.obs_layout.values()), actions, task.frame_skip, f"{task.timestep:g}"]
+    assert row[:4] == list(map(str, sizes))
+
+
+@pytest.mark.parametrize(
+    ("word", "found", "other"),
+    [("walker", "walker2d", "reach"), ("HOP", "hopper", "reach"), ("[hand]", "adroit_pen", "hopper")],
+)
+def test_a_word_selects_by_name_description_and_model(
+    word: str, found: str, other: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["tasks", word]) == 0
+    listed = rows(capsys.readouterr().out)
+    assert found in listed and other not in listed
+
+
+def test_a_word_that_no_task_has_is_refused_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["tasks", "submarine"]) == 2
+    refused(capsys, "'submarine'", "lyceum-warp tasks")
+
+
+def test_a_task_whose_extra_is_missing_is_listed_with_all_that_is_known_without_its_model(
+    without_the_hand: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["tasks"]) == 0
     out, error = capsys.readouterr()
     assert error == ""
-    assert all(name in out for name in task_names())
-    text = " ".join(out.split())
-    assert "adroit_pen - - - - - turn a pen in the hand" in text
-    assert "needs: pip install 'lyceum-warp[hand]'" in text
+    found = rows(out)
+    assert sorted(found) == task_names()
+    assert found["adroit_pen"] == ["45", "-", "5", "-", "200", "gymnasium-robotics", "[hand]"]
+    lines = out.splitlines()
+    row = next(i for i, line in enumerate(lines) if line.startswith("adroit_pen"))
+    assert lines[row + 1].startswith("    turn a pen in the hand")
+    assert lines[row + 2] == f"    needs: {INSTALL}"
+
+
+@pytest.mark.parametrize("command", ["train", "plan", "warmup"])
+def test_a_task_whose_extra_is_missing_is_refused_and_nothing_is_written(
+    command: str, without_the_hand: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main([command, "adroit_pen"]) == 2
+    refused(capsys, "gymnasium-robotics", "is not installed", INSTALL)
+    assert list(without_the_hand.iterdir()) == []
+
+
+def test_an_environment_whose_extra_is_missing_names_the_command_that_installs_it(without_the_hand: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"is not installed: pip install 'lyceum-warp\[hand\]'$"):
+        lw.make("adroit_pen")
+    with pytest.raises(FileNotFoundError, match=r"is not installed: pip install 'lyceum-warp\[hand\]'$"):
+        lw.MPPI("adroit_pen")
+
+
+def test_a_list_that_is_read_in_part_ends_quietly() -> None:
+    command = f"{sys.executable} -m lyceum_warp.cli tasks | head -1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True)
+    assert done.stdout.startswith("task ") and done.stderr == ""

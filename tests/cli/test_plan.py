@@ -247,7 +247,8 @@ def test_every_setting_has_a_flag() -> None:
 
 
 def test_a_parameter_with_the_name_of_a_setting_is_given_by_param(task_file: TaskFile, tmp_path: Path) -> None:
-    source = Path(inspect.getfile(find_task("point_mass"))).read_text()
+    origin = Path(inspect.getfile(find_task("point_mass")))
+    source = origin.read_text().replace('"point_mass.xml"', repr(str(origin.with_name("point_mass.xml"))))
     source = source.replace("@lw.register\n", "").replace("success_distance", "temperature")
     file = task_file("warm_mass.py", source)
     options = ["--param", "temperature=0.5", "--temperature", "0.25", "--planner-param", "temperature=0.75"]

@@ -50,7 +50,8 @@ def test_metrics_of_a_task_are_columns_also_after_resume(tmp_path: Path, capsys:
 def test_a_task_file_is_trained_and_evaluated(
     task_file: TaskFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    source = Path(inspect.getfile(find_task("point_mass"))).read_text()
+    origin = Path(inspect.getfile(find_task("point_mass")))
+    source = origin.read_text().replace('"point_mass.xml"', repr(str(origin.with_name("point_mass.xml"))))
     source = source.replace("@lw.register\n", "").replace("PointMass", "Mine").replace("horizon = 256", "horizon = 20")
     mine = task_file("mine.py", source)
     monkeypatch.chdir(tmp_path)

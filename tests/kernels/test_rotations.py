@@ -19,7 +19,8 @@ def compute(
     mul_out: wp.array[wp.vec4], inverse_out: wp.array[wp.vec4], rotate_out: wp.array[wp.vec3],
     rotate_inverse_out: wp.array[wp.vec3], from_axis_angle_out: wp.array[wp.vec4], from_rotvec_out: wp.array[wp.vec4],
     to_rotvec_out: wp.array[wp.vec3], difference_out: wp.array[wp.vec3], angle_out: wp.array[float],
-    to_mat_out: wp.array[wp.mat33], from_mat_out: wp.array[wp.vec4],
+    to_mat_out: wp.array[wp.mat33], from_mat_out: wp.array[wp.vec4], from_euler_out: wp.array[wp.vec4],
+    to_euler_out: wp.array[wp.vec3],
 ):  # fmt: skip
     """Every function of one pair of quaternions, one vector and one angle; launched over (n,)."""
     i = wp.tid()
@@ -35,6 +36,8 @@ def compute(
     angle_out[i] = lw.quat_angle(a, b)
     to_mat_out[i] = lw.quat_to_mat(a)
     from_mat_out[i] = lw.quat_from_mat(lw.quat_to_mat(a))
+    from_euler_out[i] = lw.quat_from_euler(v)
+    to_euler_out[i] = lw.quat_to_euler(a)
 
 
 @wp.kernel(enable_backward=False)
@@ -58,6 +61,7 @@ def inputs() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     a[:8] = np.vstack([np.eye(4), -np.eye(4)])
     a[8:12] = unit(np.array([[1, 1e-4, -2e-4, 0], [-1, 1e-4, 0, 1e-4], [1e-5, 1, 0, 0], [1, 1e-25, 0, 0]]))
     b[12], b[13] = a[12], -a[13]
+    a[14:16] = unit(np.array([[1, 0, 1, 0], [1, 1, -1, -1]]))  # the second Euler angle is a right one
     v[:2], angle[0] = [[0, 0, 0], [1e-6, 0, 0]], 0.0
     return a.astype(np.float32), b.astype(np.float32), v.astype(np.float32), angle.astype(np.float32)
 
@@ -131,6 +135,21 @@ def test_a_matrix_gives_its_quaternion_back(found: dict[str, np.ndarray]) -> Non
     assert set(largest) == {0, 1, 2, 3}
     sign = np.sign(np.sum(a * found["from_mat"], axis=1))[:, None]
     check(sign * found["from_mat"], a.astype(float))
+
+
+def test_euler_angles_are_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
+    a, _, v, _ = inputs()
+
+    def from_euler(angles: np.ndarray) -> np.ndarray:
+        return mju(lambda row, angles: mujoco.mju_euler2Quat(row, angles, "xyz"), 4, angles)
+
+    check(found["from_euler"], from_euler(v))
+    back = from_euler(found["to_euler"])
+    sign = np.sign(np.sum(a * back, axis=1))[:, None]
+    check(sign * back, a.astype(float), 5e-6)
+    assert np.abs(found["to_euler"][:, 1]).max() <= np.pi / 2 + 1e-6
+    right = np.abs(found["to_euler"][:, 1]) > np.pi / 2 - 1e-6
+    assert right[[14, 15]].all() and not found["to_euler"][[14, 15], 0].any()
 
 
 def test_random_rotations_are_uniform_and_independent() -> None:

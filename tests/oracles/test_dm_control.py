@@ -1,12 +1,21 @@
-"""The cartpole_swingup task's model against dm_control's."""
+"""The cartpole and cartpole_swingup tasks against dm_control's balance and swingup."""
 
 import importlib.util
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+import torch
+from checks import positions, put_at_random
 from conftest import SharedEnv
+
+import lyceum_warp as lw
+
+NWORLD = 256
+TASKS = ["cartpole", "cartpole_swingup"]
 
 
 @pytest.fixture(scope="module")
@@ -18,9 +27,15 @@ def dm_cartpole() -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_path(str(Path(package.submodule_search_locations[0], "suite", "cartpole.xml")))
 
 
-def test_model_has_dm_controls_masses_joints_and_motor(shared_env: SharedEnv, dm_cartpole: mujoco.MjModel) -> None:
+# the model
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_model_has_dm_controls_masses_joints_and_motor(
+    shared_env: SharedEnv, dm_cartpole: mujoco.MjModel, task: str
+) -> None:
     """Masses, inertias, joints and motor are dm_control's."""
-    ours, theirs = shared_env("cartpole_swingup").model, dm_cartpole
+    ours, theirs = shared_env(task).model, dm_cartpole
     for name in (
         "body_mass", "body_inertia", "body_pos", "body_ipos", "body_iquat",
         "jnt_type", "jnt_axis", "jnt_pos", "jnt_range", "jnt_limited", "jnt_solref", "jnt_solimp", "jnt_stiffness",
@@ -39,7 +54,7 @@ def test_same_controls_lead_to_the_same_trajectory(
     shared_env: SharedEnv, dm_cartpole: mujoco.MjModel, hold: int
 ) -> None:
     """Controls that are held for 25 steps drive the cart against both ends of the rail."""
-    ours, theirs = shared_env("cartpole_swingup").model, dm_cartpole
+    ours, theirs = shared_env("cartpole").model, dm_cartpole
     rng = np.random.default_rng(hold)
     a, b = mujoco.MjData(ours), mujoco.MjData(theirs)
     a.qpos[:] = b.qpos[:] = rng.uniform(-1.0, 1.0, 2) * (1.0, np.pi)
@@ -55,3 +70,86 @@ def test_same_controls_lead_to_the_same_trajectory(
         cart.append(a.qpos[0])
     if hold > 1:
         assert min(cart) < -1.7 and max(cart) > 1.7
+
+
+# dm_control's own tasks on this package's model
+
+
+class Physics:
+    """What dm_control's cartpole tasks ask of their physics; dm_control 1.0.50's own class cannot read MuJoCo 4 models.
+
+    ``named.data.qpos["slider"]`` and the like are positions by joint.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model, self.data = model, mujoco.MjData(model)
+        self.named = SimpleNamespace(data=SimpleNamespace(qpos=self, qvel=self.data.qvel))
+
+    def __setitem__(self, joint: str | slice, value: np.ndarray) -> None:
+        self.data.qpos[{"slider": 0, "hinge_1": 1}[joint] if isinstance(joint, str) else joint] = value
+
+    def put(self, qpos: np.ndarray, qvel: np.ndarray, action: np.ndarray) -> None:
+        self.data.qpos[:], self.data.qvel[:], self.data.ctrl[:] = qpos, qvel, action
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def cart_position(self) -> float:
+        return float(self.data.qpos[0])
+
+    def angular_vel(self) -> np.ndarray:
+        return self.data.qvel[1:]
+
+    def pole_angle_cosine(self) -> np.ndarray:
+        return self.data.body("pole").xmat[8:]
+
+    def bounded_position(self) -> np.ndarray:
+        return np.array([self.data.qpos[0], *self.data.body("pole").xmat[[8, 2]]])
+
+    def velocity(self) -> np.ndarray:
+        return self.data.qvel
+
+    def control(self) -> np.ndarray:
+        return self.data.ctrl
+
+
+def balance_task(*, swing_up: bool = False, sparse: bool = False) -> Any:
+    """dm_control's task, whose rewards, observations and resets are the reference."""
+    module = pytest.importorskip("dm_control.suite.cartpole")
+    return module.Balance(swing_up=swing_up, sparse=sparse, random=0)
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_cartpole_has_dm_controls_reward_and_observation(shared_env: SharedEnv, sparse: bool) -> None:
+    """At random states near the goal and far from it, under actions beyond the control range."""
+    env = shared_env("cartpole", nworld=NWORLD, autoreset=False, sparse=sparse)
+    theirs, balanced, physics = balance_task(sparse=sparse), balance_task(sparse=True), Physics(env.model)
+    rng, rewards = np.random.default_rng(0), []
+    for position, velocity in ((0.3, 1.0), (3.0, 8.0)):
+        put_at_random(env, rng, position=position, velocity=velocity)
+        action = torch.from_numpy(rng.uniform(-1.5, 1.5, (NWORLD, 1)).astype(np.float32))
+        env.step(action)
+        for world, (qpos, qvel) in enumerate(zip(*positions(env), strict=True)):
+            physics.put(qpos, qvel, action[world].numpy())
+            rewards.append(theirs.get_reward(physics))
+            assert env.reward[world].item() == pytest.approx(rewards[-1], abs=2e-6)
+            assert bool(env.success[world]) == (balanced.get_reward(physics) == 1.0)
+            observation = np.concatenate(list(theirs.get_observation(physics).values()))
+            np.testing.assert_allclose(env.obs[world], observation, rtol=1e-6, atol=2e-6)
+        assert not env.terminated.any()
+    assert np.ptp(rewards) > 0.7
+
+
+@pytest.mark.parametrize(("task", "swing_up"), [("cartpole", False), ("cartpole_swingup", True)])
+def test_resets_spread_as_dm_controls(task: str, swing_up: bool) -> None:
+    """Means and standard deviations of 2,000 resets, and the bounds of those draws that are uniform."""
+    env = lw.make(task, engine="mujoco", nworld=2000)
+    theirs, physics, drawn = balance_task(swing_up=swing_up), Physics(env.model), []
+    for _ in range(2000):
+        theirs.initialize_episode(physics)
+        drawn.append(np.concatenate([physics.data.qpos, physics.data.qvel]))
+    env.rand_reset(0)
+    ours, other = np.concatenate(positions(env), axis=1), np.array(drawn)
+    spread = other.std(axis=0)
+    assert (np.abs(ours.mean(axis=0) - other.mean(axis=0)) < 0.15 * spread).all()
+    assert (np.abs(ours.std(axis=0) / spread - 1.0) < 0.08).all()
+    if not swing_up:
+        np.testing.assert_allclose(np.abs(ours).max(axis=0)[:2], np.abs(other).max(axis=0)[:2], rtol=0.01)

@@ -23,8 +23,8 @@ NWORLD = 32
 TASKS = [module.name for module in pkgutil.iter_modules(lyceum_warp.tasks.__path__)]
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
-FORCE_PARTS = {"humanoid": ("contact_force",)}
-"""Parts of the observation that depend on constraint forces, which a solver finds to its tolerance."""
+FORCE_PARTS = ("contact_force",)
+"""Parts of observations that depend on constraint forces, which a solver finds to its tolerance."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,14 +40,28 @@ class Bounds:
 # Each bound is three to four times the difference measured with mujoco and mujoco_warp 4.0.0 on the CPU, over 320
 # states along random rollouts. A float32 position of about 1 is exact to 6e-8.
 ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median, 95 %
+    "adroit_door": Bounds(1.5e-7, 7e-7, 2e-5, 3.5e-4),  # 4.1e-8, 1.9e-7; 6.2e-6, 9.6e-5
+    "adroit_hammer": Bounds(6e-7, 8e-7, 3e-4, 4e-4),  # 1.6e-7, 2.2e-7; 8.0e-5, 1.1e-4
     # the worst 5 % are pens that lie on the palm's boxes
     "adroit_pen": Bounds(1.5e-7, 4e-6, 5e-6, 2e-3),  # 4.1e-8, 1.2e-6; 1.4e-6, 5.8e-4
+    "aloha_lift": Bounds(2e-7, 2e-7, 1.5e-6, 4e-6),  # 5.2e-8, 5.9e-8; 4.3e-7, 9.2e-7
+    "adroit_relocate": Bounds(2e-7, 4.5e-7, 8e-5, 2.5e-4),  # 5.1e-8, 1.2e-7; 2.0e-5, 6.2e-5
+    "ant": Bounds(1.5e-7, 3e-7, 1.5e-6, 2e-5),  # 5.2e-8, 9.8e-8; 4.4e-7, 6.5e-6
+    "cartpole": Bounds(7e-9, 4e-8, 5e-8, 2e-7),  # 2.0e-9, 1.1e-8; 1.3e-8, 5.3e-8
     "cartpole_swingup": Bounds(2e-7, 4e-7, 4e-8, 1e-7),  # 6.2e-8, 1.1e-7; 1.2e-8, 2.9e-8
     "half_cheetah": Bounds(1e-7, 1e-6, 1e-5, 1e-4),  # 3.2e-8, 2.9e-7; 3.0e-6, 2.9e-5
+    # contacts of arms and fingers are rare; MuJoCo Warp finds fewer points than C where two boxes touch
+    "herb_reach": Bounds(4e-7, 8e-7, 5e-5, 2e-4),  # 1.1e-7, 2.2e-7; 1.3e-5, 4.8e-5
     "hopper": Bounds(1e-7, 2e-7, 1e-6, 5e-6),  # 3.0e-8, 5.5e-8; 2.9e-7, 1.6e-6
     "humanoid": Bounds(2e-7, 4e-7, 3e-5, 1.2e-4),  # 5.6e-8, 1.1e-7; 8.8e-6, 3.9e-5
+    "humanoid_standup": Bounds(2e-7, 4e-7, 2e-5, 8e-5),  # 5.3e-8, 1.0e-7; 6.1e-6, 2.3e-5
+    "inverted_double_pendulum": Bounds(3e-8, 1e-7, 6e-7, 2e-6),  # 6.9e-9, 2.9e-8; 1.6e-7, 6.4e-7
+    "inverted_pendulum": Bounds(6e-9, 2e-8, 2e-7, 6e-7),  # 1.8e-9, 6.5e-9; 5.4e-8, 1.8e-7
+    "panda_lift": Bounds(3e-7, 4e-7, 5e-6, 1.2e-5),  # 8.0e-8, 1.2e-7; 1.5e-6, 3.4e-6
     "point_mass": Bounds(5e-8, 1.5e-7, 6e-8, 1.5e-7),  # 1.4e-8, 4.5e-8; 1.9e-8, 5.1e-8
+    "pusher": Bounds(1.5e-7, 3e-7, 6e-7, 2e-6),  # 4.3e-8, 8.0e-8; 1.8e-7, 5.4e-7
     "reach": Bounds(5e-7, 2e-6, 5e-5, 2e-4),  # 1.5e-7, 5.8e-7; 1.5e-5, 5.8e-5
+    "reacher": Bounds(1.2e-7, 5e-7, 7e-7, 2e-6),  # 3.5e-8, 1.6e-7; 2.0e-7, 6.5e-7
     "swimmer": Bounds(8e-8, 2e-7, 6e-7, 3e-6),  # 2.4e-8, 5.7e-8; 2.0e-7, 9.0e-7
     "walker2d": Bounds(1.2e-7, 2e-7, 2e-5, 8e-5),  # 3.7e-8, 5.8e-8; 6.2e-6, 2.4e-5
 }
@@ -120,12 +134,15 @@ def relative_error(a: torch.Tensor, b: torch.Tensor) -> float:
 
 
 def check_same(ours: Outcome, other: Outcome, force_parts: dict[str, slice] | None = None) -> None:
-    """Within 1e-5, flags equal; the named parts of the observation within 1e-3 of their largest magnitude."""
+    """Within 1e-5, flags equal.
+
+    The named parts of the observation within 1e-3 of their largest magnitude, or 0.01 N where a task clips them.
+    """
     forces = torch.zeros(ours["obs"].shape[1], dtype=torch.bool)
     for part in (force_parts or {}).values():
         forces[part] = True
         a, b = ours["obs"][:, part], other["obs"][:, part]
-        assert (a - b).abs().max() <= 1e-3 * b.abs().max()
+        assert (a - b).abs().max() <= max(1e-2, 1e-3 * float(b.abs().max()))
     assert relative_error(ours["obs"][:, ~forces], other["obs"][:, ~forces]) <= 1e-5
     for name in ("reward", "eval"):
         assert relative_error(ours[name], other[name]) <= 1e-5, name
@@ -135,11 +152,16 @@ def check_same(ours: Outcome, other: Outcome, force_parts: dict[str, slice] | No
 
 def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) -> Outcome:
     """The results of the task's functions for given field values, without any physics."""
+    kept = []
     for batch, values in ((env.worlds.before, before), (env.worlds.after, after)):
         for name, value in values.items():
-            torch_view(getattr(batch, name)).copy_(value)
+            field = torch_view(getattr(batch, name))
+            kept.append((field, field.clone()))
+            field.copy_(value)
     env.worlds.judge_transition(action)
     result = outcome(env)
+    for field, value in kept:  # MuJoCo Warp never computes the place of the world's own body
+        field.copy_(value)
     env.rand_reset(0)
     return result
 
@@ -197,7 +219,7 @@ def test_the_same_states_are_judged_alike(engines: Engines) -> None:
 
 def test_the_same_positions_and_velocities_are_observed_alike(engines: Engines) -> None:
     """Each engine computes all other fields from them."""
-    parts = {name: engines.c.obs_space.parts[name] for name in FORCE_PARTS.get(engines.task, ())}
+    parts = {name: part for name, part in engines.c.obs_space.parts.items() if name in FORCE_PARTS}
     largest = 0.0
     for state in engines.states:
         results = []
@@ -210,7 +232,7 @@ def test_the_same_positions_and_velocities_are_observed_alike(engines: Engines) 
             results.append(outcome(env))
         check_same(*results, parts)
         largest = max([largest, *(results[0]["obs"][:, part].abs().max().item() for part in parts.values())])
-    assert largest > 1.0 or not parts, "no state has a contact, so nothing was compared"
+    assert largest >= 1.0 or not parts, "no state has a contact, so nothing was compared"
 
 
 def test_one_substep_leaves_the_engines_a_rounding_apart(engines: Engines) -> None:

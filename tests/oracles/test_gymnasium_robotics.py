@@ -1,56 +1,42 @@
-"""The adroit_pen task against Gymnasium-Robotics' own environment, on the C engine."""
+"""Every task that names an environment of Gymnasium-Robotics, against that environment, on the C engine.
+
+A task names it in its attribute ``gymnasium``. A new one needs nothing here; entries in SPECIAL reach its bonuses.
+"""
 
 import dataclasses
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any
 
 import gymnasium
+import gymnasium_robotics
 import mujoco
 import numpy as np
 import pytest
 import torch
-from checks import check_uniform
 from conftest import SharedEnv
-from gymnasium_robotics.envs.adroit_hand.adroit_pen import AdroitHandPenEnv
-from gymnasium_robotics.utils.rotations import euler2quat
+from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium.envs.registration import load_env_creator
 
 import lyceum_warp as lw
+from lyceum_warp.binding.registry import find_task
 
-TIPS = {"C_rfdistal", "C_lfdistal"}
+gymnasium.register_envs(gymnasium_robotics)
 
+IDS = {
+    name: task.gymnasium or ""
+    for name in lw.task_names()
+    if (task := find_task(name)).__module__.startswith("lyceum_warp.tasks.")
+}
+"""The environment that each task of the package names."""
 
-class Oracle(AdroitHandPenEnv):
-    """Their environment without contacts of the target, and without a pair of fingertips that is listed twice there.
-
-    The C engine makes two contacts of such a pair and MuJoCo Warp one, so the task leaves out the second entry.
-    """
-
-    def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        spec = mujoco.MjSpec.from_file(self.fullpath)
-        spec.delete(next(pair for pair in spec.pairs if {pair.geomname1, pair.geomname2} == TIPS))
-        spec.geom("target").contype = spec.geom("target").conaffinity = 0
-        model = spec.compile()
-        return model, mujoco.MjData(model)
-
-
-UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
-
-
-@dataclasses.dataclass
-class Step:
-    """One step of both environments."""
-
-    obs: np.ndarray
-    gym_obs: np.ndarray
-    reward: float
-    gym_reward: float
-    success: bool
-    gym_goal: bool
-    eval: float
-
-    def check(self) -> None:
-        """Compare, to the rounding of float32."""
-        assert relative_error(self.obs, self.gym_obs) <= 1e-5
-        assert relative_error(self.reward, self.gym_reward) <= 1e-5
-        assert abs(self.eval - self.gym_obs[33:36] @ self.gym_obs[36:39]) <= 1e-6
+ENTRIES = {
+    name: str(spec.entry_point)
+    for name, id in IDS.items()
+    if (spec := gymnasium.registry.get(id)) and str(spec.entry_point).startswith("gymnasium_robotics.")
+}
+TASKS = sorted(ENTRIES)
 
 
 def relative_error(ours: np.ndarray | float, theirs: np.ndarray | float) -> float:
@@ -58,14 +44,49 @@ def relative_error(ours: np.ndarray | float, theirs: np.ndarray | float) -> floa
     return float(np.max(np.abs(ours - theirs) / np.maximum(1.0, np.abs(theirs))))
 
 
-class Pair:
-    """One world and their environment, in the same states and under the same controls."""
+def geoms(pair: mujoco.MjsPair) -> set[str]:
+    """The names of the two geoms of a pair."""
+    return {pair.geomname1, pair.geomname2}
 
-    def __init__(self, ours: lw.Env, theirs: AdroitHandPenEnv, seed: int = 0) -> None:
+
+@functools.cache
+def oracle_class(name: str) -> type[MujocoEnv]:
+    """Their environment, on their model with the task's changes, and without pairs that it lists a second time."""
+    registered: Any = load_env_creator(ENTRIES[name])
+
+    class Oracle(registered):  # type: ignore[misc]
+        def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+            spec = mujoco.MjSpec.from_file(self.fullpath)
+            find_task(name).edit_model(spec)
+            for pair in [pair for i, pair in enumerate(spec.pairs) if geoms(pair) in map(geoms, spec.pairs[:i])]:
+                spec.delete(pair)
+            model = spec.compile()
+            return model, mujoco.MjData(model)
+
+    return Oracle
+
+
+def registered(name: str) -> Any:
+    """Their environment as it is."""
+    return gymnasium.make(IDS[name], disable_env_checker=True).unwrapped
+
+
+class Pair:
+    """One world and their environment, in the same states and under the same controls.
+
+    Args:
+        ours: The world.
+        theirs: Their environment.
+    """
+
+    def __init__(self, ours: lw.Env, theirs: Any) -> None:
         self.ours, self.theirs = ours, theirs
-        self.theirs.reset(seed=seed)
-        self.rng = np.random.default_rng(seed)
-        self.apart = False
+        self.places = {field: getattr(theirs.model, field).copy() for field in ("body_pos", "body_quat", "site_pos")}
+        """Their model before a reset draws some of it."""
+        self.theirs.reset(seed=0)
+        self.rng = np.random.default_rng(0)
+        self.goals = 0
+        """Steps of the episode in which their goal was achieved."""
         self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
 
     def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:
@@ -74,206 +95,275 @@ class Pair:
         np.testing.assert_allclose(ours, ctrl, atol=2e-7)
         self._simulate(ours, frames)
 
-    def put(self, target: np.ndarray = UPRIGHT, pen: np.ndarray | float = 0.0, noise: float = 0.05) -> None:
-        """Put both near the initial state; every number is one of float32.
+    def reset(self) -> None:
+        """Begin an episode in the random initial state of ours."""
+        self.ours.rand_reset()
+        first = self.ours.obs[0].numpy().astype(np.float64)
+        self.put()
+        assert relative_error(first, self.theirs._get_obs()) <= 1e-5
+        self.goals = 0
 
-        The pen's body lies on its side: its first joint moves it down, its third along x.
-        """
+    def put(self, **values: np.ndarray) -> None:
+        """Put both into our state, some of whose fields are replaced first."""
         model, data = self.theirs.model, self.theirs.data
+        for field, own in self.places.items():
+            getattr(model, field)[:] = own
         mujoco.mj_resetData(model, data)
-        model.body("target").quat[:] = np.float32(target)
-        low, high = model.jnt_range[:24].T
-        data.qpos[:24] = np.float32(np.clip(self.rng.uniform(-noise, noise, 24), low, high))
-        data.qpos[24:] = np.float32(pen)
-        data.qvel[:] = np.float32(self.rng.uniform(-noise, noise, 30))
+        state = self.ours.get_state()
+        parts = self.ours.state_space.split(state[0])
+        for field, value in values.items():
+            parts[field].copy_(torch.from_numpy(np.float32(np.ravel(value))))
+        for field in ("qpos", "qvel"):
+            getattr(data, field)[:] = parts[field].numpy()
+        pos, quat = parts["mocap_pos"].numpy().reshape(-1, 3), parts["mocap_quat"].numpy().reshape(-1, 4)
+        for body, i in mocap_bodies(self.ours.model).items():
+            self._move(body, pos[i], quat[i])
         mujoco.mj_forward(model, data)
-        data.qacc_warmstart[:] = np.float32(data.qacc)
-        self.apart = self.touched()
-
-        state = self.ours.get_state()
-        parts = self.ours.state_space.split(state[0])
-        for name in ("qpos", "qvel", "qacc_warmstart", "xpos", "site_xpos"):
-            parts[name].copy_(torch.from_numpy(np.ravel(getattr(data, name))))
-        parts["mocap_quat"][-4:] = torch.from_numpy(np.float32(target))
-        parts["memory"].zero_()
+        # the fields that a task reads as the engine's last step left them
+        for field, part in parts.items():
+            if hasattr(data, field) and not field.startswith("mocap") and np.size(getattr(data, field)) == len(part):
+                part.copy_(torch.from_numpy(np.ravel(getattr(data, field)).astype(np.float64)))
         self.ours.set_state(state)
 
-    def pen_axis(self) -> np.ndarray:
-        data = self.theirs.data
-        return (data.site("object_top").xpos - data.site("object_bottom").xpos) / 0.13
+    def _move(self, body: str, pos: np.ndarray, quat: np.ndarray) -> None:
+        """Place a body that is a mocap body in our model; in theirs it may be a fixed body, or just a site."""
+        model, data = self.theirs.model, self.theirs.data
+        if (id := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)) < 0:
+            model.site(body).pos[:] = pos
+        elif (mocap := model.body_mocapid[id]) < 0:
+            model.body_pos[id], model.body_quat[id] = pos, quat
+        else:
+            data.mocap_pos[mocap], data.mocap_quat[mocap] = pos, quat
 
-    def point_target(self, away: float) -> None:
-        """Turn the target so that its axis is an angle away from the pen's; both environments go on from there."""
-        target, sideways = np.zeros(4), np.cross(self.pen_axis(), (0.0, 1.0, 0.0))
-        axis = np.cos(away) * self.pen_axis() + np.sin(away) * sideways / np.linalg.norm(sideways)
-        mujoco.mju_quatZ2Vec(target, axis)
-        self.theirs.model.body("target").quat[:] = np.float32(target)
-        mujoco.mj_forward(self.theirs.model, self.theirs.data)
-        state = self.ours.get_state()
-        parts = self.ours.state_space.split(state[0])
-        parts["mocap_quat"][-4:] = torch.from_numpy(np.float32(target))
-        for name in ("qacc_warmstart", "xpos", "site_xpos"):
-            parts[name].copy_(torch.from_numpy(np.ravel(getattr(self.theirs.data, name))))
-        self.ours.set_state(state)
-
-    def step(self, action: np.ndarray) -> Step:
+    def step(self, action: np.ndarray) -> None:
+        """Step both."""
         action = action.astype(np.float32)
         self.ours.step(torch.from_numpy(action[None]))
-        obs, reward, terminated, truncated, info = self.theirs.step(action.astype(np.float64))
-        assert not terminated and not truncated and not self.ours.done.any()
-        step = Step(
-            self.ours.obs[0].numpy().astype(np.float64), obs, self.ours.reward.item(), float(reward),
-            self.ours.success.item(), bool(info["success"]), self.ours.eval.item(),
-        )  # fmt: skip
-        self.apart |= self.touched()
-        if not self.apart:
-            step.check()
-        return step
+        self.obs, self.reward, self.terminated, truncated, info = self.theirs.step(action.astype(np.float64))
+        assert not truncated and not self.ours.truncated.any()
+        self.success = bool(info["success"])
+        self.goals += self.success
 
-    def touched(self) -> bool:
-        """Whether there is a contact that only their environment has; never with the oracle."""
-        model = self.theirs.model
-        touching = [{model.geom(geom).name for geom in pair} for pair in self.theirs.data.contact.geom]
-        return touching.count(TIPS) > 1 or any("target" in names for names in touching)
+    def check(self) -> None:
+        """Compare the results of the step, to the rounding of float32."""
+        assert relative_error(self.ours.obs[0].numpy().astype(np.float64), self.obs) <= 1e-5
+        assert relative_error(self.ours.reward.item(), float(self.reward)) <= 1e-5
+        assert self.ours.terminated.item() == self.terminated
+        # a task may ask for several steps at their goal
+        steps = self.ours.task.params.get("goal_steps")
+        assert self.ours.success.item() == (self.success if steps is None else self.goals > steps)
+
+    def random_action(self, reach: float) -> np.ndarray:
+        return self.rng.uniform(-reach, reach, self.theirs.model.nu)
+
+
+def mocap_bodies(model: mujoco.MjModel) -> dict[str, int]:
+    """Which mocap body each name is."""
+    return {model.body(i).name: int(mocap) for i, mocap in enumerate(model.body_mocapid) if mocap >= 0}
+
+
+@dataclasses.dataclass
+class Special:
+    """A state that random actions do not reach."""
+
+    reward: float
+    """Their reward of the next step, within 0.1."""
+    joints: dict[str, float]
+    """Coordinates of some joints."""
+    moved: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
+    """Positions and orientations of some mocap bodies."""
+
+    def fields(self, env: lw.Env) -> dict[str, np.ndarray]:
+        """The fields of this state that differ from the environment's own."""
+        parts = env.state_space.split(env.get_state()[0])
+        fields = {name: parts[name].numpy().copy() for name in ("qpos", "mocap_pos", "mocap_quat")}
+        for joint, value in self.joints.items():
+            fields["qpos"][env.model.joint(joint).qposadr] = value
+        for body, pose in self.moved.items():
+            i = mocap_bodies(env.model)[body]
+            fields["mocap_pos"][3 * i :][:3], fields["mocap_quat"][4 * i :][:4] = pose[:3], pose[3:]
+        return fields
+
+
+def pen(reward: float, angle: float, up: float) -> Special:
+    """The pen at a height above the palm, its axis at an angle to the target's; its first joint moves it down."""
+    turn = (np.pi / 2 - angle) / 2
+    return Special(reward, {"OBJTx": -up}, {"target": (0.2, 0.2, 0.2, np.cos(turn), 0.0, np.sin(turn), 0.0)})
+
+
+def ball(reward: float, up: float, aside: float) -> Special:
+    """The ball at a height and at a distance to the side of the target, which is 0.2 m above the table."""
+    joints = {"OBJTx": aside, "OBJTy": 0.0, "OBJTz": up - 0.035}
+    return Special(reward, joints, {"target": (0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0)})
+
+
+SPECIAL = {
+    "adroit_door": [
+        Special(reward, {"door_hinge": angle}) for reward, angle in ((-0.2, 0.1), (1.9, 0.3), (10.0, 1.1), (20.0, 1.4))
+    ],
+    "adroit_hammer": [
+        Special(0.7, {"OBJTy": 0.15}),
+        Special(24.4, {"nail_dir": 0.08}),
+        Special(99.4, {"nail_dir": 0.09}),
+    ],
+    "adroit_pen": [pen(61.0, 0.1, 0.0), pen(10.9, 0.38, 0.0), pen(0.8, 0.1, 0.2), pen(-5.6, 2.0, -0.2)],
+    "adroit_relocate": [ball(0.0, 0.035, 0.15), ball(0.8, 0.2, 0.15), ball(10.9, 0.2, 0.08), ball(30.9, 0.2, 0.01)],
+}
+"""States that reach the bonuses of the rewards, and success."""
+
+
+@pytest.fixture(params=TASKS)
+def task(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+MakePair = Callable[..., Pair]
 
 
 @pytest.fixture
-def ours(shared_env: SharedEnv) -> lw.Env:
-    return shared_env("adroit_pen", autoreset=False, horizon=0, nthread=1)
+def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
+    """``make_pair(theirs, sparse=True)``: our environment and theirs, by default the oracle."""
+
+    def make(theirs: Any = None, **params: Any) -> Pair:
+        ours = shared_env(task, autoreset=False, horizon=0, nthread=1, **params)
+        return Pair(ours, theirs or oracle_class(task)())
+
+    return make
 
 
-@pytest.fixture
-def pair(ours: lw.Env) -> Pair:
-    return Pair(ours, Oracle())
+def test_random_actions_lead_to_the_same_numbers(make_pair: MakePair) -> None:
+    """Five episodes of 200 steps from random initial states; a quarter of the actions is out of range."""
+    pair = make_pair()
+    for _ in range(5):
+        pair.reset()
+        for i in range(200):
+            if i % 4 == 0:
+                action = pair.random_action(1.3)
+            pair.step(action)
+            pair.check()
 
 
-def random_quat(rng: np.random.Generator) -> np.ndarray:
-    return euler2quat([*rng.uniform(-1.0, 1.0, 2), 0.0])
+def pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
+    """The pairs of geoms that the model lists."""
+    return list(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
 
 
-def test_random_actions_lead_to_the_same_numbers(pair: Pair) -> None:
-    """Four episodes, 400 steps, some actions out of range."""
+def test_the_registered_environment_agrees_until_contacts_differ(make_pair: MakePair, task: str) -> None:
+    """Their model as it is, until geoms touch that collide only there, or whose contact is counted twice there."""
+    pair = make_pair(registered(task))
+    ours, theirs = pair.ours.model, pair.theirs.model
+    ghosts = set(np.flatnonzero(ours.geom_contype != theirs.geom_contype))
+    doubled, checked = {pair for pair in pairs(theirs) if pairs(theirs).count(pair) > pairs(ours).count(pair)}, 0
     for _ in range(4):
-        pair.put(random_quat(pair.rng))
-        for i in range(100):
-            if i % 4 == 0:
-                action = pair.rng.uniform(-1.3, 1.3, 24)
-            pair.step(action)
-
-
-def test_the_registered_environment_agrees_until_contacts_differ(ours: lw.Env) -> None:
-    """Until something touches the target, or those two fingertips touch each other."""
-    theirs = gymnasium.make("AdroitHandPen-v1")
-    assert theirs.spec is not None and theirs.spec.max_episode_steps == ours.task.task.horizon == 200
-    pair = Pair(ours, theirs.unwrapped)
-    checked = 0
-    for _ in range(8):
-        pair.put(random_quat(pair.rng))
+        pair.reset()
         for i in range(50):
             if i % 4 == 0:
-                action = pair.rng.uniform(-1.0, 1.0, 24)
+                action = pair.random_action(1.0)
             pair.step(action)
-            checked += not pair.apart
-    assert 100 < checked < 400
+            touching = {(int(a), int(b)) for a, b in pair.theirs.data.contact.geom}
+            if touching & doubled or any(ghosts.intersection(geoms) for geoms in touching):
+                break
+            pair.check()
+            checked += 1
+    assert checked >= 50
 
 
-def test_bonuses_and_success_are_theirs(pair: Pair) -> None:
-    """The bonuses are +10, +60 and -5. Success needs more than 20 steps at their goal, in a row or not."""
-    seen: dict[float, int] = {}
-    goals_at_once, successes = 0, 0
-    for angle, height in ((0.1, 0.0), (0.38, 0.0), (0.1, -0.2), (2.0, -0.2), (0.1, 0.2)):
-        pair.put(pen=np.array([-height, 0.0, 0.0, 0.0, 0.0, 0.0]))
-        goals = 0
-        for i in range(50):
-            if i % 10 == 0:
-                pair.point_target(angle if i < 40 else 1.0)
-            step = pair.step(pair.rng.uniform(-0.2, 0.2, 24))
-            goals += step.gym_goal
-            assert step.success == (goals > 20)
-            successes += step.success
-            goals_at_once = max(goals_at_once, goals)
-            bonus = round(step.gym_reward - step.eval + float(np.linalg.norm(step.gym_obs[39:42])), 3)
-            seen[bonus] = seen.get(bonus, 0) + 1
-    assert seen.keys() == {0.0, 10.0, 60.0, -5.0} and min(seen.values()) >= 5, seen
-    assert goals_at_once > 30 and 10 < successes < 100
+@pytest.mark.parametrize("reward_type", ["dense", "sparse"])
+def test_bonuses_and_success_are_theirs(make_pair: MakePair, task: str, reward_type: str) -> None:
+    pair = make_pair(oracle_class(task)(reward_type=reward_type), sparse=reward_type == "sparse")
+    assert task in SPECIAL, "add states that reach the bonuses and success"
+    rewards, successes = set(), 0
+    for special in SPECIAL[task]:
+        pair.reset()
+        pair.put(**special.fields(pair.ours))
+        for i in range(30):
+            pair.step(pair.random_action(0.2))
+            pair.check()
+            if i == 0 and reward_type == "dense":
+                assert pair.reward == pytest.approx(special.reward, abs=0.1)
+            rewards.add(pair.reward)
+            successes += pair.ours.success.item()
+    assert 0 < successes < 30 * len(SPECIAL[task])
+    assert reward_type == "dense" or rewards == {10.0, -0.1}
 
 
-def test_the_target_has_no_contacts(ours: lw.Env) -> None:
-    """A pen inside the target is pushed out in their environment and falls through it in the task."""
-    heights = []
-    for theirs in (AdroitHandPenEnv(), Oracle()):
-        pair = Pair(ours, theirs)
-        pair.put(UPRIGHT, np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0]), noise=0.0)
-        assert pair.apart == (type(theirs) is AdroitHandPenEnv)
-        steps = [pair.step(np.zeros(24)) for _ in range(10)]
-        heights.append((steps[-1].obs[26], steps[-1].gym_obs[26]))
-    assert abs(heights[0][0] - heights[0][1]) > 0.01 and heights[1][0] == pytest.approx(heights[1][1], abs=1e-6)
+# models and spaces
 
 
-def test_model_is_theirs_except_for_the_target_and_a_doubled_pair(shared_env: SharedEnv) -> None:
-    """Their environment resets the actuators' gains when it is made."""
-    ours, theirs = shared_env("adroit_pen").model, AdroitHandPenEnv().model
-    assert ours.npair == theirs.npair - 1
-    for name in (
-        "body_mass", "body_inertia", "body_pos", "body_ipos", "body_iquat", "dof_damping", "dof_armature",
-        "dof_frictionloss", "jnt_range", "jnt_margin", "geom_size", "geom_friction", "geom_margin",
-        "tendon_range", "actuator_gainprm", "actuator_biasprm", "actuator_ctrlrange", "actuator_forcerange",
-    ):  # fmt: skip
-        assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
-    for name in ("timestep", "integrator", "cone", "solver", "iterations", "noslip_iterations"):
+def test_spaces_and_parameters_are_theirs(shared_env: SharedEnv, task: str) -> None:
+    ours, theirs = shared_env(task, autoreset=False, horizon=0, nthread=1), registered(task)
+    low, high = theirs.action_space.low, theirs.action_space.high
+    assert ours.obs.shape == (1, *theirs.observation_space.shape)
+    assert np.array_equal(ours.action_space.low, low) and np.array_equal(ours.action_space.high, high)
+    assert list(ours.action_space.parts) == [theirs.model.actuator(i).name for i in range(theirs.model.nu)]
+    assert ours.timestep == pytest.approx(theirs.dt, rel=1e-12)
+    assert find_task(task).horizon == gymnasium.spec(IDS[task]).max_episode_steps
+    assert set(inspect.signature(type(theirs).__init__).parameters) == {"self", "reward_type", "kwargs"}
+
+
+KINDS = {
+    "body": mujoco.mjtObj.mjOBJ_BODY, "jnt": mujoco.mjtObj.mjOBJ_JOINT, "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "site": mujoco.mjtObj.mjOBJ_SITE, "tendon": mujoco.mjtObj.mjOBJ_TENDON,
+    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR, "sensor": mujoco.mjtObj.mjOBJ_SENSOR, "dof": None, "wrap": None,
+}  # fmt: skip
+"""The kinds of elements, and how their names are found."""
+
+
+def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, str]]:
+    """Fields of elements of their model that differ from ours, with the elements' names."""
+    found = set()
+    for kind, named in KINDS.items():
+        fields = [name for name in dir(theirs) if name.startswith(f"{kind}_")]
+        for i in range(len(getattr(theirs, fields[0]))):
+            name = mujoco.mj_id2name(theirs, named, i) if named else None
+            k = mujoco.mj_name2id(ours, named, name) if name else i
+            assert k >= 0, f"the model has no {kind} {name!r}"
+            found |= {(f, name) for f in fields if not np.array_equal(getattr(ours, f)[k], getattr(theirs, f)[i])}
+    return found
+
+
+def test_model_is_theirs_except_for_edits(shared_env: SharedEnv, task: str) -> None:
+    """Only what a reset moves may differ, and pairs that they list twice. Sensors count sites in another order."""
+    ours, theirs = shared_env(task, autoreset=False, horizon=0, nthread=1).model, registered(task).model
+    moved = mocap_bodies(ours)
+    others = {(field, name) for field, name in differences(ours, theirs) if name not in moved}
+    assert {field for field, _ in others} <= {"sensor_objid"}, others
+    first = {pair: i for i, pair in reversed(list(enumerate(pairs(theirs))))}
+    assert ours.npair == len(first)
+    for field in ("solref", "solimp", "margin", "gap", "friction", "dim"):
+        assert np.array_equal(
+            getattr(ours, f"pair_{field}"), getattr(theirs, f"pair_{field}")[[first[pair] for pair in pairs(ours)]]
+        )
+    for name in ("timestep", "integrator", "cone", "solver", "iterations", "noslip_iterations", "tolerance"):
         assert getattr(ours.opt, name) == getattr(theirs.opt, name), name
-    # the task reads none of the model's 65 sensors, so they are turned off
-    assert ours.nsensor == theirs.nsensor == 65
-    assert ours.opt.disableflags == theirs.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR
-    assert ours.opt.noslip_iterations == 20
-    meshes = ours.geom_type == mujoco.mjtGeom.mjGEOM_MESH
-    assert meshes.any() and not ours.geom_contype[meshes].any() and not ours.geom_conaffinity[meshes].any()
-    target = ours.geom_bodyid == ours.body("target").id
-    assert target.any() and not ours.geom_contype[target].any() and not ours.geom_conaffinity[target].any()
-    assert ours.body("target").mocapid[0] == 1, "the target is the second mocap body, not the first"
-
-
-def test_spaces_are_theirs(pair: Pair) -> None:
-    assert pair.ours.obs.shape == (1, *pair.theirs.observation_space.shape) == (1, 45)
-    assert np.array_equal(pair.ours.action_space.low, pair.theirs.action_space.low)
-    assert np.array_equal(pair.ours.action_space.high, pair.theirs.action_space.high)
-    assert list(pair.ours.action_space.parts) == [pair.theirs.model.actuator(i).name for i in range(24)]
-    assert pair.ours.timestep == pytest.approx(pair.theirs.dt, rel=1e-12)
 
 
 # resets
 
 
-def quats(env: lw.Env) -> np.ndarray:
-    """The targets' orientations."""
-    return env.state_space.split(env.get_state())["mocap_quat"][:, 4:].numpy().copy()
+def test_fixed_resets_put_everything_where_the_model_does(make_pair: MakePair, task: str) -> None:
+    """Their model before any reset has the same places."""
+    pair = make_pair(registered(task))
+    pair.ours.reset()
+    pair.put()
+    for field, own in pair.places.items():
+        np.testing.assert_allclose(getattr(pair.theirs.model, field), own, atol=1e-7)
+    assert np.array_equal(pair.theirs.data.qpos, pair.theirs.init_qpos)
+    assert np.array_equal(pair.theirs.data.qvel, pair.theirs.init_qvel)
 
 
 @pytest.mark.usefixtures("freed")
-@pytest.mark.parametrize("scale", [None, 0.2])
-def test_random_resets_turn_the_target_as_theirs_do(scale: float | None) -> None:
-    """Hand and pen start where the model puts them; each world draws a target of its own."""
-    env = lw.make("adroit_pen", engine="mujoco", nworld=2000, **({} if scale is None else {"target_range": scale}))
-    found = quats(env)
-    euler = 2.0 * np.arctan2(found[:, 1:3], found[:, [0, 0]])  # both half angles are under a right angle
-    np.testing.assert_allclose(euler2quat(np.concatenate([euler, np.zeros((2000, 1))], axis=1)), found, atol=1e-6)
-    check_uniform(euler / (scale or 1.0) / (1.0 + 1e-6))
-    theirs = AdroitHandPenEnv()
-    wanted, _ = theirs.reset(seed=0)
-    for w in range(20):
-        theirs.model.body("target").quat[:] = found[w]
-        theirs.set_state(theirs.init_qpos, theirs.init_qvel)
-        assert relative_error(env.obs[w].numpy().astype(np.float64), theirs._get_obs()) <= 1e-6
-    assert len(np.unique(env.obs[:, 36:39].numpy().round(5), axis=0)) > 1900
-    env.reset()
-    assert np.array_equal(quats(env), np.tile(UPRIGHT, (2000, 1)))
-    wanted[36:39], wanted[42:45] = (0.0, 0.0, 1.0), wanted[33:36] - (0.0, 0.0, 1.0)
-    assert relative_error(env.obs.numpy().astype(np.float64), np.tile(wanted, (2000, 1))) <= 1e-6
-
-
-def test_their_reset_draws_two_angles_in_the_order_of_the_axes() -> None:
-    """The target's orientation is ``euler2quat`` of these angles."""
-    env = AdroitHandPenEnv()
-    env.reset(seed=3)
-    angles = np.random.default_rng(3).uniform(-1, 1, 2)
-    np.testing.assert_allclose(env.model.body("target").quat, euler2quat([*angles, 0.0]), atol=1e-12)
+def test_random_resets_are_distributed_as_theirs(task: str) -> None:
+    """Each number of the first observations by a Kolmogorov-Smirnov test, and the correlations between them."""
+    n, m = 400, 1000
+    env, original = lw.make(task, engine="mujoco", nworld=m, nthread=1), registered(task)
+    ours = env.obs.numpy().astype(np.float64)
+    theirs = np.array([original.reset(seed=None if i else 0)[0] for i in range(n)])
+    still = theirs.std(axis=0) < 1e-6
+    np.testing.assert_allclose(ours[:, still], np.tile(theirs[0, still], (m, 1)), atol=1e-5)
+    for a, b in zip(ours[:, ~still].T, theirs[:, ~still].T, strict=True):
+        both = np.sort(np.concatenate([a, b]))
+        shares = [np.searchsorted(np.sort(x), both, side="right") / len(x) for x in (a, b)]
+        assert np.abs(shares[0] - shares[1]).max() < 2.0 * np.sqrt(1 / n + 1 / m)
+    correlations = [np.atleast_2d(np.corrcoef(x[:, ~still].T)) for x in (ours, theirs)]
+    assert np.abs(correlations[0] - correlations[1]).max() < 5.0 * np.sqrt(1 / n + 1 / m)

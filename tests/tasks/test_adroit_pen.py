@@ -66,3 +66,23 @@ def test_success_needs_more_than_20_steps_at_the_goal() -> None:
     assert not env.success.any()
     env.set_state(state)
     assert env.success.all()
+
+
+def test_a_smaller_target_range_gives_smaller_angles() -> None:
+    env = lw.make("adroit_pen", engine="mujoco", nworld=200, target_range=np.linspace(0.01, 0.4, 200), seed=2)
+    upright = env.obs[:, 38].numpy()  # the cosine of both angles
+    assert (upright >= np.cos(np.linspace(0.01, 0.4, 200)) ** 2 - 1e-6).all()
+    assert 0.7 < upright.min() < 0.95
+
+
+def test_the_target_has_no_contacts() -> None:
+    """A pen inside the target moves as without it."""
+    env = lw.make("adroit_pen", engine="mujoco", nworld=2, nthread=1)
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    parts["qpos"][:, 26] = 0.2  # along x, into the target
+    parts["mocap_pos"][1, 3:] = 5.0
+    env.set_state(state)
+    for _ in range(10):
+        env.step(torch.zeros(2, 24))
+    assert torch.equal(env.obs[0, 24:33], env.obs[1, 24:33])

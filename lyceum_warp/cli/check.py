@@ -1,0 +1,50 @@
+"""lyceum-warp check."""
+
+import dataclasses
+from typing import Annotated
+
+import tyro
+
+from lyceum_warp.cli.arguments import Physics, Placement, Repeated, parameters
+from lyceum_warp.cli.display import make_console
+from lyceum_warp.testing import check_task
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Check:
+    """Check that a task keeps every rule of an environment, and print the rules with the seconds that each took.
+
+    The rules are those that the package's own tasks keep: a saved state steps to the same numbers, functions write
+    only what they may and read within bounds, a fault stays in its world, and others. Check a new task on both engines.
+    The exit code is 1 where a rule is broken. check_task of lyceum_warp.testing does the same in Python.
+
+    $ lyceum-warp check path/to/my_task.py
+    $ lyceum-warp check path/to/my_task.py --engine warp --steps 50
+    """
+
+    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
+    """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
+    nworld: int = 4
+    """Number of worlds, at least 2."""
+    steps: int = 200
+    """Steps of the long checks."""
+    seed: int = 0
+    """Seed of the worlds and of the random actions."""
+    param: Repeated = ()
+    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf, a table as NAME=file.npy; may be given several
+    times."""
+    env: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
+    physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
+
+
+def check(options: Check) -> int:
+    """Run the command; returns the exit code."""
+    words = vars(options.env) | options.physics.options().given() | parameters(options.param, options)
+    console = make_console()
+    try:
+        report = check_task(options.task, nworld=options.nworld, steps=options.steps, seed=options.seed, **words)
+    except AssertionError as error:
+        console.print(str(error), soft_wrap=True, markup=False)
+        return 1
+    console.print(str(report), soft_wrap=True, markup=False)
+    return 0

@@ -1,0 +1,138 @@
+"""lyceum-warp new."""
+
+import dataclasses
+import importlib.util
+import keyword
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import mujoco
+import tyro
+
+from lyceum_warp.binding.models import compile_model
+from lyceum_warp.binding.registry import find_task, package_task_names, snake_case
+from lyceum_warp.cli.display import make_console
+from lyceum_warp.cli.task_text import literal, task_text
+from lyceum_warp.files import replaced
+from lyceum_warp.model_files import ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, read_spec
+from lyceum_warp.options import PhysicsOptions
+
+_SOURCES: dict[str, Callable[[str], ModelFile]] = {
+    "menagerie": menagerie_model,
+    "gymnasium": gymnasium_model,
+    "gymnasium_robotics": gymnasium_robotics_model,
+}
+"""Functions that name a model, by what stands before the colon of --model."""
+
+_TAKEN = ("World", "Params", "Row")
+"""Names that the file uses itself."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class New:
+    """Write a task file for a model: it can be checked, stepped and trained at once, with a reward of zero.
+
+    The policy observes positions and velocities and what the model's sensors measure, or only the sensors where they
+    measure every joint. It acts through the model's actuators. A step takes about 20 ms. Comments in the file say how
+    to go on.
+
+    $ lyceum-warp new walk --model robots/dog.xml
+    $ lyceum-warp new tasks/hop.py --model gymnasium:hopper.xml
+    $ MENAGERIE_ROOT=~/mujoco_menagerie lyceum-warp new go1_walk --model menagerie:unitree_go1/scene.xml
+    """
+
+    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
+    """The name of the task, in snake_case, for the file TASK.py in the current folder; or the file: path/to/task.py."""
+    model: Annotated[str, tyro.conf.arg(metavar="FILE")]
+    """An MJCF or URDF file; or menagerie:ROBOT/FILE.xml, of the checkout of MuJoCo Menagerie to which the environment
+    variable MENAGERIE_ROOT points; or gymnasium:FILE.xml or gymnasium_robotics:PATH, of these packages. A relative path
+    is written relative to the task file."""
+
+
+def new_task(options: New) -> int:
+    """Run the command; returns the exit code."""
+    path = Path(options.task if options.task.endswith(".py") else f"{options.task}.py").expanduser()
+    class_name = _class_name(path)
+    if path.exists():
+        raise ValueError(f"{path} exists: choose another name, or remove it")
+    if not path.absolute().parent.is_dir():
+        raise ValueError(f"there is no folder {path.parent} for the task file: make it first")
+    source, title, spec = _model(options.model, path)
+    try:
+        model = compile_model(spec, ("sensordata",), PhysicsOptions())
+    except ValueError as error:
+        raise ValueError(f"{options.model}: {error}") from error
+    if model.nu == 0:
+        raise ValueError(f"the model {options.model} has no actuators, so there is nothing to act on: add some to it")
+    if model.nv == 0:
+        raise ValueError(f"the model {options.model} has no joints, so nothing in it moves: add some to it")
+    _write(path, task_text(path.name, class_name, source, title, model))
+    task = find_task(path)
+    console = make_console()
+    console.print(
+        f"{path}: {sum(task.obs.values())} observations, {model.nu} actions, "
+        f"{1000 * task.frame_skip * model.opt.timestep:.3g} ms in a step; check and train it with",
+        soft_wrap=True, markup=False,
+    )  # fmt: skip
+    for command in ("check", "train"):
+        console.print(f"  lyceum-warp {command} {path}", soft_wrap=True, markup=False)
+    return 0
+
+
+def _class_name(path: Path) -> str:
+    """The name of the class in a task file.
+
+    Raises:
+        ValueError: The file's name cannot be that of a task, or belongs to another task or module.
+    """
+    name = path.stem
+    class_name = "".join(part[:1].upper() + part[1:] for part in name.split("_"))
+    if not (name.isidentifier() and class_name.isidentifier() and name.isascii()) or keyword.iskeyword(name):
+        raise ValueError(f"a task can't be named {name!r}: use letters, digits and _, as in my_robot")
+    if snake_case(class_name) != name:  # the class alone has the name of the task
+        raise ValueError(f"a task can't be named {name!r}: use {snake_case(class_name)!r}, for the class {class_name}")
+    if class_name in _TAKEN:
+        raise ValueError(f"a task can't be named {name!r}: its file uses {class_name} for something else")
+    if name in package_task_names():
+        raise ValueError(f"the task name {name!r} is taken by a task of the package: choose another")
+    module = importlib.util.find_spec(name)
+    if module is not None and module.origin is not None and Path(module.origin).parent != path.absolute().parent:
+        raise ValueError(f"a task can't be named {name!r}: its file would hide the Python module of this name")
+    return class_name
+
+
+def _model(text: str, path: Path) -> tuple[str, str, mujoco.MjSpec]:
+    """A model as an expression in a task file, what to call it, and the model itself.
+
+    Args:
+        text: The model as it is given on the command line.
+        path: The task file.
+
+    Raises:
+        FileNotFoundError: There is no such file, or its package or checkout is not there.
+        ValueError: MuJoCo cannot read the file.
+    """
+    where, _, file = text.partition(":")
+    if where in _SOURCES:
+        return f"lw.{where}_model({literal(file)})", _title(file), _SOURCES[where](file).spec()
+    model = Path(text).expanduser()
+    if not model.is_file():
+        raise FileNotFoundError(f"there is no model file {text!r}")
+    given = model if model.is_absolute() else Path(os.path.relpath(model, path.parent))
+    return literal(given.as_posix()), _title(model.name), read_spec(model)
+
+
+def _title(file: str) -> str:
+    """What the docstring of a task file calls a model."""
+    plain = file.isprintable() and not set(file) & set('\\"') and len(file) <= 50
+    return f"the model {file}" if plain else "a model"
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        with replaced(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ValueError(f"can't write {path}: {error.strerror}") from error

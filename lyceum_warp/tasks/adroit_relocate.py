@@ -1,0 +1,113 @@
+"""AdroitRelocate: pick up a ball and carry it to a target (Gymnasium-Robotics' AdroitHandRelocate-v1).
+
+The hand's model comes with the extra "hand". The target is a mocap body here, and resets move the ball by its own
+joints: both places belong to the state. The tips of ring and little finger, which the model pairs twice, are paired
+once. As in the original, positions are those that ``mj_step`` leaves. The reward grows with the palm's distance from
+the ball, as in gymnasium-robotics 1.2.1 to 1.4.2, by mistake; ``palm_weight=-0.1`` subtracts it, as in version 1.2.0.
+"""
+
+import mujoco
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+
+@wp.struct
+class World:
+    qpos: Row[float]  # the arm's 6 joints, the hand's 24, then the ball's 3 slides and 3 hinges
+    xpos: Row[wp.vec3]
+    site_xpos: Row[wp.vec3]
+    mocap_pos: Row[wp.vec3]
+
+
+@wp.struct
+class Params:
+    dt: float
+    sparse: bool = False  # a reward of 10 for success, else -0.1
+    palm_weight: float = 0.1
+    success_distance: float = 0.1  # m
+    lifted_height: float = 0.04  # m; the ball's radius is 0.035
+    ball_low: wp.vec2 = wp.vec2(-0.15, -0.15)
+    ball_high: wp.vec2 = wp.vec2(0.15, 0.3)
+    target_low: wp.vec3 = wp.vec3(-0.2, -0.2, 0.15)
+    target_high: wp.vec3 = wp.vec3(0.2, 0.2, 0.35)
+    ball: int = lw.body("Object")
+    ball_x: int = lw.qpos("OBJTx")
+    palm: int = lw.site("S_grasp")
+    target: int = lw.mocap("target")
+    target_site: int = lw.site("target")
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    palm, ball, target = s.site_xpos[p.palm], s.xpos[p.ball], s.site_xpos[p.target_site]
+    k = lw.put(obs, 0, s.qpos, 0, 30)
+    k = lw.put(obs, k, palm - ball)
+    k = lw.put(obs, k, palm - target)
+    lw.put(obs, k, ball - target)
+
+
+@wp.func
+def evaluate(s: World, p: Params) -> float:
+    return wp.length(s.xpos[p.ball] - s.site_xpos[p.target_site])
+
+
+@wp.func
+def success(s: World, p: Params) -> bool:
+    return evaluate(s, p) < p.success_distance
+
+
+@wp.func
+def terms(s: World, p: Params) -> wp.vec3:
+    palm = s.site_xpos[p.palm]
+    carried = float(0.0)
+    if s.xpos[p.ball][2] > p.lifted_height:
+        carried = 1.0 - 0.5 * wp.length(palm - s.site_xpos[p.target_site]) - 0.5 * evaluate(s, p)
+    bonus = wp.where(evaluate(s, p) < 0.1, 10.0, 0.0) + wp.where(evaluate(s, p) < 0.05, 20.0, 0.0)
+    return wp.vec3(p.palm_weight * wp.length(palm - s.xpos[p.ball]), carried, bonus)
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    if p.sparse:
+        return wp.where(success(s1, p), 10.0, -0.1)
+    t = terms(s1, p)
+    return t[0] + t[1] + t[2]
+
+
+@wp.func
+def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):
+    lw.put(metrics, 0, terms(s1, p))
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    for i in range(2):
+        s.qpos[p.ball_x + i] = lw.uniform(rng, p.ball_low[i], p.ball_high[i])  # from the body's place, above (0, 0)
+    for i in range(3):
+        s.mocap_pos[p.target][i] = lw.uniform(rng, p.target_low[i], p.target_high[i])
+
+
+@lw.register
+class AdroitRelocate(lw.Task):
+    model = lw.gymnasium_robotics_model("adroit_hand/adroit_relocate.xml")
+    gymnasium = "AdroitHandRelocate-v1"
+    frame_skip = 5
+    obs = {"joints": 30, "palm_to_ball": 3, "palm_to_target": 3, "ball_to_target": 3}
+    metrics = ("palm_to_ball", "carried", "bonus")
+    horizon = 200
+    lagged = ("xpos", "site_xpos")
+    action_range = (-1.0, 1.0)
+    planning = lw.Planning(
+        settings={"horizon": 32, "samples": 160, "temperature": 0.1, "noise": 1.0}, params={"palm_weight": -1.0}
+    )
+
+    @staticmethod
+    def edit_model(spec: mujoco.MjSpec) -> None:
+        """Let each world move its target."""
+        fixed = spec.site("target")
+        target = spec.worldbody.add_body(name="target", mocap=True, pos=fixed.pos)
+        looks = {"size": fixed.size.copy(), "rgba": fixed.rgba.copy()}
+        spec.delete(fixed)
+        target.add_site(name="target", **looks)

@@ -1,0 +1,142 @@
+"""AlohaLift: take a pot by its two handles and lift it with two arms (ALOHA and pot of mujoco_warp's test data).
+
+The model comes with mujoco_warp, where another release may move it. Meshes are only drawn: capsules fitted to the arms
+collide with pot and table, and fingers, pot and table have the simple shapes of the MJCF file beside this one; the arms
+don't collide with each other. Actions are velocities, which move the targets of the model's position servos. The reward
+weighs four terms between 0 and 1. An episode is a success while the pot was held up for ten steps.
+"""
+
+import mujoco
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+POT = "partnet_100015/"
+ARM = (0.0, -1.05, 1.06, 0.0, 0.78, 1.57, 0.035, 0.035)  # beside a handle, one finger above the other
+
+
+@wp.struct
+class World:
+    qpos: Row[float]  # 8 joints of the left arm, 8 of the right one, the pot's position and quaternion, its lid
+    qvel: Row[float]
+    act: Row[float]  # targets of both arms
+    xpos: Row[wp.vec3]
+    xmat: Row[wp.mat33]
+    site_xpos: Row[wp.vec3]
+    site_xmat: Row[wp.mat33]
+    memory: Row[float]  # steps since the pot was last under the goal's height
+
+
+@wp.struct
+class Params:
+    dt: float
+    goal_height: float = 0.1
+    goal_steps: float = 10.0
+    rest_height: float = 0.0658  # of the pot on the table
+    place: wp.vec3 = wp.vec3(0.03, 0.03, 0.25)  # of the pot at the start: x, y and yaw, each plus or minus this
+    pot: int = lw.body(POT)
+    pot_qpos: int = lw.qpos(POT)
+    left_grip: int = lw.site("lift/left_grip")
+    right_grip: int = lw.site("lift/right_grip")
+    left_handle: int = lw.site("lift/left_handle")
+    right_handle: int = lw.site("lift/right_handle")
+    left_finger: int = lw.qpos("left\\left_finger")
+    right_finger: int = lw.qpos("right\\left_finger")
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    k = lw.put(obs, 0, s.qpos, 0, 16)
+    k = lw.put(obs, k, s.qvel, 0, 22)
+    k = lw.put(obs, k, s.act)
+    k = lw.put(obs, k, s.xpos[p.pot])
+    k = lw.put(obs, k, s.xmat[p.pot])
+    k = lw.put(obs, k, s.site_xpos[p.left_handle] - s.site_xpos[p.left_grip])
+    k = lw.put(obs, k, s.site_xpos[p.right_handle] - s.site_xpos[p.right_grip])
+
+
+@wp.func
+def evaluate(s: World, p: Params) -> float:  # height of the pot above the table
+    return s.xpos[p.pot][2] - p.rest_height
+
+
+@wp.func
+def arm(s: World, grip: int, handle: int, finger: int) -> wp.vec4:
+    distance = wp.length(s.site_xpos[grip] - s.site_xpos[handle])
+    around = lw.tolerance(distance, wp.vec2(0.0, 0.01), 0.01)
+    closed = lw.tolerance(s.qpos[finger], wp.vec2(0.0, 0.015), 0.02, int(lw.Sigmoid.LINEAR))
+    reach = lw.tolerance(distance, wp.vec2(0.0, 0.005), 0.1, int(lw.Sigmoid.RECIPROCAL), 0.2)
+    # the fingers slide along the gripper's y axis, across the handle's bar, the pot's x axis
+    orient = 1.0 - wp.abs(wp.dot(s.site_xmat[grip][:, 1], s.site_xmat[handle][:, 0]))
+    grasp = around * closed + 0.5 * (1.0 - around) * (1.0 - closed)  # open on the way, closed around the handle
+    return wp.vec4(reach, orient, grasp, around)
+
+
+@wp.func
+def terms(s: World, p: Params) -> wp.vec4:
+    left = arm(s, p.left_grip, p.left_handle, p.left_finger)
+    right = arm(s, p.right_grip, p.right_handle, p.right_finger)
+    mean, upright = 0.5 * (left + right), wp.max(s.xmat[p.pot][2, 2], 0.0)
+    lift = wp.min(left[3], right[3]) * upright * wp.clamp(evaluate(s, p) / (1.5 * p.goal_height), 0.0, 1.0)
+    return wp.vec4(mean[0], mean[1], mean[2], lift)
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    return wp.dot(terms(s1, p), wp.vec4(1.0, 0.5, 1.0, 4.0)) - 0.005 * lw.sum_squares(action)
+
+
+@wp.func
+def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):
+    lw.put(metrics, 0, terms(s1, p))
+
+
+@wp.func
+def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
+    s1.memory[0] = wp.where(evaluate(s1, p) > p.goal_height, s0.memory[0] + 1.0, 0.0)
+
+
+@wp.func
+def success(s: World, p: Params) -> bool:
+    return s.memory[0] >= p.goal_steps
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    x, y = lw.uniform(rng, -p.place[0], p.place[0]), lw.uniform(rng, -p.place[1], p.place[1])
+    k = lw.put(s.qpos, p.pot_qpos, wp.vec3(x, y, p.rest_height))
+    yaw = 0.5 * wp.pi + lw.uniform(rng, -p.place[2], p.place[2])  # a handle for each arm
+    lw.put(s.qpos, k, lw.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw))
+
+
+@lw.register
+class AlohaLift(lw.Task):
+    model = lw.package_model("mujoco_warp", "test_data/aloha_pot/scene.xml", install="mujoco-warp>=4.0,<5")
+    keyframe, frame_skip, horizon, memory = "start", 8, 150, 1
+    obs = {"position": 16, "velocity": 22, "target": 14, "pot": 3, "pot_axes": 9, "handles_from_grips": 6}
+    metrics = ("reach", "orient", "grasp", "lift")
+    action_range = (-1.0, 1.0)
+    planning = lw.Planning(settings={"horizon": 16, "samples": 128, "temperature": 0.5, "noise": 0.6})
+
+    @staticmethod
+    def edit_model(spec: mujoco.MjSpec) -> None:
+        """Let simple shapes collide, and turn the servos into ones that follow velocities."""
+        spec.option.timestep, spec.option.integrator = 0.005, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        for servo in spec.actuators:
+            servo.set_to_intvelocity(kp=servo.gainprm[0], kv=-servo.biasprm[2])
+            speed = 0.1 if servo.name.endswith("gripper") else 1.0  # m/s or rad/s
+            servo.actrange, servo.ctrlrange = servo.ctrlrange, (-speed, speed)
+        for geom in spec.geoms:
+            arm = geom.classname.name == "collision" and geom.name != "table"
+            geom.contype, geom.conaffinity = 0, int(arm)
+            if arm:
+                geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
+            elif geom.name.startswith(POT):
+                geom.rgba = (0.75, 0.77, 0.8, 1.0)
+        spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK  # so that videos take it
+        child = mujoco.MjSpec.from_file(__file__.replace(".py", ".xml"))
+        for part in child.worldbody.bodies:
+            spec.body(part.name).add_frame().attach_body(part, "lift/", "")
+        pot = (0.0, 0.0, 0.0658, 0.7071068, 0.0, 0.0, 0.7071068, 0.0)
+        spec.add_key(name="start", qpos=[*ARM, *ARM, *pot], act=[*ARM[:7], *ARM[:7]])

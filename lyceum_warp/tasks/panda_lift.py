@@ -1,0 +1,122 @@
+"""PandaLift: grasp a cube on a table and lift it (a Franka Panda with its gripper, as in robosuite's Lift).
+
+The arm comes with the extra "robots", without a gripper: hand, table and cube are MJCF files beside this one. Actions
+are velocities, which move the targets of position servos; gravity does not act on the robot, which compensates it. The
+arm's meshes are only drawn: capsules fitted to them collide with table and cube. The reward weighs four terms between
+0 and 1. An episode is a success while the cube was held up for ten steps.
+"""
+
+import mujoco
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+HOME = (0.0, 0.1, 0.0, -2.1, 0.0, 2.2, 0.785, 0.03, 0.03)  # of arm and fingers: the gripper points down
+
+
+@wp.struct
+class World:
+    qpos: Row[float]  # 7 joints of the arm, 2 fingers, the cube's position and quaternion
+    qvel: Row[float]
+    act: Row[float]  # targets of arm and gripper
+    xpos: Row[wp.vec3]
+    xmat: Row[wp.mat33]
+    site_xpos: Row[wp.vec3]
+    site_xmat: Row[wp.mat33]
+    memory: Row[float]  # steps since the cube was last under the goal's height
+
+
+@wp.struct
+class Params:
+    dt: float
+    goal_height: float = 0.1
+    goal_steps: float = 10.0
+    half_size: float = 0.02  # of the cube, in m
+    area: wp.vec4 = wp.vec4(0.45, 0.65, -0.15, 0.15)  # of the cube at the start: x from, to, y from, to
+    cube: int = lw.body("table/cube")
+    cube_qpos: int = lw.qpos("table/cube")
+    finger: int = lw.qpos("hand/left_finger")
+    grip: int = lw.site("hand/grip")  # between the fingers' pads
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    k = lw.put(obs, 0, s.qpos, 0, 9)
+    k = lw.put(obs, k, s.qvel)
+    k = lw.put(obs, k, s.act)
+    k = lw.put(obs, k, s.xpos[p.cube])
+    k = lw.put(obs, k, s.xmat[p.cube])
+    k = lw.put(obs, k, s.xpos[p.cube] - s.site_xpos[p.grip])
+
+
+@wp.func
+def evaluate(s: World, p: Params) -> float:  # height of the cube above the table
+    return s.xpos[p.cube][2] - p.half_size
+
+
+@wp.func
+def terms(s: World, p: Params) -> wp.vec4:
+    grip = s.site_xmat[p.grip]  # z points out of the hand, the fingers slide along y
+    distance = wp.length(s.xpos[p.cube] - s.site_xpos[p.grip])
+    around = lw.tolerance(distance, wp.vec2(0.0, 0.01), 0.01)
+    closed = lw.tolerance(s.qpos[p.finger], wp.vec2(0.0, p.half_size), 0.02, int(lw.Sigmoid.LINEAR))
+    reach = lw.tolerance(distance, wp.vec2(0.0, 0.005), 0.1, int(lw.Sigmoid.RECIPROCAL), 0.2)
+    # down, and the fingers along an edge of the cube
+    orient = wp.clamp(-grip[2, 2], 0.0, 1.0) * wp.max(wp.abs(wp.transpose(s.xmat[p.cube]) * grip[:, 1]))
+    grasp = around * closed + 0.5 * (1.0 - around) * (1.0 - closed)  # open on the way, closed around the cube
+    lift = around * orient * wp.clamp(evaluate(s, p) / (1.5 * p.goal_height), 0.0, 1.0)
+    return wp.vec4(reach, orient, grasp, lift)
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    return wp.dot(terms(s1, p), wp.vec4(1.0, 0.5, 1.0, 4.0)) - 0.01 * lw.sum_squares(action)
+
+
+@wp.func
+def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):
+    lw.put(metrics, 0, terms(s1, p))
+
+
+@wp.func
+def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
+    s1.memory[0] = wp.where(evaluate(s1, p) > p.goal_height, s0.memory[0] + 1.0, 0.0)
+
+
+@wp.func
+def success(s: World, p: Params) -> bool:
+    return s.memory[0] >= p.goal_steps
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    x, y = lw.uniform(rng, p.area[0], p.area[1]), lw.uniform(rng, p.area[2], p.area[3])
+    k = lw.put(s.qpos, p.cube_qpos, wp.vec3(x, y, p.half_size - 1e-4))  # at rest, its weight presses it into the table
+    lw.put(s.qpos, k, lw.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), lw.uniform(rng, -wp.pi, wp.pi)))
+
+
+@lw.register
+class PandaLift(lw.Task):
+    model = lw.package_model("robopal", "assets/models/manipulators/Panda/panda.xml", install="lyceum-warp[robots]")
+    keyframe, frame_skip, horizon, memory = "start", 8, 150, 1
+    obs = {"position": 9, "velocity": 15, "target": 8, "cube": 3, "cube_axes": 9, "cube_from_grip": 3}
+    metrics = ("reach", "orient", "grasp", "lift")
+    action_range = (-1.0, 1.0)
+    planning = lw.Planning(settings={"horizon": 16, "samples": 64, "temperature": 0.5, "noise": 0.6})
+
+    @staticmethod
+    def edit_model(spec: mujoco.MjSpec) -> None:
+        """Put the arm at a table, give it a hand, and turn its motors into servos that follow velocities."""
+        spec.option.timestep, spec.option.cone = 0.005, mujoco.mjtCone.mjCONE_ELLIPTIC
+        for i, (motor, joint) in enumerate(zip(spec.actuators, spec.joints, strict=True)):
+            kp, force = (4500.0, 87.0) if i < 4 else (2000.0, 12.0)  # the published limits of torque
+            motor.set_to_intvelocity(kp=kp, kv=0.05 * kp)
+            motor.actrange, motor.ctrlrange, motor.forcerange = joint.range, (-1.0, 1.0), (-force, force)  # rad/s
+        for geom in spec.geoms:
+            if geom.classname.name == "panda/collision":
+                geom.type, geom.contype, geom.parent.gravcomp = mujoco.mjtGeom.mjGEOM_CAPSULE, 0, 1.0
+        for name, prefix, parent in (("hand", "hand/", "attachment"), ("lift", "table/", "world")):
+            child = mujoco.MjSpec.from_file(__file__.replace("lift.py", f"{name}.xml"))
+            spec.attach(child, prefix=prefix, frame=spec.body(parent).add_frame())
+        spec.add_key(name="start", qpos=[*HOME, 0.55, 0.0, 0.0199, 1.0, 0.0, 0.0, 0.0], act=HOME[:8])

@@ -1,0 +1,265 @@
+"""lyceum-warp new: a task file for any model, and the models and names that it refuses."""
+
+import importlib.util
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from arbitrary_models import ARM, BALL, MODEL_CHECKS, MOVING, PLUGINS, SENSING, actuated, text
+from training_runs import refused
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.testing import CHECKS, check_task
+from lyceum_warp.testing import bounds_rules as bounds
+from lyceum_warp.testing import episode_rules as episodes
+
+ROOT = Path(__file__).parent.parent.parent
+RICH = text(
+    ARM
+    + BALL.format(z=0.1)
+    + '<body name="target" mocap="true" pos=".3 0 .6"/>'
+    + '<body name="swing" pos="1 0 1"><joint name="ball" type="ball"/><geom size=".1" pos="0 0 -.3"/></body>',
+    '<tendon><spatial name="string"><site site="here"/><site site="tip"/></spatial></tendon>'
+    + actuated(
+        '<position name="slow" joint="hinge" kp="5" timeconst=".05" ctrlrange="-2 2"/>',
+        '<motor tendon="string" ctrlrange="0 1"/>',
+        '<motor joint="ball" gear="0 1 0 0 0 0" ctrlrange="-1 1"/>',
+    )
+    + '<sensor><gyro site="end"/><clock/><touch site="end"/><user dim="2"/></sensor>'
+    '<keyframe><key name="home" qpos=".3 -.3  0 0 .1 1 0 0 0  1 0 0 0" ctrl=".5 0 0" mpos=".2 0 .5"/></keyframe>',
+)
+SENSED = text(
+    ARM + '<body name="robot" pos="0 0 .1"><freejoint/><geom size=".1"/><site name="imu"/></body>',
+    actuated('<motor joint="hinge"/>')
+    + '<sensor><gyro site="imu"/><jointpos joint="hinge"/><jointvel joint="hinge"/><jointpos joint="wrist"/>'
+    '<jointvel joint="wrist"/></sensor>',
+)
+"""Its sensors measure every joint, and the motion of the body that floats."""
+
+# without those that take long, whatever the model
+QUICK_CHECKS = tuple(check for check in CHECKS if check not in (episodes.check_memory, bounds.check_bounds))
+
+
+@pytest.fixture
+def folder(pytestconfig: pytest.Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty current folder, the same in every run of the tests, so that Warp finds compiled kernels in its cache."""
+    cache = getattr(pytestconfig, "cache", None)
+    folder = Path(cache.mkdir("new")) if cache else tmp_path / "new"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def new(name: str, xml: str) -> Path:
+    """The task file that the command writes for a model."""
+    Path(f"{name}.xml").write_text(xml)
+    assert cli.main(["new", name, "--model", f"{name}.xml"]) == 0
+    return Path(f"{name}.py")
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_a_new_task_keeps_the_rules_on_both_engines(engine: str, folder: Path) -> None:
+    file = new("everything", RICH)
+    check_task(str(file), engine=engine, nworld=2, horizon=6, frame_skip=1, checks=MODEL_CHECKS)
+
+
+def test_a_new_task_observes_the_state_and_those_sensors_that_measure_it(folder: Path) -> None:
+    env = lw.make(str(new("everything", RICH)), nworld=2, seed=3)
+    task = env.task.task
+    assert task.obs == {"position": 13, "velocity": 11, "activation": 1, "sensors": 4}
+    assert (task.frame_skip, task.horizon, task.keyframe, task.action_range) == (4, 500, "home", (-1.0, 1.0))
+    assert env.field("qpos", "hinge")[0] == pytest.approx(0.3)
+    state = [env.field(name)[0].float() for name in ("qpos", "qvel", "act")]
+    measured = env.field("sensordata")[0]  # the gyro's three numbers, the clock, the touch, and two of the user
+    wanted = [*(value for field in state for value in field.tolist()), *measured[:3].tolist(), measured[4].item()]
+    assert env.obs[0].tolist() == pytest.approx(wanted)
+    assert env.obs[0, 13:24].abs().max() > 0  # worlds start with different velocities
+    env.step()
+    assert env.reward.tolist() == [0.0, 0.0]
+
+
+def test_a_model_whose_sensors_measure_every_joint_is_observed_through_them_alone(folder: Path) -> None:
+    task = find_task(new("sensed", SENSED))
+    assert task.obs == {"sensors": 7}
+    unsensed = SENSED.replace('<gyro site="imu"/>', '<gyro site="end"/>')  # the floating body is not measured
+    assert list(find_task(new("unsensed", unsensed)).obs) == ["position", "velocity", "sensors"]
+
+
+@pytest.mark.parametrize("model", [*MOVING.values(), *SENSING.values(), *PLUGINS.values()],
+                         ids=[*MOVING, *SENSING, *PLUGINS])  # fmt: skip
+def test_any_model_gets_a_task_that_fits_it(model: str, folder: Path) -> None:
+    task = BoundTask(find_task(new("walk", model)))
+    sizes = {"position": task.model.nq, "velocity": task.model.nv, "activation": task.model.na}
+    found = dict(task.obs_layout)
+    assert found.pop("sensors", 0) <= task.model.nsensordata
+    assert all(sizes[part] == size for part, size in found.items())
+    assert task.timestep == pytest.approx(0.02)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+@pytest.mark.parametrize("model", [*MOVING.values(), *SENSING.values()], ids=[*MOVING, *SENSING])
+def test_a_new_task_of_any_model_keeps_the_rules(model: str, engine: str, folder: Path) -> None:
+    file = new("walk", model)
+    check_task(str(file), engine=engine, nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
+
+
+def package_models() -> list[Path]:
+    """Models that gymnasium, dm_control and MuJoCo Warp ship, except those without actuators or without their files."""
+    folders = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite", "mujoco_warp": "test_data"}
+    found: list[Path] = []
+    for package, within in folders.items():
+        spec = importlib.util.find_spec(package)
+        if spec is not None and spec.submodule_search_locations:
+            found += sorted(Path(spec.submodule_search_locations[0], within).rglob("*.xml"))
+    return [path for path in found if path.parent.name != "common" and "<actuator" in path.read_text()]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("model", package_models(), ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_a_new_task_of_a_package_s_model_keeps_the_rules(model: Path, folder: Path) -> None:
+    assert cli.main(["new", "walk", "--model", str(model)]) == 0
+    check_task("walk.py", engine="mujoco", nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
+
+
+def test_functions_in_comments_work_once_they_are_taken_in(folder: Path) -> None:
+    file = new("everything", RICH)
+    head, body = file.read_text().split("# Three more functions that most tasks have:\n#\n")
+    commented, tail = body.split("\n\n@lw.register")
+    functions = re.sub(r"^# ?", "", commented, flags=re.MULTILINE)
+    name = re.search(r'tip: int = lw\.site\(".*?"\)', head)
+    assert name is not None
+    head = head.replace("dt: float  #", f"{name[0]}\n    dt: float  #")
+    file.write_text(f"{head}{functions}\n\n@lw.register{tail}")
+    task = BoundTask(find_task(file))
+    assert all(task.functions[name] is not None for name in ("evaluate", "terminated", "success"))
+    assert task.params["tip"] == 0
+
+
+def test_new_files_are_formatted(folder: Path) -> None:
+    if importlib.util.find_spec("ruff") is None:
+        pytest.skip("ruff is not installed")
+    names = "abcdefghijklmnopqrstuvwxyz"
+    many = "".join(f'<site name="{letter * 15}" pos="0 0 1"/>' for letter in names)
+    for name, xml in (("everything", RICH), ("sensed", SENSED), ("crowd", text(ARM + many))):
+        new(name, xml)
+    assert "  sites: here, aaaaaaaaaaaaaaa, bbb" in Path("crowd.py").read_text()
+    assert "... (29 in all)" in Path("crowd.py").read_text()
+    settings = ["--isolated", "--line-length", "120", "--target-version", "py311"]
+    for command in (["format", "--check", *settings], ["check", "--select", "E,W,F,UP,B,SIM", *settings]):
+        done = subprocess.run([sys.executable, "-m", "ruff", *command, "."], capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout
+
+
+def test_the_model_s_path_is_written_relative_to_the_task_file(folder: Path) -> None:
+    for made in ("models", "tasks"):
+        Path(made).mkdir()
+    model = Path("models", "robot.xml")
+    model.write_text(text(ARM))
+    assert cli.main(["new", "tasks/walk.py", "--model", str(model)]) == 0
+    assert find_task("tasks/walk.py").model == "../models/robot.xml"
+    assert cli.main(["new", "stand", "--model", str(model.absolute())]) == 0
+    assert find_task("stand.py").model == str(model.absolute())
+    for file in ("tasks/walk.py", "stand.py"):
+        assert BoundTask(find_task(file)).model.nu == 1
+
+
+def test_a_model_of_a_package_or_of_menagerie_is_named_by_its_source(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = Path("checkout", "leg", "scene.xml")
+    robot.parent.mkdir(parents=True)
+    robot.write_text(text(ARM))
+    monkeypatch.setenv("MENAGERIE_ROOT", "checkout")
+    assert cli.main(["new", "leg_walk", "--model", "menagerie:leg/scene.xml"]) == 0
+    assert cli.main(["new", "hop", "--model", "gymnasium:hopper.xml"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "leg_walk.py: 4 observations, 1 actions, 20 ms in a step; check and train it with",
+        "  lyceum-warp check leg_walk.py",
+        "  lyceum-warp train leg_walk.py",
+        "hop.py: 12 observations, 3 actions, 20 ms in a step; check and train it with",
+        "  lyceum-warp check hop.py",
+        "  lyceum-warp train hop.py",
+    ]
+    assert find_task("leg_walk.py").model == lw.menagerie_model("leg/scene.xml")
+    assert find_task("hop.py").model == lw.gymnasium_model("hopper.xml")
+    monkeypatch.setenv("MENAGERIE_ROOT", "elsewhere")
+    assert cli.main(["new", "other", "--model", "menagerie:leg/scene.xml"]) == 2
+    refused(capsys, "MENAGERIE_ROOT is 'elsewhere'", "is not a folder")
+    monkeypatch.delenv("MENAGERIE_ROOT")
+    assert cli.main(["new", "other", "--model", "menagerie:leg/scene.xml"]) == 2
+    refused(capsys, "set MENAGERIE_ROOT to", "git clone https")
+    assert not Path("other.py").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("hopper", ["'hopper' is taken by a task of the package"]),
+        ("2walk", ["can't be named '2walk'", "letters, digits and _"]),
+        ("my-walk", ["can't be named 'my-walk'"]),
+        ("class", ["can't be named 'class'"]),
+        ("größe", ["can't be named 'größe'"]),
+        ("MyWalk", ["can't be named 'MyWalk'", "use 'my_walk'"]),
+        ("walk_2", ["can't be named 'walk_2'", "use 'walk2'"]),
+        ("world", ["can't be named 'world'", "uses World"]),
+        ("torch", ["can't be named 'torch'", "hide the Python module"]),
+        ("random", ["can't be named 'random'", "hide the Python module"]),
+        ("", ["can't be named '.py'"]),
+        ("old", ["old.py exists"]),
+        ("nowhere/walk", ["no folder nowhere"]),
+        ("/proc/walk", ["can't write /proc/walk.py"]),
+    ],
+)
+def test_a_name_that_cannot_be_used_is_refused_in_a_line(
+    name: str, words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("robot.xml").write_text(text(ARM))
+    Path("old.py").write_text("mine")
+    assert cli.main(["new", name, "--model", "robot.xml"]) == 2
+    refused(capsys, *words)
+    assert {path.name for path in folder.iterdir()} == {"robot.xml", "old.py"}
+    assert Path("old.py").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        ("absent.xml", ["there is no model file 'absent.xml'"]),
+        ("folder", ["there is no model file 'folder'"]),
+        ("gymnasium:hoper.xml", ["no model file 'hoper.xml'", "hopper.xml"]),
+        ("broken.xml", ["can't read the model", "broken.xml"]),
+        ("meshless.xml", ["meshless.xml: MuJoCo refuses the model", "absent.stl"]),
+        ("still.xml", ["still.xml has no actuators, so there is nothing to act on"]),
+        ("stuck.xml", ["stuck.xml has no joints"]),
+    ],
+)
+def test_a_model_that_cannot_be_used_is_refused_in_a_line(
+    model: str, words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mesh = (
+        '<asset><mesh name="absent" file="absent.stl"/></asset><worldbody><geom type="mesh" mesh="absent"/></worldbody>'
+    )
+    Path("folder").mkdir()
+    Path("broken.xml").write_text("<mujoco>")
+    Path("meshless.xml").write_text(f"<mujoco>{mesh}</mujoco>")
+    Path("still.xml").write_text(text(ARM, ""))
+    Path("stuck.xml").write_text(text("", actuated('<adhesion body="world" ctrlrange="0 1"/>')))
+    assert cli.main(["new", "walk", "--model", model]) == 2
+    refused(capsys, *words)
+    assert not Path("walk.py").exists()
+
+
+def test_names_that_need_quoting_are_written_as_they_are(folder: Path) -> None:
+    xml = text(ARM.replace('name="tip"', 'name="a &quot;tip&quot;"'), actuated('<motor joint="hinge"/>'))
+    Path('my "{robot}".xml').write_text(xml.replace('<site name="here" pos="0 0 2"/>', ""))
+    assert cli.main(["new", "walk", "--model", 'my "{robot}".xml']) == 0
+    assert find_task("walk.py").model == 'my "{robot}".xml'
+    assert r'lw.site("a \"tip\"")' in Path("walk.py").read_text()

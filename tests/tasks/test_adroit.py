@@ -1,0 +1,84 @@
+"""Parameters and metrics of adroit_hammer, adroit_door and adroit_relocate.
+
+oracles/test_gymnasium_robotics.py compares the tasks with the originals.
+"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import SharedEnv
+
+import lyceum_warp as lw
+
+GOALS = {"adroit_hammer": "success_distance", "adroit_door": "success_angle", "adroit_relocate": "success_distance"}
+"""The threshold of each task's success."""
+
+
+@pytest.fixture(params=sorted(GOALS))
+def task(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def steps(env: lw.Env, n: int = 5) -> None:
+    """Take random actions, the same ones every time."""
+    rng = torch.Generator().manual_seed(0)
+    for _ in range(n):
+        env.step(2 * torch.rand(env.action.shape, generator=rng) - 1)
+
+
+def test_metrics_add_up_to_the_reward(shared_env: SharedEnv, task: str) -> None:
+    env = shared_env(task, nworld=4, nthread=1)
+    steps(env)
+    torch.testing.assert_close(sum(env.metrics.values()), env.reward)
+    assert (env.metrics["bonus"] == 0).all()
+
+
+def test_palm_weight_turns_the_first_term_around(shared_env: SharedEnv, task: str) -> None:
+    """The planner's worlds reward a palm that is near, the task itself one that is far, as its original does."""
+    env, turned = (shared_env(task, nworld=4, nthread=1, palm_weight=weight) for weight in (0.1, -0.1))
+    assert lw.MPPI(task, horizon=2, samples=2, nthread=1).env.task.params["palm_weight"] == -1.0
+    for each in (env, turned):
+        each.rand_reset(3)
+        steps(each)
+    first, *others = env.metrics
+    assert (env.metrics[first] > 0.01).all()
+    torch.testing.assert_close(turned.metrics[first], -env.metrics[first])
+    for name in others:
+        assert torch.equal(turned.metrics[name], env.metrics[name])
+
+
+def test_success_has_a_threshold(task: str) -> None:
+    """A threshold between the worlds' own values: those beyond it succeed."""
+    env = lw.make(task, engine="mujoco", nworld=4, nthread=1)
+    steps(env)
+    assert not env.success.any()
+    values = env.eval.numpy()
+    moved = values + np.array([-1e-3, 1e-3, -1e-3, 1e-3])
+    env.set_params(**{GOALS[task]: moved})
+    env.set_state(env.get_state())
+    assert env.success.tolist() == [False, True, False, True] if task != "adroit_door" else [True, False, True, False]
+
+
+RANGES: dict[str, dict[str, Any]] = {
+    "adroit_hammer": {"board_height": (0.2, 0.2)},
+    "adroit_door": {"frame_low": (-0.1, 0.3, 0.3), "frame_high": (-0.1, 0.3, 0.3)},
+    "adroit_relocate": {
+        "ball_low": (0.1, 0.2), "ball_high": (0.1, 0.2), "target_low": (0, 0.1, 0.2), "target_high": (0, 0.1, 0.2),
+    },
+}  # fmt: skip
+
+
+def test_resets_draw_from_the_ranges_of_the_parameters(shared_env: SharedEnv, task: str) -> None:
+    env = shared_env(task, nworld=2, nthread=1, **RANGES[task])
+    place = {name: part[1].tolist() for name, part in env.state_space.split(env.get_state()).items()}
+    moved = place["mocap_pos"][3:]
+    if task == "adroit_hammer":
+        assert moved == pytest.approx([0.05, 0.0, 0.2])
+    elif task == "adroit_door":
+        assert moved == pytest.approx([-0.1, 0.3, 0.3])
+    else:
+        assert moved == pytest.approx([0.0, 0.1, 0.2])
+        assert place["qpos"][30:33] == pytest.approx([0.1, 0.2, 0.0])
+        assert env.obs[1, 36:39].tolist() == pytest.approx([0.1, 0.1, -0.165], abs=1e-6)

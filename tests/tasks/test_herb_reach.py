@@ -1,0 +1,287 @@
+"""The herb_reach task: HERB's published numbers, its two equal arms, formulas, targets within reach, success."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from checks import check_formula, check_uniform, positions, put_at_random
+from conftest import SharedEnv
+
+import lyceum_warp as lw
+
+NWORLD = 64
+SIDES = ("left", "right")
+
+# the robot
+
+MASSES = {  # kg; Barrett D1005 AC-02, and for the BH280 Barrett's mass properties
+    "wam_base": 9.97059584,
+    "wam1": 10.76768767,
+    "wam2": 3.87493756,
+    "wam3": 1.80228141,
+    "wam4": 2.40016804,
+    "wam5": 0.12376019,
+    "wam6": 0.41797364,
+    "wam7": 0.06864753,
+    "hand_base": 0.60858 + 0.133278,
+    "finger0_0": 0.14109,
+    "finger0_1": 0.062139,
+    "finger0_2": 0.04166,
+    "finger1_0": 0.14109,
+    "finger1_1": 0.062139,
+    "finger1_2": 0.04166,
+    "finger2_1": 0.062139,
+    "finger2_2": 0.04166,
+}
+ARM = {  # range in rad (Barrett D1001, tables 5 and 6; HERB turns the first joint by pi), peak torque in N m
+    "j1": (np.pi - 2.6, np.pi + 2.6, 77.3),
+    "j2": (-2.0, 2.0, 160.6),
+    "j3": (-2.8, 2.8, 95.6),
+    "j4": (-0.9, 3.1, 29.4),
+    "j5": (-4.76, 1.24, 11.6),
+    "j6": (-1.6, 1.6, 11.6),
+    "j7": (-3.0, 3.0, 2.7),
+}
+FINGERS = {"j00": 180, "j10": 180, "j01": 140, "j11": 140, "j21": 140, "j02": 48, "j12": 48, "j22": 48}  # degrees
+
+# of the WAM's links in Barrett's frames, whose z axis is the next joint's: moments (xx, yy, zz, xy, xz, yz)
+INERTIAS = {
+    "wam1": (0.13488033, 0.11328369, 0.09046330, -0.00213041, -0.00012485, 0.00068555),
+    "wam2": (0.02140958, 0.01377875, 0.01558906, 0.00027172, 0.00002461, -0.00181920),
+    "wam3": (0.05911077, 0.00324550, 0.05927043, -0.00249612, 0.00000738, -0.00001767),
+    "wam4": (0.01491672, 0.01482922, 0.00294463, 0.00001741, -0.00150604, -0.00002109),
+    "wam5": (0.00005029, 0.00007582, 0.00006270, 0.00000020, -0.00000005, -0.00000359),
+    "wam6": (0.00055516, 0.00024367, 0.00045358, 0.00000061, -0.00000074, -0.00004590),
+}
+# Denavit-Hartenberg: a in m, alpha in rad, d in m; Barrett D1001, table 5, with the hand's palm as the tool
+CHAIN = ((0, -np.pi / 2, 0), (0, np.pi / 2, 0), (0.045, -np.pi / 2, 0.55), (-0.045, np.pi / 2, 0),
+         (0, -np.pi / 2, 0.3), (0, np.pi / 2, 0), (0, 0, 0.072 + 0.095))  # fmt: skip
+
+
+def matrix(values: tuple[float, ...]) -> np.ndarray:
+    xx, yy, zz, xy, xz, yz = values
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def turn(angle: float) -> np.ndarray:
+    """The rotation by an angle about x."""
+    return np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_model_has_the_published_masses_limits_and_torques(shared_env: SharedEnv, side: str) -> None:
+    model = shared_env("herb_reach").model
+    assert (model.nq, model.nv, model.nu, model.nmocap) == (30, 30, 22, 2)
+    for name, mass in MASSES.items():
+        np.testing.assert_allclose(model.body(f"{side}/{name}").mass, mass, rtol=1e-9, err_msg=name)
+    for name, (low, high, torque) in ARM.items():
+        np.testing.assert_allclose(model.joint(f"{side}/{name}").range, (low, high), err_msg=name)
+        actuator = model.actuator(f"{side}/{name}")
+        assert actuator.gear[0] == torque and np.array_equal(actuator.ctrlrange, [-1, 1])
+        assert actuator.trnid[0] == model.joint(f"{side}/{name}").id
+    for name, degrees in FINGERS.items():
+        np.testing.assert_allclose(model.joint(f"{side}/{name}").range, (0, np.deg2rad(degrees)), err_msg=name)
+    assert model.jnt_limited.all() and model.actuator_ctrllimited.all()
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_model_has_the_published_inertias(shared_env: SharedEnv, side: str) -> None:
+    """Barrett's frames are turned by a quarter about x against the model's, to one side and the other in turn."""
+    model = shared_env("herb_reach").model
+    for i, (name, values) in enumerate(INERTIAS.items()):
+        body = model.body(f"{side}/{name}")
+        axes = np.zeros(9)
+        mujoco.mju_quat2Mat(axes, body.iquat)
+        axes = axes.reshape(3, 3)
+        turned = turn(np.pi / 2 * (-1) ** (i + 1))
+        np.testing.assert_allclose(
+            axes @ np.diag(body.inertia) @ axes.T, turned @ matrix(values) @ turned.T, atol=1e-9, err_msg=name
+        )
+
+
+def test_palms_are_where_the_published_chain_puts_them(shared_env: SharedEnv) -> None:
+    """Denavit-Hartenberg transforms from the first joint on, at random angles."""
+    model = shared_env("herb_reach").model
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    for _ in range(20):
+        data.qpos[:] = rng.uniform(*model.jnt_range.T)
+        mujoco.mj_kinematics(model, data)
+        for side, angles in zip(SIDES, (data.qpos[:7], data.qpos[15:22]), strict=True):
+            base, start = data.body(f"{side}/wam_base"), model.body(f"{side}/wam1")
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = base.xmat.reshape(3, 3), base.xpos + base.xmat.reshape(3, 3) @ start.pos
+            for (a, alpha, d), theta in zip(CHAIN, angles, strict=True):
+                c, s = np.cos(theta), np.sin(theta)
+                link = np.eye(4)
+                link[:3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ turn(alpha)
+                link[:3, 3] = a * c, a * s, d
+                pose = pose @ link
+            np.testing.assert_allclose(data.site(f"{side}/palm").xpos, pose[:3, 3], atol=1e-9)
+
+
+def test_both_arms_are_equal(shared_env: SharedEnv) -> None:
+    """One file, attached twice: the second half of every array of joints, motors and bodies repeats the first."""
+    model = shared_env("herb_reach").model
+    for name in ("jnt_range", "jnt_axis", "jnt_pos", "dof_damping", "dof_armature", "actuator_gear"):
+        first, second = np.split(getattr(model, name), 2)
+        assert np.array_equal(first, second), name
+    starts = [model.body(f"{side}/wam_base").id for side in SIDES]
+    for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_gravcomp", "body_quat"):
+        first, second = (getattr(model, name)[start : start + len(MASSES)] for start in starts)
+        assert np.array_equal(first, second), name
+
+
+def test_arms_stay_where_they_are_without_torque(shared_env: SharedEnv) -> None:
+    """Gravity is compensated: an action is what a motor does on top."""
+    env = shared_env("herb_reach", nworld=2, autoreset=False)
+    before = positions(env)[0]
+    for _ in range(50):
+        env.step(torch.zeros(2, 22))
+    np.testing.assert_allclose(positions(env)[0], before, atol=1e-3)
+
+
+def test_a_finger_moves_with_one_motor(shared_env: SharedEnv) -> None:
+    """The tip by 45 degrees in 140, and both spread joints alike."""
+    env = shared_env("herb_reach", nworld=1, autoreset=False)
+    env.reset()
+    action = torch.zeros(1, 22)
+    action[0, 7:11] = 0.3  # spread, fingers 0, 1 and 2
+    for _ in range(50):
+        env.step(action)
+    angle = {name: positions(env)[0][0, env.model.joint(f"left/{name}").qposadr[0]] for name in FINGERS}
+    assert angle["j00"] > 1.0 and angle["j00"] == pytest.approx(angle["j10"], abs=0.05)
+    for i in range(3):
+        assert angle[f"j{i}1"] > 1.0 and angle[f"j{i}2"] == pytest.approx(angle[f"j{i}1"] * 45 / 140, abs=0.05)
+
+
+# formulas
+
+
+def palms(env: lw.Env, qpos: np.ndarray) -> np.ndarray:
+    """Both palms in each world, (nworld, 2, 3), from MuJoCo's kinematics in float64."""
+    data, found = mujoco.MjData(env.model), []
+    for row in qpos:
+        data.qpos[:] = row
+        mujoco.mj_kinematics(env.model, data)
+        found.append([data.site(f"{side}/palm").xpos.copy() for side in SIDES])
+    return np.array(found)
+
+
+def targets(env: lw.Env) -> np.ndarray:
+    """Both targets in each world, (nworld, 2, 3)."""
+    return env.state_space.split(env.get_state())["mocap_pos"].numpy().reshape(-1, 2, 3).copy()
+
+
+def put_targets(env: lw.Env, offset: np.ndarray) -> None:
+    """Put the targets at offsets from the palms, (nworld, 2) in metres along x, with the arms at rest."""
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    parts["qvel"][:] = 0.0
+    goals = palms(env, parts["qpos"].numpy())
+    goals[..., 0] += offset
+    parts["mocap_pos"].copy_(torch.from_numpy(goals.reshape(len(goals), 6)))
+    env.set_state(state)
+
+
+def test_reward_evaluation_and_observation_equal_their_formulas(shared_env: SharedEnv) -> None:
+    """After a step, at distances up to a metre and close to the targets, in every term of the reward."""
+    env = shared_env("herb_reach", nworld=NWORLD, autoreset=False)
+    rng = np.random.default_rng(0)
+    for near in (False, True):
+        put_at_random(env, rng, position=1.0, velocity=0.5)
+        if near:
+            put_targets(env, rng.uniform(-0.06, 0.06, (NWORLD, 2)))
+        action = torch.from_numpy(rng.uniform(-0.1, 0.1, (NWORLD, 22)).astype(np.float32))
+        env.step(action)
+        qpos, qvel = positions(env)
+        palm, goal = palms(env, qpos), targets(env)
+        distance = np.linalg.norm(goal - palm, axis=2)
+        parts = (qpos, qvel, palm.reshape(-1, 6), (goal - palm).reshape(-1, 6))
+        check_formula(env.obs, np.concatenate(parts, axis=1))
+        check_formula(env.eval, distance.max(axis=1))
+        terms = {
+            "reaching": -distance.sum(axis=1),
+            "precision": 0.5 * (0.1 ** ((distance / 0.05) ** 2)).sum(axis=1),
+            "effort": -0.01 * (action.numpy().astype(np.float64) ** 2).sum(axis=1),
+        }
+        for name, term in terms.items():
+            np.testing.assert_allclose(env.metrics[name].numpy(), term, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(env.reward.numpy(), sum(terms.values()), rtol=1e-5, atol=1e-5)
+        assert not env.terminated.any()
+        assert terms["precision"].max() > 0.3 or not near
+
+
+# resets
+
+
+@pytest.mark.usefixtures("freed")
+def test_random_resets_draw_targets_before_each_shoulder_and_arms_near_home() -> None:
+    env = lw.make("herb_reach", engine="mujoco", nworld=2000)
+    env.rand_reset(0)
+    low, high = np.float32([0.6, 0.1, 0.7]), np.float32([0.95, 0.6, 1.3])
+    goals = targets(env) * [[[1, 1, 1], [1, -1, 1]]]
+    home = env.model.key("home").qpos
+    qpos, qvel = positions(env)
+    arms = np.r_[0:7, 15:22]
+    drawn = [(2 * goals - low - high).reshape(-1, 6) / np.tile(high - low, 2), (qpos - home)[:, arms] / 0.1]
+    check_uniform(np.concatenate(drawn, axis=1) / (1.0 + 1e-5))
+    assert not np.delete(qpos - home, arms, axis=1).any() and not qvel.any()
+    env.reset()
+    np.testing.assert_allclose(positions(env)[0], np.tile(home, (2000, 1)), atol=1e-6)
+    np.testing.assert_allclose(targets(env)[0], [[0.8, 0.35, 1.0], [0.8, -0.35, 1.0]], atol=1e-6)
+
+
+def test_both_hands_reach_their_targets_at_once(shared_env: SharedEnv) -> None:
+    """Corners of the boxes, and random targets: steps of damped least squares find angles, which nothing blocks."""
+    env = shared_env("herb_reach", nworld=16)
+    model, rng = env.model, np.random.default_rng(0)
+    corners = np.stack(np.meshgrid([0.6, 0.95], [0.1, 0.6], [0.7, 1.3]), axis=-1).reshape(-1, 1, 3)
+    goals = np.concatenate([corners * np.array([[[1, 1, 1], [1, -1, 1]]]), targets(env)])
+    for goal in goals:
+        starts = [model.key("home").qpos + (i > 0) * 0.3 * i * rng.normal(size=30) for i in range(20)]
+        assert any(reachable(model, goal, start) for start in starts), goal
+
+
+def reachable(model: mujoco.MjModel, goals: np.ndarray, start: np.ndarray) -> bool:
+    """Whether a search from given angles ends with both palms at their targets, within limits and out of contact."""
+    data, jacobian = mujoco.MjData(model), np.zeros((3, 30))
+    arms = np.r_[0:7, 15:22]
+    data.qpos[arms] = start[arms]
+    low, high = model.jnt_range.T
+    for _ in range(300):
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        errors = [goal - data.site(f"{side}/palm").xpos for side, goal in zip(SIDES, goals, strict=True)]
+        if np.linalg.norm(errors, axis=1).max() < 1e-3:
+            mujoco.mj_forward(model, data)
+            return data.ncon == 0
+        for side, error in zip(SIDES, errors, strict=True):
+            mujoco.mj_jacSite(model, data, jacobian, None, data.site(f"{side}/palm").id)
+            data.qpos += 0.5 * jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-3 * np.eye(3), error)
+        data.qpos[:] = np.clip(data.qpos, low, high)
+    return False
+
+
+# success
+
+
+def test_success_needs_both_hands_for_ten_steps() -> None:
+    """One hand is not enough; a step away starts the count again, and a reset clears it."""
+    env = lw.make("herb_reach", engine="mujoco", nworld=4, autoreset=False, horizon=0)
+    offset = np.array([[0.0, 0.0], [0.06, 0.0], [0.0, 0.06], [0.045, -0.045]])
+    put_targets(env, offset)
+    still = torch.zeros(4, 22)
+    for _ in range(9):
+        env.step(still)
+        assert not env.success.any()
+    env.step(still)
+    assert env.success.tolist() == [True, False, False, True]
+    np.testing.assert_allclose(env.eval, np.abs(offset).max(axis=1), atol=2e-3)
+    state = env.get_state()
+    put_targets(env, offset + np.array([[0.0, 0.1], [0, 0], [0, 0], [0, 0]]))
+    env.step(still)
+    assert env.success.tolist() == [False, False, False, True]
+    env.rand_reset(0)
+    assert not env.success.any()
+    env.set_state(state)  # the count belongs to the state
+    assert env.success.tolist() == [True, False, False, True]

@@ -1,0 +1,128 @@
+"""The panda_lift task: the robot, a scripted grasp, the reward's terms, resets and the rule of success."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from checks import check_uniform, positions
+from conftest import SharedEnv
+from lifting import follow, joints_at
+
+import lyceum_warp as lw
+
+ARM = [f"joint{i}" for i in range(1, 8)]
+
+
+def cube(env: lw.Env) -> np.ndarray:
+    """Position and quaternion of the cube in each world."""
+    return positions(env)[0][:, 9:]
+
+
+def put_cube(env: lw.Env, height: float) -> None:
+    """Hang the cube in the air, beside the hand, in every world."""
+    state = env.get_state()
+    env.state_space.split(state)["qpos"][:, 9:] = torch.tensor([0.3, 0.5, height, 1.0, 0.0, 0.0, 0.0])
+    env.set_state(state)
+
+
+def test_robot_is_a_panda_with_the_published_hand(shared_env: SharedEnv) -> None:
+    model = shared_env("panda_lift").model
+    assert (model.nq, model.nv, model.nu, model.na) == (16, 15, 8, 8)
+    for name, mass in (("hand/hand", 0.73), ("hand/left_finger", 0.015), ("hand/right_finger", 0.015)):
+        np.testing.assert_allclose(model.body(name).mass, mass)
+    for name in ("hand/left_finger", "hand/right_finger"):
+        np.testing.assert_allclose(model.joint(name).range, [0.0, 0.04])
+    for i, name in enumerate(ARM):
+        np.testing.assert_allclose(model.actuator_actrange[i], model.joint(name).range)
+    np.testing.assert_allclose(model.actuator_forcerange[:7, 1], [87, 87, 87, 87, 12, 12, 12])
+
+
+def test_only_simple_shapes_collide(shared_env: SharedEnv) -> None:
+    model = shared_env("panda_lift").model
+    solid = (model.geom_contype | model.geom_conaffinity) > 0
+    shapes = [mujoco.mjtGeom(kind) for kind in np.unique(model.geom_type[solid])]
+    assert shapes == [mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX]
+    assert (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).any(), "meshes are drawn"
+
+
+def test_arm_without_commands_stands_still(shared_env: SharedEnv) -> None:
+    """Gravity does not act on it; an action of 1 moves a target by 1 rad/s."""
+    env = shared_env("panda_lift", nworld=2, autoreset=False)
+    before = positions(env)[0][:, :9]
+    for _ in range(50):
+        env.step(torch.zeros(2, 8))
+    assert np.abs(positions(env)[0][:, :9] - before).max() < 1e-3
+    act = env.state_space.split(env.get_state())["act"].clone()
+    env.step(torch.ones(2, 8))
+    moved = env.state_space.split(env.get_state())["act"] - act
+    np.testing.assert_allclose(moved[0], [0.04] * 7 + [0.004], atol=1e-6)
+
+
+def test_a_scripted_grasp_lifts_the_cube_in_every_world(shared_env: SharedEnv) -> None:
+    """Above the cube, down, closed, up: success within an episode, and a reward of nearly 6.5."""
+    env = shared_env("panda_lift", nworld=4, autoreset=False)
+    start, at = positions(env)[0], cube(env)
+    waypoints = np.zeros((3, 4, 8))
+    for world in range(4):
+        yaw = 2.0 * np.arctan2(at[world, 6], at[world, 3])
+        yaw -= np.round(yaw / (0.5 * np.pi)) * 0.5 * np.pi  # the edge that is nearest to the fingers
+        y, z = np.array([-np.sin(yaw), np.cos(yaw), 0.0]), np.array([0.0, 0.0, -1.0])
+        axes = np.stack([np.cross(y, z), y, z], axis=1)
+        for i, height in enumerate((0.12, 0.02, 0.2)):
+            place = np.array([*at[world, :2], height])
+            waypoints[i, world, :7] = joints_at(env.model, start[world], "hand/grip", place, axes, ARM)[:7]
+            waypoints[i, world, 7] = 0.0 if i == 2 else 0.04
+    above, down, up = waypoints
+    closed = down * ([1] * 7 + [0])
+    for targets, steps in ((above, 35), (down, 20), (closed, 12), (up, 35)):
+        follow(env, targets, steps)
+    assert env.success.all() and (env.eval > 0.15).all()
+    assert (env.reward > 6.0).all() and not any(env.fault_counts.values())
+
+
+def test_reward_weighs_terms_between_0_and_1(shared_env: SharedEnv) -> None:
+    env = shared_env("panda_lift", nworld=32)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        action = torch.from_numpy(rng.uniform(-1.0, 1.0, (32, 8)).astype(np.float32))
+        env.step(action)
+        terms = torch.stack([env.metrics[name] for name in ("reach", "orient", "grasp", "lift")], dim=1)
+        assert (terms >= 0.0).all() and (terms <= 1.0 + 1e-6).all()
+        expected = terms @ torch.tensor([1.0, 0.5, 1.0, 4.0]) - 0.01 * (action**2).sum(dim=1)
+        torch.testing.assert_close(env.reward, expected)
+        np.testing.assert_allclose(env.eval, cube(env)[:, 2] - 0.02, atol=1e-6)
+
+
+def test_success_needs_ten_steps_in_a_row_above_the_goal() -> None:
+    """A cube that falls from 0.5 m is up for 7 steps, one that falls from 1.6 m for 13; a state holds the count."""
+    env = lw.make("panda_lift", engine="mujoco", nworld=1, autoreset=False, horizon=0)
+    for height, steps in ((0.5, 0), (1.6, 4)):
+        env.rand_reset(0)
+        put_cube(env, height)
+        successes = []
+        for i in range(25):
+            env.step(torch.zeros(1, 8))
+            successes.append(bool(env.success))
+            if i == 10:
+                state = env.get_state()
+        assert sum(successes) == steps and not any(successes[:9])
+    assert not env.success
+    env.set_state(state)
+    assert env.success
+
+
+@pytest.mark.usefixtures("freed")
+@pytest.mark.parametrize("area", [None, (0.4, 0.5, 0.0, 0.3)])
+def test_random_resets_draw_the_cubes_place_and_yaw(area: tuple[float, ...] | None) -> None:
+    env = lw.make("panda_lift", engine="mujoco", nworld=2000, **({} if area is None else {"area": area}))
+    env.rand_reset(0)
+    found = cube(env)
+    x0, x1, y0, y1 = np.array(area or (0.45, 0.65, -0.15, 0.15))
+    yaw = 2.0 * np.arctan2(found[:, 6], found[:, 3])
+    middle = [(2 * found[:, 0] - x0 - x1) / (x1 - x0), (2 * found[:, 1] - y0 - y1) / (y1 - y0), yaw / np.pi]
+    check_uniform(np.stack(middle, axis=1) / (1.0 + 1e-6))
+    np.testing.assert_allclose(found[:, 2], 0.0199, atol=1e-7)
+    assert not found[:, 4:6].any()
+    qpos, qvel = positions(env)
+    np.testing.assert_allclose(qpos[:, :9], np.tile(env.model.key("start").qpos[:9], (2000, 1)), atol=1e-6)
+    assert not qvel.any()
