@@ -76,7 +76,7 @@ def test_a_crushed_or_lost_ball_ends_the_episode(shared_env: SharedEnv, axis: in
     """The corners of the ball's box hold it; the ball is scaled to 80 and 60 % along an axis, and moved."""
     env = shared_env("soft_ball", nworld=4, autoreset=False)
     env.reset()
-    corners = np.array([env.model.body(f"ball_{i}").pos - (0, 0, 0.053) for i in range(8)])
+    corners = np.array([env.model.body(f"ball_{i // 4}_{i // 2 % 2}_{i % 2}").pos for i in range(8)])
     state = env.get_state()
     qpos = env.state_space.split(state)["qpos"]
     along = torch.arange(4 + axis, 28, 3)
