@@ -1,6 +1,6 @@
-"""A task of your own in one file: swing up a pendulum whose motor is too weak to lift it directly.
+"""A task and its model in one Python file: swing up a pendulum whose motor is too weak to lift it directly.
 
-``python examples/own_task.py`` checks and steps it, ``lyceum-warp train examples/own_task.py`` trains it.
+``python examples/own_task.py`` checks and steps it; docs/own_task.md shows the command line, and a model in a file.
 """
 
 import mujoco

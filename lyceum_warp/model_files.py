@@ -133,7 +133,8 @@ def package_model(package: str, file: str, *, install: str | None = None) -> Mod
 def menagerie_model(file: str) -> ModelFile:
     """A model of a local checkout of MuJoCo Menagerie, such as "unitree_go1/scene.xml".
 
-    The environment variable MENAGERIE_ROOT must point to the checkout.
+    ``git clone https://github.com/google-deepmind/mujoco_menagerie`` makes a checkout. The environment variable
+    MENAGERIE_ROOT must point to it where an environment is made; until then a task with such a model can be listed.
     """
     return MenagerieFile(file, "MuJoCo Menagerie")
 

@@ -1,13 +1,15 @@
 """lyceum-warp check."""
 
 import dataclasses
+import difflib
+from collections.abc import Callable
 from typing import Annotated
 
 import tyro
 
 from lyceum_warp.cli.arguments import Physics, Placement, Repeated, parameters
 from lyceum_warp.cli.display import make_console
-from lyceum_warp.testing import check_task
+from lyceum_warp.testing import CHECKS, Context, check_task
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,6 +32,8 @@ class Check:
     """Steps of the long checks."""
     seed: int = 0
     """Seed of the worlds and of the random actions."""
+    rule: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
+    """A rule to check, by the name that the report gives it; may be given several times. By default all."""
     param: Repeated = ()
     """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf, a table as NAME=file.npy; may be given several
     times."""
@@ -40,11 +44,23 @@ class Check:
 def check(options: Check) -> int:
     """Run the command; returns the exit code."""
     words = vars(options.env) | options.physics.options().given() | parameters(options.param, options)
+    checks = [_check(name) for name in options.rule] or CHECKS
     console = make_console()
     try:
-        report = check_task(options.task, nworld=options.nworld, steps=options.steps, seed=options.seed, **words)
+        report = check_task(
+            options.task, nworld=options.nworld, steps=options.steps, seed=options.seed, checks=checks, **words
+        )
     except AssertionError as error:
         console.print(str(error), soft_wrap=True, markup=False)
         return 1
     console.print(str(report), soft_wrap=True, markup=False)
     return 0
+
+
+def _check(rule: str) -> Callable[[Context], None]:
+    checks = {check.__name__.removeprefix("check_"): check for check in CHECKS}
+    if rule not in checks:
+        close = difflib.get_close_matches(rule, checks, 3)
+        hint = f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(checks)}"
+        raise ValueError(f"there is no rule {rule!r}: {hint}")
+    return checks[rule]

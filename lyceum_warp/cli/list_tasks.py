@@ -22,9 +22,12 @@ from lyceum_warp.model_files import ModelFile, PackageFile
 from lyceum_warp.options import PhysicsOptions
 from lyceum_warp.task import Task
 
-_HEADINGS = ("task", "obs", "action", "substeps", "dt", "horizon", "model")
+_HEADINGS = ("task", "obs", "act", "skip", "dt", "horizon", "model")
 _RIGHT = slice(1, 6)
 """The columns of numbers."""
+
+_LEGEND = """obs, act: numbers in an observation and an action; skip: substeps in a step; dt: seconds in a step.
+A task of your own: lyceum-warp new --help"""
 
 _UNKNOWN = "-"
 
@@ -92,7 +95,7 @@ def list_tasks(options: Tasks) -> int:
         if note:
             show(note, "yellow", "    ")
     show("")
-    show("dt: seconds in a step, all its substeps together. A task of your own: lyceum-warp new --help", "dim")
+    show(_LEGEND, "dim")
     return 0
 
 

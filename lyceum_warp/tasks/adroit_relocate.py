@@ -100,7 +100,7 @@ class AdroitRelocate(lw.Task):
     lagged = ("xpos", "site_xpos")
     action_range = (-1.0, 1.0)
     planning = lw.Planning(
-        settings={"horizon": 32, "samples": 160, "temperature": 0.1, "noise": 1.0}, params={"palm_weight": -1.0}
+        settings={"horizon": 32, "samples": 160, "temperature": 0.1, "noise": 0.3}, params={"palm_weight": -1.0}
     )
 
     @staticmethod

@@ -1,7 +1,8 @@
 """HumanoidStandup: stand up from the floor (Gymnasium's HumanoidStandup-v5).
 
-The contact forces are those that a sensor of the model sees, as in the task humanoid. The model's PGS solver is
-replaced by Newton. Gymnasium documents ``uph_cost_weight`` but does not use it; here it is the weight of the height.
+The contact forces are those that a sensor of the model sees, as in the task humanoid; the first observation of an
+episode shows them, too, where Gymnasium shows zeros. The model's PGS solver is replaced by Newton. Gymnasium documents
+``uph_cost_weight`` but does not use it; here it is the weight of the height.
 """
 
 import warp as wp

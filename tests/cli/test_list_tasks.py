@@ -20,9 +20,9 @@ INSTALL = "pip install 'lyceum-warp[hand]'"
 def rows(out: str) -> dict[str, list[str]]:
     """The words of each task's row by its name; descriptions and notes are indented."""
     table, _, legend = out.partition("\n\n")
-    assert legend.startswith("dt: ")
+    assert legend.startswith("obs, act: ")
     heading, *lines = table.splitlines()
-    assert heading.split() == ["task", "obs", "action", "substeps", "dt", "horizon", "model"]
+    assert heading.split() == ["task", "obs", "act", "skip", "dt", "horizon", "model"]
     return {line.split()[0]: line.split()[1:] for line in lines if not line.startswith(" ")}
 
 

@@ -1,0 +1,65 @@
+"""lyceum-warp check: the rules of an environment from a shell."""
+
+import pytest
+from conftest import TaskFile
+from training_runs import refused
+
+from lyceum_warp import cli
+from lyceum_warp.testing import CHECKS
+
+
+def test_all_rules_are_checked_and_listed_with_their_seconds(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", "point_mass", "--nworld", "2", "--steps", "5", "--param", "success_distance=0.1"]) == 0
+    head, *lines = capsys.readouterr().out.splitlines()
+    assert head == "point_mass on the mujoco engine (cpu, 2 worlds) keeps the rules:"
+    assert [line.split()[0] for line in lines] == [check.__name__.removeprefix("check_") for check in CHECKS]
+    assert all(float(line.split()[1]) >= 0 and line.endswith(" s") for line in lines)
+
+
+def test_single_rules_are_checked_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", "point_mass", "--rule", "spaces", "--rule", "time"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]] == ["spaces", "time"]
+    assert cli.main(["check", "point_mass", "--rule", "space"]) == 2
+    refused(capsys, "no rule 'space'", "did you mean spaces")
+
+
+ALIKE = """
+import warp as wp
+import lyceum_warp as lw
+
+
+@wp.struct
+class World:
+    qpos: lw.Row[float]
+
+
+@wp.struct
+class Params:
+    dt: float
+
+
+@wp.func
+def observe(s: World, p: Params, obs: lw.Row[float]):
+    obs[0] = s.qpos[0]
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: lw.Row[wp.uint32]):
+    s.qpos[0] = 0.5
+
+
+class Alike(lw.Task):
+    model, obs = "hopper.xml", {"position": 1}
+"""
+"""Its initial states are not random."""
+
+
+def test_a_broken_rule_is_named_and_the_exit_code_is_1(task_file: TaskFile, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", str(task_file("alike.py", ALIKE)), "--rule", "spaces", "--rule", "rand_reset"]) == 1
+    out = capsys.readouterr().out
+    assert out == "alike on the mujoco engine breaks the rule 'rand_reset': two consecutive draws are the same\n"
+
+
+def test_a_wrong_number_of_worlds_is_refused_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["check", "point_mass", "--nworld", "1"]) == 2
+    refused(capsys, "nworld must be at least 2")
