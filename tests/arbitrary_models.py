@@ -152,6 +152,11 @@ PLUGINS = {
         '<config key="ki" value="1"/><config key="slewmax" value="3"/></instance></plugin></extension>'
         + actuated('<plugin joint="hinge" plugin="mujoco.pid" instance="pid" actdim="2"/>'),
     ),
+    "Quadratic flex interpolation": text(
+        '<flexcomp name="ball" type="ellipsoid" dim="3" count="3 3 3" spacing=".05 .05 .05" dof="quadratic" mass=".1" '
+        'pos="0 0 .3" radius=".003"><contact selfcollide="none"/><elasticity young="1e4" damping=".01"/></flexcomp>'
+        + ARM,
+    ),
     "'mjTRN_SO3'] not supported": text(
         ARM, actuated('<orientation name="aim" site="tip" refsite="here" kp="1"/>', '<motor joint="wrist"/>')
     ),

@@ -1,6 +1,8 @@
 """Fixtures of all tests: shared environments, files with tasks, and skips on machines without a GPU."""
 
+import functools
 import gc
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import torch
 import warp as wp
 
 import lyceum_warp as lw
+from lyceum_warp.binding.registry import find_task
 
 # the tests' batches are too small to divide, and on a busy machine torch's threads wait for each other
 torch.set_num_threads(1)
@@ -99,6 +102,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keep what shares environments in one process, and skip tests marked ``gpu`` on machines without a GPU."""
     for item in items:
         item.add_marker(pytest.mark.xdist_group(_group(item)))
+        if (missing := _missing_model(_task(item))) is not None:
+            item.add_marker(pytest.mark.skip(reason=missing))
     if wp.is_cuda_available():
         return
     skip = pytest.mark.skip(reason="needs a CUDA device")
@@ -109,6 +114,24 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def _group(item: pytest.Item) -> str:
     """The tests that one process runs one after another: those of a file, and within it those of one task."""
+    task = _task(item)
+    return f"{item.path.stem}:{task}" if task is not None else item.path.stem
+
+
+def _task(item: pytest.Item) -> str | None:
+    """The name of the task that is a test's parameter."""
     callspec = getattr(item, "callspec", None)
     task = callspec.params.get("task", callspec.params.get("engines")) if callspec else None
-    return f"{item.path.stem}:{task}" if isinstance(task, str) else item.path.stem
+    return task if isinstance(task, str) else None
+
+
+@functools.cache
+def _missing_model(task: str | None) -> str | None:
+    """Why a task's model is missing, on versions of Python for which a package that brings models has no wheel."""
+    if task is None or sys.version_info < (3, 13):
+        return None
+    try:
+        find_task(task).model.path()
+    except (FileNotFoundError, AttributeError, ValueError) as error:
+        return str(error) if isinstance(error, FileNotFoundError) else None
+    return None

@@ -1,13 +1,10 @@
 """ArmHandPickup: pick up a ball with an arm and a hand, and hold it at a goal (Lyceum's ArmHandPickup).
 
-The arm and its hand of three fingers are Kinova's Jaco, from the extra "jaco"; in Lyceum, a hand of five fingers. Goal,
-distances, reward and the ball's start are Lyceum's, but for an error of it: its reward takes the ball's distance from
-(ball - goal), which is |goal| everywhere and tells nothing. Here it is the distance from the goal. Actions are speeds
-of joints, which are observed, too. Arm and hand touch the table and the ball, not each other. An episode is a success
-once the ball has stayed within 5 cm of the goal for 0.2 s.
+Arm and hand are Kinova's Jaco, from the extra "jaco"; in Lyceum the hand has five fingers. Goal, reward and the ball's
+start are Lyceum's, with an error corrected: its reward takes the ball's distance from (ball - goal), which is the same
+everywhere, in place of that from the goal. Actions are speeds of joints, which are observed, too. Arm and hand touch
+table and ball, not each other. An episode is a success while the ball has been within 5 cm of the goal for 0.2 s.
 """
-
-from pathlib import Path
 
 import mujoco
 import warp as wp
@@ -16,8 +13,6 @@ import lyceum_warp as lw
 from lyceum_warp import Row
 
 HAND = lw.package_model("dm_control", "third_party/kinova/jaco_hand.xml", install="lyceum-warp[jaco]")
-HOME = (1.775, 3.682, 1.303, 3.395, 5.351, 3.133, 0.2, 0.2, 0.2)  # the hand points down, open, above the table
-JOINTS = 9
 
 
 @wp.struct
@@ -37,7 +32,6 @@ class Params:
     near: float = 0.03  # m from the palm to the ball, from which on the goal counts
     finger_weight: float = 0.1
     success_distance: float = 0.05
-    success_time: float = 0.2
     ball: int = lw.body("table/ball")
     goal: int = lw.site("table/goal")
     palm: int = lw.site("hand/pinchsite")
@@ -45,24 +39,19 @@ class Params:
 
 
 @wp.func
-def distance(s: World, p: Params, point: wp.vec3) -> float:
-    return wp.min(wp.length(point - s.xpos[p.ball]), p.far)
-
-
-@wp.func
-def distances(s: World, p: Params) -> wp.vec3:
-    """From the ball to the palm, to the goal, and to the fingers in all."""
-    fingers = float(0.0)
+def distances(s: World, p: Params) -> wp.vec3:  # of the ball from the palm, from the goal, and from the fingers in all
+    d = wp.vec3(wp.length(s.site_xpos[p.palm] - s.xpos[p.ball]), wp.length(s.site_xpos[p.goal] - s.xpos[p.ball]), 0.0)
+    d = wp.min(d, wp.vec3(p.far))
     for i in range(3):
-        fingers += distance(s, p, s.geom_xpos[p.finger + 2 * i])
-    return wp.vec3(distance(s, p, s.site_xpos[p.palm]), distance(s, p, s.site_xpos[p.goal]), fingers)
+        d[2] += wp.min(wp.length(s.geom_xpos[p.finger + 2 * i] - s.xpos[p.ball]), p.far)
+    return d
 
 
 @wp.func
 def observe(s: World, p: Params, obs: Row[float]):
     ball = s.xpos[p.ball]
-    k = lw.put(obs, 0, s.qpos, 0, JOINTS)
-    k = lw.put(obs, k, s.qvel, 0, JOINTS + 3)
+    k = lw.put(obs, 0, s.qpos, 0, 9)
+    k = lw.put(obs, k, s.qvel, 0, 12)
     k = lw.put(obs, k, ball)
     k = lw.put(obs, k, s.site_xpos[p.palm] - ball)
     k = lw.put(obs, k, s.site_xpos[p.goal] - ball)
@@ -93,13 +82,13 @@ def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uin
 
 @wp.func
 def success(s: World, p: Params) -> bool:
-    return s.memory[0] > p.success_time - 0.5 * p.dt
+    return s.memory[0] > 0.19
 
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    s.qpos[JOINTS] = lw.uniform(rng, -0.15, 0.15)
-    s.qpos[JOINTS + 1] = lw.uniform(rng, -0.1, 0.1)
+    s.qpos[9] = lw.uniform(rng, -0.15, 0.15)
+    s.qpos[10] = lw.uniform(rng, -0.1, 0.1)
 
 
 @lw.register
@@ -107,11 +96,10 @@ class ArmHandPickup(lw.Task):
     model = lw.package_model("dm_control", "third_party/kinova/jaco_arm.xml", install="lyceum-warp[jaco]")
     keyframe, frame_skip, horizon, memory = "home", 4, 300, 1
     obs = {"joints": 9, "velocity": 9, "ball_velocity": 3, "ball": 3, "palm": 3, "goal": 3, "fingers": 9}
-    metrics = ("palm_distance", "goal_distance", "finger_distances")
-    action_range = (-1.0, 1.0)
-    planning = lw.Planning(
+    metrics, action_range = ("palm_distance", "goal_distance", "finger_distances"), (-1.0, 1.0)
+    planning = lw.Planning(  # whose reward shows the goal from afar and asks more for a closed hand
         settings={"horizon": 32, "samples": 64, "temperature": 0.1, "noise": 0.8, "fill": "repeat"},
-        params={"far": 1.0, "finger_weight": 2.0},  # the goal counts from anywhere, and closing the hand counts more
+        params={"far": 1.0, "finger_weight": 2.0},
     )
 
     @staticmethod
@@ -126,8 +114,8 @@ class ArmHandPickup(lw.Task):
             motor.set_to_velocity(kv=gain)
             motor.ctrlrange, motor.forcerange = (-speed, speed), (-torque, torque)
         spec.body("b_base").pos = (0, -0.4, 0)
-        scene = mujoco.MjSpec.from_file(str(Path(__file__).with_name("arm_hand_pickup.xml")))
-        for name in ("timestep", "integrator", "cone", "impratio", "disableflags"):
-            setattr(spec.option, name, getattr(scene.option, name))
+        scene = lw.package_model("lyceum_warp", "tasks/arm_hand_pickup.xml").spec()
+        spec.option = scene.option
         spec.attach(scene, frame=spec.worldbody.add_frame(), prefix="table/")
-        spec.add_key(name="home", qpos=[*HOME, 0, 0, 0.035, 1, 0, 0, 0])
+        above = (1.775, 3.682, 1.303, 3.395, 5.351, 3.133, 0.2, 0.2, 0.2)  # the hand points down, open, over the ball
+        spec.add_key(name="home", qpos=[*above, 0, 0, 0.035, 1, 0, 0, 0])

@@ -27,6 +27,10 @@ FORCE_PARTS = ("contact_force",)
 """Parts of observations that depend on constraint forces, which a solver finds to its tolerance."""
 
 
+PARAMS = {"soft_ball": {"reach": 0.15}}
+"""Parameters with which some episodes of a task end under random values of the fields."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Bounds:
     """Largest difference between the engines after one substep: of a world's coordinates, then over worlds."""
@@ -47,6 +51,7 @@ ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median
     "aloha_lift": Bounds(2e-7, 2e-7, 1.5e-6, 4e-6),  # 5.2e-8, 5.9e-8; 4.3e-7, 9.2e-7
     "adroit_relocate": Bounds(2e-7, 4.5e-7, 8e-5, 2.5e-4),  # 5.1e-8, 1.2e-7; 2.0e-5, 6.2e-5
     "ant": Bounds(1.5e-7, 3e-7, 1.5e-6, 2e-5),  # 5.2e-8, 9.8e-8; 4.4e-7, 6.5e-6
+    "arm_hand_pickup": Bounds(4e-7, 7e-7, 4e-8, 1.2e-7),  # 1.2e-7, 2.2e-7; 1.2e-8, 3.8e-8
     "cartpole": Bounds(7e-9, 4e-8, 5e-8, 2e-7),  # 2.0e-9, 1.1e-8; 1.3e-8, 5.3e-8
     "cartpole_swingup": Bounds(2e-7, 4e-7, 4e-8, 1e-7),  # 6.2e-8, 1.1e-7; 1.2e-8, 2.9e-8
     "half_cheetah": Bounds(1e-7, 1e-6, 1e-5, 1e-4),  # 3.2e-8, 2.9e-7; 3.0e-6, 2.9e-5
@@ -62,6 +67,8 @@ ONE_STEP = {  #                         measured: qpos median, 95 %; qvel median
     "pusher": Bounds(1.5e-7, 3e-7, 6e-7, 2e-6),  # 4.3e-8, 8.0e-8; 1.8e-7, 5.4e-7
     "reach": Bounds(5e-7, 2e-6, 5e-5, 2e-4),  # 1.5e-7, 5.8e-7; 1.5e-5, 5.8e-5
     "reacher": Bounds(1.2e-7, 5e-7, 7e-7, 2e-6),  # 3.5e-8, 1.6e-7; 2.0e-7, 6.5e-7
+    # MuJoCo Warp merges contacts of a flex that are less than 1 mm apart, C does not; they differ in hard squeezes
+    "soft_ball": Bounds(3e-8, 3e-3, 2.5e-6, 6e-1),  # 8.5e-9, 8.8e-4; 6.8e-7, 1.8e-1
     "swimmer": Bounds(8e-8, 2e-7, 6e-7, 3e-6),  # 2.4e-8, 5.7e-8; 2.0e-7, 9.0e-7
     "walker2d": Bounds(1.2e-7, 2e-7, 2e-5, 8e-5),  # 3.7e-8, 5.8e-8; 6.2e-6, 2.4e-5
 }
@@ -114,6 +121,7 @@ def device(request: pytest.FixtureRequest) -> str:
 def engines(request: pytest.FixtureRequest, device: str, shared_env: SharedEnv) -> Iterator[Engines]:
     task = request.param
     options = {"nworld": NWORLD, "cone": "elliptic", "frame_skip": 1, "autoreset": False, "horizon": 0}
+    options |= PARAMS.get(task, {})
     states = rollout_states(shared_env(task, engine="mujoco", nworld=NWORLD))
     c = shared_env(task, engine="mujoco", **options)
     warp = shared_env(task, engine="warp", device=device, **options)

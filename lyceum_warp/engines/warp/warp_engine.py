@@ -112,6 +112,10 @@ class WarpEngine(Engine):
         # a step goes on from the parts that were computed for its state, whether a world stepped there or restarted
         moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
         self._shared = () if moved else takes_over(model, self._current_parts or (), self.dynamics)
+        # A geom at a place that is not-a-number has contacts with every element of a flex. Their rows of the Jacobian
+        # would outlast a reset, because the solver multiplies unused rows by zero: a reset clears them.
+        self._jacobian = flat(self.d.efc.J if model.nflex else wp.zeros((nworld, 0), dtype=float, device=device))
+        self._zeros = wp.zeros(self._jacobian.shape[1], dtype=float, device=device)
         self._conditional = Conditional(device)
         self._partial = self._partial_forward()
         self._settling: PartialForward | None = None
@@ -275,6 +279,7 @@ class WarpEngine(Engine):
     def reset(self, mask: wp.array) -> None:
         with self._on_device():
             mjw.reset_data(self.m, self.d, reset=mask)
+            launch_rows(fill_rows, mask, self._zeros, self._jacobian)
             if self._start is not None:
                 launch_rows(fill_rows, mask, self._start, self._state)
                 mjw.set_state(self.m, self.d, self._state, _SPEC, mask)
@@ -351,7 +356,10 @@ def _refusals() -> Iterator[None]:
     try:
         yield
     except (NotImplementedError, ValueError) as error:
-        raise ValueError(f"MuJoCo Warp refuses the model: {error}; change the model, or use engine='mujoco'") from error
+        reason = str(error).rstrip(".")
+        raise ValueError(
+            f"MuJoCo Warp refuses the model: {reason}; change the model, or use engine='mujoco'"
+        ) from error
 
 
 def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied: Collection[str]) -> tuple[int, int]:
