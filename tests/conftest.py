@@ -97,11 +97,15 @@ def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
     return made
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep what shares environments in one process, and skip tests marked ``gpu`` on machines without a GPU."""
-    for item in items:
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Keep what shares environments and folders in one process; pytest-xdist looks for these marks right afterwards."""
+    if item.config.pluginmanager.hasplugin("xdist"):
         item.add_marker(pytest.mark.xdist_group(_group(item)))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip tests marked ``gpu`` on machines without a GPU, and those of tasks whose model cannot be installed."""
+    for item in items:
         if (missing := _missing_model(_task(item))) is not None:
             item.add_marker(pytest.mark.skip(reason=missing))
     if wp.is_cuda_available():
@@ -113,8 +117,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _group(item: pytest.Item) -> str:
-    """The tests that one process runs one after another: those of a file, and within it those of one task."""
-    task = _task(item)
+    """The tests that one process runs one after another: those of a file; in two folders, those of a task in a file."""
+    task = _task(item) if item.path.parent.name in ("conformance", "oracles") else None
     return f"{item.path.stem}:{task}" if task is not None else item.path.stem
 
 

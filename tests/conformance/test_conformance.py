@@ -7,7 +7,11 @@ from toy_engine import ToyEngine
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.testing import CHECKS, check_task
+from lyceum_warp.testing.episode_rules import check_memory
 
+WITH_MEMORY = ("hopper", "humanoid", "adroit_pen", "soft_ball")
+"""Tasks for which the rule about memory, which takes longest and depends little on the task, is always checked."""
+WITHOUT_MEMORY = tuple(check for check in CHECKS if check is not check_memory)
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
 
 
@@ -17,20 +21,29 @@ def settled_again() -> None:
     settle()
 
 
-@pytest.mark.parametrize("task", PACKAGE)
-def test_a_task_keeps_the_rules_on_the_mujoco_engine(task: str) -> None:
-    # a leak in a long run shows with any task, so one of them is run for long
-    report = check_task(task, engine="mujoco", steps=1000 if task == "hopper" else 300)
-    assert list(report.seconds) == [check.__name__.removeprefix("check_") for check in CHECKS]
+def options(task: str, engine: str) -> dict[str, int]:
+    """The steps of the long rules, for one task enough to notice a leak of one number a step.
+
+    On the CPU a step of the Warp engine takes milliseconds: one task runs for long there, with all its substeps.
+    """
+    if engine == "mujoco":
+        return {"steps": 1000 if task == "hopper" else 300}
+    return {"steps": 600} if task == "hopper" else {"steps": 100, "frame_skip": min(2, find_task(task).frame_skip)}
 
 
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("task", PACKAGE)
-def test_a_task_keeps_the_rules_on_the_warp_engine(task: str) -> None:
-    # on the CPU a step of this engine takes milliseconds: one task runs for long, with all its substeps
-    if task == "hopper":
-        check_task(task, engine="warp", steps=600)  # enough to notice a leak of one number a step
-    else:
-        check_task(task, engine="warp", steps=100, frame_skip=min(2, find_task(task).frame_skip))
+def test_a_task_keeps_the_rules(task: str, engine: str) -> None:
+    checks = CHECKS if task in WITH_MEMORY else WITHOUT_MEMORY
+    report = check_task(task, engine=engine, checks=checks, **options(task, engine))
+    assert list(report.seconds) == [check.__name__.removeprefix("check_") for check in checks]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+@pytest.mark.parametrize("task", [task for task in PACKAGE if task not in WITH_MEMORY])
+def test_a_task_leaves_no_memory_behind(task: str, engine: str) -> None:
+    check_task(task, engine=engine, checks=[check_memory], **options(task, engine))
 
 
 @pytest.mark.parametrize("task", ["hopper", "point_mass", "humanoid"])

@@ -164,6 +164,8 @@ def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) ->
     for batch, values in ((env.worlds.before, before), (env.worlds.after, after)):
         for name, value in values.items():
             field = torch_view(getattr(batch, name))
+            if field.stride(0) == 0:  # a field of the model, which all worlds share
+                continue
             kept.append((field, field.clone()))
             field.copy_(value)
     env.worlds.judge_transition(action)
