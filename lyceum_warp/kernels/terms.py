@@ -215,3 +215,22 @@ def tolerance(
     root = wp.sqrt(1.0 - v)
     t = wp.tanh(0.5 * d * wp.log((1.0 + root) / (1.0 - root)))
     return 1.0 - t * t
+
+
+@wp.func
+def grasp_terms(distance: float, finger: float, closed: float) -> tuple[float, float, float]:
+    """Terms of a reward for grasping with two fingers, each between 0 and 1: ``near, reach, grasp``.
+
+    ``near`` is 1 up to 1 cm from the target and 0.1 at 2 cm; ``reach`` falls slowly, to 0.2 at 10.5 cm. ``grasp`` asks
+    for open fingers on the way and closed ones at the target: it is 0.5 for open fingers far from the target, 1 for
+    closed ones near it, and 0 for closed ones far from it and for open ones near it.
+
+    Args:
+        distance: From the point between the fingers to the target, in m.
+        finger: Position of a finger, in m; 0 where the fingers meet.
+        closed: Up to this position the fingers are closed, and from about 2 cm above it they are open, in m.
+    """
+    near = tolerance(distance, wp.vec2(0.0, 0.01), 0.01)
+    reach = tolerance(distance, wp.vec2(0.0, 0.005), 0.1, int(Sigmoid.RECIPROCAL), 0.2)
+    shut = tolerance(finger, wp.vec2(0.0, closed), 0.02, int(Sigmoid.LINEAR))
+    return near, reach, near * shut + 0.5 * (1.0 - near) * (1.0 - shut)

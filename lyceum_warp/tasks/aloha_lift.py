@@ -1,9 +1,8 @@
 """AlohaLift: take a pot by its two handles and lift it with two arms (ALOHA and pot of mujoco_warp's test data).
 
-The model comes with mujoco_warp, where another release may move it. Meshes are only drawn: capsules fitted to the arms
-collide with pot and table, and fingers, pot and table have the simple shapes of the MJCF file beside this one; the arms
-don't collide with each other. Actions are velocities, which move the targets of the model's position servos. The reward
-weighs four terms between 0 and 1. An episode is a success while the pot was held up for ten steps.
+Meshes are only drawn: what collides are capsules fitted to the arms, which pass through each other, and the simple
+shapes of the MJCF file beside this one. Actions are velocities, which move the targets of the model's position servos.
+An episode is a success while the pot was held up for ten steps.
 """
 
 import mujoco
@@ -12,13 +11,10 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row
 
-POT = "partnet_100015/"
-ARM = (0.0, -1.05, 1.06, 0.0, 0.78, 1.57, 0.035, 0.035)  # beside a handle, one finger above the other
-
 
 @wp.struct
 class World:
-    qpos: Row[float]  # 8 joints of the left arm, 8 of the right one, the pot's position and quaternion, its lid
+    qpos: Row[float]  # per arm 6 joints and 2 fingers, left arm first; then the pot's position and quaternion, its lid
     qvel: Row[float]
     act: Row[float]  # targets of both arms
     xpos: Row[wp.vec3]
@@ -35,14 +31,11 @@ class Params:
     goal_steps: float = 10.0
     rest_height: float = 0.0658  # of the pot on the table
     place: wp.vec3 = wp.vec3(0.03, 0.03, 0.25)  # of the pot at the start: x, y and yaw, each plus or minus this
-    pot: int = lw.body(POT)
-    pot_qpos: int = lw.qpos(POT)
+    pot: int = lw.body("partnet_100015/")
     left_grip: int = lw.site("lift/left_grip")
     right_grip: int = lw.site("lift/right_grip")
     left_handle: int = lw.site("lift/left_handle")
     right_handle: int = lw.site("lift/right_handle")
-    left_finger: int = lw.qpos("left\\left_finger")
-    right_finger: int = lw.qpos("right\\left_finger")
 
 
 @wp.func
@@ -63,20 +56,16 @@ def evaluate(s: World, p: Params) -> float:  # height of the pot above the table
 
 @wp.func
 def arm(s: World, grip: int, handle: int, finger: int) -> wp.vec4:
-    distance = wp.length(s.site_xpos[grip] - s.site_xpos[handle])
-    around = lw.tolerance(distance, wp.vec2(0.0, 0.01), 0.01)
-    closed = lw.tolerance(s.qpos[finger], wp.vec2(0.0, 0.015), 0.02, int(lw.Sigmoid.LINEAR))
-    reach = lw.tolerance(distance, wp.vec2(0.0, 0.005), 0.1, int(lw.Sigmoid.RECIPROCAL), 0.2)
+    near, reach, grasp = lw.grasp_terms(wp.length(s.site_xpos[grip] - s.site_xpos[handle]), s.qpos[finger], 0.015)
     # the fingers slide along the gripper's y axis, across the handle's bar, the pot's x axis
     orient = 1.0 - wp.abs(wp.dot(s.site_xmat[grip][:, 1], s.site_xmat[handle][:, 0]))
-    grasp = around * closed + 0.5 * (1.0 - around) * (1.0 - closed)  # open on the way, closed around the handle
-    return wp.vec4(reach, orient, grasp, around)
+    return wp.vec4(reach, orient, grasp, near)
 
 
 @wp.func
 def terms(s: World, p: Params) -> wp.vec4:
-    left = arm(s, p.left_grip, p.left_handle, p.left_finger)
-    right = arm(s, p.right_grip, p.right_handle, p.right_finger)
+    left = arm(s, p.left_grip, p.left_handle, 6)
+    right = arm(s, p.right_grip, p.right_handle, 14)
     mean, upright = 0.5 * (left + right), wp.max(s.xmat[p.pot][2, 2], 0.0)
     lift = wp.min(left[3], right[3]) * upright * wp.clamp(evaluate(s, p) / (1.5 * p.goal_height), 0.0, 1.0)
     return wp.vec4(mean[0], mean[1], mean[2], lift)
@@ -105,7 +94,7 @@ def success(s: World, p: Params) -> bool:
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     x, y = lw.uniform(rng, -p.place[0], p.place[0]), lw.uniform(rng, -p.place[1], p.place[1])
-    k = lw.put(s.qpos, p.pot_qpos, wp.vec3(x, y, p.rest_height))
+    k = lw.put(s.qpos, 16, wp.vec3(x, y, p.rest_height))
     yaw = 0.5 * wp.pi + lw.uniform(rng, -p.place[2], p.place[2])  # a handle for each arm
     lw.put(s.qpos, k, lw.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw))
 
@@ -115,8 +104,7 @@ class AlohaLift(lw.Task):
     model = lw.package_model("mujoco_warp", "test_data/aloha_pot/scene.xml", install="mujoco-warp>=4.0,<5")
     keyframe, frame_skip, horizon, memory = "start", 8, 150, 1
     obs = {"position": 16, "velocity": 22, "target": 14, "pot": 3, "pot_axes": 9, "handles_from_grips": 6}
-    metrics = ("reach", "orient", "grasp", "lift")
-    action_range = (-1.0, 1.0)
+    metrics, action_range = ("reach", "orient", "grasp", "lift"), (-1.0, 1.0)
     planning = lw.Planning(settings={"horizon": 16, "samples": 128, "temperature": 0.5, "noise": 0.6})
 
     @staticmethod
@@ -128,11 +116,10 @@ class AlohaLift(lw.Task):
             speed = 0.1 if servo.name.endswith("gripper") else 1.0  # m/s or rad/s
             servo.actrange, servo.ctrlrange = servo.ctrlrange, (-speed, speed)
         for geom in spec.geoms:
-            arm = geom.classname.name == "collision" and geom.name != "table"
-            geom.contype, geom.conaffinity = 0, int(arm)
-            if arm:
-                geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
-            elif geom.name.startswith(POT):
+            geom.contype = geom.conaffinity = 0
+            if geom.classname.name == "collision" and geom.name != "table":
+                geom.type, geom.conaffinity = mujoco.mjtGeom.mjGEOM_CAPSULE, 1
+            elif geom.name.startswith("partnet"):
                 geom.rgba = (0.75, 0.77, 0.8, 1.0)
         spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK  # so that videos take it
         for light in spec.lights:
@@ -140,5 +127,6 @@ class AlohaLift(lw.Task):
         child = mujoco.MjSpec.from_file(__file__.replace(".py", ".xml"))
         for part in child.worldbody.bodies:
             spec.body(part.name).add_frame().attach_body(part, "lift/", "")
-        pot = (0.0, 0.0, 0.0658, 0.7071068, 0.0, 0.0, 0.7071068, 0.0)
-        spec.add_key(name="start", qpos=[*ARM, *ARM, *pot], act=[*ARM[:7], *ARM[:7]])
+        arm = [0, -1.05, 1.06, 0, 0.78, 1.57, 0.035, 0.035]  # beside a handle, one finger above the other
+        pot = [0, 0, 0.0658, 0.7071068, 0, 0, 0.7071068, 0]
+        spec.add_key(name="start", qpos=arm + arm + pot, act=arm[:7] + arm[:7])

@@ -1,9 +1,8 @@
 """ArmHandPickup: pick up a ball with an arm and a hand, and hold it at a goal (Lyceum's ArmHandPickup).
 
 Arm and hand are Kinova's Jaco, from the extra "jaco"; in Lyceum the hand has five fingers. Goal, reward and the ball's
-start are Lyceum's, with an error corrected: its reward takes the ball's distance from (ball - goal), which is the same
-everywhere, in place of that from the goal. Actions are speeds of joints, which are observed, too. Arm and hand touch
-table and ball, not each other. An episode is a success while the ball has been within 5 cm of the goal for 0.2 s.
+start are Lyceum's, but Lyceum measures the ball's distance from (ball - goal), by error, and this task from the goal.
+Actions are speeds of joints. Success: the ball has been within 5 cm of the goal for 0.2 s.
 """
 
 import mujoco
@@ -107,7 +106,7 @@ class ArmHandPickup(lw.Task):
         """Give the arm a hand, a table and motors that hold the speeds of joints."""
         spec.attach(HAND.spec(), site=spec.site("wristsite"), prefix="hand/")
         for geom in spec.geoms:
-            geom.contype, geom.conaffinity = 0, 1
+            geom.contype, geom.conaffinity = 0, 1  # arm and hand touch table and ball, not each other
         for i, joint in enumerate(spec.joints):  # of large joints, small joints, fingers: gain, rad/s and N m at most
             gain, speed, torque = ((500, 0.628, 30.5), (500, 0.838, 6.8), (100, 1.0, 1.0))[i // 3]
             motor = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)

@@ -59,13 +59,10 @@ def evaluate(s: World, p: Params) -> float:  # height of the cube above the tabl
 def terms(s: World, p: Params) -> wp.vec4:
     grip = s.site_xmat[p.grip]  # z points out of the hand, the fingers slide along y
     distance = wp.length(s.xpos[p.cube] - s.site_xpos[p.grip])
-    around = lw.tolerance(distance, wp.vec2(0.0, 0.01), 0.01)
-    closed = lw.tolerance(s.qpos[p.finger], wp.vec2(0.0, p.half_size), 0.02, int(lw.Sigmoid.LINEAR))
-    reach = lw.tolerance(distance, wp.vec2(0.0, 0.005), 0.1, int(lw.Sigmoid.RECIPROCAL), 0.2)
+    near, reach, grasp = lw.grasp_terms(distance, s.qpos[p.finger], p.half_size)
     # down, and the fingers along an edge of the cube
     orient = wp.clamp(-grip[2, 2], 0.0, 1.0) * wp.max(wp.abs(wp.transpose(s.xmat[p.cube]) * grip[:, 1]))
-    grasp = around * closed + 0.5 * (1.0 - around) * (1.0 - closed)  # open on the way, closed around the cube
-    lift = around * orient * wp.clamp(evaluate(s, p) / (1.5 * p.goal_height), 0.0, 1.0)
+    lift = near * orient * wp.clamp(evaluate(s, p) / (1.5 * p.goal_height), 0.0, 1.0)
     return wp.vec4(reach, orient, grasp, lift)
 
 

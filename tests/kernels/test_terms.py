@@ -157,6 +157,30 @@ def test_angle_between_is_exact_for_small_and_for_straight_angles() -> None:
     np.testing.assert_allclose(out.numpy(), wanted, atol=5e-7)
 
 
+@wp.kernel
+def grasps(distance: wp.array[float], finger: wp.array[float], out: wp.array2d[float]):
+    i = wp.tid()
+    near, reach, grasp = lw.grasp_terms(distance[i], finger[i], 0.01)
+    out[i, 0] = near
+    out[i, 1] = reach
+    out[i, 2] = grasp
+
+
+def test_grasp_terms_ask_for_open_fingers_on_the_way_and_closed_ones_at_the_target() -> None:
+    cases = {  # distance, finger: near, reach, grasp
+        (0.0, 0.005): (1.0, 1.0, 1.0),
+        (0.0, 0.04): (1.0, 1.0, 0.0),
+        (0.02, 0.04): (0.1, 1.0 / 1.6, 0.45),
+        (0.105, 0.04): (0.0, 0.2, 0.5),
+        (0.105, 0.005): (0.0, 0.2, 0.0),
+        (0.105, 0.03): (0.0, 0.2, 0.45),
+    }
+    distance, finger = (wp.array(x, dtype=float, device="cpu") for x in zip(*cases, strict=True))
+    out = wp.zeros((len(cases), 3), dtype=float, device="cpu")
+    wp.launch(grasps, len(cases), [distance, finger, out], device="cpu")
+    np.testing.assert_allclose(out.numpy(), list(cases.values()), atol=1e-6)
+
+
 @wp.struct
 class Bodies:
     cvel: wp.array[wp.spatial_vector]
