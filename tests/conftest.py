@@ -97,12 +97,6 @@ def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
     return made
 
 
-def pytest_itemcollected(item: pytest.Item) -> None:
-    """Keep what shares environments and folders in one process; pytest-xdist looks for these marks right afterwards."""
-    if item.config.pluginmanager.hasplugin("xdist"):
-        item.add_marker(pytest.mark.xdist_group(_group(item)))
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip tests marked ``gpu`` on machines without a GPU, and those of tasks whose model cannot be installed."""
     for item in items:
@@ -114,12 +108,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "gpu" in item.keywords:
             item.add_marker(skip)
-
-
-def _group(item: pytest.Item) -> str:
-    """The tests that one process runs one after another: those of a file; in two folders, those of a task in a file."""
-    task = _task(item) if item.path.parent.name in ("conformance", "oracles") else None
-    return f"{item.path.stem}:{task}" if task is not None else item.path.stem
 
 
 def _task(item: pytest.Item) -> str | None:
