@@ -51,7 +51,7 @@ class Row:
     faults: dict[str, int]
     """Number of each kind of fault, those that occurred."""
     largest_speed: float
-    """The largest magnitude in ``qvel`` that a world had after a step."""
+    """The largest magnitude in ``qvel`` after a step, in worlds whose episode went on."""
     seconds: float
 
 
@@ -96,21 +96,22 @@ def show(rows: list[Row], console: Console) -> None:
 
 
 def main() -> int:
-    """Run all tasks, print and store the counts; the exit code is 1 where a world had a fault."""
+    """Run all tasks, print and store the counts; the exit code is 1 after a fault, or where a model is missing."""
     options = tyro.cli(Options, description=__doc__)
-    console, rows = Console(), []
+    console, rows, missing = Console(), [], False
     for task in options.tasks or lw.task_names():
         try:
             rows.append(run(options, task))
         except FileNotFoundError as error:  # an extra that is not installed
             console.print(f"{task}: {error}", highlight=False, markup=False)
+            missing = True
             continue
         console.print(f"{task}: {rows[-1].seconds:.1f} s", highlight=False)
     show(rows, console)
     if options.out is not None:
         more = {"engine": options.engine, "nworld": options.nworld, "steps": options.steps, "seed": options.seed}
         measurements.write(options.out, rows, options.device, **more)
-    return int(any(row.faults for row in rows))
+    return int(missing or any(row.faults for row in rows))
 
 
 if __name__ == "__main__":

@@ -340,7 +340,7 @@ class Task:
     controls of its initial state and without ``substep``; its time then starts from 0."""
     gymnasium: ClassVar[str | None] = None
     """Id of the Gymnasium environment whose model, observation, reward, termination, reset and parameters the task
-    has, as "Hopper-v5"; None where there is no such environment."""
+    has, as "Hopper-v5"; None where there is no such environment. Subclasses do not inherit it."""
     planning: ClassVar[Planning] = Planning()
     """The task's settings for MPPI: those of the planner, and options and parameters of its worlds, as
     ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
@@ -354,6 +354,8 @@ class Task:
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
+        if "gymnasium" not in vars(cls):
+            cls.gymnasium = None
         # now: another task, in a later cell of the same notebook, has the same names
         module = vars(sys.modules[cls.__module__])
         cls.scope = {

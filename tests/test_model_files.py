@@ -74,6 +74,10 @@ class Light(find_task("hopper")):  # type: ignore[misc]
                 geom.density /= 2
 
 
+def test_a_task_that_extends_another_has_not_its_gymnasium_environment() -> None:
+    assert find_task("hopper").gymnasium == "Hopper-v5" and Light.gymnasium is None
+
+
 def test_a_task_edits_its_model_once_whatever_it_is_made_from() -> None:
     light, whole = lw.make(Light), lw.make("hopper")
     half = 0.5 * whole.model.body_mass[1:].sum()

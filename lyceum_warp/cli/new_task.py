@@ -89,7 +89,11 @@ def _class_name(path: Path) -> str:
     """
     name = path.stem
     class_name = "".join(part[:1].upper() + part[1:] for part in name.split("_"))
-    if not (name.isidentifier() and class_name.isidentifier() and name.isascii()) or keyword.iskeyword(name):
+    if (
+        not (name.isidentifier() and class_name.isidentifier() and name.isascii())
+        or keyword.iskeyword(name)
+        or keyword.iskeyword(class_name)
+    ):
         raise ValueError(f"a task can't be named {name!r}: use letters, digits and _, as in my_robot")
     if snake_case(class_name) != name:  # the class alone has the name of the task
         raise ValueError(f"a task can't be named {name!r}: use {snake_case(class_name)!r}, for the class {class_name}")

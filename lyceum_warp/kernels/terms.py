@@ -25,12 +25,22 @@ class Sigmoid(enum.IntEnum):
 def put(row: wp.array[float], at: int, value: float) -> int:
     """Write a value into a row from the index ``at`` on; returns the index after it.
 
-    The value is a number, a vector, a matrix (row by row), or a row of any of these; of a row, ``first`` and ``last``
-    choose the elements with first <= i < last. An observation is written as a chain: ``k = lw.put(obs, 0, s.qpos)``,
-    then ``k = lw.put(obs, k, s.qvel)``.
+    The value is a number or a bool, a vector, a matrix (row by row), or a row of any of these; of a row, ``first`` and
+    ``last``     choose the elements with first <= i < last. An observation is written as a chain: ``k = lw.put(obs, 0,
+    s.qpos)``,     then ``k = lw.put(obs, k, s.qvel)``.
     """
     row[at] = value
     return at + 1
+
+
+@wp.func
+def put(row: wp.array[float], at: int, value: int) -> int:
+    return put(row, at, float(value))
+
+
+@wp.func
+def put(row: wp.array[float], at: int, value: bool) -> int:
+    return put(row, at, wp.where(value, 1.0, 0.0))
 
 
 @wp.func

@@ -124,7 +124,7 @@ class AlohaLift(lw.Task):
         spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK  # so that videos take it
         for light in spec.lights:
             light.castshadow = False  # drawing a frame without a GPU took 17 times as long
-        child = mujoco.MjSpec.from_file(__file__.replace(".py", ".xml"))
+        child = lw.package_model("lyceum_warp", "tasks/aloha_lift.xml").spec()
         for part in child.worldbody.bodies:
             spec.body(part.name).add_frame().attach_body(part, "lift/", "")
         arm = [0, -1.05, 1.06, 0, 0.78, 1.57, 0.035, 0.035]  # beside a handle, one finger above the other

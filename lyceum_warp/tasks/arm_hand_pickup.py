@@ -1,8 +1,8 @@
 """ArmHandPickup: pick up a ball with an arm and a hand, and hold it at a goal (Lyceum's ArmHandPickup).
 
-Arm and hand are Kinova's Jaco, from the extra "jaco"; in Lyceum the hand has five fingers. Goal, reward and the ball's
-start are Lyceum's, but Lyceum measures the ball's distance from (ball - goal), by error, and this task from the goal.
-Actions are speeds of joints. Success: the ball has been within 5 cm of the goal for 0.2 s.
+Arm and hand are Kinova's Jaco (extra "jaco"). Goal, reward and the ball's start are Lyceum's, whose code takes, by
+mistake, the ball's distance from (ball - goal), which is constant; here it is the distance from the goal. Actions are
+speeds of joints; a step takes 20 ms. Success: the ball has been within 5 cm of the goal for 0.2 s.
 """
 
 import mujoco

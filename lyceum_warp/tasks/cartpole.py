@@ -1,8 +1,8 @@
 """Cartpole: keep a pole upright on a cart in the middle of its rail (dm_control's cartpole balance).
 
 The reward is dm_control's smooth one; ``sparse=True`` gives that of balance_sparse. An episode is a success while cart
-and pole are within the bounds of the sparse reward. It never terminates, unlike Gymnasium's CartPole-v1, which ends
-with the pole at 12 degrees and pushes with one of two forces. CartpoleSwingup starts with the pole hanging down.
+and pole are within the bounds of the sparse reward. Episodes do not terminate; those of Gymnasium's CartPole-v1 end
+with the pole at 12 degrees, and its actions are two forces. CartpoleSwingup starts with the pole hanging down.
 """
 
 import warp as wp

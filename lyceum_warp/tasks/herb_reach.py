@@ -1,10 +1,10 @@
 """HerbReach: move the hands of two 7-joint Barrett arms to targets in space (the paper's HERB).
 
-The paper counts the throughput of a HERB whose model is not published; this one is made from published numbers (see
-herb.xml). An action is a share of each motor's peak torque, fingers included, on top of gravity compensation, as the
-robot's own controller takes torques. The targets are mocap bodies, and so belong to the state; they are drawn from two
-boxes in front of the shoulders, within reach of HERB's home position, from which an episode starts. An episode is a
-success while both palms have been within 5 cm of their targets for ten steps, 0.2 s. It never terminates.
+The paper's model of HERB is not published; this one has published numbers (see herb.xml). An action is a share of each
+motor's peak torque, fingers included, on top of gravity compensation. The targets are mocap bodies, and so belong to
+the state; they are drawn from two boxes in front of the shoulders, which the arms can reach. An episode starts at
+HERB's home position, and is a success once both palms have been within 5 cm of their targets for ten steps, 0.2 s.
+Where two boxes of the arms touch, MuJoCo Warp finds fewer points of contact than MuJoCo.
 """
 
 import warp as wp

@@ -1,9 +1,9 @@
 """PandaLift: grasp a cube on a table and lift it (a Franka Panda with its gripper, as in robosuite's Lift).
 
 The arm comes with the extra "robots", without a gripper: hand, table and cube are MJCF files beside this one. Actions
-are velocities, which move the targets of position servos; gravity does not act on the robot, which compensates it. The
+are velocities, which move the targets of position servos; the arm compensates gravity, as the robot itself does. The
 arm's meshes are only drawn: capsules fitted to them collide with table and cube. The reward weighs four terms between
-0 and 1. An episode is a success while the cube was held up for ten steps.
+0 and 1. An episode is a success once the cube has been held up for ten steps in a row.
 """
 
 import mujoco
@@ -114,6 +114,6 @@ class PandaLift(lw.Task):
             if geom.classname.name == "panda/collision":
                 geom.type, geom.contype, geom.parent.gravcomp = mujoco.mjtGeom.mjGEOM_CAPSULE, 0, 1.0
         for name, prefix, parent in (("hand", "hand/", "attachment"), ("lift", "table/", "world")):
-            child = mujoco.MjSpec.from_file(__file__.replace("lift.py", f"{name}.xml"))
+            child = lw.package_model("lyceum_warp", f"tasks/panda_{name}.xml").spec()
             spec.attach(child, prefix=prefix, frame=spec.body(parent).add_frame())
         spec.add_key(name="start", qpos=[*HOME, 0.55, 0.0, 0.0199, 1.0, 0.0, 0.0, 0.0], act=HOME[:8])

@@ -1,8 +1,8 @@
 """SoftBall: grip a soft ball with two fingers and lift it to a target (a flex).
 
-A grip must be firm enough to hold the ball; squeezing costs reward, and a ball that is crushed to two thirds of its
-width ends the episode. The policy sees where the ball's vertices are, as their mean and their extent along each axis.
-An episode is a success while the ball has been within 3 cm of the target for half a second.
+Squeezing the ball costs reward, and a ball that is crushed to two thirds of its width ends the episode. The policy sees
+the mean and the extents of its vertices. An episode is a success once the ball has been within 3 cm of the target for
+half a second. MuJoCo Warp merges contacts of a flex that lie within 1 mm, so that the engines differ in hard squeezes.
 """
 
 import warp as wp

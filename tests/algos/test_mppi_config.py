@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+import lyceum_warp as lw
 from lyceum_warp import MPPI, MPPIConfig
+from lyceum_warp.binding.registry import find_task
 from lyceum_warp.spaces import Space
 
 
@@ -106,3 +108,10 @@ def test_the_action_of_a_fill_is_within_the_bounds() -> None:
     assert isinstance(space, Space)
     for fill, action in (("zero", [0, 0.2]), ("repeat", [0, 0.2]), (0.3, [0.3, 0.3]), ([-5, 5], [-1, 0.4])):
         np.testing.assert_array_equal(MPPIConfig(fill=fill).fill_action(space), action)
+
+
+@pytest.mark.parametrize("task", [name for name in lw.task_names() if find_task(name).planning != lw.Planning()])
+def test_the_settings_of_a_task_make_a_plan(task: str) -> None:
+    plan = lw.MPPI(task, horizon=3, samples=4)
+    action = plan(plan.env.get_state()[0])
+    assert torch.isfinite(action).all() and action.abs().max() > 0.0

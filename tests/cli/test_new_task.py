@@ -206,6 +206,7 @@ def test_a_model_of_a_package_or_of_menagerie_is_named_by_its_source(
         ("2walk", ["can't be named '2walk'", "letters, digits and _"]),
         ("my-walk", ["can't be named 'my-walk'"]),
         ("class", ["can't be named 'class'"]),
+        ("true", ["can't be named 'true'"]),
         ("größe", ["can't be named 'größe'"]),
         ("MyWalk", ["can't be named 'MyWalk'", "use 'my_walk'"]),
         ("walk_2", ["can't be named 'walk_2'", "use 'walk2'"]),

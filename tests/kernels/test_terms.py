@@ -72,6 +72,9 @@ class Rows:
 @wp.kernel
 def write_rows(r: Rows, out: wp.array[float], last: wp.array[int]):
     k = lw.put(out, 0, 0.25)
+    k = lw.put(out, k, 3)
+    k = lw.put(out, k, out[0] > 0.0)
+    k = lw.put(out, k, out[0] < 0.0)
     k = lw.put(out, k, r.numbers)
     k = lw.put(out, k, r.numbers, 1, 3)
     k = lw.put(out, k, r.vectors)
@@ -110,7 +113,8 @@ def test_put_writes_numbers_vectors_and_rows_one_after_another(rows: dict[str, n
     out, last = wp.zeros(80, dtype=float, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
     wp.launch(write_rows, 1, [struct, out, last], device="cpu")
     parts = [
-        0.25, rows["numbers"], rows["numbers"][1:3], rows["vectors"], rows["vectors"][1], rows["vectors"][0],
+        [0.25, 3.0, 1.0, 0.0],
+        rows["numbers"], rows["numbers"][1:3], rows["vectors"], rows["vectors"][1], rows["vectors"][0],
         rows["spatial"][0], rows["quats"][1], rows["matrices"][0], rows["matrices"],
     ]  # fmt: skip
     wanted = np.concatenate([np.ravel(part) for part in parts])

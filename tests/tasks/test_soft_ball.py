@@ -108,3 +108,16 @@ def test_sizes_for_a_flex_hold_bursts_of_contacts(shared_env: SharedEnv) -> None
     hold(env, 10, 0.0, 1.0, CLOSED)
     hold(env, 25, 0.0, LOW, CLOSED)
     assert not any(env.fault_counts.values())
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_npg_trains_on_the_engine(shared_env: SharedEnv, engine: str) -> None:
+    """Two iterations change the policy, and every number stays finite; bench/README.md has learning curves."""
+    env = shared_env("soft_ball", engine=engine, nworld=4, frame_skip=1)
+    npg = lw.NPG(env, config=lw.NPGConfig(samples=64, mean_every=0, hidden=(8,)))
+    before = torch.cat([p.flatten() for p in npg.policy.parameters()]).clone()
+    for _ in range(2):
+        next(npg)
+    after = torch.cat([p.flatten() for p in npg.policy.parameters()])
+    assert torch.isfinite(after).all()
+    assert not torch.equal(before, after) and not any(env.fault_counts.values())
