@@ -35,6 +35,9 @@ _UNWRITTEN = 7.25e33
 _SPARE = 64
 """Places after the end of a row in which a write that goes too far is found."""
 
+_MOST_SUCCESS_STEPS = 2**24
+"""Up to here a float32, as counts are kept, holds every whole number."""
+
 _MISSING = {"obs": 'the parts of its observation, as obs = {"position": 5}', "model": 'a model, as model = "robot.xml"'}
 
 
@@ -273,6 +276,7 @@ class BoundTask:
             if not hasattr(task, name) and (name == "obs" or model is None):
                 raise ValueError(f"the task {self.name!r} has no {name}: add {_MISSING[name]} to its class")
         whole_number(f"horizon of the task {self.name!r}", task.horizon, low=0)
+        self._check_success_steps()
         if task.action_range is not None:
             try:
                 low, high = map(float, task.action_range)
@@ -283,6 +287,18 @@ class BoundTask:
                     f"action_range of the task {self.name!r} must be two finite numbers, lowest first, as (-1.0, 1.0), "
                     f"not {task.action_range!r}"
                 )
+
+    def _check_success_steps(self) -> None:
+        task = self.task
+        name = f"success_steps of the task {self.name!r}"
+        steps = whole_number(name, task.success_steps, low=1, high=_MOST_SUCCESS_STEPS)
+        if steps > 1 and self.functions["success"] is None:
+            raise ValueError(f"{name} is {steps}, but the task has no {FUNCTIONS['success'].signature}: add it")
+        if steps > task.horizon > 0:
+            raise ValueError(
+                f"{name} is {steps}, but its episodes have {task.horizon} steps, so that none could be a success: "
+                "choose a smaller one, or a larger horizon"
+            )
 
     def _check_metrics(self) -> None:
         metrics: Any = self.task.metrics

@@ -117,16 +117,16 @@ def _row(entry: _Entry) -> tuple[tuple[str, ...], str]:
     task, note = entry.task, entry.note
     if task is None:
         return (entry.name, *[_UNKNOWN] * (len(_HEADINGS) - 2), entry.source), note
-    obs = sum(obs_layouts(task, defaults(TaskSource(task, entry.name).params))["policy"].values())
+    obs, timestep = _UNKNOWN, _UNKNOWN
     actions = _UNKNOWN if task.actions is None else str(sum(task.actions.values()))
-    timestep = _UNKNOWN
     try:
+        obs = str(sum(obs_layouts(task, defaults(TaskSource(task, entry.name).params))["policy"].values()))
         spec = task_spec(task)
         actions = str(_controls(spec)) if task.actions is None else actions
         timestep = f"{spec.option.timestep * task.frame_skip:g} s"
     except (ImportError, OSError, ValueError) as error:  # such as a package that is not installed, with a model's files
         note = note or _reason(error)
-    numbers = (str(obs), actions, str(task.frame_skip), timestep, str(task.horizon or "none"))
+    numbers = (obs, actions, str(task.frame_skip), timestep, str(task.horizon or "none"))
     return (entry.name, *numbers, entry.source), note
 
 
