@@ -24,7 +24,7 @@ def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:
     """
     name, kp = f"the actuator {actuator.name!r}", actuator.gainprm[0]
     if actuator.biastype != mujoco.mjtBias.mjBIAS_AFFINE or actuator.biasprm[1] != -kp or kp <= 0.0:
-        raise ValueError(f"{name} is not a position servo: write it as <position kp=...>, or call set_to_position first")
+        raise ValueError(f"{name} is not a position servo: make it one, as <position kp=...> or by set_to_position")
     if actuator.ctrlrange[0] >= actuator.ctrlrange[1]:
         raise ValueError(f"{name} has no range for its target: set its ctrlrange first")
     speed = positive_number("speed", speed, "m/s or rad/s")

@@ -104,7 +104,8 @@ class Env:
     episode_metric_sums: torch.Tensor
     """The same as one tensor, (nworld, number of metrics), in the order of their names."""
     success: torch.Tensor
-    """Whether the task's goal is met, (nworld,), bool; where the task has ``success_steps``, in so many steps in a row."""
+    """Whether the task's goal is met, (nworld,), bool; where the task has ``success_steps``, for so many steps in a row
+    up to now."""
     done: torch.Tensor
     """Whether the episode ended for any reason, (nworld,), bool."""
     done_reason: torch.Tensor

@@ -96,8 +96,8 @@ FUNCTIONS = {
         TaskFunction("terminated", "s: World, p: Params", bool,
                      "Whether the state ends the episode. Default: False.", "return False"),
         TaskFunction("success", "s: World, p: Params", bool,
-                     "Whether the task's goal is met. ``success_steps`` asks for several steps in a row. Default: False.",
-                     "return False"),
+                     "Whether the state meets the task's goal; ``success_steps`` asks for several steps in a row. "
+                     "Default: False.", "return False"),
         TaskFunction("startup", f"s: World, p: Params, {_RNG}", None,
                      "Draws model fields once for each world, when its random stream starts. Default: keeps them.",
                      "pass", writes={"s": "model"}),

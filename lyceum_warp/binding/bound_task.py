@@ -349,7 +349,10 @@ class BoundTask:
             return error
         # which kernel is compiled first, and so which of its lines is in the message, differs from run to run
         flat = " ".join(text.split())
-        call = re.search(r"\b(reward|evaluate|terminated|success)\((?:s0|s1|view)\b", flat)
+        # the last function that is named holds the line that fails: where that is no call from a kernel, the mistake is
+        # within a function
+        innermost = flat.rpartition("while parsing function")[2]
+        call = re.search(r"\b(reward|evaluate|terminated|success)\((?:s0|s1|view)\b", innermost)
         kind = re.search(r"value argument type \((.+?)\) must be|with different type \(<class '[\w.]*?(\w+)'>\)", flat)
         if call and kind:
             signature, returned = FUNCTIONS[call.group(1)].signature, kind.group(1) or kind.group(2)

@@ -11,7 +11,10 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row
 
-HAND = lw.package_model("dm_control", "third_party/kinova/jaco_hand.xml", install="lyceum-warp[jaco]")
+
+def jaco(file: str) -> lw.ModelFile:
+    file = f"third_party/kinova/{file}"
+    return lw.package_model("dm_control", file, install="lyceum-warp[jaco]", before_python="3.13")
 
 
 @wp.struct
@@ -86,7 +89,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @lw.register
 class ArmHandPickup(lw.Task):
-    model = lw.package_model("dm_control", "third_party/kinova/jaco_arm.xml", install="lyceum-warp[jaco]")
+    model = jaco("jaco_arm.xml")
     keyframe, frame_skip, horizon, success_steps = "home", 4, 300, 10
     obs = {"joints": 9, "velocity": 9, "ball_velocity": 3, "ball": 3, "palm": 3, "goal": 3, "fingers": 9}
     metrics, action_range = ("palm_distance", "goal_distance", "finger_distances"), (-1.0, 1.0)
@@ -98,7 +101,7 @@ class ArmHandPickup(lw.Task):
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Give the arm a hand, a table and motors that hold the speeds of joints."""
-        spec.attach(HAND.spec(), site=spec.site("wristsite"), prefix="hand/")
+        spec.attach(jaco("jaco_hand.xml").spec(), site=spec.site("wristsite"), prefix="hand/")
         for geom in spec.geoms:
             geom.contype, geom.conaffinity = 0, 1  # arm and hand touch table and ball, not each other
         for i, joint in enumerate(spec.joints):  # of large joints, small joints, fingers: gain, rad/s and N m at most
