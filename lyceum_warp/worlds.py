@@ -430,9 +430,10 @@ class Worlds:
 
     def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
         """Arrays that belong to the state beside the engine's and the counters, with their columns."""
-        arrays = {"metrics": self.metric_sums, "success_steps": self.success_counts}
+        arrays = {name: getattr(self, name) for name in MEMORIES}
+        arrays |= {"metrics": self.metric_sums, "success_steps": self.success_counts}
         for name in own_parts(self.task):
-            yield arrays.get(name, getattr(self, name, None)), self.state[:, self.state_space.parts[name]]
+            yield arrays[name], self.state[:, self.state_space.parts[name]]
 
     # parts of phases, and preparations, for environments and open-loop rollouts
 

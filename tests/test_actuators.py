@@ -8,9 +8,9 @@ import lyceum_warp as lw
 
 XML = """
 <mujoco>
-  <worldbody><body><joint name="hinge" axis="0 1 0" damping="1"/><geom size=".1" mass="1"/></body></worldbody>
+  <worldbody><body><joint name="hinge" axis="0 1 0" damping=".1"/><geom size=".1" mass="1"/></body></worldbody>
   <actuator>
-    <position name="servo" joint="hinge" kp="400" kv="20" ctrlrange="-.5 .4"/>
+    <position name="servo" joint="hinge" kp="4" kv=".2" ctrlrange="-.5 .4"/>
     <position name="free" joint="hinge" kp="400"/>
     <motor name="motor" joint="hinge"/>
   </actuator>
@@ -20,13 +20,15 @@ XML = """
 
 def test_a_servo_follows_a_velocity_up_to_its_former_range() -> None:
     spec = mujoco.MjSpec.from_string(XML)
+    for name in ("free", "motor"):
+        spec.delete(spec.actuator(name))
     lw.follow_velocity(spec.actuator("servo"), 0.25)
     model = spec.compile()
     servo = model.actuator("servo")
     np.testing.assert_array_equal(servo.ctrlrange, (-0.25, 0.25))
     np.testing.assert_array_equal(servo.actrange, (-0.5, 0.4))
     assert servo.actlimited and servo.ctrllimited
-    assert (servo.gainprm[0], *servo.biasprm[:3]) == (400.0, 0.0, -400.0, -20.0)
+    assert (servo.gainprm[0], *servo.biasprm[:3]) == (4.0, 0.0, -4.0, -0.2)
     data = mujoco.MjData(model)
     found = []
     for _ in range(3):

@@ -349,7 +349,7 @@ class BoundTask:
             return error
         # which kernel is compiled first, and so which of its lines is in the message, differs from run to run
         flat = " ".join(text.split())
-        # the last function that is named holds the line that fails: where that is no call from a kernel, the mistake is
+        # the last function that is named holds the line that fails: where a kernel does not call it, the mistake lies
         # within a function
         innermost = flat.rpartition("while parsing function")[2]
         call = re.search(r"\b(reward|evaluate|terminated|success)\((?:s0|s1|view)\b", innermost)

@@ -215,9 +215,7 @@ def test_more_success_steps_than_an_episode_has_are_refused(tmp_path: Path) -> N
     source = tiny_task.with_function("def success(s: World, p: Params) -> bool:\n    return True")
     for horizon, steps in ((0, 6), (6, 6), (6, 1)):
         bound(tiny_task.write(tmp_path, f"{source}    horizon, success_steps = {horizon}, {steps}\n"))
-    with pytest.raises(
-        ValueError, match="success_steps of the task 'tiny' is 7, but its episodes have 6 steps, .* larger"
-    ):
+    with pytest.raises(ValueError, match="success_steps of the task 'tiny' is 7, but its episodes have 6 steps"):
         bound(tiny_task.write(tmp_path, f"{source}    horizon, success_steps = 6, 7\n"))
 
 
