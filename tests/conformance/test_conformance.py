@@ -8,7 +8,6 @@ import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.testing import CHECKS, check_task
 from lyceum_warp.testing import buffer_rules as buffers
-from lyceum_warp.testing import reset_rules as resets
 from lyceum_warp.testing import state_rules as state
 from lyceum_warp.testing.episode_rules import check_memory
 
@@ -18,9 +17,9 @@ OF_THE_TASK = tuple(check for check in CHECKS if check is not check_memory)
 """For other tasks on the C engine: without the rule about memory, which takes long and depends little on the task."""
 OF_THE_STATE = (
     buffers.check_addresses, buffers.check_getters, state.check_restoring, state.check_purity, state.check_determinism,
-    resets.check_reset,
+    state.check_reset,
 )  # fmt: skip
-"""For other tasks on the Warp engine, whose steps take milliseconds on a CPU: whether it keeps and restores the states of
+"""For other tasks on the Warp engine, whose steps take milliseconds on a CPU: whether it keeps and restores states of
 their models. Their functions are checked on the C engine, and their numbers by the comparison of the engines."""
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
 
