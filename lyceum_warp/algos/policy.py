@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.networks import Normalizer, mlp
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.validate import layer_sizes
@@ -63,6 +64,16 @@ class GaussianPolicy(nn.Module):
             out: Where to write the actions, (..., nact).
         """
         return torch.addcmul(self(obs), noise, self.log_std.exp(), out=out)
+
+    def observe(self, obs: torch.Tensor, team: Team | None = None) -> None:
+        """Take observations into the normaliser's statistics; the mean actions stay the same.
+
+        Args:
+            obs: Observations, (..., nobs).
+            team: The processes; each brings the same number of observations.
+        """
+        if isinstance(self.normalizer, Normalizer):
+            self.normalizer.update_before(self.network[0], obs, team)
 
     def log_prob(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Log-density of actions, (...,)."""
