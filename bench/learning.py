@@ -51,7 +51,7 @@ class Options:
     judge_every: int = 5
     """Iterations from one such judgement to the next."""
     reward_scale: float = 1.0
-    """Factor of all rewards that NPG gets. The returns in the table are divided by it."""
+    """Factor of all rewards that NPG gets. The returns in the table are the task's own."""
     outlier: float | None = None
     """A reward that one sample of iteration 3 gets in place of its own."""
     processes: int = 1
@@ -80,7 +80,6 @@ def run(options: Options, seed: int) -> list[dict[str, Any]]:
         iteration = next(npg)
         seconds += time.perf_counter() - start
         row = iteration.row() | {"seed": seed, "seconds": seconds, "judged": None}
-        row["return_mean"] /= options.reward_scale
         rows.append(row)
         if judge is not None and options.target is not None and number % options.judge_every == 0:
             row["judged"] = judge(npg.policy)

@@ -111,7 +111,8 @@ def main(options: Options) -> None:
                 options.out.parent.mkdir(parents=True, exist_ok=True)
                 with options.out.open("a") as file:
                     file.write(json.dumps(result) + "\n")
-            print(f"{result['task']} seed {result['seed']}: {result['final']:.1f}, {result['seconds']:.0f} s", flush=True)
+            ended = f"{result['final']:.1f}, {result['seconds']:.0f} s"
+            print(f"{result['task']} seed {result['seed']}: {ended}", flush=True)
     Console(width=130).print(table([r for r in done if r["task"] in options.tasks and r["own"] == options.own]))
 
 
