@@ -108,11 +108,14 @@ class NPG:
         nobs, nact = env.obs_space.size, env.action_space.size
         init = torch.Generator().manual_seed(seed)
         options: dict[str, Any] = dict(normalize=config.normalize, generator=init)
-        self.policy = policy or GaussianPolicy(nobs, nact, config.hidden, log_std=config.log_std, **options)
+        self.policy = policy or GaussianPolicy(
+            nobs, nact, config.hidden, activation=config.activation, log_std=config.log_std, **options
+        )
         scale = 1.0 / max(1.0 - config.gamma, 1e-3)
         self.value = value or ValueFunction(
-            nobs, config.value_hidden, scale=scale, time_orders=config.time_orders, **options
-        )
+            nobs, config.value_hidden, activation=config.value_activation, scale=scale, time_orders=config.time_orders,
+            **options,
+        )  # fmt: skip
         self.value.discount = config.gamma
         self.policy.to(device)
         self.value.to(device)

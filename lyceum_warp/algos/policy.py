@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from lyceum_warp.algos.networks import Normalizer, mlp
+from lyceum_warp.algos.networks import Activation, Normalizer, mlp
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.validate import layer_sizes
 
@@ -20,12 +20,13 @@ class GaussianPolicy(nn.Module):
         nobs: Numbers in an observation.
         nact: Numbers in an action.
         hidden: Widths of the hidden layers.
+        activation: What follows each hidden layer.
         log_std: Initial logarithm of the standard deviations.
         normalize: Whether to normalise observations by their running mean and variance.
         generator: Draws the initial weights.
 
     Raises:
-        ValueError: ``hidden`` is not a sequence of positive whole numbers.
+        ValueError: ``hidden`` is not a sequence of positive whole numbers, or ``activation`` is not a known name.
     """
 
     shape: dict[str, Any]
@@ -37,16 +38,19 @@ class GaussianPolicy(nn.Module):
         nact: int,
         hidden: Sequence[int] = (64, 64),
         *,
+        activation: Activation = "tanh",
         log_std: float = -0.5,
         normalize: bool = False,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.nobs, self.nact = nobs, nact
-        self.shape = {"nobs": nobs, "nact": nact, "hidden": layer_sizes(hidden), "normalize": normalize}
+        self.shape = {
+            "nobs": nobs, "nact": nact, "hidden": layer_sizes(hidden), "activation": activation, "normalize": normalize,
+        }  # fmt: skip
         self.normalizer: nn.Module = Normalizer(nobs) if normalize else nn.Identity()
         # a last layer near zero starts every mean near the middle of its range (mjrl)
-        self.network = mlp([nobs, *hidden, nact], last_scale=1e-2, generator=generator)
+        self.network = mlp([nobs, *hidden, nact], activation=activation, last_scale=1e-2, generator=generator)
         self.log_std = nn.Parameter(torch.full((nact,), float(log_std)))
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:

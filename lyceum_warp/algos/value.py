@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from lyceum_warp.algos.networks import Normalizer, mlp
+from lyceum_warp.algos.networks import Activation, Normalizer, mlp
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.validate import layer_sizes
 
@@ -18,6 +18,7 @@ class ValueFunction(nn.Module):
     Args:
         nobs: Numbers in an observation.
         hidden: Widths of the hidden layers.
+        activation: What follows each hidden layer.
         scale: Factor of the network's output, which keeps that output of order one: 1 / (1 - gamma) for rewards of
             order one.
         time_orders: Highest power of the time feature; 0 for none. A time limit that the observation does not show
@@ -27,7 +28,7 @@ class ValueFunction(nn.Module):
         generator: Draws the initial weights.
 
     Raises:
-        ValueError: ``hidden`` is not a sequence of positive whole numbers.
+        ValueError: ``hidden`` is not a sequence of positive whole numbers, or ``activation`` is not a known name.
     """
 
     discount: float | None
@@ -40,6 +41,7 @@ class ValueFunction(nn.Module):
         nobs: int,
         hidden: Sequence[int] = (128, 128),
         *,
+        activation: Activation = "tanh",
         scale: float = 200.0,
         time_orders: int = 0,
         normalize: bool = False,
@@ -49,12 +51,12 @@ class ValueFunction(nn.Module):
         super().__init__()
         self.scale, self.discount = scale, discount
         self._shape = {
-            "nobs": nobs, "hidden": layer_sizes(hidden), "scale": scale, "time_orders": time_orders,
-            "normalize": normalize,
+            "nobs": nobs, "hidden": layer_sizes(hidden), "activation": activation, "scale": scale,
+            "time_orders": time_orders, "normalize": normalize,
         }  # fmt: skip
         self.normalizer: nn.Module = Normalizer(nobs) if normalize else nn.Identity()
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
-        self.network = mlp([nobs + time_orders, *hidden, 1], generator=generator)
+        self.network = mlp([nobs + time_orders, *hidden, 1], activation=activation, generator=generator)
 
     @property
     def shape(self) -> dict[str, Any]:
