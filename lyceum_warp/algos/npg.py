@@ -29,6 +29,7 @@ from lyceum_warp.algos.npg_statistics import (
     summary,
 )
 from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.policy_check import check_policy
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.timing import PhaseTimer, one_thread
 from lyceum_warp.algos.value import ValueFunction
@@ -51,7 +52,7 @@ class NPG:
 
     Args:
         env: The environment; do not step it between iterations.
-        policy: The policy; a new one by default.
+        policy: The policy; a new one by default. ``GaussianPolicy(nobs, nact, network=...)`` has a network of your own.
         value: The value function; a new one by default.
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
@@ -59,7 +60,8 @@ class NPG:
             make the same calls with the same arguments; all get the same numbers.
 
     Raises:
-        ValueError: The environment does not reset automatically, or an argument is of the wrong type.
+        ValueError: The environment does not reset automatically, or an argument is of the wrong type, or
+            the policy cannot be learned (``lyceum_warp.algos.policy_check``).
         FloatingPointError: Raised by an iteration whose gradient is not finite; the policy is left unchanged.
     """
 
@@ -102,6 +104,8 @@ class NPG:
             )
         if not env.autoreset:
             raise ValueError("NPG needs an environment that resets automatically: make it with autoreset=True")
+        if policy is not None:
+            check_policy(policy, env)
 
         # networks
         device = env.obs.device
