@@ -28,6 +28,7 @@ from lyceum_warp.algos.npg_statistics import (
     summary,
 )
 from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.policy_check import check_policy
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.timing import PhaseTimer, one_thread
 from lyceum_warp.algos.value import BOUND, ValueFunction
@@ -53,7 +54,7 @@ class NPG:
 
     Args:
         env: The environment; do not step it between iterations.
-        policy: The policy; a new one by default.
+        policy: The policy; a new one by default. ``GaussianPolicy(nobs, nact, network=...)`` has a network of your own.
         value: The value function; a new one by default.
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
@@ -61,7 +62,8 @@ class NPG:
             make the same calls with the same arguments; all get the same numbers.
 
     Raises:
-        ValueError: The environment does not reset automatically, or an argument is of the wrong type.
+        ValueError: The environment does not reset automatically, or an argument is of the wrong type, or
+            the policy cannot be learned (``lyceum_warp.algos.policy_check``).
         FloatingPointError: Raised by an iteration whose gradient is not finite; the policy is left unchanged.
     """
 
@@ -104,6 +106,8 @@ class NPG:
             )
         if not env.autoreset:
             raise ValueError("NPG needs an environment that resets automatically: make it with autoreset=True")
+        if policy is not None:
+            check_policy(policy, env)
 
         # networks
         device = env.obs.device
@@ -111,10 +115,12 @@ class NPG:
         group = _value_group(env, config) if value is None else value.group
         init = torch.Generator().manual_seed(seed)
         options: dict[str, Any] = dict(normalize=config.normalize, generator=init)
-        self.policy = policy or GaussianPolicy(nobs, nact, config.hidden, log_std=config.log_std, **options)
+        self.policy = policy or GaussianPolicy(
+            nobs, nact, config.hidden, activation=config.activation, log_std=config.log_std, **options
+        )
         self._value_is_new = value is None
         self.value = value or ValueFunction(
-            env.obs_spaces[group].size, config.value_hidden, scale=1.0 / max(1.0 - config.gamma, 1e-3),
+            env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation,
             time_orders=config.time_orders, group=group, **options,
         )  # fmt: skip
         self.value.discount = config.gamma

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from typing import Literal
 
+from lyceum_warp.algos.networks import Activation, check_activation
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.validate import finite_number, layer_sizes, whole_number
 
@@ -56,12 +57,16 @@ class NPGConfig:
     is shortened."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the policy's hidden layers."""
+    activation: Activation = "tanh"
+    """What follows each of the policy's hidden layers."""
     log_std: float = -0.5
     """Initial logarithm of the policy's standard deviations."""
     min_log_std: float = -3.0
     """Lower limit of the logarithm of the policy's standard deviations (as mjrl; Lyceum has none)."""
     value_hidden: tuple[int, ...] = (128, 128)
     """Widths of the value function's hidden layers."""
+    value_activation: Activation = "tanh"
+    """What follows each of the value function's hidden layers."""
     value_group: str | None = None
     """Group of observations that the value function gets; by default "critic" where the task has such a group, else
     "policy"."""
@@ -91,6 +96,8 @@ class NPGConfig:
             checked[name] = finite_number(name, getattr(self, name), low=smallest, high=largest)
         for name in ("hidden", "value_hidden"):
             checked[name] = tuple(layer_sizes(getattr(self, name), name))
+        for name in ("activation", "value_activation"):
+            check_activation(getattr(self, name), name)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         if self.rollout not in ("auto", "episodes", "segments"):

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.networks import Normalizer, mlp
+from lyceum_warp.algos.networks import Activation, Normalizer, mlp
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.validate import layer_sizes
 
@@ -19,6 +19,7 @@ class ValueFunction(nn.Module):
     Args:
         nobs: Numbers in an observation.
         hidden: Widths of the hidden layers.
+        activation: What follows each hidden layer.
         scale: Factor of the network's output until ``rescale`` fits it to returns.
         time_orders: Highest power of the time feature; 0 for none. A time limit that the observation does not show
             makes the return depend on the step; the features t, t^2, ... with t = step / 1000 show it (mjrl).
@@ -28,7 +29,7 @@ class ValueFunction(nn.Module):
         generator: Draws the initial weights.
 
     Raises:
-        ValueError: ``hidden`` is not a sequence of positive whole numbers.
+        ValueError: ``hidden`` is not a sequence of positive whole numbers, or ``activation`` is not a known name.
     """
 
     group: str
@@ -47,6 +48,7 @@ class ValueFunction(nn.Module):
         nobs: int,
         hidden: Sequence[int] = (128, 128),
         *,
+        activation: Activation = "tanh",
         scale: float = 200.0,
         time_orders: int = 0,
         normalize: bool = False,
@@ -57,13 +59,13 @@ class ValueFunction(nn.Module):
         super().__init__()
         self.discount, self.group = discount, group
         self._shape = {
-            "nobs": nobs, "hidden": layer_sizes(hidden), "scale": scale, "time_orders": time_orders,
-            "normalize": normalize, "group": group,
+            "nobs": nobs, "hidden": layer_sizes(hidden), "activation": activation, "scale": scale,
+            "time_orders": time_orders, "normalize": normalize, "group": group,
         }  # fmt: skip
         self.normalizer: nn.Module = Normalizer(nobs) if normalize else nn.Identity()
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
-        # a last layer near zero starts every prediction near the mean of the returns
-        self.network = mlp([nobs + time_orders, *hidden, 1], last_scale=1e-2, generator=generator)
+        # a last layer of zeros predicts the mean of the returns, whatever their scale
+        self.network = mlp([nobs + time_orders, *hidden, 1], activation=activation, last_scale=0.0, generator=generator)
         self.register_buffer("shift", torch.zeros((), dtype=torch.float64))
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
 
@@ -90,7 +92,7 @@ class ValueFunction(nn.Module):
         return self.network(self.features(obs, step)).squeeze(-1) * self.scale.float() + self.shift.float()
 
     def observe(self, obs: torch.Tensor, team: Team | None = None) -> None:
-        """Take observations into the normaliser's statistics; the predictions stay the same.
+        """Take observations into the normaliser's statistics; after the first call the predictions stay the same.
 
         Args:
             obs: Observations, (..., nobs).

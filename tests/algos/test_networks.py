@@ -1,9 +1,38 @@
-"""The normaliser of observations."""
+"""Networks and the normaliser of observations."""
 
+from typing import get_args
+
+import pytest
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.algos.networks import Normalizer, moved
+from lyceum_warp.algos.networks import Activation, Normalizer, mlp, moved
+
+
+@pytest.mark.parametrize("name", get_args(Activation))
+def test_every_activation_follows_the_hidden_layers_alone(name: Activation) -> None:
+    network, obs = mlp([3, 5, 4, 2], activation=name), torch.randn(7, 3)
+    function = getattr(torch.nn.functional, name) if name != "tanh" else torch.tanh
+    expected = obs
+    for i, linear in enumerate(network[::2]):
+        expected = torch.nn.functional.linear(expected if i == 0 else function(expected), linear.weight, linear.bias)
+    torch.testing.assert_close(network(obs), expected)
+
+
+def test_an_unknown_activation_is_refused_by_name() -> None:
+    for module in (lambda: mlp([2, 2, 1], activation="sin"), lambda: lw.GaussianPolicy(2, 1, activation="sin"),
+                   lambda: lw.ValueFunction(2, activation="sin")):  # type: ignore[arg-type] # fmt: skip
+        with pytest.raises(ValueError, match="^activation must be one of 'tanh', .* not 'sin'$"):
+            module()
+
+
+def test_npg_learns_with_activations_of_policy_and_value_apart() -> None:
+    env = lw.make("point_mass", nworld=4, horizon=25)
+    config = lw.NPGConfig(samples=200, hidden=(8,), activation="elu", value_hidden=(8,), value_activation="relu")
+    npg = lw.NPG(env, config=config)
+    assert (npg.policy.shape["activation"], npg.value.shape["activation"]) == ("elu", "relu")
+    iteration = next(npg)
+    assert iteration.kl == pytest.approx(0.5 * config.delta, rel=0.3)  # the Fisher products are right
 
 
 def test_normalizer_has_mean_and_variance_of_all_portions_together() -> None:
