@@ -268,7 +268,7 @@ class NPG:
         if config.whiten:
             advantage = advantage - team.sum(advantage.sum()) / self.count
             variance = team.sum(advantage.square().sum()) / (self.count - 1)
-            advantage = advantage / (variance.sqrt() + 1e-6)
+            advantage = advantage / (variance.sqrt() + 1e-6 * self.value.scale.float())
         return advantage, target, prediction, outliers
 
     def fisher(self, obs: torch.Tensor) -> FisherProduct:
