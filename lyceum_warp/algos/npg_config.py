@@ -53,7 +53,7 @@ class NPGConfig:
     fisher_fraction: float = 1.0
     """Share of the samples that the Fisher information is averaged over, drawn at random in each iteration."""
     kl_limit: float = 1.5
-    """Largest KL divergence of a step, as a multiple of delta / 2, which it has to second order. A step that exceeds it
+    """Largest KL divergence of a step, as a multiple of delta / 2, its value to second order. A step that exceeds it
     is shortened."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the policy's hidden layers."""

@@ -32,6 +32,9 @@ class ValueFunction(nn.Module):
         ValueError: ``hidden`` is not a sequence of positive whole numbers, or ``activation`` is not a known name.
     """
 
+    LATER = ("shift", "scale")
+    """Buffers that files of earlier releases lack: their shift was 0, and their scale is among the arguments."""
+
     group: str
     """The group of observations that it gets."""
     shift: torch.Tensor
@@ -140,8 +143,7 @@ class ValueFunction(nn.Module):
         self.scale.copy_(scale)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        # earlier releases saved no shift, and the scale only among the arguments
-        for name in ("shift", "scale"):
+        for name in self.LATER:
             state_dict.setdefault(prefix + name, getattr(self, name))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
