@@ -6,8 +6,10 @@
 import importlib.util
 import json
 import math
+import os
 import struct
 import subprocess
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -99,29 +101,37 @@ class TensorBoard:
         self._write(Summary(value=[Summary.Value(tag="video", image=image)]), samples)
 
     def close(self) -> None:
-        """Write what is left, and close the file. A later iteration opens another one."""
+        """Close the file. A later iteration opens another one."""
         if self._file is not None:
-            self._file.close()
-            self._file = None
+            file, self._file = self._file, None
+            file.close()
 
     def _write(self, summary: Any, samples: int) -> None:
+        from tensorboard.compat.proto.event_pb2 import Event
+
         if self._file is None:
-            self._file = self._opened(samples)
-        self._file.file_writer.add_summary(summary, samples)
+            self._open(samples)
+        self._add(Event(step=samples, summary=summary))
         self._file.flush()
 
-    def _opened(self, samples: int) -> Any:
-        from torch.utils.tensorboard import SummaryWriter
-        from torch.utils.tensorboard.summary import hparams
+    def _open(self, samples: int) -> None:
+        """Open a file. torch's and TensorBoard's own writers would write it in a thread, which hides a full disk."""
+        from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+        from torch.utils.tensorboard import RecordWriter
 
-        known = any(self._folder.glob("events.out.tfevents.*"))
-        writer: Any = SummaryWriter(str(self._folder), purge_step=samples if known else None)
-        if not known:
-            for part in hparams(dict(_flat(self._config)), dict.fromkeys(_COMPARED, 0.0)):
-                writer.file_writer.add_summary(part)
-            text = json.dumps(self._config, indent=2, default=str)
-            writer.add_text("config", "\n".join("    " + line for line in text.splitlines()))
-        return writer
+        number = len(list(self._folder.glob("events.out.tfevents.*")))  # files are read in the order of their names
+        name = f"events.out.tfevents.{int(time.time()):010d}.{number:04d}.{os.getpid()}"
+        self._file = RecordWriter((self._folder / name).open("xb"))
+        self._add(Event(file_version="brain.Event:2"))
+        if number:  # TensorBoard leaves out points of earlier files from this step on
+            self._add(Event(step=samples, session_log=SessionLog(status=SessionLog.START)))
+        else:
+            for summary in _hyperparameters(self._config):
+                self._add(Event(summary=summary))
+
+    def _add(self, event: Any) -> None:
+        event.wall_time = time.time()
+        self._file.write(event.SerializeToString())
 
 
 def check_tensorboard() -> None:
@@ -142,6 +152,17 @@ def tag(column: str) -> str:
         if column.startswith(beginning):
             return f"{group}/{column.removeprefix(beginning)}"
     return f"policy/{column}"
+
+
+def _hyperparameters(config: Mapping[str, Any]) -> list[Any]:
+    """What the tabs HPARAMS and TEXT show."""
+    from tensorboard.plugins.hparams.summary_v2 import HParam, Metric, hparams_config_pb, hparams_pb
+    from tensorboard.plugins.text.summary_v2 import text_pb
+
+    flat = dict(_flat(config))
+    names, metrics = [HParam(name) for name in flat], [Metric(name) for name in _COMPARED]
+    text = "\n".join("    " + line for line in json.dumps(config, indent=2, default=str).splitlines())
+    return [hparams_config_pb(names, metrics), hparams_pb(flat), text_pb("config", text)]
 
 
 def _flat(config: Mapping[str, Any]) -> Iterator[tuple[str, bool | float | str]]:

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import math
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -96,7 +97,7 @@ def test_the_tab_of_hyperparameters_has_them_once_with_the_curves_to_compare(fir
     experiment = metadata.parse_experiment_plugin_data(content[metadata.EXPERIMENT_TAG])
     compared = {info.name.tag for info in experiment.metric_infos}
     assert {"return/mean", "mean_policy/return"} <= compared <= set(read(tmp_path).Tags()["scalars"])
-    assert "config/text_summary" in read(tmp_path).Tags()["tensors"]
+    assert "config" in read(tmp_path).Tags()["tensors"]
 
 
 def test_a_video_becomes_an_animated_picture(first: lw.Iteration, tmp_path: Path) -> None:
@@ -114,6 +115,22 @@ def test_a_video_becomes_an_animated_picture(first: lw.Iteration, tmp_path: Path
     assert (video.step, video.width, video.height) == (96, 320, 240)
     animation = image.open(io.BytesIO(video.encoded_image_string))
     assert animation.format == "GIF" and animation.n_frames == 30  # 2 seconds of 15 frames
+
+
+def test_a_full_disk_is_an_error_of_the_call(first: lw.Iteration, tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    before, limits = signal.signal(signal.SIGXFSZ, signal.SIG_IGN), resource.getrlimit(resource.RLIMIT_FSIZE)
+    board = TensorBoard(tmp_path, CONFIG)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+        with pytest.raises(OSError, match="File too large"):
+            for i in range(1, 100):
+                board(numbered(first, i))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+    board.close()
+    assert [step for step, _ in curve(tmp_path, "policy/kl")] == [96 * i for i in range(1, i + 1)]
 
 
 def test_a_missing_package_is_one_line_with_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
