@@ -153,7 +153,7 @@ def test_a_policy_with_a_network_of_the_users_own_is_saved_and_filled(tmp_path: 
     ):
         lw.load(run)
     with pytest.raises(
-        ValueError, match=r"'network.first.weight' is \(8, 6\) in the file, and absent in .*: give one like"
+        ValueError, match=r"\('network.weight' is absent in the file, and \(2, 6\) in .*: give one like"
     ):
         lw.load(run, policy=lw.GaussianPolicy(6, 2, network=nn.Linear(6, 2), normalize=True))
 
