@@ -223,18 +223,26 @@ class Run:
         return read_checkpoint(self.checkpoint, device)
 
 
-def load(run: str | Path | Run, *, device: str | torch.device = "cpu") -> GaussianPolicy:
+def load(
+    run: str | Path | Run, *, policy: GaussianPolicy | None = None, device: str | torch.device = "cpu"
+) -> GaussianPolicy:
     """Load the policy of a run, with its observation normaliser: ``action = policy(obs)`` is the mean action.
 
     Args:
         run: A run's folder, or a checkpoint file.
+        policy: A policy that takes the run's weights and is returned; necessary where its network is your own.
         device: Device for its parameters.
 
     Raises:
         FileNotFoundError: There is no run, or it has no checkpoint.
-        ValueError: The checkpoint is broken, was not written by lyceum_warp, or was written by a newer release.
+        ValueError: The checkpoint is broken, was not written by lyceum_warp, or was written by a newer release; or the
+            policy in it is of a class of its own and ``policy`` is not given, or does not fit.
     """
-    return _module(run, "policy", GaussianPolicy, device)
+
+    def made(**shape: Any) -> GaussianPolicy:
+        return GaussianPolicy.like(shape) if policy is None else policy
+
+    return _module(run, "policy", made, device, fix=_FIX if policy is None else "give one like that of the run")
 
 
 def load_value(run: str | Path | Run, *, device: str | torch.device = "cpu") -> ValueFunction:
@@ -252,7 +260,12 @@ def load_value(run: str | Path | Run, *, device: str | torch.device = "cpu") -> 
     return _module(run, "value", ValueFunction, device)
 
 
-def _module(run: str | Path | Run, name: str, kind: Callable[..., Module], device: str | torch.device) -> Module:
+_FIX = "restore the file from a copy, or train again with another --out"
+
+
+def _module(
+    run: str | Path | Run, name: str, kind: Callable[..., Module], device: str | torch.device, *, fix: str = _FIX
+) -> Module:
     if isinstance(run, (str, Path)) and Path(run).is_file():
         path = Path(run)
     else:
@@ -260,13 +273,23 @@ def _module(run: str | Path | Run, name: str, kind: Callable[..., Module], devic
     try:
         saved = read_checkpoint(path, device)[name]
         module = kind(**saved["shape"])
+        if different := _difference(module, saved["state"]):
+            raise ValueError(f"{path} holds a {name} of other parameters ({different}): {fix}")
         module.load_state_dict(saved["state"])
     except (KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"{path} holds no {name} of lyceum_warp ({_first_sentence(error)}): {_FIX}") from error
     return module.to(device).eval().requires_grad_(False)
 
 
-_FIX = "restore the file from a copy, or train again with another --out"
+def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
+    """The first difference between a module's weights and saved ones; empty where there is none."""
+    own, saved = ({name: tuple(part.shape) for name, part in s.items()} for s in (module.state_dict(), state))
+    saved = {name: own[name] for name in getattr(module, "LATER", ())} | saved
+    for name in {**own, **saved}:
+        if own.get(name) != saved.get(name):
+            one, other = (f"{shape}" if shape is not None else "absent" for shape in (saved.get(name), own.get(name)))
+            return f"{name!r} is {one} in the file, and {other} in the network that takes it"
+    return ""
 
 
 def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str, Any]:
