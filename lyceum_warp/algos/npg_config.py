@@ -25,7 +25,7 @@ _REAL = {
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NPGConfig:
-    """Hyperparameters of NPG. The defaults are those of Rajeswaran et al. (2017), where the paper gives them.
+    """Hyperparameters of NPG. The defaults are those of Rajeswaran et al. (2017), where nothing else is said.
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.
@@ -79,8 +79,9 @@ class NPGConfig:
     """Learning rate of the value function's fit (Adam)."""
     time_orders: int = 0
     """Highest power of the value function's time feature; 0 for none."""
-    normalize: bool = False
-    """Whether policy and value function normalise observations by their running mean and variance."""
+    normalize: bool = True
+    """Whether policy and value function normalise observations by their running mean and variance (unlike the
+    paper)."""
     mean_every: int = 10
     """Iterations between two evaluations of the mean policy; 0 for never."""
     mean_episodes: int = 16
