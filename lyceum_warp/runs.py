@@ -284,6 +284,7 @@ def _module(
 def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
     """The first difference between a module's weights and saved ones; empty where there is none."""
     own, saved = ({name: tuple(part.shape) for name, part in s.items()} for s in (module.state_dict(), state))
+    saved = {name: own[name] for name in getattr(module, "LATER", ())} | saved
     for name in {**own, **saved}:
         if own.get(name) != saved.get(name):
             one, other = (f"{shape}" if shape is not None else "absent" for shape in (saved.get(name), own.get(name)))

@@ -109,6 +109,30 @@ class Normalizer(nn.Module):
         self.shift.copy_(self.mean)
         self.scale.copy_((self.square / total).sqrt().clamp_min(1e-4).reciprocal())
 
+    @torch.no_grad()
+    def update_before(self, layer: nn.Module, obs: torch.Tensor, team: Team | None = None) -> None:
+        """Update, and change the layer that takes the normalised observations so that its output stays the same.
+
+        A policy's actions and a value function's predictions then do not depend on when the statistics are updated,
+        except for observations that are clipped. The first update leaves the layer as it is: it was not trained yet.
+        A layer that is not linear cannot compensate later ones, so that they are left out.
+
+        Args:
+            layer: The layer whose first inputs are the normalised observations.
+            obs: Observations, (..., size).
+            team: The processes; each brings the same number of observations.
+        """
+        first, before = self.count == 0, {name: buffer.clone() for name, buffer in self.named_buffers()}
+        self.update(obs, team)
+        if not isinstance(layer, nn.Linear):
+            for name, buffer in self.named_buffers():
+                buffer.copy_(torch.where(first, buffer, before[name]))
+            return
+        shift, scale = before["shift"], before["scale"]
+        weight = layer.weight[:, : len(shift)]  # of scale (x - shift) before, and of self.scale (x - self.shift) now
+        layer.bias.add_(((self.shift - shift) * scale).masked_fill(first, 0.0) @ weight.T)
+        weight.mul_((scale / self.scale).masked_fill(first, 1.0))
+
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Normalised observations, (..., size)."""
         return ((obs - self.shift) * self.scale).clamp(-self.limit, self.limit)
