@@ -21,7 +21,7 @@ def test_evaluate_takes_the_same_number_of_episodes_of_every_world() -> None:
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
     counts: list[tuple[int, int]] = []
     got = lw.evaluate(env, policy, 8, seed=3, progress=lambda *now: counts.append(now))
-    assert counts == sorted(counts) and counts[-1] == (8, 8)
+    assert counts == sorted(counts) and 0 < counts[-1][0] <= counts[-1][1] == 8
     env.rand_reset(3)
     total, lengths, expected = torch.zeros(4), [0] * 4, [[] for _ in range(4)]
     while min(map(len, expected)) < 2:
