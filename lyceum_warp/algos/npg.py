@@ -114,8 +114,10 @@ class NPG:
             nobs, config.value_hidden, scale=scale, time_orders=config.time_orders, **options
         )
         self.value.discount = config.gamma
-        self.policy.to(device)
-        self.value.to(device)
+        for module in (self.policy, self.value):
+            module.to(device)
+            if not any(parameter.requires_grad for parameter in module.parameters()):
+                module.requires_grad_(True)  # a loaded one is frozen
 
         # samples, and whether an iteration begins new episodes or continues those of the last one
         samples = enough_samples(config, nworld)

@@ -8,7 +8,7 @@ import rich.box
 import tyro
 from rich.table import Table
 
-from lyceum_warp.algos.evaluation import evaluate
+from lyceum_warp.algos.evaluation import evaluate, evaluation_seed
 from lyceum_warp.cli.arguments import NO_FLAGS, given, optional_flags, run_options
 from lyceum_warp.cli.display import make_console, policy_video
 from lyceum_warp.engines.placement import options_for_few_worlds
@@ -89,6 +89,6 @@ def evaluate_run(options: Eval) -> int:
     if env.task.functions["success"] is not None:
         console.print(f"success: {episodes.success.mean().item():.0%}")
     if options.video:
-        video = policy_video(env, policy, run.folder / "eval.mp4", options.seed)
+        video = policy_video(env, policy, run.folder / "eval.mp4", evaluation_seed(options.seed))
         console.print(f"video: {video}", soft_wrap=True, markup=False)
     return 0

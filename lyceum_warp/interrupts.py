@@ -1,0 +1,96 @@
+"""Ctrl-C, SIGTERM and SIGHUP as an exception, at once or postponed until the caller handles it."""
+
+import contextlib
+import signal
+from collections.abc import Callable, Iterator
+from typing import Any
+
+
+class Interrupted(BaseException):
+    """A signal asks the program to end."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+@contextlib.contextmanager
+def signals() -> Iterator[None]:
+    """Within the context the first Ctrl-C, SIGTERM or SIGHUP raises Interrupted, and later ones are ignored."""
+
+    def interrupt(number: int, frame: Any) -> None:
+        for other in previous:
+            signal.signal(other, signal.SIG_IGN)
+        raise Interrupted(number)
+
+    previous = _handled_by(interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def ending() -> Iterator[None]:
+    """Within the context SIGTERM and SIGHUP end the program by SystemExit, where it has no handlers of its own for them.
+
+    By default they end a program at once, without its ``finally`` blocks.
+    """
+
+    def leave(number: int, frame: Any) -> None:
+        raise SystemExit(128 + number)
+
+    numbers = [number for number in _numbers()[1:] if signal.getsignal(number) is signal.SIG_DFL]
+    previous: dict[int, Any] = {}
+    with contextlib.suppress(ValueError):  # only the main thread may set handlers
+        for number in numbers:
+            previous[number] = signal.signal(number, leave)
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def postponed(when: bool = True) -> Iterator[list[int]]:
+    """List Ctrl-C, SIGTERM and SIGHUP instead of handling them, which is left to the caller.
+
+    A signal that is still listed at the end of the context is handled there, within ``signals`` by raising Interrupted.
+    Once Interrupted is raised, later signals are ignored.
+
+    Args:
+        when: False leaves signals alone.
+
+    Raises:
+        Interrupted: A signal came, and the caller did not raise it.
+    """
+    noted: list[int] = []
+    previous = _handled_by(lambda number, frame: noted.append(number)) if when else {}
+    try:
+        yield noted
+    except Interrupted:
+        previous = dict.fromkeys(previous, signal.SIG_IGN)
+        raise
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+    if noted:
+        signal.raise_signal(signal.Signals(noted[0]))
+
+
+def _numbers() -> list[int]:
+    names = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
+    return [int(getattr(signal, name)) for name in names if hasattr(signal, name)]
+
+
+def _handled_by(handler: Callable[[int, Any], None]) -> dict[int, Any]:
+    """Handle Ctrl-C, SIGTERM and SIGHUP, and return their previous handlers."""
+    previous: dict[int, Any] = {}
+    with contextlib.suppress(ValueError):  # only the main thread may set handlers
+        for number in _numbers():
+            # a shell that starts a program in the background makes it ignore SIGINT on purpose, and nohup SIGHUP
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                previous[number] = signal.signal(number, handler)
+    return previous
