@@ -33,7 +33,7 @@ def signals() -> Iterator[None]:
 
 @contextlib.contextmanager
 def ending() -> Iterator[None]:
-    """Within the context SIGTERM and SIGHUP end the program by SystemExit, where it has no handlers of its own for them.
+    """Within the context SIGTERM and SIGHUP raise SystemExit, unless the program handles them.
 
     By default they end a program at once, without its ``finally`` blocks.
     """

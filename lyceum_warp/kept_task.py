@@ -1,4 +1,4 @@
-"""The task of a run: a copy of its file and of its model in the run's folder, and which of them a later command uses."""
+"""A run's copies of its task and its model, and whether a later command uses them."""
 
 import dataclasses
 import hashlib

@@ -15,6 +15,7 @@ from torch import nn
 
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.env import Env
 from lyceum_warp.files import newer_format, replaced
 from lyceum_warp.versions import versions
 
@@ -227,7 +228,7 @@ class Run:
             _write(self.metrics, "".join(kept))
 
     def files(self) -> dict[str, bytes]:
-        """The content of the small files by their paths below the folder: versions, the table, the task, best policy."""
+        """The content of versions, table, best policy and task, by their paths below the folder."""
         paths = [self.folder / name for name in (_VERSIONS, _METRICS, _BEST)]
         paths += [path for path in sorted(self.task_folder.rglob("*")) if path.is_file()]
         return {path.relative_to(self.folder).as_posix(): path.read_bytes() for path in paths if path.is_file()}
@@ -254,7 +255,9 @@ class Run:
         else:
             raise ValueError(f"which must be 'last', 'best' or the number of an iteration, not {which!r}")
         if not path.is_file():
-            raise FileNotFoundError(f"the run in {self.folder} has no policy {which!r}: it has {self._known_policies()}")
+            raise FileNotFoundError(
+                f"the run in {self.folder} has no policy {which!r}: it has {self._known_policies()}"
+            )
         return path
 
     def _known_policies(self) -> str:
@@ -330,9 +333,7 @@ class Run:
             if self.checkpoint.exists():
                 _keep(self.checkpoint, self.previous)
 
-    def read(
-        self, device: str | torch.device = "cpu", *, note: Callable[[str], None] = log.warning
-    ) -> dict[str, Any]:
+    def read(self, device: str | torch.device = "cpu", *, note: Callable[[str], None] = log.warning) -> dict[str, Any]:
         """Read the checkpoint: ``iteration``, ``policy``, ``state``, and ``value`` if there is one.
 
         If it is broken or missing, and the one before it is whole, that one is read.
@@ -461,6 +462,25 @@ def networks(content: PolicyContent, path: Path) -> tuple[GaussianPolicy, ValueF
     return policy, _from_content(content, path, "value", ValueFunction, None, "cpu")
 
 
+def check_sizes(policy: Any, env: Env, path: Path) -> None:
+    """Refuse a policy that was trained on observations or actions of other sizes.
+
+    Args:
+        policy: The policy.
+        env: The environment that it is to act in.
+        path: Where it is from, for the message.
+
+    Raises:
+        ValueError: The sizes differ.
+    """
+    sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
+    if sizes != wanted:
+        raise ValueError(
+            f"the policy in {path} takes {sizes[0]} observations and gives {sizes[1]} actions, but the task "
+            f"{env.task.name!r} has {wanted[0]} and {wanted[1]}: use a task with the sizes that it was trained on"
+        )
+
+
 def _from_content(
     content: PolicyContent, path: Path, name: str, kind: Callable[..., Any], module: Any, device: Any
 ) -> Any:
@@ -551,7 +571,7 @@ def _write_bytes(path: Path, data: memoryview) -> None:
 
 
 def _keep(path: Path, other: Path) -> None:
-    """Give a file a second name, in place of another file, so that the file exists under its first name all the time."""
+    """Give a file a second name, in place of another file. It exists under its first name all the time."""
     temporary = other.with_name(other.name + ".tmp")
     try:
         temporary.unlink(missing_ok=True)

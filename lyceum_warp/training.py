@@ -1,6 +1,7 @@
 """Training with a run's folder: the loop that the command line and ``lw.train`` share."""
 
 import dataclasses
+import json
 import math
 import shutil
 import tempfile
@@ -17,6 +18,7 @@ from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.interrupts import Interrupted, ending, postponed
 from lyceum_warp.kept_task import KeptTask, given_params, spelled_task
 from lyceum_warp.runs import PolicyContent, Run, policy_content
+from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
 from lyceum_warp.validate import whole_number
 
 SHARE = 200
@@ -70,16 +72,16 @@ def train(
 
     Raises:
         ValueError: The folder holds something else, an argument is out of range, or the run does not fit ``npg``.
+        ImportError: The extra ``tensorboard`` is not installed.
         NotSavedError: The folder could no longer be written; the message says where the run was saved instead.
     """
     iterations = whole_number("iterations", iterations, low=1)
     settings = checked_settings(target_return=target_return, keep_every=keep_every, save_every=save_every)
     team, folder = npg.team, Path(folder)
     config = describe(npg) | {"iterations": iterations, **settings}
-    board = None
     with team.together():
-        if tensorboard and team.leads:
-            board = open_tensorboard(folder, config)
+        if tensorboard:
+            check_tensorboard()
         if resume:
             run = Run.open(folder)
             content = run.read()
@@ -94,25 +96,13 @@ def train(
             run = Run(folder, config)
     if resume and team.leads:
         reopen(run, npg, iterations=iterations, **settings)
+    board = TensorBoard(folder, run.config) if tensorboard and team.leads else None
     with ending():
         learn(run if team.leads else None, npg, iterations=iterations, callback=callback, board=board, **settings)
     return run
 
 
-def open_tensorboard(folder: Path, config: Mapping[str, Any]) -> Any:
-    """A writer of TensorBoard's files in a run's folder.
-
-    Raises:
-        ValueError: The extra is not installed.
-    """
-    from lyceum_warp.tensorboard import TensorBoard
-
-    return TensorBoard(folder, config)
-
-
-def checked_settings(
-    *, target_return: float | None = None, keep_every: int = 0, save_every: int = 0
-) -> dict[str, Any]:
+def checked_settings(*, target_return: float | None = None, keep_every: int = 0, save_every: int = 0) -> dict[str, Any]:
     """The settings of a run that do not change its numbers, as config.json holds them.
 
     Raises:
@@ -152,9 +142,7 @@ def describe(npg: NPG) -> dict[str, Any]:
 # continuing
 
 
-def check_resumable(
-    run: Run, content: Mapping[str, Any], iterations: int, target_return: float | None
-) -> None:
+def check_resumable(run: Run, content: Mapping[str, Any], iterations: int, target_return: float | None) -> None:
     """Refuse to continue a run that is finished.
 
     Args:
@@ -180,11 +168,19 @@ def check_resumable(
 
 
 def _check_equal(run: Run, config: Mapping[str, Any]) -> None:
-    for name in ("params", "physics", "nworld", "npg"):
-        if run.config.get(name) != config[name]:
+    """Refuse an algorithm with other settings than the run's."""
+    then, now = (
+        {**c, **c.pop("npg")}
+        for c in (
+            {name: value.get(name, {}) for name in ("params", "physics", "nworld", "npg")}
+            for value in (run.config, json.loads(json.dumps(config)))
+        )
+    )
+    for name, value in now.items():
+        if name in then and then[name] != value:
             raise ValueError(
-                f"the run in {run.folder} has {name} {run.config.get(name)}, not {config[name]}, and a run keeps its "
-                "settings: make NPG with the same arguments, or give another folder"
+                f"the run in {run.folder} has {name} {then[name]}, not {value}, and a run keeps its settings: make NPG "
+                "with the same arguments, or give another folder"
             )
 
 
@@ -351,8 +347,8 @@ class _Loop:
         """Bring the processes to the same decisions, and raise what one of them met."""
         due = self.keeper is not None and self.keeper.due()
         numbers = max(self.noted, default=0), self.ended, self.error is not None, due
-        signal, ended, failed, due = self.npg.team.largest(*map(int, numbers))
-        self.ended, self.due = bool(ended), bool(due)
+        signal, ended, failed, complete = self.npg.team.largest(*map(int, numbers))
+        self.ended, self.due = bool(ended), bool(complete)
         if self.error is not None:
             raise self.error
         if failed:
@@ -390,7 +386,8 @@ class Keeper:
         self._saved = npg.iteration if npg.iteration else -1
         self._best = run.best_score()
         self._best_content: PolicyContent | None = None
-        self._files, self._rows = run.files(), []
+        self._files = run.files()
+        self._rows: list[dict[str, Any]] = []
         self._seconds, self._when = 0.0, time.perf_counter()
 
     def due(self) -> bool:

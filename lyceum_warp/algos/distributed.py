@@ -83,7 +83,7 @@ class Team:
         return tensor
 
     def largest(self, *numbers: int) -> tuple[int, ...]:
-        """The largest of the processes' numbers, for each place. Waits for the device if there are several processes."""
+        """The largest of the processes' numbers, for each place. Several processes wait for the device."""
         if self.size == 1:
             return numbers
         whole = torch.tensor(numbers, device=self.device)

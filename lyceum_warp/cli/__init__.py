@@ -10,12 +10,12 @@ import tyro
 
 from lyceum_warp.cli.check import Check, check
 from lyceum_warp.cli.evaluate import Eval, evaluate_run
-from lyceum_warp.interrupts import Interrupted, signals
 from lyceum_warp.cli.list_tasks import Tasks, list_tasks
 from lyceum_warp.cli.new_task import New, new_task
 from lyceum_warp.cli.plan import Plan, plan
 from lyceum_warp.cli.train import Train, origin_options, resume, saved_options, train
 from lyceum_warp.cli.warmup import Warmup, warm_up
+from lyceum_warp.interrupts import Interrupted, signals
 from lyceum_warp.viz.video import NoVideoError
 
 _Command = Annotated[Tasks, tyro.conf.subcommand("tasks")] \

@@ -29,14 +29,15 @@ from lyceum_warp.cli.arguments import (
     run_options,
     spelled,
 )
-from lyceum_warp.cli.display import Display, curve_table, make_console, plotted, policy_video
+from lyceum_warp.cli.display import Display, curve_table, make_console, note, plotted, policy_video
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted
 from lyceum_warp.kept_task import KeptTask, run_env
 from lyceum_warp.machine import cpu_cores
-from lyceum_warp.runs import PolicyContent, Run, networks, read_checkpoint
-from lyceum_warp.training import check_resumable, checked_settings, learn, open_tensorboard, reopen, restore
+from lyceum_warp.runs import PolicyContent, Run, check_sizes, networks, read_checkpoint
+from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
+from lyceum_warp.training import check_resumable, checked_settings, learn, reopen, restore
 from lyceum_warp.versions import versions
 
 _FINAL_EPISODES = 32
@@ -130,16 +131,15 @@ def train(options: Train) -> int:
             # every mistake in the options is found before the folder is made
             origin = _origin(options)
             config, out = _config(options, team, origin), _folder(options)
-            run = board = None
+            run = None
             if team.leads:
                 Run.check_free(out)
-                board = open_tensorboard(out, config) if options.tensorboard else None
             npg = _algorithm(config, team, origin=origin)
             if team.leads:
                 kept = KeptTask.of(npg.env)
                 run = Run.create(out, config | kept.config, device=options.env.device)
                 kept.write(run)
-        return _learn(run, npg, options, board)
+        return _learn(run, npg, options)
 
 
 def _origin(options: Train) -> tuple[PolicyContent, Path] | None:
@@ -154,6 +154,8 @@ def _config(options: Train, team: Team, origin: tuple[PolicyContent, Path] | Non
     if options.task is None:
         raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
     _check_iterations(options.iterations)
+    if options.tensorboard:
+        check_tensorboard()
     find_task(options.task)
     npg, nworld = options.npg.checked(), options.nworld
     settings = checked_settings(
@@ -193,7 +195,7 @@ def _fitted(npg: NPGConfig, content: PolicyContent, path: Path) -> NPGConfig:
     """
     shapes = {"hidden": ("policy", "hidden"), "value_hidden": ("value", "hidden"), "normalize": ("policy", "normalize"),
               "time_orders": ("value", "time_orders")}  # fmt: skip
-    fitted = {}
+    fitted: dict[str, Any] = {}
     for name, (module, entry) in shapes.items():
         given, saved = getattr(npg, name), (content[module]["shape"] or {}).get(entry)
         if saved is None:
@@ -268,12 +270,13 @@ def resume(options: Train, folder: Path) -> int:
             settings = checked_settings(
                 target_return=options.target_return, keep_every=options.keep_every, save_every=options.save_every
             )
+            if options.tensorboard:
+                check_tensorboard()
             run, npg = _reopened(options, folder, team)
-            board = open_tensorboard(folder, run.config) if team.leads and options.tensorboard else None
         if team.leads:
             _warn_of_versions(run)
             reopen(run, npg, iterations=options.iterations, **settings)
-        return _learn(run if team.leads else None, npg, options, board)
+        return _learn(run if team.leads else None, npg, options)
 
 
 def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, NPG]:
@@ -340,30 +343,6 @@ def _algorithm(
     return NPG(env, policy, value, _hyperparameters(config), seed=config["seed"], team=team)
 
 
-def check_sizes(policy: Any, env: Env, path: Path) -> None:
-    """Refuse a policy that was trained on observations or actions of other sizes.
-
-    Args:
-        policy: The policy.
-        env: The environment that it is to act in.
-        path: Where it is from, for the message.
-
-    Raises:
-        ValueError: The sizes differ.
-    """
-    sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
-    if sizes != wanted:
-        raise ValueError(
-            f"the policy in {path} takes {sizes[0]} observations and gives {sizes[1]} actions, but the task "
-            f"{env.task.name!r} has {wanted[0]} and {wanted[1]}: use a task with the sizes that it was trained on"
-        )
-
-
-def note(line: str) -> None:
-    """Print a line that is not a result, to stderr."""
-    print(f"lyceum-warp: {line}", file=sys.stderr)
-
-
 def _silent(line: str) -> None:
     """Print nothing, in processes that do not write."""
 
@@ -373,11 +352,12 @@ def _engine(config: dict[str, Any]) -> str:
     return engine_name(config["engine"], config["device"])
 
 
-def _learn(run: Run | None, npg: NPG, options: Train, board: Any) -> int:
+def _learn(run: Run | None, npg: NPG, options: Train) -> int:
     """Iterate; the process that has the run writes files and messages."""
     console = make_console()
-    display = None
+    display = board = None
     if run is not None:
+        board = TensorBoard(run.folder, run.config) if options.tensorboard else None
         console.print(_headline(run, npg, options), soft_wrap=True)
         display = Display(console, npg.iteration, options.iterations)
     try:
@@ -425,7 +405,8 @@ def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:
     if options.plot:
         paths.append(("curve", plotted(run)))
     if options.video:
-        paths.append(("video", policy_video(npg.env, npg.policy, run.folder / "video.mp4", evaluation_seed(options.seed + 1))))
+        seed = evaluation_seed(options.seed + 1)
+        paths.append(("video", policy_video(npg.env, npg.policy, run.folder / "video.mp4", seed)))
     for name, path in paths:
         console.print(f"{name + ':':<12}{path}", soft_wrap=True, markup=False)
     final = episodes.returns.mean().item()
