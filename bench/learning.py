@@ -50,6 +50,10 @@ class Options:
     An iteration's episodes would not do: with short segments, the long ones among them end late."""
     judge_every: int = 5
     """Iterations from one such judgement to the next."""
+    reward_scale: float = 1.0
+    """Factor of all rewards that NPG gets. The returns in the table are the task's own."""
+    outlier: float | None = None
+    """A reward that one sample of iteration 3 gets in place of its own."""
     processes: int = 1
     """Runs at the same time; each then has one thread."""
     out: Path | None = None
@@ -67,6 +71,8 @@ def run(options: Options, seed: int) -> list[dict[str, Any]]:
         integrator=options.integrator, nthread=nthread,
     )  # fmt: skip
     npg = lw.NPG(env, config=options.config, seed=seed)
+    if options.reward_scale != 1.0 or options.outlier is not None:
+        distort(npg, options)
     judge = None if options.target is None else Judge(env)
     seconds, rows = 0.0, []
     for number in range(1, options.iterations + 1):
@@ -80,6 +86,19 @@ def run(options: Options, seed: int) -> list[dict[str, Any]]:
             if row["judged"] >= options.target:
                 break
     return rows
+
+
+def distort(npg: lw.NPG, options: Options) -> None:
+    """Scale the rewards of the rollouts, and put an outlier into the middle of the third."""
+    collect, reward = npg.rollout.collect, npg.rollout.reward
+
+    def distorted(policy: lw.GaussianPolicy, noise: torch.Tensor) -> None:
+        collect(policy, noise)
+        reward.mul_(options.reward_scale)
+        if options.outlier is not None and npg.iteration == 2:
+            reward[len(reward) // 2, 0] = options.outlier
+
+    npg.rollout.collect = distorted  # type: ignore[method-assign]
 
 
 class Judge:

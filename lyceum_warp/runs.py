@@ -8,7 +8,7 @@ import logging
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
@@ -306,7 +306,7 @@ class Run:
     # the checkpoint
 
     def save(
-        self, iteration: int, policy: nn.Module, state: Mapping[str, Any], value: ValueFunction | None = None
+        self, iteration: int, policy: GaussianPolicy, state: Mapping[str, Any], value: ValueFunction | None = None
     ) -> None:
         """Replace the checkpoint; the old one is kept as the previous one.
 
@@ -361,7 +361,7 @@ PolicyContent = dict[str, Any]
 """A policy and a value function as they are saved: ``iteration``, ``policy``, and ``value`` if there is one."""
 
 
-def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> PolicyContent:
+def policy_content(iteration: int, policy: GaussianPolicy, value: ValueFunction | None = None) -> PolicyContent:
     """A copy of a policy and of a value function on the CPU.
 
     Args:
@@ -373,32 +373,19 @@ def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = 
     for name, module in (("policy", policy), ("value", value)):
         if module is not None:
             content[name] = {
-                "shape": getattr(module, "shape", None),
-                "class": f"{type(module).__module__}.{type(module).__qualname__}",
+                "shape": module.shape,
                 "state": {key: tensor.detach().cpu().clone() for key, tensor in module.state_dict().items()},
             }
     return content
-
-
-@overload
-def load(
-    run: str | Path | Run, *, which: str | int = ..., policy: None = ..., device: str | torch.device = ...
-) -> GaussianPolicy: ...
-
-
-@overload
-def load(
-    run: str | Path | Run, *, which: str | int = ..., policy: Module, device: str | torch.device = ...
-) -> Module: ...
 
 
 def load(
     run: str | Path | Run,
     *,
     which: str | int = "last",
-    policy: Any = None,
+    policy: GaussianPolicy | None = None,
     device: str | torch.device = "cpu",
-) -> Any:
+) -> GaussianPolicy:
     """Load the policy of a run, with its observation normaliser: ``action = policy(obs)`` is the mean action.
 
     Its parameters are frozen; ``NPG(env, policy=lw.load(RUN))`` trains them further.
@@ -406,14 +393,16 @@ def load(
     Args:
         run: A run's folder, or a file of it with a policy.
         which: "last", "best" (see ``train``), or the number of an iteration that the run kept.
-        policy: A policy of a class of your own, which gets the saved weights; by default a new ``GaussianPolicy``.
+        policy: A policy that takes the run's weights and is returned; necessary where its network is your own.
         device: Device for its parameters.
 
     Raises:
         FileNotFoundError: There is no run, or it has no such policy.
-        ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release.
+        ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release; or the
+            policy in it is of a class of its own and ``policy`` is not given, or does not fit.
     """
-    return _module(run, "policy", GaussianPolicy, which, policy, device)
+    content, path = _content(run, which, device)
+    return _policy(content, path, policy).to(device).eval().requires_grad_(False)
 
 
 def load_value(
@@ -431,12 +420,15 @@ def load_value(
         ValueError: The file holds no value function, is broken, was not written by lyceum_warp, or was written by a
             newer release.
     """
-    return _module(run, "value", ValueFunction, which, None, device)
+    content, path = _content(run, which, device)
+    return _filled(content, path, "value", lambda shape: ValueFunction(**shape)).to(device).eval().requires_grad_(False)
 
 
-def _module(
-    run: str | Path | Run, name: str, kind: Callable[..., Any], which: str | int, module: Any, device: Any
-) -> Any:
+_FIX = "restore the file from a copy, or train again with another --out"
+
+
+def _content(run: str | Path | Run, which: str | int, device: str | torch.device) -> tuple[PolicyContent, Path]:
+    """A saved policy and its file."""
     if isinstance(run, (str, Path)) and Path(run).is_file():
         if which != "last":
             raise ValueError(f"{run} is a file with one policy: give the run's folder to choose {which!r}")
@@ -444,8 +436,7 @@ def _module(
     else:
         run = run if isinstance(run, Run) else Run.open(run)
         path = run.policy_file(which)
-    content = read_checkpoint(path, device, parts=("iteration", "policy"))
-    return _from_content(content, path, name, kind, module, device)
+    return read_checkpoint(path, device, parts=("iteration", "policy")), path
 
 
 def networks(content: PolicyContent, path: Path) -> tuple[GaussianPolicy, ValueFunction]:
@@ -458,8 +449,28 @@ def networks(content: PolicyContent, path: Path) -> tuple[GaussianPolicy, ValueF
     Raises:
         ValueError: The checkpoint holds something else.
     """
-    policy = _from_content(content, path, "policy", GaussianPolicy, None, "cpu")
-    return policy, _from_content(content, path, "value", ValueFunction, None, "cpu")
+    return _policy(content, path, None), _filled(content, path, "value", lambda shape: ValueFunction(**shape))
+
+
+def _policy(content: PolicyContent, path: Path, given: GaussianPolicy | None) -> GaussianPolicy:
+    if given is None:
+        return _filled(content, path, "policy", GaussianPolicy.like)
+    return _filled(content, path, "policy", lambda shape: given, fix="give one like that of the run")
+
+
+def _filled(
+    content: PolicyContent, path: Path, name: str, made: Callable[[Mapping[str, Any]], Module], *, fix: str = _FIX
+) -> Module:
+    """A network with the weights of a checkpoint."""
+    try:
+        saved = content[name]
+        module = made(saved["shape"])
+        if different := _difference(module, saved["state"]):
+            raise ValueError(f"{path} holds a {name} of other parameters ({different}): {fix}")
+        module.load_state_dict(saved["state"])
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"{path} holds no {name} of lyceum_warp ({_first_sentence(error)}): {_FIX}") from error
+    return module
 
 
 def check_sizes(policy: Any, env: Env, path: Path) -> None:
@@ -481,25 +492,15 @@ def check_sizes(policy: Any, env: Env, path: Path) -> None:
         )
 
 
-def _from_content(
-    content: PolicyContent, path: Path, name: str, kind: Callable[..., Any], module: Any, device: Any
-) -> Any:
-    try:
-        saved = content[name]
-        if module is None:
-            if saved["shape"] is None:
-                raise ValueError(
-                    f"{path} holds the weights of {saved['class']}, a class of your own: make one and give it, as "
-                    f"lw.load({str(path)!r}, policy={saved['class'].rpartition('.')[2]}(...))"
-                )
-            module = kind(**saved["shape"])
-        module.load_state_dict(saved["state"])
-    except (KeyError, TypeError, RuntimeError) as error:
-        raise ValueError(f"{path} holds no {name} of lyceum_warp ({_first_sentence(error)}): {_FIX}") from error
-    return module.to(device).eval().requires_grad_(False)
-
-
-_FIX = "restore the file from a copy, or train again with another --out"
+def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
+    """The first difference between a module's weights and saved ones; empty where there is none."""
+    own, saved = ({name: tuple(part.shape) for name, part in s.items()} for s in (module.state_dict(), state))
+    saved = {name: own[name] for name in getattr(module, "LATER", ())} | saved
+    for name in {**own, **saved}:
+        if own.get(name) != saved.get(name):
+            one, other = (f"{shape}" if shape is not None else "absent" for shape in (saved.get(name), own.get(name)))
+            return f"{name!r} is {one} in the file, and {other} in the network that takes it"
+    return ""
 
 
 def read_checkpoint(

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.npg import NPG
-from lyceum_warp.algos.npg_config import enough_samples
+from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
 from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.interrupts import Interrupted, ending, postponed
 from lyceum_warp.kept_task import KeptTask, given_params, spelled_task
@@ -120,6 +120,7 @@ def checked_settings(*, target_return: float | None = None, keep_every: int = 0,
 def describe(npg: NPG) -> dict[str, Any]:
     """The configuration of a run that an algorithm stands for, as config.json holds it."""
     env, options = npg.env, npg.env.options
+    config = fitted_config(npg.config, npg.policy.shape, npg.value.shape)
     others = {name: value for name, value in options.given().items() if name in ("nthread", "horizon", "graphs")}
     others |= {name: list(names) for name in ("fields", "dynamics") if (names := getattr(options, name))}
     if isinstance(options.model, str | Path):
@@ -135,8 +136,22 @@ def describe(npg: NPG) -> dict[str, Any]:
         "nworld": env.nworld * npg.team.size,
         "threads": torch.get_num_threads(),
         "seed": options.seed,
-        "npg": dataclasses.asdict(npg.config) | {"samples": enough_samples(npg.config, env.nworld * npg.team.size)},
+        "npg": dataclasses.asdict(config) | {"samples": enough_samples(config, env.nworld * npg.team.size)},
     }
+
+
+def fitted_config(config: NPGConfig, policy_shape: Mapping[str, Any], value_shape: Mapping[str, Any]) -> NPGConfig:
+    """Hyperparameters with the sizes of given networks, from which networks like these can be made.
+
+    Args:
+        config: The hyperparameters.
+        policy_shape: The ``shape`` of the policy.
+        value_shape: That of the value function.
+    """
+    entries = {"hidden": policy_shape.get("hidden"), "activation": policy_shape.get("activation")}
+    entries |= {f"value_{name}": value_shape.get(name) for name in ("hidden", "activation", "group")}
+    entries |= {"normalize": policy_shape.get("normalize"), "time_orders": value_shape.get("time_orders")}
+    return dataclasses.replace(config, **{name: entry for name, entry in entries.items() if entry is not None})
 
 
 # continuing

@@ -43,6 +43,14 @@ def test_train_improves_and_saves_the_policy(run, tmp_path: Path) -> None:
     assert (tmp_path / "policy.pt").is_file()
 
 
+def test_own_policy_improves(run) -> None:
+    lines = run("own_policy.py", "--iterations", "8")
+    returns = numbers(r"return +(-?[\d.]+)", lines)
+    assert len(returns) == 9  # eight iterations and the mean policy
+    assert returns[-1] > max(returns[:3]) + 50
+    assert lines[-1].endswith("370 parameters")
+
+
 def test_plan_reaches_the_target_in_each_episode(run) -> None:
     lines = run("plan.py", "--episodes", "2")
     assert sum("success after" in line for line in lines) == 2

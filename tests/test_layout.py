@@ -22,7 +22,7 @@ LEVELS = {
     "env": 5,
     "openloop": 6,
     "algos": 7, "control": 7, "testing": 7,
-    "runs": 8,
+    "runs": 8, "tensorboard": 8,
     "kept_task": 9, "viz": 9,
     "training": 10,
     "cli": 11,

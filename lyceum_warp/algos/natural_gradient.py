@@ -20,6 +20,7 @@ class FisherProduct:
         obs: Observations, (samples, nobs).
         damping: Added to the diagonal.
         count: Number of observations of all processes; by default those in ``obs``.
+        weight: Weights of the observations, (samples,): 1, or 0 for one that another process brings.
         team: The processes.
     """
 
@@ -30,12 +31,15 @@ class FisherProduct:
         damping: float,
         *,
         count: int | None = None,
+        weight: torch.Tensor | None = None,
         team: Team | None = None,
     ) -> None:
         self.parameters = [p for p in policy.parameters() if p.requires_grad]
         self.log_std_at = next((i for i, p in enumerate(self.parameters) if p is policy.log_std), None)
         self.network = [p for p in self.parameters if p is not policy.log_std]
         self.precision = torch.exp(-2 * policy.log_std.detach()) / (count or len(obs))
+        if weight is not None:
+            self.precision = weight.unsqueeze(-1) * self.precision
         self.damping, self.team = damping, team or Team()
         self.mean = policy(obs)
         self.probe = torch.zeros_like(self.mean, requires_grad=True)

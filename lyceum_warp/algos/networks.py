@@ -3,7 +3,7 @@
 import copy
 import itertools
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Literal, TypeAlias, TypeVar, get_args
 
 import torch
 from torch import nn
@@ -13,15 +13,46 @@ from lyceum_warp.env import Env
 
 Module = TypeVar("Module", bound=nn.Module)
 
+Activation: TypeAlias = Literal["tanh", "relu", "leaky_relu", "elu", "selu", "gelu", "silu", "softplus"]
+"""Names of the activations of hidden layers."""
 
-def mlp(sizes: Sequence[int], *, last_scale: float = 1.0, generator: torch.Generator | None = None) -> nn.Sequential:
-    """A tanh network with Glorot-uniform weights and zero biases.
+_ACTIVATIONS: dict[str, type[nn.Module]] = {
+    "tanh": nn.Tanh, "relu": nn.ReLU, "leaky_relu": nn.LeakyReLU, "elu": nn.ELU, "selu": nn.SELU, "gelu": nn.GELU,
+    "silu": nn.SiLU, "softplus": nn.Softplus,
+}  # fmt: skip
+
+
+def check_activation(activation: object, name: str = "activation") -> Activation:
+    """Check the name of an activation, and return it.
+
+    Raises:
+        ValueError: It is not one of the known names.
+    """
+    for known in get_args(Activation):
+        if activation == known:
+            return known
+    raise ValueError(f"{name} must be one of {', '.join(map(repr, get_args(Activation)))}, not {activation!r}")
+
+
+def mlp(
+    sizes: Sequence[int],
+    *,
+    activation: Activation = "tanh",
+    last_scale: float = 1.0,
+    generator: torch.Generator | None = None,
+) -> nn.Sequential:
+    """A network of fully connected layers with Glorot-uniform weights and zero biases.
 
     Args:
         sizes: Widths of all layers, the input and the output included.
+        activation: What follows each layer but the last one.
         last_scale: Factor of the last layer's initial weights.
         generator: Draws the initial weights.
+
+    Raises:
+        ValueError: The activation is not one of the known names.
     """
+    kind = _ACTIVATIONS[check_activation(activation)]
     layers: list[nn.Module] = []
     for i, (n, m) in enumerate(itertools.pairwise(sizes)):
         linear = nn.Linear(n, m)
@@ -29,7 +60,7 @@ def mlp(sizes: Sequence[int], *, last_scale: float = 1.0, generator: torch.Gener
         nn.init.zeros_(linear.bias)
         layers.append(linear)
         if i < len(sizes) - 2:
-            layers.append(nn.Tanh())
+            layers.append(kind())
     with torch.no_grad():
         linear.weight.mul_(last_scale)
     return nn.Sequential(*layers)
@@ -77,6 +108,30 @@ class Normalizer(nn.Module):
         self.count.copy_(total)
         self.shift.copy_(self.mean)
         self.scale.copy_((self.square / total).sqrt().clamp_min(1e-4).reciprocal())
+
+    @torch.no_grad()
+    def update_before(self, layer: nn.Module, obs: torch.Tensor, team: Team | None = None) -> None:
+        """Update, and change the layer that takes the normalised observations so that its output stays the same.
+
+        A policy's actions and a value function's predictions then do not depend on when the statistics are updated,
+        except for observations that are clipped. The first update leaves the layer as it is: it was not trained yet.
+        A layer that is not linear cannot compensate later ones, so that they are left out.
+
+        Args:
+            layer: The layer whose first inputs are the normalised observations.
+            obs: Observations, (..., size).
+            team: The processes; each brings the same number of observations.
+        """
+        first, before = self.count == 0, {name: buffer.clone() for name, buffer in self.named_buffers()}
+        self.update(obs, team)
+        if not isinstance(layer, nn.Linear):
+            for name, buffer in self.named_buffers():
+                buffer.copy_(torch.where(first, buffer, before[name]))
+            return
+        shift, scale = before["shift"], before["scale"]
+        weight = layer.weight[:, : len(shift)]  # of scale (x - shift) before, and of self.scale (x - self.shift) now
+        layer.bias.add_(((self.shift - shift) * scale).masked_fill(first, 0.0) @ weight.T)
+        weight.mul_((scale / self.scale).masked_fill(first, 1.0))
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Normalised observations, (..., size)."""

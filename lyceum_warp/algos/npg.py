@@ -16,7 +16,6 @@ import warp as wp
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
 from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, flatten
-from lyceum_warp.algos.networks import Normalizer
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
 from lyceum_warp.algos.npg_statistics import (
     Iteration,
@@ -29,9 +28,10 @@ from lyceum_warp.algos.npg_statistics import (
     summary,
 )
 from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.policy_check import check_policy
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.timing import PhaseTimer, one_thread
-from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.algos.value import BOUND, ValueFunction
 from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
@@ -39,6 +39,9 @@ from lyceum_warp.kernels import returns
 from lyceum_warp.validate import check_kind
 
 log = logging.getLogger(__name__)
+
+_SHORTER = 4
+"""How often a step is shortened at most."""
 
 
 @document_attributes
@@ -51,7 +54,7 @@ class NPG:
 
     Args:
         env: The environment; do not step it between iterations.
-        policy: The policy; a new one by default.
+        policy: The policy; a new one by default. ``GaussianPolicy(nobs, nact, network=...)`` has a network of your own.
         value: The value function; a new one by default.
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
@@ -59,7 +62,8 @@ class NPG:
             make the same calls with the same arguments; all get the same numbers.
 
     Raises:
-        ValueError: The environment does not reset automatically, or an argument is of the wrong type.
+        ValueError: The environment does not reset automatically, or an argument is of the wrong type, or
+            the policy cannot be learned (``lyceum_warp.algos.policy_check``).
         FloatingPointError: Raised by an iteration whose gradient is not finite; the policy is left unchanged.
     """
 
@@ -102,29 +106,37 @@ class NPG:
             )
         if not env.autoreset:
             raise ValueError("NPG needs an environment that resets automatically: make it with autoreset=True")
+        for module in (policy, value):
+            if isinstance(module, torch.nn.Module) and not any(p.requires_grad for p in module.parameters()):
+                module.requires_grad_(True)  # lw.load freezes what it loads
+        if policy is not None:
+            check_policy(policy, env)
 
         # networks
         device = env.obs.device
         nobs, nact = env.obs_space.size, env.action_space.size
+        group = _value_group(env, config) if value is None else value.group
         init = torch.Generator().manual_seed(seed)
         options: dict[str, Any] = dict(normalize=config.normalize, generator=init)
-        self.policy = policy or GaussianPolicy(nobs, nact, config.hidden, log_std=config.log_std, **options)
-        scale = 1.0 / max(1.0 - config.gamma, 1e-3)
-        self.value = value or ValueFunction(
-            nobs, config.value_hidden, scale=scale, time_orders=config.time_orders, **options
+        self.policy = policy or GaussianPolicy(
+            nobs, nact, config.hidden, activation=config.activation, log_std=config.log_std, **options
         )
+        self._value_is_new = value is None
+        self.value = value or ValueFunction(
+            env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation,
+            time_orders=config.time_orders, group=group, **options,
+        )  # fmt: skip
         self.value.discount = config.gamma
-        for module in (self.policy, self.value):
-            module.to(device)
-            if not any(parameter.requires_grad for parameter in module.parameters()):
-                module.requires_grad_(True)  # a loaded one is frozen
+        self.policy.to(device)
+        self.value.to(device)
 
         # samples, and whether an iteration begins new episodes or continues those of the last one
         samples = enough_samples(config, nworld)
-        self.rollout = Rollout(env, -(-samples // nworld))
-        self.count = self.rollout.steps * nworld
-        whole = 0 < env.horizon <= self.rollout.steps
+        steps = -(-samples // nworld)
+        self.count = steps * nworld
+        whole = 0 < env.horizon <= steps
         self.segments = config.rollout == "segments" or (config.rollout == "auto" and not whole)
+        self.rollout = Rollout(env, steps, groups=(group,), first_only=not self.segments)
         if not self.segments and not whole and team.leads:
             log.warning(
                 "%d samples of %d worlds are %d steps: no episode will reach its horizon of %d; use fewer worlds, "
@@ -139,9 +151,7 @@ class NPG:
             self.value, self.count, n, rate=config.value_rate, epochs=config.value_epochs,
             batch=config.value_batch or max(64, self.count // 256), team=team,
         )  # fmt: skip
-        fisher_samples = torch.arange(0, self.count, min(self.count, round(1.0 / config.fisher_fraction)))
-        places, own = team.locate(fisher_samples, n)
-        self._fisher_count, self._fisher_places = len(fisher_samples), places[own].to(device)
+        self._fisher_count = max(1, round(config.fisher_fraction * self.count))
         self._evaluate_mean = MeanPolicyEvaluation(env, config.mean_episodes, team)
         # a seed of its own: the same numbers should not make both the weights and the noise
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
@@ -164,28 +174,32 @@ class NPG:
         self.sample()
         timer.mark()
 
-        # 2. Advantages, from the value function that was not yet fitted to these samples.
-        advantage, target, prediction = self.advantages()
+        # 2. Statistics that normalise observations; policy and value stay the same functions.
+        obs, value_obs = rollout.obs.flatten(0, 1), rollout.obs_groups[self.value.group].flatten(0, 1)
+        self.policy.observe(obs, team)
+        self.value.observe(value_obs, team)
 
-        # 3. Vanilla gradient of E[log pi(a|s) A(s, a)].
-        obs, action = rollout.obs.flatten(0, 1), rollout.action.flatten(0, 1)
+        # 3. Advantages, from the value function that was not yet fitted to these samples.
+        advantage, target, prediction, outliers = self.advantages()
+
+        # 4. Vanilla gradient of E[log pi(a|s) A(s, a)].
+        action = rollout.action.flatten(0, 1)
         parameters = [p for p in self.policy.parameters() if p.requires_grad]
         objective = (self.policy.log_prob(obs, action) * advantage.flatten()).sum() / self.count
         gradient = team.sum(flatten(torch.autograd.grad(objective, parameters)))
         timer.mark()
 
-        # 4. Natural gradient x = F^-1 g, and the step x sqrt(delta / (g.x)), so that step.F.step = delta.
-        fisher_obs = obs if self._fisher_count == self.count else obs[self._fisher_places]
-        fisher = FisherProduct(self.policy, fisher_obs, config.damping, count=self._fisher_count, team=team)
+        # 5. Natural gradient x = F^-1 g, and the step x sqrt(delta / (g.x)), so that step.F.step = delta.
+        fisher = self.fisher(obs)
         direction = conjugate_gradient(fisher, gradient, config.cg_iterations)
         step = direction * torch.sqrt(config.delta / (gradient @ direction + 1e-20))
-        finite, kl = self.move(step, obs)
+        finite, fraction, kl = self.move(step, obs)
         timer.mark()
 
         # One copy brings the numbers of all processes to the host.
         update = UpdateNumbers(
-            finite=finite, kl=kl, step_norm=step.norm(), gradient_norm=gradient.norm(),
-            std_mean=self.policy.log_std.detach().exp().mean(), faults=rollout.faults.sum(),
+            finite=finite, kl=kl, step_norm=step.norm(), step_fraction=fraction, gradient_norm=gradient.norm(),
+            std_mean=self.policy.log_std.detach().exp().mean(), faults=rollout.faults.sum(), outliers=outliers,
         )  # fmt: skip
         packed = ProcessNumbers(update, prediction, finished(rollout), finished_metrics(rollout)).pack()
         processes = [ProcessNumbers.unpack(numbers) for numbers in team.gather(packed[None]).tolist()]
@@ -195,14 +209,11 @@ class NPG:
                 f"{rollout.explain_not_finite()}"
             )
 
-        # 5. The value function, on the returns of these samples.
-        self.fit(obs, rollout.step.flatten(), target.flatten(), self.generator)
-        for module in (self.policy, self.value):
-            if isinstance(module.normalizer, Normalizer):
-                module.normalizer.update(obs, team)
+        # 6. The value function, on the returns of these samples.
+        self.fit(value_obs, rollout.step.flatten(), target.flatten(), self.generator)
         timer.mark()
 
-        # 6. Every few iterations, the mean policy in whole episodes.
+        # 7. Every few iterations, the mean policy in whole episodes.
         self.iteration += 1
         self.samples += self.count
         mean: dict[str, Any] = dict.fromkeys(MEAN_STATISTICS)
@@ -231,18 +242,21 @@ class NPG:
             self.rollout.collect(self.policy, self.noise[:, self._own])
 
     @torch.no_grad()
-    def advantages(self) -> tuple[torch.Tensor, torch.Tensor, ValueSums]:
+    def advantages(self) -> tuple[torch.Tensor, torch.Tensor, ValueSums, torch.Tensor]:
         """Generalised advantages and discounted returns of the rollout.
 
         At a time limit and at the end of the rollout, the value function's prediction stands for the rest of the
-        episode. A state in which the episode terminated is worth 0 (mjrl; Lyceum bootstraps there, too).
+        episode. A state in which the episode terminated is worth 0 (mjrl; Lyceum bootstraps there, too). The returns
+        set the value function's scale, and advantages beyond ten times that scale are set to this bound, so that one
+        extreme reward neither hides all others nor spoils the value function.
 
         Returns:
-            Advantages, (steps, nworld); returns, (steps, nworld); and how well the value function predicted them.
+            Advantages, (steps, nworld); returns, (steps, nworld); how well the value function predicted them; and the
+            number of advantages that were bounded.
         """
         rollout, config, team = self.rollout, self.config, self.team
-        value = self.value(rollout.obs, rollout.step)
-        next_value = self.value(rollout.final_obs, rollout.step + 1.0)
+        value = self.value(rollout.obs_groups[self.value.group], rollout.step)
+        next_value = self.value(rollout.final_obs_groups[self.value.group], rollout.step + 1.0)
         arrays = [rollout.reward, value, next_value, rollout.terminated, rollout.done]
         inputs = [wp.from_torch(array) for array in arrays]
         outputs = [wp.from_torch(self._advantage), wp.from_torch(self._return)]
@@ -250,38 +264,81 @@ class NPG:
         wp.launch(returns.advantages, self.env.nworld, args, device=self.env.device)
         advantage, target = self._advantage, self._return
         prediction = prediction_sums(target, value)
+        self.value.rescale(target, first=self._value_is_new and self.iteration == 0, team=team)
+        bound = BOUND * self.value.scale.float()
+        outliers = (advantage.abs() > bound).sum()
+        advantage = torch.minimum(torch.maximum(advantage, -bound), bound)
         if config.whiten:
             advantage = advantage - team.sum(advantage.sum()) / self.count
             variance = team.sum(advantage.square().sum()) / (self.count - 1)
-            advantage = advantage / (variance.sqrt() + 1e-6)
-        return advantage, target, prediction
+            advantage = advantage / (variance.sqrt() + 1e-6 * self.value.scale.float())
+        return advantage, target, prediction, outliers
+
+    def fisher(self, obs: torch.Tensor) -> FisherProduct:
+        """Products with the Fisher information, averaged over a share of the samples that is drawn at random.
+
+        Args:
+            obs: Observations of this process's worlds, (samples, nobs).
+        """
+        weight = None
+        if self._fisher_count < self.count:
+            subset = torch.randperm(self.count, generator=self.generator, device=obs.device)[: self._fisher_count]
+            if self.team.size == 1:
+                obs = obs[subset]
+            else:  # counting the own samples would wait for the device, so the others get the weight 0
+                places, own = self.team.locate(subset, self.env.nworld)
+                obs, weight = obs[places], own.float()
+        return FisherProduct(
+            self.policy, obs, self.config.damping, count=self._fisher_count, weight=weight, team=self.team
+        )
 
     @torch.no_grad()
-    def move(self, step: torch.Tensor, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Add a step to the policy's parameters, unless it is not finite.
+    def move(self, step: torch.Tensor, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Add a step, or a part of it, to the policy's parameters.
+
+        The Fisher information describes the KL divergence to second order only, and only on some of the samples. Where
+        the measured divergence exceeds its limit, the step is shortened as the second order suggests, by at least
+        half, at most four times; if that is not enough, or the step is not finite, the policy stays as it is. Nothing
+        waits for the device.
 
         Args:
             step: The step, (parameters,).
             obs: Observations, (samples, nobs).
 
         Returns:
-            Whether the step is finite; and the KL divergence from the old policy to the new one, averaged over
-            ``obs``.
+            Whether the step is finite; the share of it that was made; and the KL divergence from the old policy to the
+            new one, averaged over the samples of all processes.
         """
+        wanted = 0.5 * self.config.delta
+        limit = self.config.kl_limit * wanted + 1e-6  # and rounding
+        parameters = [p for p in self.policy.parameters() if p.requires_grad]
+        old = [p.clone() for p in parameters]
+        steps = [part.view_as(p) for part, p in zip(step.split([p.numel() for p in parameters]), old, strict=True)]
         old_mean, old_log_std = self.policy(obs), self.policy.log_std.clone()
-        finite = torch.isfinite(step).all()
-        start = 0
-        for parameter in self.policy.parameters():
-            if parameter.requires_grad:
-                moved = parameter + step[start : start + parameter.numel()].view_as(parameter)
+        lowest = old_log_std.clamp_max(self.config.min_log_std)
+
+        def divergence(fraction: torch.Tensor) -> torch.Tensor:
+            for parameter, before, part in zip(parameters, old, steps, strict=True):
+                moved = before + fraction * part
                 if parameter is self.policy.log_std:
-                    moved.clamp_(min=self.config.min_log_std)
-                parameter.copy_(torch.where(finite, moved, parameter))
-                start += parameter.numel()
+                    moved = torch.maximum(moved, lowest)
+                parameter.copy_(torch.where(fraction > 0.0, moved, before))
+            log_std = self.policy.log_std
+            square = (old_mean - self.policy(obs)).square() + torch.exp(2 * old_log_std)
+            kl = (log_std - old_log_std + 0.5 * square * torch.exp(-2 * log_std) - 0.5).sum(-1).mean()
+            return self.team.sum(kl) / self.team.size
+
+        finite = torch.isfinite(step).all()
+        fraction = finite.float()
+        for _ in range(_SHORTER):
+            kl = divergence(fraction)
+            factor = (wanted / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5)
+            fraction = torch.where(kl <= limit, fraction, fraction * factor)
+        kl = divergence(fraction)
+        fraction = torch.where(kl <= limit, fraction, 0.0)
+        kl = divergence(fraction)
         self.team.copy_leader(self.policy.parameters())
-        log_std = self.policy.log_std
-        square = (old_mean - self.policy(obs)).square() + torch.exp(2 * old_log_std)
-        return finite, (log_std - old_log_std + 0.5 * square * torch.exp(-2 * log_std) - 0.5).sum(-1).mean()
+        return finite, fraction, kl
 
     def state_dict(self) -> dict[str, Any]:
         """The state on which the next iteration depends, with the worlds of all processes.
@@ -317,3 +374,15 @@ class NPG:
         self.rollout.running_return.copy_(state["returns"][self._own])
         self.iteration = state["iteration"]
         self.samples = state["samples"]
+
+
+def _value_group(env: Env, config: NPGConfig) -> str:
+    """The group of observations for a new value function."""
+    if config.value_group is None:
+        return "critic" if "critic" in env.obs_groups else "policy"
+    if config.value_group not in env.obs_groups:
+        raise ValueError(
+            f"the task {env.task.name!r} has no group {config.value_group!r} of observations for the value function: "
+            f"it has {', '.join(env.obs_groups)}"
+        )
+    return config.value_group

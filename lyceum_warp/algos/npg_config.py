@@ -4,6 +4,7 @@ import dataclasses
 import math
 from typing import Literal
 
+from lyceum_warp.algos.networks import Activation, check_activation
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.validate import finite_number, layer_sizes, whole_number
 
@@ -15,8 +16,8 @@ _WHOLE = {
 
 _REAL = {
     "gamma": (0.0, 1.0), "lam": (0.0, 1.0), "delta": (0.0, math.inf), "damping": (0.0, math.inf),
-    "fisher_fraction": (0.0, 1.0), "log_std": (-math.inf, math.inf), "min_log_std": (-math.inf, math.inf),
-    "value_rate": (0.0, math.inf),
+    "fisher_fraction": (0.0, 1.0), "kl_limit": (1.0, math.inf), "log_std": (-math.inf, math.inf),
+    "min_log_std": (-math.inf, math.inf), "value_rate": (0.0, math.inf),
 }  # fmt: skip
 """The smallest and the largest value of each number."""
 
@@ -50,16 +51,25 @@ class NPGConfig:
     damping: float = 1e-4
     """Added to the diagonal of the Fisher information (as mjrl; Lyceum has none)."""
     fisher_fraction: float = 1.0
-    """Share of the samples that the Fisher information is averaged over: every n-th, n being the whole number nearest
-    to 1 / fisher_fraction."""
+    """Share of the samples that the Fisher information is averaged over, drawn at random in each iteration."""
+    kl_limit: float = 1.5
+    """Largest KL divergence of a step, as a multiple of delta / 2, its value to second order. A step that exceeds it
+    is shortened."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the policy's hidden layers."""
+    activation: Activation = "tanh"
+    """What follows each of the policy's hidden layers."""
     log_std: float = -0.5
     """Initial logarithm of the policy's standard deviations."""
     min_log_std: float = -3.0
     """Lower limit of the logarithm of the policy's standard deviations (as mjrl; Lyceum has none)."""
     value_hidden: tuple[int, ...] = (128, 128)
     """Widths of the value function's hidden layers."""
+    value_activation: Activation = "tanh"
+    """What follows each of the value function's hidden layers."""
+    value_group: str | None = None
+    """Group of observations that the value function gets; by default "critic" where the task has such a group, else
+    "policy"."""
     value_epochs: int = 2
     """Passes over the samples when the value function is fitted."""
     value_batch: int | None = None
@@ -86,6 +96,8 @@ class NPGConfig:
             checked[name] = finite_number(name, getattr(self, name), low=smallest, high=largest)
         for name in ("hidden", "value_hidden"):
             checked[name] = tuple(layer_sizes(getattr(self, name), name))
+        for name in ("activation", "value_activation"):
+            check_activation(getattr(self, name), name)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         if self.rollout not in ("auto", "episodes", "segments"):
@@ -93,6 +105,8 @@ class NPGConfig:
         for name in ("whiten", "normalize"):
             if not isinstance(flag := getattr(self, name), bool):
                 raise ValueError(f"{name} must be True or False, not {flag!r}")
+        if self.value_group is not None and not isinstance(self.value_group, str):
+            raise ValueError(f"value_group must be the name of a group of observations, not {self.value_group!r}")
         if self.fisher_fraction == 0.0:
             raise ValueError("fisher_fraction must be greater than 0, as in 0.1 for every tenth sample")
         if self.log_std < self.min_log_std:

@@ -56,7 +56,9 @@ class Iteration:
     kl: float
     """KL divergence from the old to the new policy, averaged over the samples."""
     step_norm: float
-    """Euclidean length of the step in the policy's parameters."""
+    """Euclidean length of the full step in the policy's parameters."""
+    step_fraction: float
+    """Share of the full step that was made; less than 1 where the full step exceeded the limit of the KL divergence."""
     gradient_norm: float
     """Euclidean length of the vanilla policy gradient."""
     std_mean: float
@@ -67,6 +69,8 @@ class Iteration:
     """Share of the returns' variance that the value function explained before the fit."""
     faults: int
     """Faults of worlds in this iteration."""
+    outliers: int
+    """Samples whose advantage exceeded ten standard deviations of the returns, and was set to that bound."""
     time_sample: float
     """Seconds of sampling."""
     time_gradient: float
@@ -99,15 +103,19 @@ class UpdateNumbers(NamedTuple):
     finite: Scalar
     """Whether the step is finite; all processes have the same."""
     kl: Scalar
-    """KL divergence from the old to the new policy, averaged over the process's samples."""
+    """KL divergence from the old to the new policy, averaged over all samples; all processes have the same."""
     step_norm: Scalar
-    """Euclidean length of the step; all processes have the same."""
+    """Euclidean length of the full step; all processes have the same."""
+    step_fraction: Scalar
+    """Share of the full step that was made; all processes have the same."""
     gradient_norm: Scalar
     """Euclidean length of the gradient; all processes have the same."""
     std_mean: Scalar
     """Mean standard deviation of the policy's actions; all processes have the same."""
     faults: Scalar
     """Faults of the process's worlds."""
+    outliers: Scalar
+    """Samples of the process whose advantage was set to its bound."""
 
 
 class ValueSums(NamedTuple):
@@ -236,12 +244,14 @@ def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence
     update = processes[0].update
     return {
         **episode_statistics([process.episodes for process in processes]),
-        "kl": sum(process.update.kl for process in processes) / len(processes),
+        "kl": update.kl,
         "step_norm": update.step_norm,
+        "step_fraction": update.step_fraction,
         "gradient_norm": update.gradient_norm,
         "std_mean": update.std_mean,
         **value_statistics([process.values for process in processes], samples),
         "faults": round(sum(process.update.faults for process in processes)),
+        "outliers": round(sum(process.update.outliers for process in processes)),
         "metrics": metric_means(processes, metrics),
     }
 

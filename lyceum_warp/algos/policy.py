@@ -1,35 +1,45 @@
 """Policies: a diagonal Gaussian around a small network."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import nn
 
-from lyceum_warp.algos.networks import Normalizer, mlp
+from lyceum_warp.algos.distributed import Team
+from lyceum_warp.algos.networks import Activation, Normalizer, mlp
 from lyceum_warp.docstrings import document_attributes
-from lyceum_warp.validate import layer_sizes
+from lyceum_warp.validate import described, layer_sizes
 
 
 @document_attributes
 class GaussianPolicy(nn.Module):
     """Actions from N(mean(obs), exp(log_std)^2), with a log_std that does not depend on the observation.
 
+    Example:
+        >>> policy = GaussianPolicy(nobs, nact, network=MyNetwork())  # any nn.Module, (..., nobs) -> (..., nact)
+        >>> npg = NPG(env, policy)
+
     Args:
         nobs: Numbers in an observation.
         nact: Numbers in an action.
         hidden: Widths of the hidden layers.
+        network: A network of your own, instead of one with ``hidden`` layers and an ``activation``: it maps
+            (normalised) observations, (..., nobs), to mean actions, (..., nact), each row alone, in float32. NPG also
+            needs it to be differentiable twice.
+        activation: What follows each hidden layer.
         log_std: Initial logarithm of the standard deviations.
         normalize: Whether to normalise observations by their running mean and variance.
         generator: Draws the initial weights.
 
     Raises:
-        ValueError: ``hidden`` is not a sequence of positive whole numbers.
+        ValueError: ``hidden`` is not a sequence of positive whole numbers, ``activation`` is not a known name, or
+            ``network`` is not a module of torch.
     """
 
     shape: dict[str, Any]
-    """The arguments of a policy that takes the same weights."""
+    """What ``like`` makes a policy of that takes the same weights."""
 
     def __init__(
         self,
@@ -37,17 +47,43 @@ class GaussianPolicy(nn.Module):
         nact: int,
         hidden: Sequence[int] = (64, 64),
         *,
+        network: nn.Module | None = None,
+        activation: Activation = "tanh",
         log_std: float = -0.5,
         normalize: bool = False,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.nobs, self.nact = nobs, nact
-        self.shape = {"nobs": nobs, "nact": nact, "hidden": layer_sizes(hidden), "normalize": normalize}
         self.normalizer: nn.Module = Normalizer(nobs) if normalize else nn.Identity()
-        # a last layer near zero starts every mean near the middle of its range (mjrl)
-        self.network = mlp([nobs, *hidden, nact], last_scale=1e-2, generator=generator)
+        self.shape = {"nobs": nobs, "nact": nact, "normalize": normalize}
+        if network is None:
+            self.shape |= {"hidden": layer_sizes(hidden), "activation": activation}
+            # a last layer near zero starts every mean near the middle of its range (mjrl)
+            network = mlp([nobs, *hidden, nact], activation=activation, last_scale=1e-2, generator=generator)
+        elif isinstance(network, nn.Module):
+            self.shape["own"] = _class_name(network)
+        else:
+            raise ValueError(f"network must be a module of torch (torch.nn.Module), not {described(network)}")
+        if type(self) is not GaussianPolicy:
+            self.shape["own"] = _class_name(self)
+        self.network = network
         self.log_std = nn.Parameter(torch.full((nact,), float(log_std)))
+
+    @staticmethod
+    def like(shape: Mapping[str, Any]) -> "GaussianPolicy":
+        """A new policy that takes the weights of one with this ``shape``.
+
+        Raises:
+            ValueError: That policy, or its network, is of a class of the user's own.
+        """
+        if (own := shape.get("own")) is not None:
+            normalize = ", normalize=True" if shape["normalize"] else ""
+            raise ValueError(
+                f"the policy is of a class of its own, {own}: give one of this class, as in lw.load(run, "
+                f"policy=lw.GaussianPolicy({shape['nobs']}, {shape['nact']}, network=...{normalize}))"
+            )
+        return GaussianPolicy(**shape)
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Mean actions, (..., nact)."""
@@ -64,7 +100,25 @@ class GaussianPolicy(nn.Module):
         """
         return torch.addcmul(self(obs), noise, self.log_std.exp(), out=out)
 
+    def observe(self, obs: torch.Tensor, team: Team | None = None) -> None:
+        """Take observations into the normaliser's statistics; after the first call the mean actions stay the same.
+
+        The first layer compensates a change of the statistics. A network of your own can do so if it is an
+        ``nn.Sequential`` that begins with an ``nn.Linear``; otherwise the statistics stay those of the first call.
+
+        Args:
+            obs: Observations, (..., nobs).
+            team: The processes; each brings the same number of observations.
+        """
+        if isinstance(self.normalizer, Normalizer):
+            first = self.network[0] if isinstance(self.network, nn.Sequential) else self.network
+            self.normalizer.update_before(first, obs, team)
+
     def log_prob(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Log-density of actions, (...,)."""
         z = (action - self(obs)) * torch.exp(-self.log_std)
         return -0.5 * z.square().sum(-1) - self.log_std.sum() - 0.5 * action.shape[-1] * math.log(2 * math.pi)
+
+
+def _class_name(module: nn.Module) -> str:
+    return f"{type(module).__module__}.{type(module).__qualname__}"

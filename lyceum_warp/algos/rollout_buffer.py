@@ -22,6 +22,8 @@ class Rollout:
         env: The environment.
         steps: Number of steps.
         groups: Groups of observations to store beside "policy", as ``("critic",)``.
+        first_only: Whether only the first episode of each world since ``restart`` counts. Where all worlds began
+            together, counting all episodes that ended would favour short ones.
 
     Raises:
         ValueError: The task has no such group of observations.
@@ -44,13 +46,14 @@ class Rollout:
     eval: torch.Tensor
     """Evaluation metric after each step, (steps, nworld)."""
     terminated: torch.Tensor
-    """Whether the task, or a fault, ended the episode, (steps, nworld) bool."""
+    """Whether the task ended the episode, (steps, nworld) bool. An episode with a fault is cut off instead: the value
+    of its last good observation stands for the rest, so that a fault is neither worth a return of 0 nor punished."""
     done: torch.Tensor
     """Whether the episode ended for any reason, (steps, nworld) bool."""
     success: torch.Tensor
     """Whether the goal was met after each step, (steps, nworld) bool."""
     episode_return: torch.Tensor
-    """Sum of the rewards of the episode so far, (steps, nworld)."""
+    """Sum of the rewards of the episode so far, (steps, nworld); nan in an episode that does not count."""
     episode_length: torch.Tensor
     """Steps of the episode so far, (steps, nworld)."""
     episode_metrics: dict[str, torch.Tensor]
@@ -61,13 +64,14 @@ class Rollout:
     faults: torch.Tensor
     """Faults of each world within these steps, (nworld,) int32."""
 
-    def __init__(self, env: Env, steps: int, *, groups: Collection[str] = ()) -> None:
+    def __init__(self, env: Env, steps: int, *, groups: Collection[str] = (), first_only: bool = False) -> None:
         if unknown := [group for group in groups if group not in env.obs_groups]:
             raise ValueError(
                 f"the task {env.task.name!r} has no group {unknown[0]!r} of observations: it has {list(env.obs_groups)}"
             )
         self.env = env
         self.steps = steps
+        self._first_only = first_only
         n, nobs, nact = env.nworld, env.obs_space.size, env.action_space.size
         last = {"obs": (nobs,), "final_obs": (nobs,), "action": (nact,)}
         flags = {"terminated", "done", "success"}
@@ -177,7 +181,7 @@ class Rollout:
 
     def _store_outputs(self) -> None:
         dim = (self.env.nworld, self.env.obs_space.size)
-        args = [self._index, *self._outputs, self._return, self._fault, self._arrays]
+        args = [self._index, *self._outputs, self._first_only, self._return, self._fault, self._arrays]
         wp.launch(collect.store_outputs, dim, args, device=self.env.device)
         for rows in self._rows_after:
             rows.store(self._index)

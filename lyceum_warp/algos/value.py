@@ -6,7 +6,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from lyceum_warp.algos.networks import Normalizer, mlp
+from lyceum_warp.algos.distributed import Team
+from lyceum_warp.algos.networks import Activation, Normalizer, mlp
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.validate import layer_sizes
 
@@ -18,18 +19,28 @@ class ValueFunction(nn.Module):
     Args:
         nobs: Numbers in an observation.
         hidden: Widths of the hidden layers.
-        scale: Factor of the network's output, which keeps that output of order one: 1 / (1 - gamma) for rewards of
-            order one.
+        activation: What follows each hidden layer.
+        scale: Factor of the network's output until ``rescale`` fits it to returns.
         time_orders: Highest power of the time feature; 0 for none. A time limit that the observation does not show
             makes the return depend on the step; the features t, t^2, ... with t = step / 1000 show it (mjrl).
         normalize: Whether to normalise observations by their running mean and variance.
         discount: The discount of the returns that it is fitted to, where known.
+        group: The group of observations that it gets.
         generator: Draws the initial weights.
 
     Raises:
-        ValueError: ``hidden`` is not a sequence of positive whole numbers.
+        ValueError: ``hidden`` is not a sequence of positive whole numbers, or ``activation`` is not a known name.
     """
 
+    LATER = ("shift", "scale")
+    """Buffers that files of earlier releases lack: their shift was 0, and their scale is among the arguments."""
+
+    group: str
+    """The group of observations that it gets."""
+    shift: torch.Tensor
+    """What is added to the network's scaled output: the mean of the returns."""
+    scale: torch.Tensor
+    """Factor of the network's output: the standard deviation of the returns."""
     discount: float | None
     """The discount of the returns that it was fitted to, where known."""
     orders: torch.Tensor
@@ -40,21 +51,26 @@ class ValueFunction(nn.Module):
         nobs: int,
         hidden: Sequence[int] = (128, 128),
         *,
+        activation: Activation = "tanh",
         scale: float = 200.0,
         time_orders: int = 0,
         normalize: bool = False,
         discount: float | None = None,
+        group: str = "policy",
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        self.scale, self.discount = scale, discount
+        self.discount, self.group = discount, group
         self._shape = {
-            "nobs": nobs, "hidden": layer_sizes(hidden), "scale": scale, "time_orders": time_orders,
-            "normalize": normalize,
+            "nobs": nobs, "hidden": layer_sizes(hidden), "activation": activation, "scale": scale,
+            "time_orders": time_orders, "normalize": normalize, "group": group,
         }  # fmt: skip
         self.normalizer: nn.Module = Normalizer(nobs) if normalize else nn.Identity()
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
-        self.network = mlp([nobs + time_orders, *hidden, 1], generator=generator)
+        # a last layer of zeros predicts the mean of the returns, whatever their scale
+        self.network = mlp([nobs + time_orders, *hidden, 1], activation=activation, last_scale=0.0, generator=generator)
+        self.register_buffer("shift", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
 
     @property
     def shape(self) -> dict[str, Any]:
@@ -76,4 +92,61 @@ class ValueFunction(nn.Module):
 
     def forward(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Predicted returns, (...,)."""
-        return self.network(self.features(obs, step)).squeeze(-1) * self.scale
+        return self.network(self.features(obs, step)).squeeze(-1) * self.scale.float() + self.shift.float()
+
+    def observe(self, obs: torch.Tensor, team: Team | None = None) -> None:
+        """Take observations into the normaliser's statistics; after the first call the predictions stay the same.
+
+        Args:
+            obs: Observations, (..., nobs).
+            team: The processes; each brings the same number of observations.
+        """
+        if isinstance(self.normalizer, Normalizer):
+            self.normalizer.update_before(self.network[0], obs, team)
+
+    @torch.no_grad()
+    def rescale(self, returns: torch.Tensor, *, first: bool = False, team: Team | None = None) -> None:
+        """Set shift and scale to mean and standard deviation of returns, and keep the predictions.
+
+        The last layer compensates the change (Pop-Art; van Hasselt et al. 2016, "Learning values across many orders of
+        magnitude"). Outliers are bounded: a return counts as at most ``BOUND`` scales away from the shift, and the
+        scale changes by at most that factor. Returns that are all equal leave the scale as it is.
+
+        Args:
+            returns: Returns, of any shape.
+            first: Whether the function was never fitted. The bound then is 20 times the range between the quartiles,
+                and the scale may change by any factor.
+            team: The processes; each brings the same number of returns.
+        """
+        team = team or Team()
+        returns = returns.flatten().double()
+        low, high = self.shift - BOUND * self.scale, self.shift + BOUND * self.scale
+        if first:
+            ordered = team.gather(returns).nan_to_num().sort().values
+            quartile, median, other = (ordered[i * (len(ordered) - 1) // 4] for i in (1, 2, 3))
+            width = 20.0 * (other - quartile)
+            width.masked_fill_(width == 0.0, torch.inf)  # as where few rewards are not zero
+            low, high = median - width, median + width
+        returns = torch.minimum(torch.maximum(returns, low), high).nan_to_num()
+        count = len(returns) * team.size
+        mean = team.sum(returns.sum()) / count
+        std = (team.sum((returns - mean).square().sum()) / count).sqrt()
+        # float32 returns differ by rounding alone where they are equal
+        scale = torch.where(std > 1e-6 * mean.abs(), torch.maximum(std, 1e-3 * mean.abs()), self.scale)
+        if not first:
+            scale = torch.minimum(torch.maximum(scale, self.scale / BOUND), self.scale * BOUND)
+        last = self.network[-1]
+        assert isinstance(last, nn.Linear)
+        last.weight.mul_(self.scale / scale)
+        last.bias.copy_((last.bias * self.scale + self.shift - mean) / scale)
+        self.shift.copy_(mean)
+        self.scale.copy_(scale)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        for name in self.LATER:
+            state_dict.setdefault(prefix + name, getattr(self, name))
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+BOUND = 10.0
+"""How many scales a return or an advantage may lie away from the mean; what lies further is an outlier."""

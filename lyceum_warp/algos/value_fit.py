@@ -6,7 +6,7 @@ import torch
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.timing import one_thread
-from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.algos.value import BOUND, ValueFunction
 
 
 class ValueFit:
@@ -49,12 +49,13 @@ class ValueFit:
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
             step: Steps since the reset, (samples,).
-            target: Returns, (samples,).
+            target: Returns, (samples,). One further than ``BOUND`` scales from the value's shift is set to that bound.
             generator: Draws the order of all processes' samples.
         """
         with torch.no_grad():
             features = self.value.features(obs, step)
-            target = (target / self.value.scale).unsqueeze(-1)
+            target = ((target - self.value.shift) / self.value.scale).clamp(-BOUND, BOUND)
+            target = target.float().unsqueeze(-1)
         with one_thread():
             for _ in range(self.epochs):
                 order = torch.randperm(self.samples, generator=generator, device=features.device)

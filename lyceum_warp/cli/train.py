@@ -37,7 +37,7 @@ from lyceum_warp.kept_task import KeptTask, run_env
 from lyceum_warp.machine import cpu_cores
 from lyceum_warp.runs import PolicyContent, Run, check_sizes, networks, read_checkpoint
 from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
-from lyceum_warp.training import check_resumable, checked_settings, learn, reopen, restore
+from lyceum_warp.training import check_resumable, checked_settings, fitted_config, learn, reopen, restore
 from lyceum_warp.versions import versions
 
 _FINAL_EPISODES = 32
@@ -193,18 +193,13 @@ def _fitted(npg: NPGConfig, content: PolicyContent, path: Path) -> NPGConfig:
     Raises:
         ValueError: Other sizes are given.
     """
-    shapes = {"hidden": ("policy", "hidden"), "value_hidden": ("value", "hidden"), "normalize": ("policy", "normalize"),
-              "time_orders": ("value", "time_orders")}  # fmt: skip
-    fitted: dict[str, Any] = {}
-    for name, (module, entry) in shapes.items():
-        given, saved = getattr(npg, name), (content[module]["shape"] or {}).get(entry)
-        if saved is None:
-            continue
-        saved = tuple(saved) if isinstance(saved, list) else saved
-        if given not in (saved, getattr(NPGConfig(), name)):
-            raise ValueError(f"the {module} in {path} has {entry} {saved}, not {given}: leave the option out")
-        fitted[name] = saved
-    return dataclasses.replace(npg, **fitted)
+    fitted = fitted_config(npg, content["policy"]["shape"], content["value"]["shape"])
+    for field in dataclasses.fields(npg):
+        given, saved = getattr(npg, field.name), getattr(fitted, field.name)
+        if given not in (saved, field.default):
+            flag = f"--{field.name.replace('_', '-')}"
+            raise ValueError(f"the networks in {path} have {field.name} {saved}, not {given}: leave out {flag}")
+    return fitted
 
 
 def _folder(options: Train) -> Path:
@@ -293,7 +288,8 @@ def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, NPG]:
         raise ValueError(f"a resumed run stays in its folder {folder}: omit --out")
     content = run.read(note=note if team.leads else _silent)
     check_resumable(run, content, options.iterations, options.target_return)
-    npg = _algorithm(run.config, team, run=run, origin=(content, run.checkpoint))
+    origin = (content, run.checkpoint) if "from" in run.config else None
+    npg = _algorithm(run.config, team, run=run, origin=origin)
     restore(run, npg, content)
     return run, npg
 

@@ -51,25 +51,31 @@ def store_outputs(
     done_in: wp.array[bool],
     success_in: wp.array[bool],
     done_reason_in: wp.array[int],
+    first_only: bool,
     return_inout: wp.array[float],
     fault_inout: wp.array[int],
     out: RolloutArrays,
 ):
-    """Store the results of a step and the episode's return so far, and count faults; launched over (nworld, nobs)."""
+    """Store the results of a step and the episode's return so far, and count faults; launched over (nworld, nobs).
+
+    A fault does not count as a termination. With ``first_only`` the returns of a world's later episodes are nan.
+    """
     w, i = wp.tid()
     t = index_in[0]
     out.final_obs[t, w, i] = final_obs_in[w, i]
     if i == 0:
         out.reward[t, w] = reward_in[w]
         out.eval[t, w] = eval_in[w]
-        out.terminated[t, w] = terminated_in[w]
+        fault = done_reason_in[w] & _FAULTS
+        out.terminated[t, w] = terminated_in[w] and fault == 0
         out.done[t, w] = done_in[w]
         out.success[t, w] = success_in[w]
         total = return_inout[w] + reward_in[w]
         out.episode_return[t, w] = total
         out.episode_length[t, w] = out.step[t, w] + 1.0
-        return_inout[w] = wp.where(done_in[w], 0.0, total)
-        fault = done_reason_in[w] & _FAULTS
+        if done_in[w]:
+            total = wp.where(first_only, wp.nan, 0.0)
+        return_inout[w] = total
         if fault != 0:
             count = int(0)
             for bit in range(_BITS):

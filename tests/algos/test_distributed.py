@@ -66,7 +66,8 @@ def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
     """The same numbers in the tables' last rows and in the checkpoints, to rounding."""
     row, expected = table(one)[-1], table(other)[-1]
     for name in expected:
-        np.testing.assert_allclose(row[name], expected[name], rtol=tolerance, atol=tolerance, err_msg=name)
+        bound = tolerance * (10.0 if name.startswith("mean_") else 1.0)  # of whole episodes after the update
+        np.testing.assert_allclose(row[name], expected[name], rtol=bound, atol=bound, err_msg=name)
     state, wanted = (Run.open(folder).read()["state"] for folder in (one, other))
     assert torch.equal(state["generator"], wanted["generator"])
     close = dict(rtol=tolerance, atol=tolerance)

@@ -2,11 +2,13 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
 from conftest import TaskFile
+from full_task import Full
 
 import lyceum_warp as lw
 
@@ -53,6 +55,88 @@ def test_a_run_is_reproducible_and_resumes_to_the_bit(env: lw.Env, rollout: str)
     np.testing.assert_equal([numbers(next(resumed)) for _ in range(2)], rest)
 
 
+def learned(env: lw.Env, iterations: int, change: Callable[[torch.Tensor, int], object]) -> list[lw.Iteration]:
+    """Iterations of NPG whose rewards, (steps, nworld), are changed; the change gets the iteration's number, too."""
+    env.rand_reset(3)
+    config = dataclasses.replace(SMALL, value_epochs=20, value_rate=1e-2, mean_every=0)
+    npg = lw.NPG(env, config=config, seed=0)
+    collect = npg.rollout.collect
+
+    def changed(policy: lw.GaussianPolicy, noise: torch.Tensor) -> None:
+        collect(policy, noise)
+        change(npg.rollout.reward, npg.iteration + 1)
+
+    npg.rollout.collect = changed  # type: ignore[method-assign]
+    return [next(npg) for _ in range(iterations)]
+
+
+def test_rewards_of_any_scale_learn_alike(env: lw.Env) -> None:
+    plain = learned(env, 5, lambda *_: None)
+    for exponent in (-14, 14):  # rounding is the same for powers of two
+        scaled = learned(env, 5, lambda reward, _, by=2.0**exponent: reward.mul_(by))  # type: ignore[misc]
+        for name in ("return_mean", "explained_variance", "kl", "step_norm"):
+            values = [getattr(it, name) for it in scaled]
+            assert values == pytest.approx([getattr(it, name) for it in plain], rel=1e-4), (exponent, name)
+    assert plain[-1].explained_variance > 0.5
+
+
+def test_one_extreme_reward_is_bounded_and_counted(env: lw.Env) -> None:
+    def outlier(reward: torch.Tensor, iteration: int) -> None:
+        if iteration == 3:
+            reward[5, 2] = -1e10
+
+    plain, disturbed = learned(env, 8, lambda *_: None), learned(env, 8, outlier)
+    assert [it.outliers for it in plain] == [0] * 8
+    assert disturbed[2].outliers > 0 and not any(it.outliers for it in (*disturbed[:2], *disturbed[4:]))
+    assert disturbed[-1].explained_variance == pytest.approx(plain[-1].explained_variance, abs=0.15)
+    assert disturbed[-1].step_norm > 0.1 * plain[-1].step_norm
+
+
+def test_an_extreme_reward_in_the_first_iteration_does_not_set_the_scale(env: lw.Env) -> None:
+    def outlier(reward: torch.Tensor, iteration: int) -> None:
+        if iteration == 1:
+            reward[5, 2] = 1e10
+
+    plain, disturbed = learned(env, 5, lambda *_: None), learned(env, 5, outlier)
+    assert disturbed[-1].explained_variance == pytest.approx(plain[-1].explained_variance, abs=0.15)
+
+
+def test_a_step_that_the_fisher_information_misjudges_is_shortened(env: lw.Env) -> None:
+    env.rand_reset(0)
+    one_sample = dataclasses.replace(SMALL, fisher_fraction=1e-6, delta=0.1, mean_every=0)
+    npg = lw.NPG(env, config=one_sample, seed=0)
+    iterations = [next(npg) for _ in range(4)]
+    assert all(0.0 <= it.kl <= 1.5 * 0.05 + 1e-5 for it in iterations)
+    assert min(it.step_fraction for it in iterations) < 0.5
+    free = lw.NPG(env, config=dataclasses.replace(one_sample, kl_limit=1e9), seed=0)
+    assert max(next(free).kl for _ in range(4)) > 0.2
+
+
+def test_the_fisher_information_takes_other_samples_each_time(env: lw.Env) -> None:
+    env.rand_reset(0)
+    npg = lw.NPG(env, config=dataclasses.replace(SMALL, fisher_fraction=1 / 16), seed=0)
+    next(npg)
+    obs = npg.rollout.obs.flatten(0, 1)
+    means = [npg.fisher(obs).mean for _ in range(2)]
+    assert means[0].shape == (20, 2) and not torch.equal(*means)
+    # of 16 worlds, a stride of 16 would take the same one every time
+    every = npg.policy(obs).detach()
+    worlds = {int((every - mean).abs().sum(1).argmin()) % 16 for mean in means[0].detach()}
+    assert len(worlds) > 5
+
+
+def test_the_value_function_gets_the_group_critic_where_the_task_has_one() -> None:
+    env = lw.make(Full, nworld=4)
+    npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=40))
+    it = next(npg)
+    assert npg.value.group == "critic" and math.isfinite(it.explained_variance)
+    assert npg.value.network[0].in_features == env.obs_spaces["critic"].size != env.obs_space.size
+    policy_group = lw.NPG(env, config=dataclasses.replace(SMALL, samples=40, value_group="policy"))
+    assert policy_group.value.network[0].in_features == env.obs_space.size
+    with pytest.raises(ValueError, match="has no group 'privileged' of observations .* it has policy, critic"):
+        lw.NPG(env, config=dataclasses.replace(SMALL, value_group="privileged"))
+
+
 def test_a_state_of_another_number_of_worlds_is_refused(env: lw.Env) -> None:
     npg = lw.NPG(env, config=SMALL)
     with pytest.raises(ValueError, match="the state has 16 worlds, but the environment has 3"):
@@ -92,7 +176,6 @@ def test_a_gradient_that_is_not_finite_leaves_the_policy_unchanged(env: lw.Env) 
     env.rand_reset(0)
     npg = lw.NPG(env, config=SMALL)
     with torch.no_grad():
-        npg.policy.log_std.fill_(-4.0)  # below its limit, which a step would restore
         npg.value.network[0].weight[0, 0] = math.nan
     before = [p.clone() for p in (*npg.policy.parameters(), *npg.value.parameters())]
     with pytest.raises(FloatingPointError, match="gradient of iteration 1 is not finite; .* finite: make the step"):

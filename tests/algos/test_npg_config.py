@@ -36,6 +36,8 @@ from lyceum_warp.algos.npg_config import enough_samples
         ("normalize", "yes", "be True or False"),
         ("hidden", 8, r"the widths of the hidden layers, as in \(64, 64\)"),
         ("value_hidden", (8, 0), r"the widths of the hidden layers, as in \(64, 64\)"),
+        ("activation", "swish", "be one of 'tanh', 'relu', .*, not 'swish'"),
+        ("value_activation", None, "be one of 'tanh', 'relu', .*, not None"),
         ("hidden", "wide", "the widths of the hidden layers"),
     ],
 )

@@ -65,6 +65,21 @@ def test_an_unknown_group_is_refused() -> None:
         lw.Rollout(lw.make(Metered), 2, groups=("actor",))
 
 
+def test_only_the_first_episode_of_each_world_counts_on_request() -> None:
+    env = lw.make("hopper", nworld=8)
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
+    noise = torch.randn(200, 8, 3, generator=torch.Generator().manual_seed(0))
+    counted = []
+    for first_only in (False, True):
+        rollout = lw.Rollout(env, 200, first_only=first_only)
+        env.rand_reset(0)
+        rollout.collect(policy, noise)
+        counted.append(rollout.done & ~rollout.episode_return.isnan())
+    every, first = counted
+    assert (every.sum(0) > 1).all() and (first.sum(0) == 1).all()
+    assert torch.equal(first.int().argmax(0), every.int().argmax(0))
+
+
 def test_faults_within_a_rollout_are_counted() -> None:
     env = lw.make("hopper", nworld=3)
     rollout = lw.Rollout(env, 4)
@@ -73,6 +88,8 @@ def test_faults_within_a_rollout_are_counted() -> None:
     noise[1:3, 2] = math.nan
     rollout.collect(policy, noise)
     assert rollout.faults.tolist() == [0, 0, 2]
+    # a fault cuts an episode off: it is not the termination that is worth a return of 0
+    assert rollout.done[1, 2] and not rollout.terminated.any()
     assert env.fault_counts["action"] == 2
     noise.zero_()
     rollout.collect(policy, noise)

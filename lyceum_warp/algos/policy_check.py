@@ -1,0 +1,123 @@
+"""A check of a policy that a user made, before NPG learns with it."""
+
+import torch
+from torch import nn
+
+from lyceum_warp.algos.natural_gradient import FisherProduct, flatten
+from lyceum_warp.algos.networks import moved
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.env import Env
+from lyceum_warp.validate import described
+
+_ROWS = 4
+"""Observations that the policy is called with."""
+
+
+def check_policy(policy: object, env: Env) -> None:
+    """Check that NPG can learn a policy in an environment.
+
+    A policy is a ``GaussianPolicy``, with the package's network or one of the user's. Called with observations
+    (..., nobs) it returns mean actions (..., nact), which depend on the observation in the same row alone, and which
+    are differentiable twice by the parameters that are learned.
+
+    Args:
+        policy: The policy.
+        env: The environment; its worlds are left as they are.
+
+    Raises:
+        ValueError: The policy breaks one of these rules.
+    """
+    if not isinstance(policy, GaussianPolicy):
+        kind = getattr(policy, "__name__", None) or type(policy).__name__
+        fix = "lw.GaussianPolicy(nobs, nact, network=net) makes one of a network of your own"
+        raise ValueError(f"policy must be a GaussianPolicy, not {kind}: {fix}")
+    policy = moved(policy, env)
+    sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
+    if sizes != wanted:
+        raise ValueError(
+            f"the policy takes {sizes[0]} observations and gives {sizes[1]} actions, but the task {env.task.name!r} "
+            f"has {wanted[0]} and {wanted[1]}"
+        )
+    _check_parameters(policy)
+    obs = env.obs.repeat(-(-_ROWS // env.nworld), 1)[:_ROWS]
+    noise = torch.randn(obs.shape, generator=torch.Generator().manual_seed(0))  # rows differ from each other
+    obs = obs + 0.1 * noise.to(obs.device)
+    _check_output(policy, obs)
+    _check_derivatives(policy, obs)
+
+
+def _check_parameters(policy: GaussianPolicy) -> None:
+    log_std = getattr(policy, "log_std", None)
+    if not isinstance(log_std, nn.Parameter) or log_std.shape != (policy.nact,):
+        raise ValueError(f"policy.log_std must be an nn.Parameter of shape ({policy.nact},), not {described(log_std)}")
+    for name, parameter in policy.named_parameters():
+        if parameter.dtype != torch.float32:
+            raise ValueError(f"the policy's parameter {name!r} must be float32, not {described(parameter)}")
+        if not parameter.isfinite().all():
+            raise ValueError(f"the policy's parameter {name!r} is not finite: initialise it")
+    if not any(p.requires_grad for p in policy.parameters() if p is not log_std):
+        raise ValueError("the policy's network has no parameter to learn: unfreeze it with policy.requires_grad_(True)")
+
+
+@torch.no_grad()
+def _check_output(policy: GaussianPolicy, obs: torch.Tensor) -> None:
+    mean, again = _called(policy, obs), _called(policy, obs)
+    if mean.isfinite().all() and not torch.equal(mean, again):
+        raise ValueError(
+            "the policy gives two different mean actions for the same observations: it must not draw random numbers "
+            "(dropout: call eval() on its network), nor keep anything from one call to the next"
+        )
+    if not mean.isfinite().all():
+        raise ValueError("the policy's mean actions are not finite for finite observations")
+    alone = torch.cat([_called(policy, row) for row in obs.split(1)])
+    if not torch.allclose(mean, alone, rtol=0.0, atol=1e-2 * max(mean.abs().max().item(), 1e-6)):
+        raise ValueError(
+            "the policy's mean action depends on the other rows of the batch (batch normalisation?): use "
+            "normalize=True, or LayerNorm"
+        )
+
+
+def _called(policy: GaussianPolicy, obs: torch.Tensor) -> torch.Tensor:
+    """The mean actions for observations, (rows, nact)."""
+    shape = (len(obs), policy.nact)
+    try:
+        mean: object = policy(obs)
+    except Exception as error:  # of any type, from the user's network
+        reason = f"{type(error).__name__}: {_first_line(error)}"
+        raise ValueError(f"the policy fails for observations of shape {tuple(obs.shape)} ({reason})") from error
+    if not isinstance(mean, torch.Tensor) or mean.shape != shape or mean.dtype != obs.dtype:
+        wanted = f"a {str(obs.dtype).removeprefix('torch.')} tensor of shape {shape}"
+        given = described(mean) if isinstance(mean, torch.Tensor) else type(mean).__name__
+        raise ValueError(f"the policy must give {wanted} for observations of shape {tuple(obs.shape)}, not {given}")
+    return mean
+
+
+def _check_derivatives(policy: GaussianPolicy, obs: torch.Tensor) -> None:
+    named = [(name, p) for name, p in policy.named_parameters() if p.requires_grad and p is not policy.log_std]
+    with torch.enable_grad():
+        mean = policy(obs)
+        sums = mean.sum()
+        if not sums.requires_grad:
+            raise ValueError("the policy's mean actions depend on no parameter: leave out detach() and no_grad()")
+        gradients = torch.autograd.grad(sums, [p for _, p in named], allow_unused=True)
+        if unused := [name for (name, _), gradient in zip(named, gradients, strict=True) if gradient is None]:
+            raise ValueError(
+                f"the policy's mean actions do not depend on its parameter {unused[0]!r}: use it, without detach() or "
+                "no_grad(), or freeze it with requires_grad_(False)"
+            )
+        try:
+            product = FisherProduct(policy, obs, 0.0)(
+                flatten(p.detach() for p in policy.parameters() if p.requires_grad)
+            )
+        except RuntimeError as error:
+            raise ValueError(
+                "the policy cannot be differentiated twice, which NPG needs for the Fisher information "
+                f"({_first_line(error)}): use other layers"
+            ) from error
+    if not product.isfinite().all():
+        raise ValueError("the policy's derivatives are not finite")
+
+
+def _first_line(error: BaseException) -> str:
+    """The first line of an error's message; torch's messages fill a page."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0].split(". ")[0][:200]

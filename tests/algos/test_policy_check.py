@@ -1,0 +1,171 @@
+"""Policies with networks of the user's own: what NPG refuses, and that it learns the others as its own."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import SharedEnv
+from torch import nn
+
+import lyceum_warp as lw
+from lyceum_warp.algos.networks import mlp
+from lyceum_warp.algos.policy_check import check_policy
+from lyceum_warp.runs import Run
+
+
+class Net(nn.Module):
+    """A network whose output a function changes."""
+
+    def __init__(self, change: Callable[[torch.Tensor], object] = lambda mean: mean) -> None:
+        super().__init__()
+        self.first, self.last = nn.Linear(6, 8), nn.Linear(8, 2)
+        self.change = change
+
+    def forward(self, obs: torch.Tensor) -> object:
+        return self.change(self.last(torch.tanh(self.first(obs))))
+
+
+class Once(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x):
+        return 1.0 * x
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient):
+        return gradient
+
+
+class Unused(Net):
+    def __init__(self) -> None:
+        super().__init__()
+        self.spare = nn.Linear(2, 2)
+
+
+class Counting(Net):
+    """A network that depends on how often it was called."""
+
+    def forward(self, obs: torch.Tensor) -> object:
+        self.calls = getattr(self, "calls", 0.0) + 1.0
+        return super().forward(obs) + self.calls
+
+
+def frozen(module: nn.Module) -> nn.Module:
+    return module.requires_grad_(False)
+
+
+def without_log_std() -> lw.GaussianPolicy:
+    policy = lw.GaussianPolicy(6, 2)
+    policy.log_std = None
+    return policy
+
+
+@pytest.mark.parametrize(
+    ("network", "message"),
+    [
+        (Net(lambda mean: mean[..., :1]), r"must give a float32 tensor of shape \(4, 2\) .* not .* shape \(4, 1\)"),
+        (Net(lambda mean: mean.double()), r"must give a float32 tensor of .* not a float64 tensor of shape \(4, 2\)"),
+        (Net(lambda mean: (mean, None)), r"must give a float32 tensor .* not tuple"),
+        (Net(lambda mean: mean / 0.0), "mean actions are not finite"),
+        (Net(lambda mean: mean.detach()), "depend on no parameter: leave out detach"),
+        (Net(lambda mean: mean + torch.ones(3)), r"fails for observations of shape \(4, 6\) \(RuntimeError: The size"),
+        (Net(Once.apply), r"cannot be differentiated twice, which NPG needs .*\): use other layers"),
+        (nn.Linear(5, 2), r"fails for observations of shape \(4, 6\) \(RuntimeError: mat1 and mat2"),
+        (frozen(Net()), r"no parameter to learn: unfreeze it with policy.requires_grad_\(True\)"),
+        (nn.Flatten(), "no parameter to learn"),
+        (Net().double(), "parameter 'network.first.weight' must be float32, not a float64 tensor"),
+        (Unused(), "do not depend on its parameter 'network.spare.weight': use it"),
+        (Counting(), "two different mean actions for the same observations"),
+        (nn.Sequential(nn.Linear(6, 2), nn.Dropout(0.5)), "two different mean actions .*dropout"),
+        (
+            nn.Sequential(nn.Linear(6, 2), nn.BatchNorm1d(2, track_running_stats=False)),
+            r"fails .* \(1, 6\) .*more than 1",
+        ),
+        (nn.Sequential(nn.Linear(6, 2), nn.Softmax(0)), "depends on the other rows of the batch"),
+    ],
+)
+def test_npg_refuses_a_network_in_one_line(shared_env: SharedEnv, network: nn.Module, message: str) -> None:
+    env = shared_env("point_mass", nworld=2)
+    torch.manual_seed(0)
+    with pytest.raises(ValueError, match=message) as caught:
+        lw.NPG(env, lw.GaussianPolicy(6, 2, network=network))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        (Net(), r"policy must be a GaussianPolicy, not Net: lw.GaussianPolicy\(nobs, nact, network=net\) makes one"),
+        (lw.GaussianPolicy, "policy must be a GaussianPolicy, not GaussianPolicy"),
+        ("policy.pt", "policy must be a GaussianPolicy, not str"),
+        (lw.GaussianPolicy(5, 2), "takes 5 observations and gives 2 actions, but the task 'point_mass' has 6 and 2"),
+        (without_log_std(), r"log_std must be an nn.Parameter of shape \(2,\), not NoneType None"),
+        (lw.GaussianPolicy(6, 2, log_std=torch.nan), "parameter 'log_std' is not finite: initialise it"),
+    ],
+)
+def test_npg_refuses_a_policy_in_one_line(shared_env: SharedEnv, policy: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        lw.NPG(shared_env("point_mass"), policy)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_network_that_is_not_a_module_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"network must be a module of torch \(torch.nn.Module\), not list"):
+        lw.GaussianPolicy(6, 2, network=[64, 64])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("layer", [nn.LayerNorm(8), nn.GELU(), nn.PReLU(), nn.Softsign()])
+def test_the_check_accepts_usual_layers_and_changes_nothing(shared_env: SharedEnv, layer: nn.Module) -> None:
+    env = shared_env("point_mass")
+    policy = lw.GaussianPolicy(6, 2, network=nn.Sequential(nn.Linear(6, 8), layer, nn.Linear(8, 2)))
+    before, random = env.get_state(), torch.get_rng_state()
+    check_policy(policy, env)
+    assert torch.equal(env.get_state(), before) and torch.equal(torch.get_rng_state(), random)
+    assert all(parameter.grad is None for parameter in policy.parameters())
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_npg_learns_a_network_of_the_users_own_as_its_own(normalize: bool) -> None:
+    config = lw.NPGConfig(samples=200, hidden=(8,), normalize=normalize)
+    own = mlp([6, 8, 2], last_scale=1e-2, generator=torch.Generator().manual_seed(3))
+    policies = (
+        lw.GaussianPolicy(6, 2, network=own, normalize=normalize),
+        lw.GaussianPolicy(6, 2, (8,), normalize=normalize, generator=torch.Generator().manual_seed(3)),
+    )
+    iterations = []
+    for policy in policies:
+        npg = lw.NPG(lw.make("point_mass", nworld=4, horizon=25, seed=1), policy, config=config)
+        iterations.append([next(npg).kl for _ in range(2)])
+    assert iterations[0] == iterations[1]
+
+
+def test_a_policy_with_a_network_of_the_users_own_is_saved_and_filled(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    policy, obs = lw.GaussianPolicy(6, 2, network=Net(), normalize=True), torch.randn(5, 6)
+    policy.normalizer.update(torch.randn(10, 6) + 3.0)
+    run = Run.create(tmp_path / "run", {})
+    run.save(0, policy, {})
+    loaded = lw.load(run, policy=lw.GaussianPolicy(6, 2, network=Net(), normalize=True))
+    assert torch.equal(loaded(obs), policy(obs))
+    with pytest.raises(
+        ValueError, match=r"own, test_policy_check.Net: .*lw.GaussianPolicy\(6, 2, network=..., normalize=True\)\)$"
+    ):
+        lw.load(run)
+    with pytest.raises(
+        ValueError, match=r"\('network.weight' is absent in the file, and \(2, 6\) in .*: give one like"
+    ):
+        lw.load(run, policy=lw.GaussianPolicy(6, 2, network=nn.Linear(6, 2), normalize=True))
+
+
+def test_a_policy_of_the_users_own_class_is_not_loaded_as_another(tmp_path: Path) -> None:
+    class Bounded(lw.GaussianPolicy):
+        def forward(self, obs: torch.Tensor) -> torch.Tensor:
+            return torch.tanh(super().forward(obs))
+
+    run = Run.create(tmp_path / "run", {})
+    run.save(0, policy := Bounded(6, 2, (4,)), {})
+    with pytest.raises(ValueError, match="of a class of its own, .*Bounded"):
+        lw.load(run)
+    obs = torch.randn(3, 6)
+    assert torch.equal(lw.load(run, policy=Bounded(6, 2, (4,)))(obs), policy(obs))
