@@ -77,6 +77,7 @@ from lyceum_warp.task import (
     site,
     tendon,
 )
+from lyceum_warp.training import train
 
 __version__ = "0.1.0"
 
@@ -158,6 +159,7 @@ __all__ = [
     "task_names",
     "tendon",
     "tolerance",
+    "train",
     "uniform",
     "vec10",
 ]

@@ -486,6 +486,11 @@ class Env:
 
     # parameters and other environments of the same task
 
+    @property
+    def given_params(self) -> dict[str, Any]:
+        """The parameters of the task that were given, by name; all others have their defaults."""
+        return dict(self._given_params)
+
     def set_params(self, **params: Any) -> None:
         """Change parameters of the task from the next step on, in place.
 

@@ -9,9 +9,18 @@ from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
+from lyceum_warp.validate import whole_number
 
 MEAN_SEED = 2**31 - 1
 """Seed of the initial states from which NPG evaluates the mean policy."""
+
+
+def evaluation_seed(seed: int) -> int:
+    """The seed of an environment's random streams for an evaluation with a seed.
+
+    Training with the same seed draws other initial states. Different seeds of evaluations stay different.
+    """
+    return whole_number("seed", seed, low=0) ^ 0x5A17C3E9
 
 
 @document_attributes
@@ -57,7 +66,8 @@ def evaluate(
         env: The environment; its worlds are reset.
         policy: Called with observations (nworld, nobs), returns actions (nworld, nact).
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
-        seed: Seed of the initial states; by default the worlds continue their random streams.
+        seed: Seed of the initial states, which differ from those of an environment made with the same seed; by default
+            the worlds continue their random streams.
         progress: Called every 50 steps with the number of finished episodes and that of all.
 
     Raises:
@@ -68,7 +78,7 @@ def evaluate(
     if not env.autoreset:
         raise ValueError("evaluate needs an environment that resets automatically: make it with autoreset=True")
     each = -(-episodes // env.nworld)
-    env.rand_reset(seed)
+    env.rand_reset(None if seed is None else evaluation_seed(seed))
     metrics = list(env.episode_metrics.values())
     results = torch.zeros(5 + len(metrics), each, env.nworld, device=env.obs.device)
     count = torch.zeros(env.nworld, dtype=torch.long, device=env.obs.device)

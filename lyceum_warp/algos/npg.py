@@ -107,6 +107,9 @@ class NPG:
             )
         if not env.autoreset:
             raise ValueError("NPG needs an environment that resets automatically: make it with autoreset=True")
+        for module in (policy, value):
+            if isinstance(module, torch.nn.Module) and not any(p.requires_grad for p in module.parameters()):
+                module.requires_grad_(True)  # lw.load freezes what it loads
         if policy is not None:
             check_policy(policy, env)
 

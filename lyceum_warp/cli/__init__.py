@@ -10,12 +10,12 @@ import tyro
 
 from lyceum_warp.cli.check import Check, check
 from lyceum_warp.cli.evaluate import Eval, evaluate_run
-from lyceum_warp.cli.interrupts import Interrupted, signals
 from lyceum_warp.cli.list_tasks import Tasks, list_tasks
 from lyceum_warp.cli.new_task import New, new_task
 from lyceum_warp.cli.plan import Plan, plan
-from lyceum_warp.cli.train import Train, resume, saved_options, train
+from lyceum_warp.cli.train import Train, origin_options, resume, saved_options, train
 from lyceum_warp.cli.warmup import Warmup, warm_up
+from lyceum_warp.interrupts import Interrupted, signals
 from lyceum_warp.viz.video import NoVideoError
 
 _Command = Annotated[Tasks, tyro.conf.subcommand("tasks")] \
@@ -66,15 +66,22 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return warm_up(command)
             if command.resume is not None:
                 return resume(_parse(argv, saved_options(command.resume)), command.resume)
+            if command.from_run is not None:
+                command = _parse(argv, origin_options(command))
             return train(command)
     except (ValueError, FileNotFoundError, FloatingPointError, ImportError, NoVideoError) as error:
-        print(f"lyceum-warp: {' '.join(str(error).split())}", file=sys.stderr)
+        text = "; ".join([str(error), *getattr(error, "__notes__", [])])
+        print(f"lyceum-warp: {' '.join(text.split())}", file=sys.stderr)
         return 2
     except Interrupted as signalled:
         return 128 + signalled.number
     except BrokenPipeError:  # as in: lyceum-warp tasks | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:  # as a full disk, or a folder that cannot be written
+        text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        print(f"lyceum-warp: {text}", file=sys.stderr)
+        return 2
 
 
 def _parse(argv: Sequence[str], default: Train | None = None) -> Any:

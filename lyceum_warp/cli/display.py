@@ -28,6 +28,11 @@ def make_console() -> Console:
     return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=120)
 
 
+def note(line: str) -> None:
+    """Print a line that is not a result, to stderr."""
+    print(f"lyceum-warp: {line}", file=sys.stderr)
+
+
 class Display:
     """Progress of a training run: a live bar of at most 80 columns on a terminal, a line for each iteration elsewhere.
 
