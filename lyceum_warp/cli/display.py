@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from lyceum_warp.algos.networks import moved
+from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.control.control_report import ControlReport
@@ -19,6 +20,7 @@ from lyceum_warp.control.episode_collector import ControlProgress
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs import Run
+from lyceum_warp.tensorboard import TensorBoard
 
 _TABLE_ROWS = 15
 
@@ -104,13 +106,14 @@ class LongWork:
         text: What is done.
         unit: What is counted, as "frames".
         console: Where it is shown.
+        quiet: Whether to show nothing.
     """
 
-    def __init__(self, text: str, unit: str, console: Console | None = None) -> None:
-        self.text, self.unit, self.console = text, unit, console or make_console()
+    def __init__(self, text: str, unit: str, console: Console | None = None, *, quiet: bool = False) -> None:
+        self.text, self.unit, self.console, self.quiet = text, unit, console or make_console(), quiet
         self.progress = Progress(
             TextColumn("{task.description}"), BarColumn(bar_width=12), MofNCompleteColumn(), TextColumn(unit),
-            TimeElapsedColumn(), console=self.console, transient=True, disable=not self.console.is_terminal,
+            TimeElapsedColumn(), console=self.console, transient=True, disable=quiet or not self.console.is_terminal,
         )  # fmt: skip
         self.bar = self.progress.add_task(text, total=None)
         self.start, self.next = time.monotonic(), 3.0
@@ -126,7 +129,7 @@ class LongWork:
         """Show that a part of the work is done."""
         self.progress.update(self.bar, completed=done, total=total)
         seconds = time.monotonic() - self.start
-        if not self.console.is_terminal and seconds >= self.next and done < total:
+        if not (self.quiet or self.console.is_terminal) and seconds >= self.next and done < total:
             self.console.print(f"{self.text}: {done} of {total} {self.unit}, {seconds:.0f} s", soft_wrap=True)
             sys.stdout.flush()
             self.next = seconds + 10.0
@@ -181,28 +184,65 @@ def plotted(run: Run) -> str:
         return f"none: {error}"
 
 
-def policy_video(env: Env, policy: GaussianPolicy, path: Path, seed: int) -> str:
-    """Write a video of an episode under a policy; returns its path, or the reason why there is none."""
+def policy_video(env: Env, policy: GaussianPolicy, path: Path, seed: int, *, quiet: bool = False) -> str:
+    """Write a video of an episode under a policy; returns its path, or the reason why there is none.
+
+    Args:
+        env: The policy's environment; the episode runs in a world of its own.
+        policy: The policy.
+        path: The mp4 file.
+        seed: Seed of the initial state.
+        quiet: Whether to show no progress, as while another progress is shown.
+    """
     from lyceum_warp.viz import video
 
     one = env.replicate_few(1, autoreset=False)
     try:
-        with LongWork("running an episode for the video", "steps") as work:
+        with LongWork("running an episode for the video", "steps", quiet=quiet) as work:
             states = video.episode(one, moved(policy, one), seed=seed, progress=work)
-        return states_video(one, states, path)
+        return states_video(one, states, path, quiet=quiet)
     except ValueError as error:
         return f"none: {error}"
 
 
-def states_video(env: Env, states: torch.Tensor, path: Path) -> str:
+def states_video(env: Env, states: torch.Tensor, path: Path, *, quiet: bool = False) -> str:
     """Write a video of given states; returns its path, or the reason why there is none."""
     from lyceum_warp.viz import video
 
     try:
-        with LongWork("drawing the video", "frames") as work:
+        with LongWork("drawing the video", "frames", quiet=quiet) as work:
             return str(video.write_video(env, states, path, progress=work))
     except (video.NoVideoError, ValueError) as error:
         return f"none: {error}"
+
+
+class Videos:
+    """Writes a video of the mean policy every few iterations, and shows it in TensorBoard.
+
+    A machine that cannot draw is reported once, and gets no further video.
+
+    Args:
+        npg: The algorithm.
+        folder: Folder of the videos, which have the numbers of their iterations.
+        every: Iterations between two videos; 0 for none.
+        seed: Seed of the initial state, the same for all videos.
+        board: TensorBoard's writer, if there is one.
+    """
+
+    def __init__(self, npg: NPG, folder: Path, every: int, seed: int, board: TensorBoard | None) -> None:
+        self.npg, self.folder, self.every, self.seed, self.board = npg, folder, every, seed, board
+
+    def __call__(self, iteration: Iteration) -> None:
+        """Write a video after an iteration, if it is time for one."""
+        if not self.every or iteration.iteration % self.every:
+            return
+        path = self.folder / f"{iteration.iteration:06d}.mp4"
+        result = policy_video(self.npg.env, self.npg.policy, path, self.seed, quiet=True)
+        if result != str(path):
+            note(f"no videos every {self.every} iterations ({result.removeprefix('none: ')})")
+            self.every = 0
+        elif self.board is not None:
+            self.board.video(path, iteration.samples)
 
 
 # plans
