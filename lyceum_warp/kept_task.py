@@ -9,7 +9,7 @@ import os
 import shutil
 import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,8 @@ log = logging.getLogger(__name__)
 Note = Callable[[str], None]
 
 _MODEL, _TABLES = "model", "tables"
+_APART = 2
+"""A task's file lies at most this many folders below the common one of it and its model."""
 _LARGEST = 512 * 2**20
 """Models with larger files than this, in bytes, are not copied."""
 
@@ -68,15 +70,17 @@ class KeptTask:
         files: dict[str, Path | bytes | np.ndarray] = {}
         if file is not None:
             kept["source_hash"] = _digest(file.read_bytes())
-            if own:
-                kept["file"] = file.name
-                files[file.name] = file
-                kept["program"] = task.__module__ == "__main__"
+        sources: dict[Path, Path | bytes] = {file: file} if own and file is not None else {}
+        main = None
         if own or env.options.model is not None:
             main, model = _model_files(env)
-            if main is not None:
-                kept["model"] = f"{_MODEL}/{main}"
-                files |= {f"{_MODEL}/{name}": content for name, content in model.items()}
+            sources |= model
+        names = _names_in_copy(sources, file)
+        if own and file is not None:
+            kept["file"], kept["program"] = names[file], task.__module__ == "__main__"
+        if main is not None:
+            kept["model"] = names[main]
+        files |= {names[path]: content for path, content in sources.items()}
         kept["model_given"] = env.options.model is not None
         for name, value in env.given_params.items():
             if (table := _table(value)) is not None:
@@ -142,8 +146,8 @@ def run_env(
     if task is not None:
         return Env(task, options, **params)
     kept = run.config.get("kept", {})
-    chosen = _run_task(run, kept, note)
-    params = {name: _found_table(run, name, value) for name, value in params.items()}
+    chosen = run_task(run, note=note)
+    params = run_params(run, params)
     copy = run.task_folder / kept["model"] if "model" in kept else None
     if copy is None or not copy.is_file():
         env = Env(chosen, options, **params)
@@ -163,9 +167,17 @@ def run_env(
     return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
 
 
-def _run_task(run: Run, kept: Mapping[str, Any], note: Note) -> str:
-    """The task, by name or file, that stands for a run's."""
-    task = run.config["task"]
+def run_task(run: Run, *, note: Note = log.warning) -> str:
+    """The task, by name or file, that stands for a run's; see ``run_env``.
+
+    Args:
+        run: The run.
+        note: Called with each line.
+
+    Raises:
+        ValueError: The task was defined in a program or a notebook.
+    """
+    task, kept = run.config["task"], run.config.get("kept", {})
     if task is None or kept.get("program"):
         where = "a notebook" if task is None else task.partition(":")[0]
         raise ValueError(
@@ -190,6 +202,11 @@ def _run_task(run: Run, kept: Mapping[str, Any], note: Note) -> str:
     return f"{copy}{colon}{attribute}"
 
 
+def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters of a run's task; a table that is not where it was is the run's own copy."""
+    return {name: _found_table(run, name, value) for name, value in params.items()}
+
+
 def _found_table(run: Run, name: str, value: Any) -> Any:
     """A parameter, with the run's copy of a table that is not where it was."""
     copy = run.task_folder / _TABLES / f"{name}.npy"
@@ -210,20 +227,43 @@ def _model_changed(run: Run, kept: Mapping[str, Any], env: Env) -> bool:
 # copies
 
 
-def _digest(content: bytes | np.ndarray) -> str:
+def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()[:16]
 
 
 def _model_hash(env: Env) -> str:
-    """A hash of the compiled model, the same in every process."""
-    model = env.task.model
-    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, content)
-    return _digest(content)
+    """A hash of the compiled model, the same in every process and wherever its files lie."""
+    found = hashlib.sha256()
+    for owner in (env.task.model, env.task.model.opt):
+        for name in sorted(dir(owner)):
+            if name.startswith("_") or name.endswith("pathadr") or name in ("paths", "npaths", "nbuffer"):
+                continue
+            value = getattr(owner, name)
+            if isinstance(value, np.ndarray):
+                found.update(name.encode() + np.ascontiguousarray(value).tobytes())
+            elif isinstance(value, bytes | int | float):
+                found.update(f"{name}{value!r}".encode())
+    return found.hexdigest()[:16]
 
 
-def _model_files(env: Env) -> tuple[str | None, dict[str, Path | bytes | np.ndarray]]:
-    """The main file of a task's model and all files by their paths below a common folder.
+def _names_in_copy(paths: Iterable[Path], file: Path | None) -> dict[Path, str]:
+    """The paths in the folder ``task`` of a task's file and of its model's files.
+
+    The files keep their places relative to each other, so that the copy of the task finds the copy of its model. Where
+    the task's file lies elsewhere than its model, each has a place of its own.
+    """
+    paths = list(paths)
+    if not paths:
+        return {}
+    root = Path(os.path.commonpath([path.parent for path in paths]))
+    if file in paths and len(file.parent.relative_to(root).parts) > _APART:
+        rest = [path for path in paths if path != file]
+        return {file: file.name} | {path: f"{_MODEL}/{name}" for path, name in _names_in_copy(rest, None).items()}
+    return {path: path.relative_to(root).as_posix() for path in paths}
+
+
+def _model_files(env: Env) -> tuple[Path | None, dict[Path, Path | bytes]]:
+    """The main file of a task's model, and all its files with their contents or the paths to copy.
 
     A model that was made in Python is written as MJCF, with the files that it names.
     """
@@ -243,17 +283,17 @@ def _model_files(env: Env) -> tuple[str | None, dict[str, Path | bytes | np.ndar
             log.info("the model of %s cannot be written as MJCF, so the run has no copy of it: %s", task, error)
             return None, {}
         source = Path(spec.modelfiledir or ".").absolute() / "model.xml"
+    source = source.resolve()
     found = [source, *_named_files(source, text)]
     if sum(path.stat().st_size for path in found if path.is_file()) > _LARGEST:
         log.info("the model of %s is larger than %d MiB, so the run has no copy of it", task, _LARGEST // 2**20)
         return None, {}
-    root = Path(os.path.commonpath([path.parent for path in found]))
-    files: dict[str, Path | bytes | np.ndarray] = {path.relative_to(root).as_posix(): path for path in found}
-    main = source.relative_to(root).as_posix()
+    files: dict[Path, Path | bytes] = {path: path for path in found}
     if text is not None:
-        files[main] = text.encode()
-        files |= {name: content for name, content in env.task.spec.assets.items() if name not in files}
-    return main, files
+        files[source] = text.encode()
+        for name, content in env.task.spec.assets.items():
+            files.setdefault(source.parent / name, content)
+    return source, files
 
 
 def _named_files(source: Path, text: str | None = None) -> list[Path]:

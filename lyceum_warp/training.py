@@ -121,6 +121,8 @@ def describe(npg: NPG) -> dict[str, Any]:
     """The configuration of a run that an algorithm stands for, as config.json holds it."""
     env, options = npg.env, npg.env.options
     config = fitted_config(npg.config, npg.policy.shape, npg.value.shape)
+    if npg.value.group != ("critic" if "critic" in env.obs_groups else "policy"):
+        config = dataclasses.replace(config, value_group=npg.value.group)
     others = {name: value for name, value in options.given().items() if name in ("nthread", "horizon", "graphs")}
     others |= {name: list(names) for name in ("fields", "dynamics") if (names := getattr(options, name))}
     if isinstance(options.model, str | Path):
@@ -149,7 +151,7 @@ def fitted_config(config: NPGConfig, policy_shape: Mapping[str, Any], value_shap
         value_shape: That of the value function.
     """
     entries = {"hidden": policy_shape.get("hidden"), "activation": policy_shape.get("activation")}
-    entries |= {f"value_{name}": value_shape.get(name) for name in ("hidden", "activation", "group")}
+    entries |= {f"value_{name}": value_shape.get(name) for name in ("hidden", "activation")}
     entries |= {"normalize": policy_shape.get("normalize"), "time_orders": value_shape.get("time_orders")}
     return dataclasses.replace(config, **{name: entry for name, entry in entries.items() if entry is not None})
 
@@ -184,19 +186,23 @@ def check_resumable(run: Run, content: Mapping[str, Any], iterations: int, targe
 
 def _check_equal(run: Run, config: Mapping[str, Any]) -> None:
     """Refuse an algorithm with other settings than the run's."""
-    then, now = (
-        {**c, **c.pop("npg")}
-        for c in (
-            {name: value.get(name, {}) for name in ("params", "physics", "nworld", "npg")}
-            for value in (run.config, json.loads(json.dumps(config)))
-        )
-    )
-    for name, value in now.items():
-        if name in then and then[name] != value:
-            raise ValueError(
-                f"the run in {run.folder} has {name} {then[name]}, not {value}, and a run keeps its settings: make NPG "
-                "with the same arguments, or give another folder"
-            )
+    now = json.loads(json.dumps(config))  # lists in place of tuples
+    for part in ("params", "physics", "npg", "nworld"):
+        for name, then, given in _entries(part, run.config.get(part), now[part]):
+            if then != given:
+                raise ValueError(
+                    f"the run in {run.folder} has {name} {then}, not {given}, and a run keeps its settings: make NPG "
+                    "with the same arguments, or give another folder"
+                )
+
+
+def _entries(name: str, then: Any, now: Any) -> list[tuple[str, Any, Any]]:
+    """Two values of a configuration's entry; for a table those of its entries that are known."""
+    if not isinstance(then, Mapping):
+        return [(name, then, now)]
+    # an older run lacks the newest hyperparameters
+    known = then if name == "npg" else {**then, **now}
+    return [(entry, then.get(entry), now.get(entry)) for entry in known]
 
 
 def restore(run: Run, npg: NPG, content: Mapping[str, Any]) -> None:

@@ -69,10 +69,10 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return plan(command)
             if isinstance(command, Warmup):
                 return warm_up(command)
-            if command.resume is not None:
-                return resume(_parse(argv, saved_options(command.resume)), command.resume)
             if command.from_run is not None:
                 command = _parse(argv, origin_options(command))
+            if command.resume is not None:
+                return resume(_parse(argv, saved_options(command.resume)), command.resume)
             return train(command)
     except (ValueError, FileNotFoundError, FloatingPointError, ImportError, NoVideoError) as error:
         text = "; ".join([str(error), *getattr(error, "__notes__", [])])

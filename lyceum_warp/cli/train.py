@@ -43,7 +43,7 @@ from lyceum_warp.cli.display import (
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted
-from lyceum_warp.kept_task import KeptTask, run_env
+from lyceum_warp.kept_task import KeptTask, run_env, run_params, run_task
 from lyceum_warp.machine import cpu_cores
 from lyceum_warp.runs import PolicyContent, Run, check_sizes, networks, read_checkpoint
 from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
@@ -259,11 +259,13 @@ def origin_options(given: Train) -> Train:
     assert given.from_run is not None
     if given.resume is not None:
         raise ValueError("--resume continues a run with its own policy, so it cannot be combined with --from")
-    saved = saved_options(given.from_run)
-    same = given.task is None or task_name(find_task(given.task)) == Run.open(given.from_run).task_name
+    run, saved = Run.open(given.from_run), saved_options(given.from_run)
+    same = given.task is None or task_name(find_task(given.task)) == run.task_name
+    params = run_params(run, run_options(run.config)[1]) if same else {}
     return dataclasses.replace(
-        saved, resume=None, from_run=given.from_run, param=saved.param if same else (), target_return=None
-    )
+        saved, task=run_task(run, note=note) if given.task is None else given.task, resume=None, target_return=None,
+        from_run=given.from_run, param=tuple(f"{name}={spelled(value)}" for name, value in params.items()),
+    )  # fmt: skip
 
 
 def resume(options: Train, folder: Path) -> int:
