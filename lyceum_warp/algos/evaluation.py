@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 
@@ -68,7 +69,7 @@ def evaluate(
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
         seed: Seed of the initial states, which differ from those of an environment made with the same seed; by default
             the worlds continue their random streams.
-        progress: Called every 50 steps with the number of finished episodes and that of all.
+        progress: Called every 50 steps with the number of steps so far and the largest possible number.
 
     Raises:
         ValueError: The task has no horizon, or the environment was made with ``autoreset=False``.
@@ -96,13 +97,28 @@ def evaluate(
         total.masked_fill_(env.done, 0.0)
         count += wanted
         if t % 50 == 49:
-            finished = int(count.sum())
             if progress is not None:
-                progress(finished, each * env.nworld)
-            if finished == each * env.nworld:
+                progress(t + 1, each * env.horizon)
+            if bool((count >= each).all()):
                 break
     returns, lengths, rewards, evals, success, *sums = results.flatten(1).cpu()
     return Episodes(returns, lengths, rewards, evals, success, dict(zip(env.episode_metrics, sums, strict=True)))
+
+
+ENDLESS_STEPS = 1000
+"""Steps of an episode in evaluations of a task without a horizon, whose episodes may never end."""
+
+
+def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
+    """A few worlds of the same task for whole episodes; without a horizon they are cut off after 1,000 steps.
+
+    Args:
+        env: The environment.
+        nworld: Number of worlds.
+        changes: Other options, as for ``replicate``.
+    """
+    endless = {} if env.horizon else {"horizon": ENDLESS_STEPS}
+    return env.replicate_few(nworld, **(endless | changes))
 
 
 class MeanPolicyEvaluation:
@@ -126,7 +142,7 @@ class MeanPolicyEvaluation:
         means = torch.zeros(len(MEAN_STATISTICS), dtype=torch.float64, device=self.env.obs.device)
         if self.team.leads:
             if self._few is None:
-                self._few = self.env.replicate_few(self.episodes)
+                self._few = evaluation_worlds(self.env, self.episodes)
             self._few.follow(self.env)
             episodes = evaluate(self._few, moved(policy, self._few), self.episodes, seed=MEAN_SEED)
             parts = (episodes.returns, episodes.lengths, episodes.rewards, episodes.evals, episodes.success)

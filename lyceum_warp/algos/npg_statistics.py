@@ -46,7 +46,8 @@ class Iteration:
     success: float
     """Share of the episodes that ended with the goal met; nan for a task without a success."""
     mean_return: float | None
-    """Mean return of the mean policy; None in iterations without an evaluation of it."""
+    """Mean return of the mean policy; None in iterations without an evaluation of it. Episodes of a task without a
+    horizon are cut off after 1,000 steps."""
     mean_length: float | None
     """Mean number of steps in an episode of the mean policy, or None."""
     mean_terminal_reward: float | None

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from lyceum_warp.algos.evaluation import evaluation_worlds
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_statistics import Iteration
@@ -196,7 +197,7 @@ def policy_video(env: Env, policy: GaussianPolicy, path: Path, seed: int, *, qui
     """
     from lyceum_warp.viz import video
 
-    one = env.replicate_few(1, autoreset=False)
+    one = evaluation_worlds(env, 1, autoreset=False)
     try:
         with LongWork("running an episode for the video", "steps", quiet=quiet) as work:
             states = video.episode(one, moved(policy, one), seed=seed, progress=work)
@@ -239,7 +240,7 @@ class Videos:
         path = self.folder / f"{iteration.iteration:06d}.mp4"
         result = policy_video(self.npg.env, self.npg.policy, path, self.seed, quiet=True)
         if result != str(path):
-            note(f"no videos every {self.every} iterations ({result.removeprefix('none: ')})")
+            note(f"no further videos ({result.removeprefix('none: ')})")
             self.every = 0
         elif self.board is not None:
             self.board.video(path, iteration.samples)

@@ -8,7 +8,7 @@ import rich.box
 import tyro
 from rich.table import Table
 
-from lyceum_warp.algos.evaluation import evaluate, evaluation_seed
+from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.binding.registry import find_task, task_name
 from lyceum_warp.cli.arguments import NO_FLAGS, Repeated, given, optional_flags, parameters, run_options
 from lyceum_warp.cli.display import LongWork, make_console, note, policy_video
@@ -82,9 +82,11 @@ def evaluate_run(options: Eval) -> int:
         known = known.changed(options_for_few_worlds(known.engine, known.device))
     path = run.policy_file(options.which)
     env = run_env(run, known, params, note=note, task=options.task)
+    if env.horizon == 0:
+        env = evaluation_worlds(env, nworld)
     policy = load(run, which=options.which, device=env.obs.device)
     check_sizes(policy, env, path)
-    with LongWork("evaluating the policy", "episodes") as work:
+    with LongWork("evaluating the policy", "steps") as work:
         episodes = evaluate(env, policy, options.episodes, seed=options.seed, progress=work).first(options.episodes)
     table = Table(box=rich.box.SIMPLE)
     for heading in ("", "mean", "std", "min", "max"):

@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from lyceum_warp.algos.distributed import Team, join
-from lyceum_warp.algos.evaluation import Episodes, evaluate, evaluation_seed
+from lyceum_warp.algos.evaluation import Episodes, evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
@@ -415,8 +415,8 @@ def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:
     """Print the table, evaluate the policy, draw the curve and the video; returns the exit code."""
     rows = run.rows()
     console.print(curve_table(rows))
-    few = npg.env.replicate_few(_FINAL_EPISODES)
-    with LongWork("evaluating the mean policy", "episodes", console) as work:
+    few = evaluation_worlds(npg.env, _FINAL_EPISODES)
+    with LongWork("evaluating the mean policy", "steps", console) as work:
         episodes = evaluate(few, moved(npg.policy, few), _FINAL_EPISODES, seed=options.seed + 1, progress=work)
     console.print(f"mean policy, {len(episodes.returns)} new episodes: {_returns(episodes)}", soft_wrap=True)
     paths = [("checkpoint", str(run.checkpoint)), ("metrics", str(run.metrics))]

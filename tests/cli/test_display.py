@@ -4,12 +4,15 @@ import dataclasses
 import io
 import math
 import re
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 import lyceum_warp as lw
 from lyceum_warp.cli import display
+from lyceum_warp.tensorboard import TensorBoard
+from lyceum_warp.viz import video
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +106,32 @@ def test_long_work_is_a_passing_bar_on_a_terminal() -> None:
     with display.LongWork("evaluating", "episodes", console) as work:
         work(3, 32)
     assert "3/32" in console.file.getvalue() and "episodes" in console.file.getvalue()
+
+
+def test_videos_are_written_every_few_iterations_and_shown_in_tensorboard(first: lw.Iteration, tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    npg = lw.NPG(lw.make("point_mass", nworld=2, horizon=6), config=lw.NPGConfig(samples=12))
+    board = TensorBoard(tmp_path / "board", {})
+    videos = display.Videos(npg, tmp_path / "videos", 2, 0, board)
+    for i in (1, 2, 3, 4):
+        videos(dataclasses.replace(first, iteration=i, samples=12 * i))
+        if not videos.every:
+            pytest.skip("this machine cannot draw")
+    board.close()
+    assert sorted(path.name for path in (tmp_path / "videos").iterdir()) == ["000002.mp4", "000004.mp4"]
+    images = EventAccumulator(str(tmp_path / "board"), {"images": 0}).Reload().Images("video")
+    assert [image.step for image in images] == [24, 48]
+
+
+def test_a_machine_that_cannot_draw_is_reported_once(
+    first: lw.Iteration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(video, "_libraries", lambda: ["nonsense"])
+    npg = lw.NPG(lw.make("point_mass", nworld=2, horizon=6), config=lw.NPGConfig(samples=12))
+    videos = display.Videos(npg, tmp_path / "videos", 1, 0, None)
+    for i in (1, 2):
+        videos(dataclasses.replace(first, iteration=i))
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and error.startswith("lyceum-warp: no further videos (this machine cannot")
