@@ -57,7 +57,9 @@ def export_policy(policy: GaussianPolicy, path: str | Path) -> Path:
         with _quiet():
             program: Any = torch.export.export(alone, example, dynamic_shapes=shapes)
             if path.suffix == ".onnx":
-                program = torch.onnx.export(program, input_names=["obs"], output_names=["action"], verbose=False)
+                program = torch.onnx.export(
+                    program, input_names=["obs"], output_names=["action"], dynamo=True, verbose=False
+                )
     except Exception as error:  # of many types, from torch
         first = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
         raise ValueError(f"the policy's network cannot be exported to {path.suffix} ({first})") from error
