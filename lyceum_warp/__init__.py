@@ -13,6 +13,7 @@ from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig
 from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.policy_export import export_policy
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.binding.registry import register, task_names
@@ -78,6 +79,7 @@ from lyceum_warp.task import (
     site,
     tendon,
 )
+from lyceum_warp.training import train
 
 __version__ = "0.1.0"
 
@@ -120,6 +122,7 @@ __all__ = [
     "dof",
     "equality",
     "evaluate",
+    "export_policy",
     "follow_velocity",
     "geom",
     "grasp_terms",
@@ -160,6 +163,7 @@ __all__ = [
     "task_names",
     "tendon",
     "tolerance",
+    "train",
     "uniform",
     "vec10",
 ]

@@ -179,10 +179,9 @@ class Env:
             self.reward_space = self.eval_space = Space()
             self._fields = {name: torch_view(array) for name, array in worlds.fields.items()}
             self.time, self.episode_step = self._fields["time"], torch_view(worlds.counters.step)
-            if self.engine.capturable:
-                compile_ahead(worlds.rehearsal, self.device, self.task.name)
-                if options.graphs:
-                    self.engine.prepare_capture()
+            compile_ahead(worlds.rehearsal, self.device, self.task.name)
+            if self.engine.capturable and options.graphs:
+                self.engine.prepare_capture()
             self.rand_reset(options.seed)
             if self.task.dynamics and not _replica:  # later, and in a replica, a bad draw is a fault of its world
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
@@ -488,6 +487,11 @@ class Env:
                 raise ValueError(f"{self.task.name!r}: {problem}")
 
     # parameters and other environments of the same task
+
+    @property
+    def given_params(self) -> dict[str, Any]:
+        """The parameters of the task that were given, by name; all others have their defaults."""
+        return dict(self._given_params)
 
     def set_params(self, **params: Any) -> None:
         """Change parameters of the task from the next step on, in place.

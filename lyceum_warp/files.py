@@ -7,18 +7,26 @@ from pathlib import Path
 
 
 @contextlib.contextmanager
-def replaced(path: Path) -> Iterator[Path]:
+def replaced(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Replace a file in one go: a reader finds the old file or the whole new one.
 
     The block writes into the path that it is given, a temporary file beside the target. If the block raises, the target
     stays as it is and the temporary file is deleted.
+
+    Args:
+        path: The file.
+        durable: Whether the new content must reach the disk before the old file is given up, for a loss of power.
     """
     temporary = path.with_name(path.name + ".tmp")
     try:
         yield temporary
+        if durable:
+            with temporary.open("rb") as file:
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def newer_format(path: Path, number: int, known: int) -> ValueError:

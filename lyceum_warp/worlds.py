@@ -286,12 +286,12 @@ class Worlds:
         ]
 
     def rehearsal(self) -> None:
-        """Run every phase once, in arbitrary order, to find the kernels that they launch."""
+        """Run every phase that is made of launches once, in arbitrary order, to find the kernels that they launch."""
         self.seed_streams(0)
-        for phase in (*self.reset_phases(randomly=True), *self.step_phases(), *self.read_phases()):
-            phase.run()
-        for phase in self.restore_phases():
-            phase.run()
+        phases = (*self.reset_phases(randomly=True), *self.step_phases(), *self.read_phases(), *self.restore_phases())
+        for phase in phases:
+            if self.engine.capturable or not phase.engine:
+                phase.run()
 
     def keep_before(self) -> None:
         """Keep the current state as the one that a transition starts from."""

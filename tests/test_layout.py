@@ -13,8 +13,8 @@ ROOT = Path(lw.__file__).parent
 TESTS = Path(__file__).parent
 
 LEVELS = {
-    "docstrings": -1, "arrays": 0, "done": 0, "files": 0, "forks": 0, "machine": 0, "model_files": 0, "mujoco_log": 0,
-    "validate": 0, "versions": 0,
+    "docstrings": -1, "arrays": 0, "done": 0, "files": 0, "forks": 0, "interrupts": 0, "machine": 0, "model_files": 0,
+    "mujoco_log": 0, "validate": 0, "versions": 0, "warp_log": 0,
     "actuators": 1, "fields": 1, "kernels": 1, "model_fields": 1, "options": 1, "task": 1,
     "graphs": 2, "spaces": 2,
     "binding": 3, "engines": 3,
@@ -23,8 +23,9 @@ LEVELS = {
     "openloop": 6,
     "algos": 7, "control": 7, "testing": 7,
     "runs": 8, "tensorboard": 8,
-    "viz": 9,
-    "cli": 10,
+    "kept_task": 9, "viz": 9,
+    "training": 10,
+    "cli": 11,
 }  # fmt: skip
 """The floor of every room: a room imports from lower floors, or from itself."""
 

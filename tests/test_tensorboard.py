@@ -9,9 +9,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from training_runs import QUIET, train
 
 import lyceum_warp as lw
 from lyceum_warp import tensorboard as module
+from lyceum_warp.cli import main
+from lyceum_warp.runs import Run
 from lyceum_warp.tensorboard import TensorBoard, tag
 
 pytest.importorskip("tensorboard")
@@ -108,9 +111,11 @@ def test_a_video_becomes_an_animated_picture(first: lw.Iteration, tmp_path: Path
     subprocess.run([ffmpeg, *make, str(mp4)], check=True)
     with TensorBoard(tmp_path / "run", CONFIG) as board:
         board(numbered(first, 1))
+        board.close()
         board.video(mp4, 96)
         with pytest.raises(ValueError, match=r"nothing.mp4 is not a video that ffmpeg reads \(.*\)$"):
             board.video(tmp_path / "nothing.mp4", 96)
+    assert curve(tmp_path / "run", "policy/kl") == [(96, 0.01)]  # the later file of the video leaves it
     (video,) = read(tmp_path / "run").Images("video")
     assert (video.step, video.width, video.height) == (96, 320, 240)
     animation = image.open(io.BytesIO(video.encoded_image_string))
@@ -144,3 +149,13 @@ def test_a_missing_ffmpeg_is_one_line_with_the_command(tmp_path: Path, monkeypat
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ImportError, match=r"need imageio-ffmpeg: pip install 'lyceum-warp\[viz\]'$"):
         TensorBoard(tmp_path, CONFIG).video(tmp_path / "video.mp4", 0)
+
+
+def test_train_writes_the_numbers_of_metrics_csv_also_after_it_resumes(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert train(run, "--tensorboard", "--iterations", "2") == 0
+    assert main(["train", "--resume", str(run), "--tensorboard", "--iterations", "3", *QUIET]) == 0
+    rows = Run.open(run).rows()
+    for column in ("kl", "return_mean", "explained_variance"):
+        assert curve(run, tag(column)) == [(row["samples"], pytest.approx(row[column])) for row in rows]
+    assert [step for step, _ in curve(run, "mean_policy/return")] == [1024]

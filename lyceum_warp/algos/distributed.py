@@ -82,13 +82,13 @@ class Team:
             distributed.all_reduce(tensor)
         return tensor
 
-    def largest(self, number: int) -> int:
-        """The largest of the processes' numbers. Waits for the device if there are several processes."""
+    def largest(self, *numbers: int) -> tuple[int, ...]:
+        """The largest of the processes' numbers, for each place. Several processes wait for the device."""
         if self.size == 1:
-            return number
-        numbers = torch.tensor(number, device=self.device)
-        distributed.all_reduce(numbers, distributed.ReduceOp.MAX)
-        return int(numbers)
+            return numbers
+        whole = torch.tensor(numbers, device=self.device)
+        distributed.all_reduce(whole, distributed.ReduceOp.MAX)
+        return tuple(whole.tolist())
 
     def gather(self, part: torch.Tensor) -> torch.Tensor:
         """Concatenate the parts of all processes, (size * n, ...) from (n, ...), in every process."""

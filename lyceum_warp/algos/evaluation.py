@@ -1,7 +1,8 @@
 """Evaluation of policies: whole episodes under the mean action."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 
@@ -9,9 +10,18 @@ from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
+from lyceum_warp.validate import whole_number
 
 MEAN_SEED = 2**31 - 1
 """Seed of the initial states from which NPG evaluates the mean policy."""
+
+
+def evaluation_seed(seed: int) -> int:
+    """The seed of an environment's random streams for an evaluation with a seed.
+
+    Training with the same seed draws other initial states. Different seeds of evaluations stay different.
+    """
+    return whole_number("seed", seed, low=0) ^ 0x5A17C3E9
 
 
 @document_attributes
@@ -40,7 +50,14 @@ class Episodes:
 
 
 @torch.no_grad()
-def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | None = None) -> Episodes:
+def evaluate(
+    env: Env,
+    policy: torch.nn.Module,
+    episodes: int,
+    *,
+    seed: int | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> Episodes:
     """Run a policy's mean action for whole episodes from random initial states.
 
     Every world contributes the same number of episodes, its first ones. Otherwise worlds with short episodes would
@@ -50,7 +67,9 @@ def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | No
         env: The environment; its worlds are reset.
         policy: Called with observations (nworld, nobs), returns actions (nworld, nact).
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
-        seed: Seed of the initial states; by default the worlds continue their random streams.
+        seed: Seed of the initial states, which differ from those of an environment made with the same seed; by default
+            the worlds continue their random streams.
+        progress: Called every 50 steps with the number of steps so far and the largest possible number.
 
     Raises:
         ValueError: The task has no horizon, or the environment was made with ``autoreset=False``.
@@ -60,7 +79,7 @@ def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | No
     if not env.autoreset:
         raise ValueError("evaluate needs an environment that resets automatically: make it with autoreset=True")
     each = -(-episodes // env.nworld)
-    env.rand_reset(seed)
+    env.rand_reset(None if seed is None else evaluation_seed(seed))
     metrics = list(env.episode_metrics.values())
     results = torch.zeros(5 + len(metrics), each, env.nworld, device=env.obs.device)
     count = torch.zeros(env.nworld, dtype=torch.long, device=env.obs.device)
@@ -77,10 +96,29 @@ def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | No
         results[:, slot, worlds] = torch.where(wanted, now, results[:, slot, worlds])
         total.masked_fill_(env.done, 0.0)
         count += wanted
-        if t % 50 == 49 and bool((count >= each).all()):
-            break
+        if t % 50 == 49:
+            if progress is not None:
+                progress(t + 1, each * env.horizon)
+            if bool((count >= each).all()):
+                break
     returns, lengths, rewards, evals, success, *sums = results.flatten(1).cpu()
     return Episodes(returns, lengths, rewards, evals, success, dict(zip(env.episode_metrics, sums, strict=True)))
+
+
+ENDLESS_STEPS = 1000
+"""Steps of an episode in evaluations of a task without a horizon, whose episodes may never end."""
+
+
+def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
+    """A few worlds of the same task for whole episodes; without a horizon they are cut off after 1,000 steps.
+
+    Args:
+        env: The environment.
+        nworld: Number of worlds.
+        changes: Other options, as for ``replicate``.
+    """
+    endless = {} if env.horizon else {"horizon": ENDLESS_STEPS}
+    return env.replicate_few(nworld, **(endless | changes))
 
 
 class MeanPolicyEvaluation:
@@ -104,7 +142,7 @@ class MeanPolicyEvaluation:
         means = torch.zeros(len(MEAN_STATISTICS), dtype=torch.float64, device=self.env.obs.device)
         if self.team.leads:
             if self._few is None:
-                self._few = self.env.replicate_few(self.episodes)
+                self._few = evaluation_worlds(self.env, self.episodes)
             self._few.follow(self.env)
             episodes = evaluate(self._few, moved(policy, self._few), self.episodes, seed=MEAN_SEED)
             parts = (episodes.returns, episodes.lengths, episodes.rewards, episodes.evals, episodes.success)

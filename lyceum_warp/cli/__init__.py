@@ -1,4 +1,4 @@
-"""The command line: tasks, new, check, train, eval, plan, warmup."""
+"""The command line: tasks, new, check, train, eval, export, plan, warmup."""
 
 import importlib.metadata
 import os
@@ -10,12 +10,13 @@ import tyro
 
 from lyceum_warp.cli.check import Check, check
 from lyceum_warp.cli.evaluate import Eval, evaluate_run
-from lyceum_warp.cli.interrupts import Interrupted, signals
+from lyceum_warp.cli.export import Export, export
 from lyceum_warp.cli.list_tasks import Tasks, list_tasks
 from lyceum_warp.cli.new_task import New, new_task
 from lyceum_warp.cli.plan import Plan, plan
-from lyceum_warp.cli.train import Train, resume, saved_options, train
+from lyceum_warp.cli.train import Train, origin_options, resume, saved_options, train
 from lyceum_warp.cli.warmup import Warmup, warm_up
+from lyceum_warp.interrupts import Interrupted, signals
 from lyceum_warp.viz.video import NoVideoError
 
 _Command = Annotated[Tasks, tyro.conf.subcommand("tasks")] \
@@ -23,6 +24,7 @@ _Command = Annotated[Tasks, tyro.conf.subcommand("tasks")] \
     | Annotated[Check, tyro.conf.subcommand("check")] \
     | Annotated[Train, tyro.conf.subcommand("train")] \
     | Annotated[Eval, tyro.conf.subcommand("eval")] \
+    | Annotated[Export, tyro.conf.subcommand("export")] \
     | Annotated[Plan, tyro.conf.subcommand("plan")] \
     | Annotated[Warmup, tyro.conf.subcommand("warmup")]  # fmt: skip
 
@@ -33,6 +35,7 @@ $ lyceum-warp new my_task --model robot.xml
 $ lyceum-warp check my_task.py
 $ lyceum-warp train hopper --iterations 100
 $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
+$ lyceum-warp export runs/hopper-20260101-120000 --to policy.onnx
 $ lyceum-warp plan reach --real-time
 $ lyceum-warp warmup hopper --device cuda:0
 """
@@ -60,21 +63,30 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return check(command)
             if isinstance(command, Eval):
                 return evaluate_run(command)
+            if isinstance(command, Export):
+                return export(command)
             if isinstance(command, Plan):
                 return plan(command)
             if isinstance(command, Warmup):
                 return warm_up(command)
+            if command.from_run is not None:
+                command = _parse(argv, origin_options(command))
             if command.resume is not None:
                 return resume(_parse(argv, saved_options(command.resume)), command.resume)
             return train(command)
     except (ValueError, FileNotFoundError, FloatingPointError, ImportError, NoVideoError) as error:
-        print(f"lyceum-warp: {' '.join(str(error).split())}", file=sys.stderr)
+        text = "; ".join([str(error), *getattr(error, "__notes__", [])])
+        print(f"lyceum-warp: {' '.join(text.split())}", file=sys.stderr)
         return 2
     except Interrupted as signalled:
         return 128 + signalled.number
     except BrokenPipeError:  # as in: lyceum-warp tasks | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:  # as a full disk, or a folder that cannot be written
+        text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        print(f"lyceum-warp: {text}", file=sys.stderr)
+        return 2
 
 
 def _parse(argv: Sequence[str], default: Train | None = None) -> Any:

@@ -8,13 +8,14 @@ import rich.box
 import tyro
 from rich.table import Table
 
-from lyceum_warp.algos.evaluation import evaluate
-from lyceum_warp.cli.arguments import NO_FLAGS, given, optional_flags, run_options
-from lyceum_warp.cli.display import make_console, policy_video
+from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
+from lyceum_warp.binding.registry import find_task, task_name
+from lyceum_warp.cli.arguments import NO_FLAGS, Repeated, given, optional_flags, parameters, run_options
+from lyceum_warp.cli.display import LongWork, make_console, note, policy_video
 from lyceum_warp.engines.placement import options_for_few_worlds
-from lyceum_warp.env import Env
+from lyceum_warp.kept_task import run_env
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.runs import Run, load
+from lyceum_warp.runs import Run, check_sizes, load
 from lyceum_warp.viz.video import check_video
 
 
@@ -37,15 +38,25 @@ class OtherEnv:
 class Eval:
     """Run the mean policy of a run for whole episodes, in the run's own physics, and print statistics of them.
 
+    If the task's file or model has moved or changed since the run began, the run's own copy is used, and a line says
+    so.
+
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
+    which: str = "last"
+    """Which policy: last, best, or the number of an iteration that was kept."""
+    task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
+    """Another task than the run's, a name or a file, with its own physics and defaults, or the present version of the
+    run's task. Its observations and actions must have the same sizes."""
+    param: Repeated = ()
+    """Another parameter of the task than the run's, as NAME=VALUE; may be given several times."""
     episodes: int = 32
     """Number of episodes."""
     seed: int = 1
-    """Seed of the initial states."""
+    """Seed of the initial states, which differ from those that a training with the same seed draws."""
     nworld: int = 32
     """Largest number of worlds; never more than episodes."""
     video: bool = False
@@ -63,18 +74,20 @@ def evaluate_run(options: Eval) -> int:
     config = run.config
     nworld = min(options.nworld, options.episodes)
     known, params = run_options(config)
+    if options.task is not None and task_name(find_task(options.task)) != run.task_name:
+        known, params = EnvOptions(engine=known.engine, device=known.device, nthread=known.nthread), {}
+    params |= parameters(options.param, options)
     known = known.changed({"nworld": nworld} | given(options.env))
     if options.env.device is None:
         known = known.changed(options_for_few_worlds(known.engine, known.device))
-    env = Env(config["task"], known, **params)
-    policy = load(run, device=env.obs.device)
-    sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
-    if sizes != wanted:
-        raise ValueError(
-            f"the policy in {options.run} takes {sizes[0]} observations and gives {sizes[1]} actions, but the task "
-            f"{env.task.name!r} now has {wanted[0]} and {wanted[1]}: evaluate it with the task that it was trained on"
-        )
-    episodes = evaluate(env, policy, options.episodes, seed=options.seed).first(options.episodes)
+    path = run.policy_file(options.which)
+    env = run_env(run, known, params, note=note, task=options.task)
+    if env.horizon == 0:
+        env = evaluation_worlds(env, nworld)
+    policy = load(run, which=options.which, device=env.obs.device)
+    check_sizes(policy, env, path)
+    with LongWork("evaluating the policy", "steps") as work:
+        episodes = evaluate(env, policy, options.episodes, seed=options.seed, progress=work).first(options.episodes)
     table = Table(box=rich.box.SIMPLE)
     for heading in ("", "mean", "std", "min", "max"):
         table.add_column(heading, justify="right" if heading else "left")
@@ -84,11 +97,12 @@ def evaluate_run(options: Eval) -> int:
         numbers = (values.mean(), values.std(correction=0), values.min(), values.max())
         table.add_row(name, *(f"{number.item():.6g}" for number in numbers))
     console = make_console()
-    console.print(f"{env.task.name}: {options.episodes} episodes of the mean policy in {options.run}", soft_wrap=True)
+    which = "the mean policy" if options.which == "last" else f"the mean policy {options.which!r}"
+    console.print(f"{env.task.name}: {options.episodes} episodes of {which} in {options.run}", soft_wrap=True)
     console.print(table)
     if env.task.functions["success"] is not None:
         console.print(f"success: {episodes.success.mean().item():.0%}")
     if options.video:
-        video = policy_video(env, policy, run.folder / "eval.mp4", options.seed)
+        video = policy_video(env, policy, run.folder / "eval.mp4", evaluation_seed(options.seed))
         console.print(f"video: {video}", soft_wrap=True, markup=False)
     return 0

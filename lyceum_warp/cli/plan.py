@@ -15,12 +15,12 @@ from lyceum_warp.algos.mppi_config import MPPIConfig
 from lyceum_warp.binding.registry import find_task, task_name
 from lyceum_warp.cli.arguments import Physics, Placement, Repeated, given, optional_flags, parameters, portable
 from lyceum_warp.cli.display import PlanDisplay, make_console, plotted_control, report_table, states_video
-from lyceum_warp.cli.interrupts import Interrupted
 from lyceum_warp.control.control_report import control_report
 from lyceum_warp.control.loop import control
 from lyceum_warp.control.real_time import control_async
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
+from lyceum_warp.interrupts import Interrupted
 from lyceum_warp.runs import Run, load_value
 from lyceum_warp.validate import whole_number
 
@@ -221,7 +221,8 @@ def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
 def _report(run: Run, plant: Env, done: list[Trajectory], options: Plan) -> int:
     """Print the report, draw the plot and the video, and list the files."""
     console = make_console()
-    console.print(report_table(control_report(done, rate=options.rate)))
+    report = control_report(done, rate=options.rate)
+    console.print(report_table(report, success=plant.task.functions["success"] is not None))
     paths = [("episodes", str(run.folder / "episode-*.npz")), ("report", str(run.folder / "report.json"))]
     if options.plot:
         paths.append(("plot", plotted_control(done, run.folder / "plan.png")))

@@ -13,10 +13,11 @@ import tyro
 from rich.console import Console
 
 from lyceum_warp.algos.distributed import Team, join
-from lyceum_warp.algos.evaluation import Episodes, evaluate
+from lyceum_warp.algos.evaluation import Episodes, evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
+from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.cli.arguments import (
     EnvFlags,
@@ -29,12 +30,24 @@ from lyceum_warp.cli.arguments import (
     run_options,
     spelled,
 )
-from lyceum_warp.cli.display import Display, curve_table, make_console, plotted, policy_video
-from lyceum_warp.cli.interrupts import Interrupted, postponed
+from lyceum_warp.cli.display import (
+    Display,
+    LongWork,
+    Videos,
+    curve_table,
+    make_console,
+    note,
+    plotted,
+    policy_video,
+)
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.env import Env
+from lyceum_warp.interrupts import Interrupted
+from lyceum_warp.kept_task import KeptTask, run_env, run_params, run_task
 from lyceum_warp.machine import cpu_cores
-from lyceum_warp.runs import Run
+from lyceum_warp.runs import PolicyContent, Run, check_sizes, networks, read_checkpoint
+from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
+from lyceum_warp.training import check_resumable, checked_settings, fitted_config, learn, reopen, restore
 from lyceum_warp.versions import versions
 
 _FINAL_EPISODES = 32
@@ -57,14 +70,15 @@ class NPGOptions:
 class Train:
     """Train a policy on a task with the natural policy gradient.
 
-    The run's folder then holds config.json, versions.json, metrics.csv (one row for each iteration), checkpoint.pt,
-    curve.png and video.mp4. Every iteration replaces the checkpoint, so that Ctrl-C loses only the current one.
+    The run's folder then holds config.json, versions.json, metrics.csv (one row for each iteration), policy.pt,
+    best.pt, checkpoint.pt, curve.png and video.mp4. Ctrl-C loses only the current iteration.
 
     $ lyceum-warp train hopper --iterations 100 --seed 1
     $ lyceum-warp train half_cheetah --param ctrl_cost_weight=0.05 --param reset_noise_scale=0 --hidden 32 32
     $ lyceum-warp train path/to/my_task.py --samples 4000 --out runs/mine
     $ lyceum-warp train humanoid --device cuda --integrator euler --solver iterations=4
     $ lyceum-warp train --resume runs/mine --iterations 200
+    $ lyceum-warp train my_changed_task.py --from runs/mine --which best
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
     Processes that torchrun starts share the worlds, also on several machines. With --device cuda each process takes the
@@ -84,6 +98,21 @@ class Train:
     """The run's folder, new or empty; runs/TASK-DATE by default."""
     resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Continue the run in this folder, exactly and with all its settings, up to --iterations."""
+    from_run: Annotated[Path | None, tyro.conf.arg(name="from", metavar="RUN")] = None
+    """Begin a new run with the policy, the value function and the normaliser of this one. Settings that are not given
+    are those of that run; with another TASK, its parameters are not."""
+    which: str = "last"
+    """Which policy of --from: last, best, or the number of an iteration that was kept."""
+    target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    """End the run once the mean policy's return, or without --mean-every the mean return, is at least this."""
+    keep_every: int = 0
+    """Iterations between two policies that are kept under their numbers, 0 for none. The last and the best one are
+    always kept."""
+    save_every: int = 0
+    """Iterations between two saves of the complete state, from which a run that was killed continues; 0 for a number
+    that keeps their time below 0.5 %."""
+    tensorboard: bool = False
+    """Whether to write the metrics for TensorBoard, too, into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Worlds of all processes together; by default 64, or 4096 for each GPU. Each makes samples / nworld steps in an
     iteration: whole episodes where those fit (as in the paper: 10 worlds for 10,000 samples and episodes of 1,000
@@ -96,6 +125,9 @@ class Train:
     times."""
     video: bool = True
     """Whether to write a video of one episode of the trained policy at the end."""
+    video_every: int = 0
+    """Iterations between two further videos of the mean policy, videos/000100.mp4 and so on in the run's folder, which
+    TensorBoard shows, too; 0 for none."""
     plot: bool = True
     """Whether to draw the learning curve at the end."""
     require_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
@@ -110,20 +142,43 @@ def train(options: Train) -> int:
     with join(options.env.device) as team:
         with team.together():
             # every mistake in the options is found before the folder is made
-            config, out = _config(options, team), _folder(options)
+            origin = _origin(options)
+            config, out = _config(options, team, origin), _folder(options)
+            run = None
             if team.leads:
                 Run.check_free(out)
-            npg = _algorithm(config, team)
-            run = Run.create(out, config, device=options.env.device) if team.leads else None
+            npg = _algorithm(config, team, origin=origin)
+            if team.leads:
+                kept = KeptTask.of(npg.env)
+                run = Run.create(out, config | kept.config, device=options.env.device)
+                kept.write(run)
         return _learn(run, npg, options)
 
 
-def _config(options: Train, team: Team) -> dict[str, Any]:
+def _origin(options: Train) -> tuple[PolicyContent, Path] | None:
+    """The content and the file of the policy that a run begins with; None for a new policy."""
+    if options.from_run is None:
+        return None
+    path = Run.open(options.from_run).policy_file(options.which)
+    return read_checkpoint(path, parts=("iteration", "policy", "value")), path
+
+
+def _config(options: Train, team: Team, origin: tuple[PolicyContent, Path] | None = None) -> dict[str, Any]:
     if options.task is None:
         raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
     _check_iterations(options.iterations)
+    if options.tensorboard:
+        check_tensorboard()
     find_task(options.task)
     npg, nworld = options.npg.checked(), options.nworld
+    settings = checked_settings(
+        target_return=options.target_return, keep_every=options.keep_every, save_every=options.save_every
+    )
+    source = {}
+    if origin is not None:
+        npg = _fitted(npg, *origin)
+        place = {"run": str(origin[1].parent.resolve()), "which": options.which, "iteration": origin[0]["iteration"]}
+        source = {"from": place}
     if nworld is None:
         nworld = 4096 * team.size if options.env.device.startswith("cuda") else 64
     others = {name: value for name, value in given(options.env).items() if name not in ("engine", "device")}
@@ -140,7 +195,24 @@ def _config(options: Train, team: Team) -> dict[str, Any]:
         "seed": options.seed,
         "iterations": options.iterations,
         "npg": dataclasses.asdict(npg) | {"samples": enough_samples(npg, nworld)},
+        **settings,
+        **source,
     }
+
+
+def _fitted(npg: NPGConfig, content: PolicyContent, path: Path) -> NPGConfig:
+    """Hyperparameters with the sizes of loaded networks.
+
+    Raises:
+        ValueError: Other sizes are given.
+    """
+    fitted = fitted_config(npg, content["policy"]["shape"], content["value"]["shape"])
+    for field in dataclasses.fields(npg):
+        given, saved = getattr(npg, field.name), getattr(fitted, field.name)
+        if given not in (saved, field.default):
+            flag = f"--{field.name.replace('_', '-')}"
+            raise ValueError(f"the networks in {path} have {field.name} {saved}, not {given}: leave out {flag}")
+    return fitted
 
 
 def _folder(options: Train) -> Path:
@@ -166,10 +238,34 @@ def saved_options(folder: Path) -> Train:
             task=config["task"], iterations=config["iterations"], seed=config["seed"], resume=folder,
             nworld=config["nworld"], threads=config["threads"],
             param=tuple(f"{name}={spelled(value)}" for name, value in params.items()),
+            target_return=config.get("target_return"), keep_every=config.get("keep_every", 0),
+            save_every=config.get("save_every", 0),
             env=EnvFlags.of(known), physics=Physics.of(known.physics), npg=npg,
         )  # fmt: skip
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{folder / 'config.json'} is not the configuration of an NPG run ({error})") from error
+
+
+def origin_options(given: Train) -> Train:
+    """The options of a run that begins with the policy of another one, before those on the command line.
+
+    Args:
+        given: The options on the command line.
+
+    Raises:
+        FileNotFoundError: The folder holds no run.
+        ValueError: The run's configuration is not one of NPG.
+    """
+    assert given.from_run is not None
+    if given.resume is not None:
+        raise ValueError("--resume continues a run with its own policy, so it cannot be combined with --from")
+    run, saved = Run.open(given.from_run), saved_options(given.from_run)
+    same = given.task is None or task_name(find_task(given.task)) == run.task_name
+    params = run_params(run, run_options(run.config)[1]) if same else {}
+    return dataclasses.replace(
+        saved, task=run_task(run, note=note) if given.task is None else given.task, resume=None, target_return=None,
+        from_run=given.from_run, param=tuple(f"{name}={spelled(value)}" for name, value in params.items()),
+    )  # fmt: skip
 
 
 def resume(options: Train, folder: Path) -> int:
@@ -181,11 +277,15 @@ def resume(options: Train, folder: Path) -> int:
     """
     with join(options.env.device) as team:
         with team.together():
+            settings = checked_settings(
+                target_return=options.target_return, keep_every=options.keep_every, save_every=options.save_every
+            )
+            if options.tensorboard:
+                check_tensorboard()
             run, npg = _reopened(options, folder, team)
         if team.leads:
             _warn_of_versions(run)
-            run.cut(npg.iteration)
-            run.amend(iterations=options.iterations)
+            reopen(run, npg, iterations=options.iterations, **settings)
         return _learn(run if team.leads else None, npg, options)
 
 
@@ -201,23 +301,19 @@ def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, NPG]:
             )
     if options.out not in (None, folder):
         raise ValueError(f"a resumed run stays in its folder {folder}: omit --out")
-    checkpoint = run.read()
-    done = checkpoint["iteration"]
-    if options.iterations <= done:
-        raise ValueError(f"the run in {folder} already has {done} iterations: give more, as in --iterations {2 * done}")
-    npg = _algorithm(run.config, team)
-    try:
-        npg.load_state_dict(run.read(npg.env.obs.device)["state"])
-    except (KeyError, RuntimeError, ValueError) as error:
-        raise ValueError(
-            f"{run.checkpoint} does not fit the configuration beside it: {' '.join(str(error).split())}"
-        ) from error
+    content = run.read(note=note if team.leads else _silent)
+    check_resumable(run, content, options.iterations, options.target_return)
+    origin = (content, run.checkpoint) if "from" in run.config else None
+    npg = _algorithm(run.config, team, run=run, origin=origin)
+    restore(run, npg, content)
     return run, npg
 
 
 def _settings(options: Train) -> dict[str, Any]:
     """The settings that a resumed run must keep."""
-    free = ("iterations", "out", "resume", "video", "plot", "require_return", "npg", "param", "env", "physics")
+    free = ("iterations", "out", "resume", "video", "plot", "require_return", "npg", "param", "env", "physics",
+            "from_run", "which", "target_return", "keep_every", "save_every", "tensorboard",
+            "video_every")  # fmt: skip
     settings = {f.name: getattr(options, f.name) for f in dataclasses.fields(options) if f.name not in free}
     settings["task"] = portable(options.task or "")
     settings["param"] = parameters(options.param, options)
@@ -228,7 +324,17 @@ def _hyperparameters(config: dict[str, Any]) -> NPGConfig:
     return NPGConfig(**config["npg"])
 
 
-def _algorithm(config: dict[str, Any], team: Team) -> NPG:
+def _algorithm(
+    config: dict[str, Any], team: Team, *, run: Run | None = None, origin: tuple[PolicyContent, Path] | None = None
+) -> NPG:
+    """The algorithm of a configuration.
+
+    Args:
+        config: The configuration.
+        team: The processes.
+        run: The run that is continued, whose folder may hold a copy of the task.
+        origin: The content and the file with the networks; new networks without it.
+    """
     if config["threads"] < 1:
         raise ValueError(f"threads must be at least 1, not {config['threads']}")
     torch.set_num_threads(config["threads"])
@@ -237,8 +343,20 @@ def _algorithm(config: dict[str, Any], team: Team) -> NPG:
         options = options.changed({"nthread": max(1, cpu_cores() // team.neighbours)})
     nworld = team.share(config["nworld"])
     own = {"nworld": nworld, "first_world": team.rank * nworld, "device": team.device or config["device"]}
-    env = Env(config["task"], options.changed(own | {"seed": config["seed"]}), **params)
-    return NPG(env, config=_hyperparameters(config), seed=config["seed"], team=team)
+    options = options.changed(own | {"seed": config["seed"]})
+    if run is None:
+        env = Env(config["task"], options, **params)
+    else:
+        env = run_env(run, options, params, note=note if team.leads else _silent)
+    policy = value = None
+    if origin is not None:
+        policy, value = networks(*origin)
+        check_sizes(policy, env, origin[1])
+    return NPG(env, policy, value, _hyperparameters(config), seed=config["seed"], team=team)
+
+
+def _silent(line: str) -> None:
+    """Print nothing, in processes that do not write."""
 
 
 def _engine(config: dict[str, Any]) -> str:
@@ -247,32 +365,30 @@ def _engine(config: dict[str, Any]) -> str:
 
 
 def _learn(run: Run | None, npg: NPG, options: Train) -> int:
-    """Iterate; the process that has the run writes files and messages.
-
-    When one of several processes receives a signal, all of them finish the iteration and end together: the others
-    would wait endlessly for a process that ended within the iteration.
-    """
-    console, team = make_console(), npg.team
-    display = None
+    """Iterate; the process that has the run writes files and messages."""
+    console = make_console()
+    display = videos = board = None
     if run is not None:
+        board = TensorBoard(run.folder, run.config) if options.tensorboard else None
         console.print(_headline(run, npg, options), soft_wrap=True)
         display = Display(console, npg.iteration, options.iterations)
+        seed = evaluation_seed(options.seed + 1)
+        videos = Videos(npg, run.folder / "videos", options.video_every, seed, board)
+
+    def show(iteration: Iteration) -> None:
+        if display is not None and videos is not None:
+            display(iteration)
+            videos(iteration)
+
     try:
-        with postponed(team.size > 1) as noted, display or contextlib.nullcontext():
-            if npg.iteration == 0:
-                _save(run, npg)
-            while npg.iteration < options.iterations:
-                iteration = next(npg)
-                if run is not None:
-                    run.write(iteration.row())
-                _save(run, npg)
-                if display is not None:
-                    display(iteration)
-                if number := team.largest(max(noted, default=0)):
-                    raise Interrupted(number)
+        with display or contextlib.nullcontext():
+            learn(
+                run, npg, iterations=options.iterations, callback=show, board=board,
+                target_return=options.target_return, keep_every=options.keep_every, save_every=options.save_every,
+            )  # fmt: skip
     except Interrupted as signalled:
         if run is not None and run.checkpoint.exists():
-            # an iteration counts once its checkpoint is complete; the current one is lost
+            # an iteration counts once it is complete; the current one is lost
             done = run.read()["iteration"]
             run.cut(done)
             name = signal.Signals(signalled.number).name
@@ -295,25 +411,27 @@ def _headline(run: Run, npg: NPG, options: Train) -> str:
     )
 
 
-def _save(run: Run | None, npg: NPG) -> None:
-    """Replace the checkpoint; all processes must call this, because it holds all their worlds."""
-    state = npg.state_dict()
-    if run is not None:
-        run.save(npg.iteration, npg.policy, state, npg.value)
-
-
 def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:
     """Print the table, evaluate the policy, draw the curve and the video; returns the exit code."""
     rows = run.rows()
     console.print(curve_table(rows))
-    few = npg.env.replicate_few(_FINAL_EPISODES)
-    episodes = evaluate(few, moved(npg.policy, few), _FINAL_EPISODES, seed=options.seed + 1)
+    few = evaluation_worlds(npg.env, _FINAL_EPISODES)
+    with LongWork("evaluating the mean policy", "steps", console) as work:
+        episodes = evaluate(few, moved(npg.policy, few), _FINAL_EPISODES, seed=options.seed + 1, progress=work)
     console.print(f"mean policy, {len(episodes.returns)} new episodes: {_returns(episodes)}", soft_wrap=True)
     paths = [("checkpoint", str(run.checkpoint)), ("metrics", str(run.metrics))]
+    if (best := run.best_score()) is not None:
+        console.print(f"best policy: return {best[1]:.1f} in iteration {best[0]}", soft_wrap=True)
+        paths.append(("best", str(run.policy_file("best"))))
     if options.plot:
         paths.append(("curve", plotted(run)))
     if options.video:
-        paths.append(("video", policy_video(npg.env, npg.policy, run.folder / "video.mp4", options.seed + 1)))
+        seed = evaluation_seed(options.seed + 1)
+        video = policy_video(npg.env, npg.policy, run.folder / "video.mp4", seed)
+        paths.append(("video", video))
+        if options.tensorboard and Path(video).is_file():
+            with TensorBoard(run.folder, run.config) as board:
+                board.video(video, npg.samples)
     for name, path in paths:
         console.print(f"{name + ':':<12}{path}", soft_wrap=True, markup=False)
     final = episodes.returns.mean().item()
@@ -333,13 +451,9 @@ def _returns(episodes: Episodes) -> str:
 
 
 def _warn_of_versions(run: Run) -> None:
-    changed = run.changed(versions(run.config["device"]))
-    if changed:
+    if changed := run.changed(versions(run.config["device"])):
         text = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
-        print(
-            f"lyceum-warp: versions have changed, so numbers may differ from an uninterrupted run's: {text}",
-            file=sys.stderr,
-        )
+        note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")
 
 
 def _check_iterations(iterations: int) -> None:

@@ -1,5 +1,6 @@
 """Learning curves."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_pn
 
 def learning_curve(run: str | Path | Run, out: str | Path | None = None, *, title: str | None = None) -> Path:
     """Draw a run's learning curve as PNG: returns, the evaluation metric and the task's own metrics against samples.
+
+    Where no episode ended, and the mean policy was not evaluated, rewards of a step stand for returns.
 
     Args:
         run: A run, its folder, or a table of metrics.
@@ -44,14 +47,16 @@ def learning_curve(run: str | Path | Run, out: str | Path | None = None, *, titl
     panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
     top, bottom = panels[:2]
     samples = _column(rows, "samples")
-    middle, spread = _column(rows, "return_mean"), _column(rows, "return_std")
+    middle, spread, quantity = _column(rows, "return_mean"), _column(rows, "return_std"), "return"
+    if not any(map(math.isfinite, middle + _column(rows, "mean_return"))):  # no episode ended, and none was evaluated
+        middle, quantity = _column(rows, "reward_mean"), "reward of a step"
     low = [m - s for m, s in zip(middle, spread, strict=True)]
     high = [m + s for m, s in zip(middle, spread, strict=True)]
     top.fill_between(samples, low, high, color=LINE, alpha=0.2, linewidth=0, label="± standard deviation")
     line: Any = dict(color=LINE, marker="." if len(rows) < 3 else "")  # a line of a single point is invisible
     top.plot(samples, middle, label="stochastic policy", **line)
     _draw_mean_policy(top, rows, "mean_return")
-    top.set_ylabel("return")
+    top.set_ylabel(quantity)
     top.legend(frameon=False, loc="best")
     bottom.plot(samples, _column(rows, "eval_mean"), **line)
     _draw_mean_policy(bottom, rows, "mean_eval")

@@ -1,5 +1,7 @@
 """Evaluation of policies in whole episodes."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ from metered_task import Metered
 from varied_task import Varied
 
 import lyceum_warp as lw
+from lyceum_warp.algos.evaluation import evaluation_seed
 
 
 def test_evaluate_leaves_no_gradients() -> None:
@@ -19,8 +22,10 @@ def test_evaluate_takes_the_same_number_of_episodes_of_every_world() -> None:
     """Worlds with short episodes contribute no more of them; the numbers are those of a plain loop."""
     env = lw.make("hopper", nworld=4, horizon=60)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
-    got = lw.evaluate(env, policy, 8, seed=3)
-    env.rand_reset(3)
+    counts: list[tuple[int, int]] = []
+    got = lw.evaluate(env, policy, 8, seed=3, progress=lambda *now: counts.append(now))
+    assert counts == [(50, 120), (100, 120)]
+    env.rand_reset(evaluation_seed(3))
     total, lengths, expected = torch.zeros(4), [0] * 4, [[] for _ in range(4)]
     while min(map(len, expected)) < 2:
         with torch.no_grad():
@@ -92,3 +97,11 @@ def test_the_mean_policy_is_evaluated_under_dynamics_of_its_own() -> None:
     few = npg._evaluate_mean._few
     assert few is not None and few.field("body_mass")[:, 1].unique().numel() == 3
     assert not torch.isin(few.field("body_mass")[:, 1], torch.cat([before, env.field("body_mass")])).any()
+
+
+def test_the_mean_policy_of_a_task_that_never_ends_is_evaluated_over_1000_steps() -> None:
+    env = lw.make("half_cheetah", nworld=2, horizon=0)
+    config = lw.NPGConfig(samples=20, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2)
+    iteration = next(lw.NPG(env, config=config))
+    assert iteration.mean_length == 1000 and iteration.mean_return is not None
+    assert math.isnan(iteration.return_mean) and math.isfinite(iteration.reward_mean)

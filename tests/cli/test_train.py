@@ -220,10 +220,11 @@ def test_a_configuration_of_an_earlier_release_has_the_defaults_of_newer_hyperpa
     assert cli.main(resume) == 0
 
 
-def test_resume_refuses_a_broken_checkpoint(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_resume_refuses_broken_checkpoints(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     resume = changed_config(trained, tmp_path / "run", lambda config: None)
     checkpoint = tmp_path / "run" / "checkpoint.pt"
-    checkpoint.write_bytes(checkpoint.read_bytes()[:-1000])
+    for path in (checkpoint, checkpoint.with_name("previous.pt")):
+        path.write_bytes(path.read_bytes()[:-1000])
     assert cli.main(resume) == 2
     refused(capsys, str(checkpoint), "cut off", "restore the file from a copy")
     other = changed_config(trained, tmp_path / "other", lambda config: config.update(nworld=3))
@@ -231,6 +232,18 @@ def test_resume_refuses_a_broken_checkpoint(trained: Path, tmp_path: Path, capsy
     refused(capsys, "does not fit the configuration beside it")
     for folder in ("run", "other"):
         assert (tmp_path / folder / "metrics.csv").read_bytes() == (trained / "metrics.csv").read_bytes()
+
+
+def test_a_broken_checkpoint_falls_back_to_the_one_before_it(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert train(out, "--iterations", "3", "--save-every", "2") == 0
+    (out / "checkpoint.pt").write_bytes(b"PK half")
+    capsys.readouterr()
+    assert cli.main(["train", "--resume", str(out), "--iterations", "4", *QUIET]) == 0
+    refused(capsys, str(out / "checkpoint.pt"), "cut off", f"{out / 'previous.pt'}, of iteration 2, is used instead")
+    assert metrics(out) == metrics(trained)
 
 
 def test_train_refuses_to_overwrite_a_run(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -330,20 +343,25 @@ def test_a_terminated_run_continues(trained: Path, tmp_path: Path) -> None:
     assert_continues(out, rest, trained)
 
 
+@pytest.mark.parametrize("moment", ["step", "log_prob", "write", "save_state"])
 def test_an_interrupted_run_continues(
-    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    moment: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Within this process; the tests of plan interrupt a command from outside."""
+    """Within this process: while it samples, learns, or writes. The tests of plan interrupt a command from outside."""
     out = tmp_path / "run"
-    save = Run.save
+    owner: Any = {"step": lw.Env, "log_prob": lw.GaussianPolicy}.get(moment, Run)
+    original, calls = getattr(owner, moment), []
 
-    def interrupting(run: Run, iteration: int, *args: Any) -> None:
-        save(run, iteration, *args)
-        if iteration == 3:
+    def interrupting(*args: Any, **words: Any) -> Any:
+        result = original(*args, **words)
+        calls.append(moment)
+        table = out / "metrics.csv"
+        if len(calls) % 4 == 0 and table.exists() and len(metrics(out)) >= 3:
             signal.raise_signal(signal.SIGINT)
+        return result
 
-    monkeypatch.setattr(Run, "save", interrupting)
-    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "100000"]
+    monkeypatch.setattr(owner, moment, interrupting)
+    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "100000", "--save-every", "1"]
     assert interrupted(argv) == 130
     monkeypatch.undo()
     assert_continues(out, capsys.readouterr().out, trained)

@@ -7,7 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import tiny_task
 import warp as wp
+from conftest import SharedEnv
+
+import lyceum_warp as lw
 
 SCRIPT = """
 import warp as wp
@@ -55,3 +59,20 @@ def test_compiling_is_reported_and_done_once(
     runpy.run_path(str(script))
     said = capsys.readouterr()
     assert (said.out.strip(), said.err) == ("0 2", "")
+
+
+def test_kernels_of_a_new_task_are_reported_on_the_c_engine_too(
+    shared_env: SharedEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shared_env("point_mass").step()  # loads the package's own kernels
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    file = tiny_task.write(tmp_path, tiny_task.changed(("class Tiny", "class Compiled")), "compiled.py")
+    env = lw.make(str(file), engine="mujoco")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("compiling kernels of compiled for cpu: ") and lines[0].endswith(", once")
+    assert any("Compiled" in line for line in lines[1:]), lines
+    modules = len(list(tmp_path.rglob("*.o")))
+    env.step()
+    lw.make(str(file), engine="mujoco")
+    assert len(list(tmp_path.rglob("*.o"))) == modules  # the step compiles no further module
+    assert capsys.readouterr().err == ""

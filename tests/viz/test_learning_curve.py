@@ -1,11 +1,13 @@
 """Plots of learning curves."""
 
+import math
 import sys
 from pathlib import Path
 
 import pytest
 
 from lyceum_warp.runs import Run
+from lyceum_warp.viz import learning_curve as module
 from lyceum_warp.viz.learning_curve import learning_curve
 
 
@@ -58,3 +60,18 @@ def test_a_missing_matplotlib_is_reported_with_the_extra(run: Run, monkeypatch: 
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"needs matplotlib: pip install 'lyceum-warp\[viz\]'"):
         learning_curve(run)
+
+
+def test_rewards_are_drawn_where_no_episode_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("matplotlib")
+    figures = []
+    monkeypatch.setattr(module, "save_png", lambda figure, out: figures.append(figure))
+    for mean_return in (None, 3.0):
+        run = Run.create(tmp_path / str(mean_return), {"task": "half_cheetah", "seed": 3})
+        for i in (1, 2):
+            row = {"samples": 10 * i, "reward_mean": 0.1 * i, "mean_return": mean_return, "mean_eval": mean_return}
+            run.write(row | dict.fromkeys(("return_mean", "return_std", "eval_mean"), math.nan))
+        learning_curve(run)
+    rewards, returns = (figure.axes[0] for figure in figures)
+    assert rewards.get_ylabel() == "reward of a step" and list(rewards.lines[0].get_ydata()) == [0.1, 0.2]
+    assert returns.get_ylabel() == "return" and list(returns.lines[-1].get_ydata()) == [3.0, 3.0]

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as an exception, at once or postponed until the caller handles it."""
+"""Ctrl-C, SIGTERM and SIGHUP as an exception, at once or postponed until the caller handles it."""
 
 import contextlib
 import signal
@@ -16,7 +16,7 @@ class Interrupted(BaseException):
 
 @contextlib.contextmanager
 def signals() -> Iterator[None]:
-    """Within the context the first Ctrl-C or SIGTERM raises Interrupted, and later ones are ignored."""
+    """Within the context the first Ctrl-C, SIGTERM or SIGHUP raises Interrupted, and later ones are ignored."""
 
     def interrupt(number: int, frame: Any) -> None:
         for other in previous:
@@ -32,11 +32,33 @@ def signals() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def postponed(when: bool = True) -> Iterator[list[int]]:
-    """Within ``signals``: list Ctrl-C and SIGTERM instead of raising Interrupted, which is left to the caller.
+def ending() -> Iterator[None]:
+    """Within the context SIGTERM and SIGHUP raise SystemExit, unless the program handles them.
 
-    A signal that is still listed at the end of the context raises Interrupted there. Once Interrupted is raised,
-    later signals are ignored.
+    By default they end a program at once, without its ``finally`` blocks.
+    """
+
+    def leave(number: int, frame: Any) -> None:
+        raise SystemExit(128 + number)
+
+    numbers = [number for number in _numbers()[1:] if signal.getsignal(number) is signal.SIG_DFL]
+    previous: dict[int, Any] = {}
+    with contextlib.suppress(ValueError):  # only the main thread may set handlers
+        for number in numbers:
+            previous[number] = signal.signal(number, leave)
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def postponed(when: bool = True) -> Iterator[list[int]]:
+    """List Ctrl-C, SIGTERM and SIGHUP instead of handling them, which is left to the caller.
+
+    A signal that is still listed at the end of the context is handled there, within ``signals`` by raising Interrupted.
+    Once Interrupted is raised, later signals are ignored.
 
     Args:
         when: False leaves signals alone.
@@ -58,12 +80,17 @@ def postponed(when: bool = True) -> Iterator[list[int]]:
         signal.raise_signal(signal.Signals(noted[0]))
 
 
+def _numbers() -> list[int]:
+    names = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
+    return [int(getattr(signal, name)) for name in names if hasattr(signal, name)]
+
+
 def _handled_by(handler: Callable[[int, Any], None]) -> dict[int, Any]:
-    """Handle Ctrl-C and SIGTERM, and return their previous handlers."""
+    """Handle Ctrl-C, SIGTERM and SIGHUP, and return their previous handlers."""
     previous: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # only the main thread may set handlers
-        for number in (int(signal.SIGINT), int(signal.SIGTERM)):
-            # a shell that starts a program in the background makes it ignore SIGINT on purpose
+        for number in _numbers():
+            # a shell that starts a program in the background makes it ignore SIGINT on purpose, and nohup SIGHUP
             if signal.getsignal(number) is not signal.SIG_IGN:
                 previous[number] = signal.signal(number, handler)
     return previous

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from lyceum_warp.cli.interrupts import Interrupted, postponed, signals
+from lyceum_warp.interrupts import Interrupted, postponed, signals
 
 
 @pytest.fixture(autouse=True)

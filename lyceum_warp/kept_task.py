@@ -1,0 +1,327 @@
+"""A run's copies of its task and its model, and whether a later command uses them."""
+
+import dataclasses
+import hashlib
+import itertools
+import json
+import logging
+import os
+import shutil
+import sys
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from lyceum_warp.binding.models import find_model
+from lyceum_warp.binding.registry import find_task, task_name
+from lyceum_warp.env import Env
+from lyceum_warp.model_files import ModelFile, read_spec
+from lyceum_warp.options import EnvOptions
+from lyceum_warp.runs import Run
+from lyceum_warp.task import Task
+
+log = logging.getLogger(__name__)
+
+Note = Callable[[str], None]
+
+_MODEL, _TABLES = "model", "tables"
+_APART = 2
+"""A task's file lies at most this many folders below the common one of it and its model."""
+_LARGEST = 512 * 2**20
+"""Models with larger files than this, in bytes, are not copied."""
+
+
+def spelled_task(task: type[Task]) -> str | None:
+    """A task as config.json names it: a name, a file with a class, or None for a class without a file."""
+    if task.__module__.startswith("lyceum_warp."):
+        return task_name(task)
+    file = _file(task)
+    return None if file is None else f"{file}:{task.__name__}"
+
+
+def _file(task: type[Task]) -> Path | None:
+    """The file that defines a task; None in a notebook."""
+    file = getattr(sys.modules.get(task.__module__), "__file__", None)
+    return Path(file).resolve() if file and file.endswith(".py") and Path(file).is_file() else None
+
+
+@dataclasses.dataclass(frozen=True)
+class KeptTask:
+    """What a run's folder keeps of its task.
+
+    The file and the model of a task of the package are not copied: the release, which versions.json holds, has them.
+    """
+
+    config: dict[str, Any]
+    """Entries of config.json."""
+    files: dict[str, Path | bytes | np.ndarray]
+    """What the folder ``task`` will hold, by path."""
+
+    @classmethod
+    def of(cls, env: Env) -> "KeptTask":
+        """What to keep of an environment's task."""
+        task = env.task.task
+        file, own = _file(task), not task.__module__.startswith("lyceum_warp.")
+        kept: dict[str, Any] = {"name": env.task.name, "model_hash": _model_hash(env)}
+        files: dict[str, Path | bytes | np.ndarray] = {}
+        if file is not None:
+            kept["source_hash"] = _digest(file.read_bytes())
+        sources: dict[Path, Path | bytes] = {file: file} if own and file is not None else {}
+        main = None
+        if own or env.options.model is not None:
+            main, model = _model_files(env)
+            sources |= model
+        names = _names_in_copy(sources, file)
+        if own and file is not None:
+            kept["file"], kept["program"] = names[file], task.__module__ == "__main__"
+        if main is not None:
+            kept["model"] = names[main]
+        files |= {names[path]: content for path, content in sources.items()}
+        kept["model_given"] = env.options.model is not None
+        for name, value in env.given_params.items():
+            if (table := _table(value)) is not None:
+                files[f"{_TABLES}/{name}.npy"] = table
+        return cls({"kept": kept}, files)
+
+    def write(self, run: Run) -> None:
+        """Write the files into a run's folder."""
+        for name, content in self.files.items():
+            path = run.task_folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if isinstance(content, bytes):
+                path.write_bytes(content)
+            elif isinstance(content, np.ndarray):
+                np.save(path, content)
+            else:
+                shutil.copyfile(content, path)
+
+
+def given_params(env: Env) -> dict[str, Any]:
+    """The parameters that an environment was made with, as config.json holds them."""
+    return {name: _plain(name, value) for name, value in env.given_params.items()}
+
+
+def _plain(name: str, value: Any) -> Any:
+    if (table := _table(value)) is not None:
+        return value if isinstance(value, str) else f"{name}.npy" if table.size else []
+    if isinstance(value, bool | int | float | str):
+        return value
+    return np.asarray(value.cpu() if hasattr(value, "cpu") else value).tolist()
+
+
+def _table(value: Any) -> Any:
+    """The file or the array of a table, and None for other parameters."""
+    if isinstance(value, str | Path) and str(value).endswith(".npy"):
+        return Path(value)
+    array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
+    return array if array.dtype.kind in "fiu" and array.size > 64 else None
+
+
+# what a later command uses
+
+
+def run_env(
+    run: Run, options: EnvOptions, params: Mapping[str, Any], *, note: Note = log.warning, task: str | None = None
+) -> Env:
+    """Make an environment of a run's task.
+
+    A file or a model that has moved or changed since the run began is replaced by the run's own copy, and ``note`` gets
+    a line that says so. A task of the package is taken as it is now.
+
+    Args:
+        run: The run.
+        options: Options of the environment.
+        params: Parameters of the task.
+        note: Called with each line.
+        task: Another task, which is taken as it is.
+
+    Raises:
+        ValueError: The task does not fit.
+        FileNotFoundError: The task or its model is missing, and the run has no copy.
+    """
+    if task is not None:
+        return Env(task, options, **params)
+    kept = run.config.get("kept", {})
+    chosen = run_task(run, note=note)
+    params = run_params(run, params)
+    copy = run.task_folder / kept["model"] if "model" in kept else None
+    if copy is None or not copy.is_file():
+        env = Env(chosen, options, **params)
+        if _model_changed(run, kept, env):
+            note(f"the model of the task {env.task.name!r} has changed since the run began")
+        return env
+    if kept["model_given"] and not isinstance(options.model, str):
+        return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
+    try:
+        env = Env(chosen, options, **params)
+        if not _model_changed(run, kept, env):
+            return env
+        reason = "has changed since the run began"
+    except FileNotFoundError:
+        reason = "is no longer where it was"
+    note(f"the model of the task {kept['name']!r} {reason}: the run's own copy is used, {copy}")
+    return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
+
+
+def run_task(run: Run, *, note: Note = log.warning) -> str:
+    """The task, by name or file, that stands for a run's; see ``run_env``.
+
+    Args:
+        run: The run.
+        note: Called with each line.
+
+    Raises:
+        ValueError: The task was defined in a program or a notebook.
+    """
+    task, kept = run.config["task"], run.config.get("kept", {})
+    if task is None or kept.get("program"):
+        where = "a notebook" if task is None else task.partition(":")[0]
+        raise ValueError(
+            f"the task {kept['name']!r} of the run in {run.folder} was defined in {where}, which trained it: give "
+            "--task with a file that only defines it, as --task my_task.py"
+        )
+    path, colon, attribute = task.partition(":")
+    if not path.endswith(".py"):
+        file = _file(find_task(task))
+        if file is not None and kept.get("source_hash") not in (None, _digest(file.read_bytes())):
+            note(f"the task {task!r} has changed since the run began: it is used as it is now")
+        return task
+    copy = run.task_folder / kept["file"] if "file" in kept else None
+    if copy is None or not copy.is_file():
+        return task
+    if not Path(path).is_file():
+        note(f"{path} does not exist any more: the run's own copy is used, {copy}")
+    elif _digest(Path(path).read_bytes()) != kept["source_hash"]:
+        note(f"{path} has changed since the run began: the run's own copy is used, {copy}; --task {path} uses the new")
+    else:
+        return task
+    return f"{copy}{colon}{attribute}"
+
+
+def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters of a run's task; a table that is not where it was is the run's own copy."""
+    return {name: _found_table(run, name, value) for name, value in params.items()}
+
+
+def _found_table(run: Run, name: str, value: Any) -> Any:
+    """A parameter, with the run's copy of a table that is not where it was."""
+    copy = run.task_folder / _TABLES / f"{name}.npy"
+    if isinstance(value, str) and value.endswith(".npy") and not Path(value).is_file() and copy.is_file():
+        return str(copy)
+    return value
+
+
+def _model_changed(run: Run, kept: Mapping[str, Any], env: Env) -> bool:
+    """Whether the model differs from the one that the run began with; False where MuJoCo is another version."""
+    try:
+        version = json.loads((run.folder / "versions.json").read_text())["mujoco"]
+    except (OSError, ValueError, KeyError):
+        return False
+    return version == mujoco.__version__ and kept.get("model_hash") not in (None, _model_hash(env))
+
+
+# copies
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def _model_hash(env: Env) -> str:
+    """A hash of the compiled model, the same in every process and wherever its files lie."""
+    found = hashlib.sha256()
+    for owner in (env.task.model, env.task.model.opt):
+        for name in sorted(dir(owner)):
+            if name.startswith("_") or name.endswith("pathadr") or name in ("paths", "npaths", "nbuffer"):
+                continue
+            value = getattr(owner, name)
+            if isinstance(value, np.ndarray):
+                found.update(name.encode() + np.ascontiguousarray(value).tobytes())
+            elif isinstance(value, bytes | int | float):
+                found.update(f"{name}{value!r}".encode())
+    return found.hexdigest()[:16]
+
+
+def _names_in_copy(paths: Iterable[Path], file: Path | None) -> dict[Path, str]:
+    """The paths in the folder ``task`` of a task's file and of its model's files.
+
+    The files keep their places relative to each other, so that the copy of the task finds the copy of its model. Where
+    the task's file lies elsewhere than its model, each has a place of its own.
+    """
+    paths = list(paths)
+    if not paths:
+        return {}
+    root = Path(os.path.commonpath([path.parent for path in paths]))
+    if file in paths and len(file.parent.relative_to(root).parts) > _APART:
+        rest = [path for path in paths if path != file]
+        return {file: file.name} | {path: f"{_MODEL}/{name}" for path, name in _names_in_copy(rest, None).items()}
+    return {path: path.relative_to(root).as_posix() for path in paths}
+
+
+def _model_files(env: Env) -> tuple[Path | None, dict[Path, Path | bytes]]:
+    """The main file of a task's model, and all its files with their contents or the paths to copy.
+
+    A model that was made in Python is written as MJCF, with the files that it names.
+    """
+    task, given = env.task.task, env.options.model
+    source = given if given is not None else task.model
+    if isinstance(source, str | Path):
+        source = find_model(source, None if given is not None else task)
+    if isinstance(source, ModelFile):
+        source = source.path()
+    text = None
+    if not isinstance(source, Path):
+        spec = env.task.spec.copy()
+        try:
+            spec.compile()
+            text = spec.to_xml()
+        except (ValueError, mujoco.FatalError) as error:
+            log.info("the model of %s cannot be written as MJCF, so the run has no copy of it: %s", task, error)
+            return None, {}
+        source = Path(spec.modelfiledir or ".").absolute() / "model.xml"
+    source = source.resolve()
+    found = [source, *_named_files(source, text)]
+    if sum(path.stat().st_size for path in found if path.is_file()) > _LARGEST:
+        log.info("the model of %s is larger than %d MiB, so the run has no copy of it", task, _LARGEST // 2**20)
+        return None, {}
+    files: dict[Path, Path | bytes] = {path: path for path in found}
+    if text is not None:
+        files[source] = text.encode()
+        for name, content in env.task.spec.assets.items():
+            files.setdefault(source.parent / name, content)
+    return source, files
+
+
+def _named_files(source: Path, text: str | None = None) -> list[Path]:
+    """The files that a model file names: included files, other models, meshes, textures, height fields."""
+    found: dict[Path, None] = {}
+    pending = [(source, text)]
+    while pending:
+        path, content = pending.pop()
+        try:
+            root = ET.fromstring(path.read_bytes() if content is None else content)
+        except (ET.ParseError, OSError):
+            continue
+        folders = {path.parent, source.parent}
+        for compiler in root.iter("compiler"):
+            names = [compiler.get(name) for name in ("assetdir", "meshdir", "texturedir")]
+            folders |= {base / name for base, name in itertools.product(tuple(folders), filter(None, names))}
+        for file in _names(root):
+            for folder, name in itertools.product(sorted(folders), (file, Path(file).name)):
+                other = Path(os.path.normpath(folder / name))
+                if other.is_file() and other not in found and other != source:
+                    found[other] = None
+                    if other.suffix.lower() in (".xml", ".mjcf", ".urdf"):
+                        pending.append((other, None))
+    return list(found)
+
+
+def _names(root: ET.Element) -> Iterator[str]:
+    for element in root.iter():
+        for attribute, value in element.attrib.items():
+            if attribute.startswith("file") and value:
+                yield value.removeprefix("package://")

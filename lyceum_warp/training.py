@@ -1,0 +1,550 @@
+"""Training with a run's folder: the loop that the command line and ``lw.train`` share."""
+
+import dataclasses
+import json
+import math
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lyceum_warp.algos.npg import NPG
+from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
+from lyceum_warp.algos.npg_statistics import Iteration
+from lyceum_warp.interrupts import Interrupted, ending, postponed
+from lyceum_warp.kept_task import KeptTask, given_params, spelled_task
+from lyceum_warp.runs import PolicyContent, Run, policy_content
+from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
+from lyceum_warp.validate import whole_number
+
+SHARE = 200
+"""The complete state is saved once training has taken this many times as long as the last such save."""
+
+Callback = Callable[[Iteration], Any]
+
+
+class NotSavedError(OSError):
+    """A run's folder could not be written. The message says where the run was saved instead."""
+
+
+def train(
+    npg: NPG,
+    folder: str | Path,
+    *,
+    iterations: int = 100,
+    callback: Callback | None = None,
+    target_return: float | None = None,
+    keep_every: int = 0,
+    save_every: int = 0,
+    tensorboard: bool = False,
+    resume: bool = False,
+) -> Run:
+    """Train, and write the same folder as ``lyceum-warp train``: metrics, policies and checkpoints.
+
+    ``lw.load(folder)`` returns the last policy, ``lw.load(folder, which="best")`` the one with the best return:
+    the mean policy's where the configuration has it evaluated (``mean_every``), otherwise the mean return of the
+    episodes that ended in an iteration, which were sampled with the policy before it.
+
+    The policy and the value function are saved after every iteration. The complete state, from which a run continues
+    exactly, is larger. It is saved at the start, at the end, after an error or a signal, and whenever training has
+    taken 200 times as long as the last such save, or every ``save_every`` iterations. A run that is killed continues
+    from the last one, to the same numbers.
+
+    Args:
+        npg: The algorithm.
+        folder: The run's folder, new or empty.
+        iterations: Iterations in all, including those before ``resume``.
+        callback: Called with each iteration after it was saved. Training ends where it returns True, and where it
+            raises an error, which is passed on.
+        target_return: Training ends once the mean policy's return, or, without its evaluation, ``return_mean``, is at
+            least this.
+        keep_every: Iterations between two policies that are kept under their numbers; 0 for none.
+        save_every: Iterations between two saves of the complete state; 0 for a number that follows from their time.
+        tensorboard: Whether to write the metrics for TensorBoard, too.
+        resume: Whether the folder holds a run that is continued; ``npg`` must be made with the same arguments.
+
+    Returns:
+        The run. ``run.rows()`` returns the metrics.
+
+    Raises:
+        ValueError: The folder holds something else, an argument is out of range, or the run does not fit ``npg``.
+        ImportError: The extra ``tensorboard`` is not installed.
+        NotSavedError: The folder could no longer be written; the message says where the run was saved instead.
+    """
+    iterations = whole_number("iterations", iterations, low=1)
+    settings = checked_settings(target_return=target_return, keep_every=keep_every, save_every=save_every)
+    team, folder = npg.team, Path(folder)
+    config = describe(npg) | {"iterations": iterations, **settings}
+    with team.together():
+        if tensorboard:
+            check_tensorboard()
+        if resume:
+            run = Run.open(folder)
+            content = run.read()
+            check_resumable(run, content, iterations, target_return)
+            _check_equal(run, config)
+            restore(run, npg, content)
+        elif team.leads:
+            kept = KeptTask.of(npg.env)
+            run = Run.create(folder, config | kept.config, device=npg.env.options.device or "cpu")
+            kept.write(run)
+        else:
+            run = Run(folder, config)
+    if resume and team.leads:
+        reopen(run, npg, iterations=iterations, **settings)
+    board = TensorBoard(folder, run.config) if tensorboard and team.leads else None
+    with ending():
+        learn(run if team.leads else None, npg, iterations=iterations, callback=callback, board=board, **settings)
+    return run
+
+
+def checked_settings(*, target_return: float | None = None, keep_every: int = 0, save_every: int = 0) -> dict[str, Any]:
+    """The settings of a run that do not change its numbers, as config.json holds them.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+    if target_return is not None and (not isinstance(target_return, (int, float)) or math.isnan(target_return)):
+        raise ValueError(f"target_return must be a number, not {target_return!r}")
+    return {
+        "target_return": None if target_return is None else float(target_return),
+        "keep_every": whole_number("keep_every", keep_every, low=0),
+        "save_every": whole_number("save_every", save_every, low=0),
+    }
+
+
+def describe(npg: NPG) -> dict[str, Any]:
+    """The configuration of a run that an algorithm stands for, as config.json holds it."""
+    env, options = npg.env, npg.env.options
+    config = fitted_config(npg.config, npg.policy.shape, npg.value.shape)
+    if npg.value.group != ("critic" if "critic" in env.obs_groups else "policy"):
+        config = dataclasses.replace(config, value_group=npg.value.group)
+    others = {name: value for name, value in options.given().items() if name in ("nthread", "horizon", "graphs")}
+    others |= {name: list(names) for name in ("fields", "dynamics") if (names := getattr(options, name))}
+    if isinstance(options.model, str | Path):
+        others["model"] = str(Path(options.model).absolute()) if Path(options.model).is_file() else str(options.model)
+    return {
+        "algorithm": "npg",
+        "task": spelled_task(env.task.task),
+        "params": given_params(env),
+        "physics": options.physics.given(),
+        "engine": options.engine if isinstance(options.engine, str) else env.engine.name,
+        "device": options.device or "cpu",
+        "options": others,
+        "nworld": env.nworld * npg.team.size,
+        "threads": torch.get_num_threads(),
+        "seed": options.seed,
+        "npg": dataclasses.asdict(config) | {"samples": enough_samples(config, env.nworld * npg.team.size)},
+    }
+
+
+def fitted_config(config: NPGConfig, policy_shape: Mapping[str, Any], value_shape: Mapping[str, Any]) -> NPGConfig:
+    """Hyperparameters with the sizes of given networks, from which networks like these can be made.
+
+    Args:
+        config: The hyperparameters.
+        policy_shape: The ``shape`` of the policy.
+        value_shape: That of the value function.
+    """
+    entries = {"hidden": policy_shape.get("hidden"), "activation": policy_shape.get("activation")}
+    entries |= {f"value_{name}": value_shape.get(name) for name in ("hidden", "activation")}
+    entries |= {"normalize": policy_shape.get("normalize"), "time_orders": value_shape.get("time_orders")}
+    return dataclasses.replace(config, **{name: entry for name, entry in entries.items() if entry is not None})
+
+
+# continuing
+
+
+def check_resumable(run: Run, content: Mapping[str, Any], iterations: int, target_return: float | None) -> None:
+    """Refuse to continue a run that is finished.
+
+    Args:
+        run: The run.
+        content: The content of its checkpoint.
+        iterations: Iterations in all.
+        target_return: The return at which it will end.
+
+    Raises:
+        ValueError: The run has as many iterations, or has reached the return.
+    """
+    reached = run.config.get("reached")
+    if reached is not None and target_return is not None and reached["return"] >= target_return:
+        raise ValueError(
+            f"the run in {run.folder} is finished: its return reached {reached['return']:.6g} in iteration "
+            f"{reached['iteration']}: give a target return above that, or inf for none"
+        )
+    done = content["iteration"]
+    if iterations <= done:
+        raise ValueError(
+            f"the run in {run.folder} already has {done} iterations: give more, as in --iterations {2 * done}"
+        )
+
+
+def _check_equal(run: Run, config: Mapping[str, Any]) -> None:
+    """Refuse an algorithm with other settings than the run's."""
+    now = json.loads(json.dumps(config))  # lists in place of tuples
+    for part in ("params", "physics", "npg", "nworld"):
+        for name, then, given in _entries(part, run.config.get(part), now[part]):
+            if then != given:
+                raise ValueError(
+                    f"the run in {run.folder} has {name} {then}, not {given}, and a run keeps its settings: make NPG "
+                    "with the same arguments, or give another folder"
+                )
+
+
+def _entries(name: str, then: Any, now: Any) -> list[tuple[str, Any, Any]]:
+    """Two values of a configuration's entry; for a table those of its entries that are known."""
+    if not isinstance(then, Mapping):
+        return [(name, then, now)]
+    # an older run lacks the newest hyperparameters
+    known = then if name == "npg" else {**then, **now}
+    return [(entry, then.get(entry), now.get(entry)) for entry in known]
+
+
+def restore(run: Run, npg: NPG, content: Mapping[str, Any]) -> None:
+    """Put an algorithm into the state of a run's checkpoint.
+
+    Args:
+        run: The run.
+        npg: The algorithm.
+        content: The content of the checkpoint.
+
+    Raises:
+        ValueError: The checkpoint does not fit the algorithm.
+    """
+    try:
+        npg.load_state_dict(_on(npg.env.obs.device, content["state"]))
+    except (KeyError, RuntimeError, ValueError) as error:
+        raise ValueError(
+            f"{run.checkpoint} does not fit the configuration beside it: {' '.join(str(error).split())}"
+        ) from error
+
+
+def _on(device: torch.device, state: Any) -> Any:
+    """A state with all its tensors on a device."""
+    if isinstance(state, torch.Tensor):
+        return state.to(device)
+    if isinstance(state, Mapping):
+        return {name: _on(device, part) for name, part in state.items()}
+    return [_on(device, part) for part in state] if isinstance(state, list) else state
+
+
+def reopen(run: Run, npg: NPG, **settings: Any) -> None:
+    """Cut a run's table to the iterations of its checkpoint, and note new settings."""
+    run.cut(npg.iteration)
+    run.amend(**settings)
+
+
+# the loop
+
+
+def learn(
+    run: Run | None,
+    npg: NPG,
+    *,
+    iterations: int,
+    callback: Callback | None = None,
+    target_return: float | None = None,
+    keep_every: int = 0,
+    save_every: int = 0,
+    board: Any = None,
+) -> None:
+    """Iterate, and write a run's files.
+
+    Of several processes one has the run. When another one receives a signal, all of them finish the iteration and end
+    together: they would wait endlessly for a process that ended within the iteration.
+
+    Args:
+        run: The run; None in processes that do not write.
+        npg: The algorithm.
+        iterations: Iterations in all.
+        callback: Called with each iteration after it was saved; see ``train``.
+        target_return: The return at which training ends.
+        keep_every: Iterations between two numbered policies; 0 for none.
+        save_every: Iterations between two complete states; 0 for a number that follows from their time.
+        board: TensorBoard's writer.
+
+    Raises:
+        NotSavedError: The folder could no longer be written.
+        Interrupted: One of several processes received a signal.
+    """
+    alone = npg.team.size == 1
+    keeper = None if run is None else Keeper(run, npg, keep_every=keep_every, save_every=save_every)
+    try:
+        with postponed(not alone) as noted:
+            loop = _Loop(keeper, npg, noted, [board, callback], target_return)
+            if npg.iteration == 0:
+                loop.save()
+            while npg.iteration < iterations and not loop.ended:
+                loop.step()
+            loop.save()
+    except BaseException as error:
+        if alone and keeper is not None and not isinstance(error, NotSavedError):
+            with postponed():
+                keeper.save_boundary()
+            if isinstance(error, Exception):
+                error.add_note(f"the run in {keeper.run.folder} is saved up to iteration {keeper.iteration}")
+        raise
+    finally:
+        if board is not None:
+            board.close()
+
+
+class _Loop:
+    """The order of a run's iterations, and the decisions that all processes make together.
+
+    Args:
+        keeper: Writes the files; None in processes that do not.
+        npg: The algorithm.
+        noted: Signals that this process received and postponed.
+        callbacks: Called with each iteration; some may be None.
+        target_return: The return at which training ends.
+    """
+
+    def __init__(
+        self, keeper: "Keeper | None", npg: NPG, noted: list[int], callbacks: list[Callback | None],
+        target_return: float | None,
+    ) -> None:  # fmt: skip
+        self.keeper, self.npg, self.noted, self.target_return = keeper, npg, noted, target_return
+        self.callbacks = [function for function in callbacks if function is not None]
+        self.alone = npg.team.size == 1
+        self.due = self.ended = False
+        self.saved = npg.iteration if npg.iteration else -1
+        self.error: Exception | None = None
+
+    def step(self) -> None:
+        """Make an iteration, keep it, and decide whether it was the last."""
+        complete = self.due
+        iteration = next(self.npg)
+        # the worlds of several processes are brought together only to be saved
+        state = self.npg.state_dict() if complete or self.alone else None
+        self._write(lambda keeper: keeper.keep(iteration, state))
+        if complete:
+            self._write_state()
+        self._decide(iteration)
+        self._agree()
+
+    def save(self) -> None:
+        """Save the complete state, unless it is saved."""
+        if self.saved < self.npg.iteration:
+            state = self.npg.state_dict()
+            self._write(lambda keeper: keeper.take(state))
+            self._write_state()
+            self._agree()
+
+    def _write_state(self) -> None:
+        self.saved = self.npg.iteration
+        self._write(lambda keeper: keeper.save_boundary())
+
+    def _write(self, action: Callable[["Keeper"], None]) -> None:
+        """Write files in the process that has the run; an error waits until all processes know of it."""
+        if self.keeper is None or self.error is not None:
+            return
+        with postponed(self.alone):
+            try:
+                self.keeper.guarded(action)
+            except Exception as error:
+                self.error = error
+
+    def _decide(self, iteration: Iteration) -> None:
+        """Call the callbacks, and compare with the return at which training ends."""
+        if self.keeper is None or self.error is not None:
+            return
+        try:
+            for function in self.callbacks:
+                self.ended = function(iteration) is True or self.ended
+        except Exception as error:
+            self.error = error
+        reached = self.keeper.return_of(iteration)
+        if self.target_return is not None and reached is not None and reached >= self.target_return:
+            self._write(lambda keeper: keeper.note_target(iteration, reached))
+            self.ended = True
+
+    def _agree(self) -> None:
+        """Bring the processes to the same decisions, and raise what one of them met."""
+        due = self.keeper is not None and self.keeper.due()
+        numbers = max(self.noted, default=0), self.ended, self.error is not None, due
+        signal, ended, failed, complete = self.npg.team.largest(*map(int, numbers))
+        self.ended, self.due = bool(ended), bool(complete)
+        if self.error is not None:
+            raise self.error
+        if failed:
+            raise SystemExit(2)
+        if signal:
+            if self.saved < self.npg.iteration:
+                self.save()
+            raise Interrupted(signal)
+
+
+# files
+
+
+class Keeper:
+    """Writes a run's files after each iteration, and, where its folder cannot be written, the whole run elsewhere.
+
+    It keeps the boundary: the state after the last complete iteration. Whatever happens within the next one, that state
+    can be saved.
+
+    Args:
+        run: The run.
+        npg: The algorithm.
+        keep_every: Iterations between two numbered policies; 0 for none.
+        save_every: Iterations between two complete states; 0 for a number that follows from their time.
+    """
+
+    iteration: int
+    """Number of the last complete iteration."""
+
+    def __init__(self, run: Run, npg: NPG, *, keep_every: int = 0, save_every: int = 0) -> None:
+        self.run, self.npg, self.keep_every, self.save_every = run, npg, keep_every, save_every
+        self.iteration = npg.iteration
+        self._content = policy_content(npg.iteration, npg.policy, npg.value)
+        self._state: dict[str, Any] | None = None
+        self._saved = npg.iteration if npg.iteration else -1
+        self._best = run.best_score()
+        self._best_content: PolicyContent | None = None
+        self._files = run.files()
+        self._rows: list[dict[str, Any]] = []
+        self._seconds, self._when = 0.0, time.perf_counter()
+
+    def due(self) -> bool:
+        """Whether the next iteration's complete state is to be saved."""
+        if self.save_every:
+            return (self.iteration + 1) % self.save_every == 0
+        return time.perf_counter() - self._when >= SHARE * self._seconds
+
+    def return_of(self, iteration: Iteration) -> float | None:
+        """The return by which policies are compared, where the iteration has one."""
+        number = iteration.mean_return if self._by_mean else iteration.return_mean
+        return None if number is None or math.isnan(number) else number
+
+    @property
+    def _by_mean(self) -> bool:
+        return self.npg.config.mean_every > 0
+
+    def take(self, state: dict[str, Any]) -> None:
+        """Make the algorithm's present state the boundary."""
+        self.iteration = self.npg.iteration
+        if self._content["iteration"] != self.iteration:
+            self._content = policy_content(self.iteration, self.npg.policy, self.npg.value)
+        self._state = state
+
+    def keep(self, iteration: Iteration, state: dict[str, Any] | None) -> None:
+        """Write the row of an iteration, and its policy.
+
+        Args:
+            iteration: The iteration.
+            state: The algorithm's state after it, where it may be saved.
+        """
+        before = self._content
+        self.iteration, self._state = self.npg.iteration, state
+        self._content = policy_content(self.iteration, self.npg.policy, self.npg.value)
+        self._rows.append(iteration.row())
+        self.run.write(self._rows[-1])
+        score = self.return_of(iteration)
+        if score is not None and (self._best is None or score > self._best[1]):
+            # the iteration's own episodes were sampled with the policy before its step
+            self._best_content = self._content if self._by_mean else before
+            self._best = self._best_content["iteration"], score
+            self.run.save_best(self._best_content, self._score_name, score)
+        self.run.save_policy(self._content, number=bool(self.keep_every) and self.iteration % self.keep_every == 0)
+
+    @property
+    def _score_name(self) -> str:
+        return "mean_return" if self._by_mean else "return_mean"
+
+    def note_target(self, iteration: Iteration, reached: float) -> None:
+        """Note in the configuration that the run reached its return."""
+        self.run.amend(reached={"iteration": iteration.iteration, "return": reached})
+
+    def save_boundary(self) -> None:
+        """Save the complete state at the boundary, unless it is saved."""
+        if self._saved != self.iteration and self._state is not None:
+            self.guarded(Keeper._save)
+
+    def _save(self) -> None:
+        start = time.perf_counter()
+        assert self._state is not None
+        self.run.save_policy(self._content)
+        self.run.save_state(self._content, self._state)
+        self._saved, self._when = self.iteration, time.perf_counter()
+        self._seconds = self._when - start
+
+    # where the folder cannot be written
+
+    def guarded(self, action: Callable[["Keeper"], None]) -> None:
+        """Write files; if that fails, save the run elsewhere.
+
+        Raises:
+            NotSavedError: It failed.
+        """
+        try:
+            action(self)
+        except NotSavedError:
+            raise
+        except OSError as error:
+            raise NotSavedError(self._rescued(error)) from error
+
+    def _rescued(self, error: OSError) -> str:
+        """Save the run elsewhere; returns the message."""
+        folder = self.run.folder
+        what = f"{error.strerror or error}: {error.filename}" if error.filename else str(error.strerror or error)
+        text = f"the run in {folder} could not be saved after iteration {self.iteration} ({what})"
+        places = [_free(folder.with_name(f"{folder.name}-rescued")), None]
+        for whole in (True, False):
+            for place in places:
+                if (rescued := self._copied(place, whole=whole)) is None:
+                    continue
+                if whole:
+                    return f"{text}: the whole run is in {rescued}; continue it with --resume {rescued}"
+                return f"{text}: its policy is in {rescued / 'policy.pt'}{self._left()}"
+        return f"{text}, nor in another folder{self._left()}"
+
+    def _left(self) -> str:
+        """What the run's folder still holds."""
+        if self._saved >= 0 and (self.run.checkpoint.is_file() or self.run.previous.is_file()):
+            return f"; {self.run.folder} continues from iteration {self._saved} with --resume"
+        return ""
+
+    def _copied(self, folder: Path | None, *, whole: bool) -> Path | None:
+        """Write the run, or its policy alone, into another folder; None where that fails."""
+        made = None
+        try:
+            if folder is None:
+                made = Path(tempfile.mkdtemp(prefix="lyceum-warp-"))
+            else:
+                folder.mkdir(parents=True)
+                made = folder
+            run = Run(made, self.run.config)
+            run.amend()
+            for name, content in self._files.items():
+                path = made / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(content)
+            for row in self._rows:
+                run.write(row)
+            if self._best_content is not None and self._best is not None:
+                run.save_best(self._best_content, self._score_name, self._best[1])
+            run.save_policy(self._content)
+            if whole:
+                if self._state is None:
+                    raise OSError("the worlds of several processes are not at hand")
+                run.save_state(self._content, self._state)
+            return made
+        except OSError:
+            if made is not None:
+                shutil.rmtree(made, ignore_errors=True)
+            return None
+
+
+def _free(folder: Path) -> Path:
+    """The folder, or one of a similar name that does not exist."""
+    number = 2
+    free = folder
+    while free.exists():
+        free, number = folder.with_name(f"{folder.name}-{number}"), number + 1
+    return free

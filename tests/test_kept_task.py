@@ -1,0 +1,161 @@
+"""A run's copies of its task: what is kept, and what later commands use after files have moved or changed."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from training_runs import QUIET, TINY, metrics, refused
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.runs import Run
+
+SOURCE = """
+import warp as wp
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    qvel: Row[float]
+
+@wp.struct
+class Params:
+    dt: float
+    goal: wp.array[float] = [0.1, 0.2]
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    obs[0] = s.qpos[0]
+    obs[1] = s.qvel[0]
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    return -wp.abs(s1.qpos[0] - p.goal[0])
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    s.qpos[0] = lw.uniform(rng, -1.0, 1.0)
+
+class Slide(lw.Task):
+    model, horizon, obs = "robot/scene.xml", 20, {"x": 1, "v": 1}
+"""
+SCENE = """
+<mujoco>
+  <compiler meshdir="../meshes"/>
+  <include file="parts/block.xml"/>
+  <asset><mesh name="block" file="block.obj"/></asset>
+  <actuator><motor joint="x" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+PART = """
+<mujocoinclude>
+  <worldbody><body><joint name="x" type="slide" axis="1 0 0"/><geom type="mesh" mesh="block"/></body></worldbody>
+</mujocoinclude>
+"""
+BLOCK = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+SMALL = lw.NPGConfig(samples=40, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2)
+
+
+@pytest.fixture
+def folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
+    """A folder with a task, at the same path in every run of the tests, so that Warp finds compiled kernels."""
+    cache = getattr(pytestconfig, "cache", None)
+    folder = Path(cache.mkdir("kept_task")) if cache else tmp_path
+    shutil.rmtree(folder)
+    for name, text in {"mine/slide.py": SOURCE, "mine/robot/scene.xml": SCENE, "mine/robot/parts/block.xml": PART,
+                       "mine/meshes/block.obj": BLOCK}.items():  # fmt: skip
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    np.save(folder / "mine" / "goal.npy", np.array([0.3, 0.4]))
+    return folder
+
+
+def trained(folder: Path) -> Path:
+    """A run of two iterations."""
+    out, table = folder / "run", folder / "mine" / "goal.npy"
+    arguments = ["train", str(folder / "mine" / "slide.py"), "--out", str(out), "--param", f"goal={table}", *TINY]
+    assert cli.main([*arguments, *QUIET, "--iterations", "2"]) == 0
+    return out
+
+
+def returns(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The line of returns that eval prints."""
+    capsys.readouterr()
+    assert cli.main(["eval", *arguments, "--episodes", "2"]) == 0
+    output = capsys.readouterr()
+    print(output.err)  # for ``refused``, which reads it
+    return next(line for line in output.out.splitlines() if line.strip().startswith("return"))
+
+
+def test_a_run_goes_on_after_its_task_has_moved(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The model's includes, its meshes and the tables have moved with it."""
+    out = trained(folder)
+    before = returns(capsys, str(out))
+    assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
+    expected = metrics(out)
+    shutil.rmtree(out)
+    trained(folder)
+    (folder / "mine").rename(folder / "moved")
+    try:
+        assert returns(capsys, str(out)) == before
+        assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
+        gone, copy = folder / "mine" / "slide.py", out / "task" / "slide.py"
+        refused(capsys, f"{gone} does not exist any more: the run's own copy is used, {copy}")
+        assert metrics(out) == expected
+        warm = ["train", "--from", str(out), "--out", str(folder / "warm"), "--iterations", "1", *QUIET]
+        assert cli.main(warm) == 0
+        assert Run.open(folder / "warm").config["from"]["run"] == str(out)
+    finally:
+        shutil.rmtree(folder / "moved")
+
+
+def test_an_edited_task_is_named_and_the_runs_own_copy_used(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = trained(folder)
+    before = returns(capsys, str(out))
+    file = folder / "mine" / "slide.py"
+    file.write_text(SOURCE.replace("-wp.abs(", "7.0 - wp.abs("))
+    capsys.readouterr()
+    assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
+    refused(
+        capsys, f"{file} has changed since the run began: the run's own copy is used", f"--task {file} uses the new"
+    )
+    assert returns(capsys, str(out)) == before
+    assert returns(capsys, str(out), "--task", str(file)) != before
+    assert capsys.readouterr().err == ""
+
+
+def test_an_edited_model_is_named_and_the_runs_own_copy_used(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = trained(folder)
+    before = returns(capsys, str(out))
+    (folder / "mine" / "robot" / "parts" / "block.xml").write_text(
+        PART.replace('type="slide"', 'type="slide" damping="9"')
+    )
+    capsys.readouterr()
+    assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
+    refused(capsys, "the model of the task 'slide' has changed since the run began: the run's own copy is used")
+    assert returns(capsys, str(out)) == before
+    assert returns(capsys, str(out), "--task", str(folder / "mine" / "slide.py")) != before
+
+
+def test_a_run_of_python_keeps_a_model_that_was_made_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spec = lw.gymnasium_model("hopper.xml").spec()
+    spec.option.gravity = [0.0, 0.0, -30.0]
+    env = lw.make("hopper", nworld=2, model=spec, horizon=20)
+    lw.train(lw.NPG(env, config=SMALL), tmp_path / "run", iterations=1)
+    before = returns(capsys, str(tmp_path / "run"))
+    assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2", "--task", "hopper"]) == 0
+    assert before not in capsys.readouterr().out
+    assert cli.main(["train", "--resume", str(tmp_path / "run"), "--iterations", "2", *QUIET]) == 0
+
+
+def test_a_task_of_a_program_is_evaluated_with_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its file may train when it is run."""
+    lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=SMALL), tmp_path / "run", iterations=1)
+    Run.open(tmp_path / "run").amend(task=None)  # as for a class of a notebook
+    assert cli.main(["eval", str(tmp_path / "run")]) == 2
+    refused(capsys, "the task 'point_mass'", "was defined in a notebook", "give --task with a file")
+    assert cli.main(["eval", str(tmp_path / "run"), "--task", "point_mass", "--episodes", "2"]) == 0

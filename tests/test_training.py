@@ -1,0 +1,414 @@
+"""Training with a run's folder: ended, continued, warm-started, and where the folder cannot be written."""
+
+import os
+import resource
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from conftest import SharedEnv
+from training_runs import QUIET, metrics, refused
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.algos.value_fit import ValueFit
+from lyceum_warp.runs import Run
+from lyceum_warp.training import Keeper, NotSavedError
+
+CONFIG = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=2, mean_episodes=2)
+
+
+def algorithm(env: lw.Env, **options: Any) -> lw.NPG:
+    return lw.NPG(env, config=CONFIG, **options)
+
+
+@pytest.fixture
+def env(shared_env: SharedEnv) -> lw.Env:
+    """Each algorithm continues its random streams, so tests that compare numbers make environments of their own."""
+    return shared_env("point_mass", nworld=2)
+
+
+@pytest.fixture(scope="module")
+def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of six iterations."""
+    folder = tmp_path_factory.mktemp("runs") / "six"
+    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, keep_every=2)
+    return folder
+
+
+def mean_action(policy: lw.GaussianPolicy) -> torch.Tensor:
+    return policy(torch.linspace(-1.0, 1.0, policy.nobs))
+
+
+# the same folder as the command's
+
+
+def test_a_run_of_python_has_the_numbers_of_the_command(six: Path, tmp_path: Path) -> None:
+    options = ["--samples", "512", "--hidden", "8", "--value-hidden", "8", "--mean-every", "2", "--mean-episodes", "2"]
+    out = tmp_path / "command"
+    arguments = ["train", "point_mass", "--nworld", "2", "--iterations", "6", "--keep-every", "2", "--out", str(out)]
+    assert cli.main([*arguments, *options, *QUIET]) == 0
+    assert metrics(out) == metrics(six)
+    one, other = ({path.name for path in folder.rglob("*")} for folder in (out, six))
+    assert one == other
+    configs = [Run.open(folder).config for folder in (out, six)]
+    assert configs[0] == configs[1] | {"threads": 1}
+
+
+def test_a_run_of_python_is_evaluated_and_resumed_by_the_command(six: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(six, tmp_path / "run"))
+    assert cli.main(["eval", str(run), "--episodes", "2", "--which", "best"]) == 0
+    assert cli.main(["train", "--resume", str(run), "--iterations", "7", *QUIET]) == 0
+    assert metrics(run)[:6] == metrics(six)
+
+
+def test_python_resumes_a_run_to_the_same_numbers(six: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=2)
+    run = lw.train(algorithm(lw.make("point_mass", nworld=2, seed=5)), folder, iterations=6, resume=True)
+    assert metrics(folder) == metrics(six) and len(run.rows()) == 6
+    with pytest.raises(ValueError, match="has gamma 0.995, not 0.9, and a run keeps its settings"):
+        config = lw.NPGConfig(**{**vars(CONFIG), "gamma": 0.9})
+        lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), folder, iterations=9, resume=True)
+    with pytest.raises(ValueError, match="already has 6 iterations"):
+        lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
+
+
+def test_bad_arguments_leave_no_folder(env: lw.Env, tmp_path: Path) -> None:
+    npg = algorithm(env)
+    for words, message in [
+        ({"iterations": 0}, "iterations must be"),
+        ({"keep_every": -1}, "keep_every must be"),
+        ({"save_every": 1.5}, "save_every must be"),
+        ({"target_return": float("nan")}, "target_return must be a number"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            lw.train(npg, tmp_path / "run", **words)  # type: ignore[arg-type]
+    assert not (tmp_path / "run").exists()
+
+
+# which policy
+
+
+def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
+    returns = [float(row["mean_return"]) for row in metrics(six) if row["mean_return"]]
+    best = 2 * (returns.index(max(returns)) + 1)
+    actions = {which: mean_action(lw.load(six, which=which)) for which in ("last", "best", 2, 4, "6")}
+    assert torch.equal(actions["best"], actions[str(best) if best == 6 else best])
+    assert torch.equal(actions["last"], actions["6"])
+    assert not torch.equal(actions[2], actions[4])
+    assert lw.load_value(six, which="best").discount == CONFIG.gamma
+    with pytest.raises(FileNotFoundError, match=r"has no policy 3: it has 'last', 'best', 2, 4, 6"):
+        lw.load(six, which=3)
+    with pytest.raises(ValueError, match="which must be 'last', 'best' or the number of an iteration, not 'worst'"):
+        lw.load(six, which="worst")
+
+
+def test_the_best_policy_gives_the_best_return_of_the_evaluations(six: Path) -> None:
+    best = max(float(row["mean_return"]) for row in metrics(six) if row["mean_return"])
+    iteration, score = Run.open(six).best_score() or (0, 0.0)
+    assert score == best and metrics(six)[iteration - 1]["mean_return"] == repr(best)
+
+
+def test_without_evaluations_the_best_policy_sampled_the_best_iteration(tmp_path: Path) -> None:
+    """The episodes of an iteration are those of the policy before its step."""
+    config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
+    lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)
+    returns = [float(row["return_mean"]) for row in metrics(tmp_path / "run")]
+    iteration, score = Run.open(tmp_path / "run").best_score() or (-1, 0.0)
+    assert score == max(returns) and iteration == returns.index(score)
+    if iteration > 0:
+        best, numbered = (mean_action(lw.load(tmp_path / "run", which=which)) for which in ("best", iteration))
+        assert torch.equal(best, numbered)
+
+
+# the end
+
+
+def test_a_callback_sees_every_iteration_and_ends_training(env: lw.Env, tmp_path: Path) -> None:
+    seen = []
+
+    def callback(iteration: lw.Iteration) -> bool:
+        assert Run.open(tmp_path / "run").rows()[-1]["iteration"] == iteration.iteration
+        seen.append(iteration.iteration)
+        return iteration.iteration == 3
+
+    run = lw.train(algorithm(env), tmp_path / "run", iterations=9, callback=callback)
+    assert seen == [1, 2, 3] and run.read()["iteration"] == 3
+
+
+def test_an_error_in_the_callback_leaves_a_whole_run(six: Path, tmp_path: Path) -> None:
+    def callback(iteration: lw.Iteration) -> None:
+        if iteration.iteration == 3:
+            raise KeyError("mine")
+
+    folder = tmp_path / "run"
+    with pytest.raises(KeyError) as raised:
+        lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, callback=callback, save_every=100)
+    assert raised.value.__notes__ == [f"the run in {folder} is saved up to iteration 3"]
+    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
+    assert metrics(folder) == metrics(six)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, FloatingPointError])
+def test_what_ends_an_iteration_leaves_the_iterations_before_it(
+    error: type[BaseException], six: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where worlds and networks have moved on since."""
+    npg, folder = algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run"
+    fit = ValueFit.__call__
+
+    def interrupted(self: ValueFit, *args: Any) -> None:
+        fit(self, *args)
+        if npg.iteration == 3:
+            raise error
+
+    with pytest.raises(error), monkeypatch.context() as patched:
+        patched.setattr(ValueFit, "__call__", interrupted)
+        lw.train(npg, folder, iterations=6, save_every=100)
+    assert len(metrics(folder)) == 3
+    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
+    assert metrics(folder) == metrics(six)
+
+
+def test_training_ends_at_the_target_return(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The mean policy is evaluated after every second iteration."""
+    folder = tmp_path / "run"
+    run = lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=9, target_return=-1e6)
+    assert len(run.rows()) == 2
+    resume = ["train", "--resume", str(folder), "--iterations", "4", *QUIET]
+    assert cli.main(resume) == 2
+    refused(capsys, f"the run in {folder} is finished: its return reached", "in iteration 2", "give a target return")
+    assert cli.main([*resume, "--target-return", "inf"]) == 0
+    assert len(run.rows()) == 4
+
+
+# a run that was killed
+
+
+def test_a_run_continues_from_the_last_complete_state_to_the_same_numbers(six: Path, tmp_path: Path) -> None:
+    """As after kill -9 in iteration 5: the policy is that of iteration 4, the complete state that of iteration 3."""
+    folder = tmp_path / "run"
+    states = {}
+
+    def callback(iteration: lw.Iteration) -> None:
+        states[iteration.iteration] = {path: path.read_bytes() for path in folder.rglob("*.*")}
+
+    npg = algorithm(lw.make("point_mass", nworld=2))
+    lw.train(npg, folder, iterations=6, save_every=3, keep_every=2, callback=callback)
+    for path in folder.rglob("*.*"):
+        path.unlink()
+    for path, content in states[4].items():
+        path.write_bytes(content)
+    run = Run.open(folder)
+    assert run.read()["iteration"] == 3 and len(run.rows()) == 4
+    for which in ("last", 4):
+        assert torch.equal(mean_action(lw.load(folder, which=which)), mean_action(lw.load(six, which=4)))
+    assert cli.main(["train", "--resume", str(folder), "--iterations", "6", *QUIET]) == 0
+    assert metrics(folder) == metrics(six)
+    for which in ("last", "best"):
+        assert torch.equal(mean_action(lw.load(folder, which=which)), mean_action(lw.load(six, which=which)))
+
+
+def test_complete_states_take_a_small_share_of_the_time(env: lw.Env, tmp_path: Path) -> None:
+    npg = algorithm(env)
+    run = Run.create(tmp_path / "run", {})
+    keeper = Keeper(run, npg)
+    keeper.take(npg.state_dict())
+    keeper.save_boundary()
+    assert not keeper.due()
+    keeper._when -= 201 * keeper._seconds
+    assert keeper.due()
+    assert [Keeper(run, npg, save_every=n).due() for n in (1, 2)] == [True, False]
+
+
+# a new run from the policy of another
+
+
+def test_a_loaded_policy_learns_further(six: Path, env: lw.Env) -> None:
+    policy, value = lw.load(six), lw.load_value(six)
+    before = mean_action(policy)
+    npg = lw.NPG(env, policy, value, CONFIG)
+    next(npg)
+    assert npg.policy is policy and not torch.equal(mean_action(policy), before)
+
+
+def test_a_command_begins_with_the_policy_of_a_run(
+    six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With its settings, on the same task with another parameter; its first iteration samples with that policy."""
+    out = tmp_path / "out"
+    arguments = ["train", "--from", str(six), "--which", "4", "--param", "success_distance=0.5", "--iterations", "1"]
+    assert cli.main([*arguments, "--out", str(out), "--keep-every", "1", *QUIET]) == 0
+    config = Run.open(out).config
+    assert config["from"] == {"run": str(six / "policies"), "which": "4", "iteration": 4}
+    assert (config["task"], config["params"], config["nworld"]) == ("point_mass", {"success_distance": 0.5}, 2)
+    assert config["npg"] == Run.open(six).config["npg"]
+    state = Run.open(out).read()["state"]
+    assert state["iteration"] == 1
+    moved = mean_action(lw.load(out)) - mean_action(lw.load(six, which=4))
+    assert 0 < moved.abs().max() < 1.0
+    assert cli.main(["train", "--resume", str(out), "--iterations", "2", *QUIET]) == 0
+    capsys.readouterr()
+    for options, words in [
+        (["hopper"], ["takes 6 observations and gives 2 actions", "'hopper' has 11 and 3"]),
+        (["--hidden", "9"], ["have hidden (8,), not (9,)", "leave out --hidden"]),
+        (["--which", "5"], ["has no policy '5': it has 'last', 'best', 2, 4, 6"]),
+        (["--resume", str(six)], ["cannot be combined with --from"]),
+    ]:
+        assert cli.main(["train", *options, "--from", str(six), "--out", str(tmp_path / "no")]) == 2
+        refused(capsys, *words)
+    assert not (tmp_path / "no").exists()
+
+
+def test_evaluations_and_training_with_one_seed_draw_other_states(env: lw.Env) -> None:
+    env.rand_reset(1)
+    trained_on = env.obs.clone()
+    seen: list[torch.Tensor] = []
+
+    def policy(obs: torch.Tensor) -> torch.Tensor:
+        seen.append(obs.clone())
+        return torch.zeros_like(env.action)
+
+    lw.evaluate(env, policy, 2, seed=1)  # type: ignore[arg-type]
+    assert not torch.isclose(seen[0], trained_on).all(1).any()
+
+
+# folders that cannot be written
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of its own with a megabyte."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode != 0:
+        pytest.skip("cannot mount a file system")
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def trained_with(folder: Path, at_three: Callable[[], Any], tmp_path: Path) -> str:
+    """Train while something happens to the folder after the third iteration; returns the error's message."""
+
+    def callback(iteration: lw.Iteration) -> None:
+        if iteration.iteration == 3:
+            at_three()
+
+    npg = algorithm(lw.make("point_mass", nworld=2))
+    with pytest.raises(NotSavedError) as raised:
+        lw.train(npg, folder, iterations=6, callback=callback, save_every=2, keep_every=2)
+    message = str(raised.value)
+    print(message)
+    assert "\n" not in message and message.startswith(f"the run in {folder} could not be saved after iteration 4 (")
+    return message
+
+
+def assert_continues(folder: Path, six: Path) -> None:
+    """A run continues to the same numbers."""
+    assert cli.main(["train", "--resume", str(folder), "--iterations", "6", *QUIET]) == 0
+    assert metrics(folder) == metrics(six)
+
+
+def rescued_run(message: str) -> Path:
+    before, _, folder = message.rpartition(" continue it with --resume ")
+    assert before.endswith(f"the whole run is in {folder};")
+    return Path(folder)
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder for temporary files."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    return folder
+
+
+def test_a_folder_that_was_deleted_is_written_beside_it(six: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    message = trained_with(folder, lambda: shutil.rmtree(folder), tmp_path)
+    rescued = rescued_run(message)
+    assert rescued == tmp_path / "run-rescued" and "No such file or directory" in message
+    assert not folder.exists()
+    assert {path.name for path in rescued.iterdir()} >= {"config.json", "versions.json", "policy.pt", "best.pt"}
+    assert_continues(rescued, six)
+
+
+def test_a_full_disk_leaves_the_last_checkpoint_and_a_copy_elsewhere(
+    six: Path, small_disk: Path, temporary: Path, tmp_path: Path
+) -> None:
+    folder = small_disk / "run"
+
+    def fill() -> None:
+        with (small_disk / "other").open("wb", buffering=0) as file, pytest.raises(OSError, match="No space left"):
+            while True:
+                file.write(b"0" * 512)
+
+    message = trained_with(folder, fill, tmp_path)
+    rescued = rescued_run(message)
+    assert rescued.parent == temporary and "No space left on device" in message
+    assert_continues(rescued, six)
+    assert not list(folder.rglob("*.tmp")) and not (small_disk / "run-rescued").exists()
+    (small_disk / "other").unlink()
+    assert Run.open(folder).read()["iteration"] == 2
+    assert_continues(folder, six)
+
+
+def test_a_folder_that_becomes_read_only_is_written_elsewhere(
+    six: Path, small_disk: Path, temporary: Path, tmp_path: Path
+) -> None:
+    folder = small_disk / "run"
+
+    def protect() -> None:
+        subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+
+    message = trained_with(folder, protect, tmp_path)
+    assert "Read-only file system" in message
+    assert_continues(rescued_run(message), six)
+    with pytest.raises(OSError, match="Read-only file system"):
+        lw.train(algorithm(lw.make("point_mass", nworld=2)), small_disk / "another", iterations=1)
+
+
+def test_a_run_that_cannot_be_written_anywhere_leaves_the_last_checkpoint(
+    six: Path, temporary: Path, tmp_path: Path
+) -> None:
+    """No file may grow beyond the policy's size: the policy is saved, the complete state is not."""
+    folder, limits = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
+    size = 2 * os.path.getsize(six / "policy.pt")
+    assert size < os.path.getsize(six / "checkpoint.pt")
+    try:
+        message = trained_with(folder, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1])), tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "File too large" in message
+    assert message.endswith(f"; {folder} continues from iteration 2 with --resume")
+    policy = tmp_path / "run-rescued" / "policy.pt"
+    assert f"its policy is in {policy}" in message
+    assert torch.equal(mean_action(lw.load(policy)), mean_action(lw.load(six, which=4)))
+    assert_continues(folder, six)
+
+
+def test_a_command_reports_a_folder_that_cannot_be_written_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("mine")
+    arguments = ["train", "point_mass", "--samples", "512", "--nworld", "2", "--hidden", "8", "--iterations", "4"]
+    assert cli.main([*arguments, "--out", str(tmp_path / "file" / "run"), *QUIET]) == 2
+    refused(capsys, f"{tmp_path / 'file'}", "Not a directory")
+    folder = tmp_path / "run"
+    write = Run.write
+
+    def deleting(run: Run, row: Any) -> None:
+        write(run, row)
+        if row["iteration"] == 2 and run.folder == folder:
+            shutil.rmtree(folder)
+
+    monkeypatch.setattr(Run, "write", deleting)
+    assert cli.main([*arguments, "--out", str(folder), *QUIET]) == 2
+    refused(capsys, f"the run in {folder} could not be saved after iteration 2", f"--resume {folder}-rescued")
