@@ -5,6 +5,7 @@ import warp as _wp
 if _wp.config.log_level == _wp.LOG_INFO:  # Warp's default, at which it greets and reports every kernel
     _wp.config.log_level = _wp.LOG_WARNING
 
+from lyceum_warp.algos.cem import CEM
 from lyceum_warp.algos.evaluation import Episodes, evaluate
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_config import MPPIConfig
@@ -12,6 +13,7 @@ from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig
 from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.predictive_sampling import PredictiveSampling
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.binding.registry import register, task_names
@@ -80,6 +82,7 @@ from lyceum_warp.task import (
 __version__ = "0.1.0"
 
 __all__ = [
+    "CEM",
     "MPPI",
     "NPG",
     "ControlProgress",
@@ -98,6 +101,7 @@ __all__ = [
     "PhysicsOptions",
     "Planning",
     "PlanningController",
+    "PredictiveSampling",
     "Rollout",
     "Row",
     "Sigmoid",
