@@ -63,6 +63,18 @@ CASES: dict[str, dict[str, Any]] = {
     "negative": POINT | dict(noise=[[0.3, -0.2], [-0.2, 0.25]], discount=0.5, iterations=3),
     "frame_skip": REACH | dict(frame_skip=3),
     "model": REACH | dict(model=heavy_arm),
+    "include_plan": REACH | dict(include_plan=True),
+    "predictive_sampling": REACH | dict(update="predictive_sampling", include_plan=True),
+    "without_plan": POINT | dict(update="predictive_sampling", include_plan=False, noise=0.4, iterations=2),
+    "cem": POINT | dict(update="cem", noise=[0.3, 0.6], elites=5, min_noise=[0.02, 0.05], iterations=2),
+    "cem_smoothed": REACH | dict(update="cem", elites=6, min_noise=0.3, smoothing=(0.5, 0.3, 0.2)),
+    "cem_of_one": POINT | dict(update="cem", noise=0.4, elites=1, min_noise=0.1, include_plan=True),
+    "zero": REACH | dict(knots=5, spline="zero"),
+    "linear": POINT | dict(noise=0.4, knots=4, spline="linear", fill=[0.5, -0.25], iterations=2),
+    "cubic": REACH | dict(knots=4, spline="cubic"),
+    "cubic_cem": POINT | dict(update="cem", noise=0.4, knots=3, elites=4, min_noise=0.05, fill="repeat"),
+    "knot_for_each_step": POINT | dict(knots=9, spline="linear", noise=[[0.3, 0.2], [0.2, 0.25]]),
+    "one_knot": POINT | dict(update="predictive_sampling", noise=0.4, knots=1, include_plan=True),
 }
 
 
@@ -81,9 +93,10 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
     if callable(settings.get("model")):
         settings["model"] = settings["model"]()
     plan = MPPI(task, engine=engine, seed=5, iterations=iterations, **settings)
-    plain = kind(task, engine=engine, **settings)
+    plain = kind(task, engine=engine, count=len(plan.knot_actions), **settings)
     # random numbers depend on the seed and on how many came before: a twin draws those of every iteration
-    twin = MPPI(task, seed=5, samples=plan.samples, horizon=plan.horizon, iterations=1)
+    knots = {name: settings[name] for name in ("knots", "spline") if name in settings}
+    twin = MPPI(task, seed=5, samples=plan.samples, horizon=plan.horizon, iterations=1, **knots)
     plant = lw.make(task, engine=engine, seed=3, autoreset=False)
     if task == "hopper":
         falling_hopper(plant)
@@ -95,7 +108,7 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
         for _ in range(iterations):
             twin(twin.state_of())
             noises.append(twin.standard_noise.double().numpy())
-        shift = (1, 1, 2, 0, 1)[call]
+        shift = (1, 1, 2, 0, 5)[call]
         action = plan(state, shift=shift)
         assert np.array_equal(plan.standard_noise.numpy(), noises[-1])
         plain(state, noises, shift)
@@ -107,12 +120,16 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
         np.testing.assert_allclose(plan.returns, plain.returns, atol=5e-5, rtol=5e-6, err_msg=f"returns of call {call}")
         np.testing.assert_allclose(plan.weights, plain.weights, atol=1e-4, err_msg=f"weights of call {call}")
         np.testing.assert_allclose(plan.actions, plain.actions, atol=2e-4, err_msg=f"plan of call {call}")
+        if plan.adapted_noise is not None:
+            np.testing.assert_allclose(plan.adapted_noise, plain.deviation, atol=2e-4, err_msg=f"noise of call {call}")
         summary = plan.summary
         assert summary["best_return"] == pytest.approx(plain.returns.max(), rel=1e-4)
         assert summary["mean_return"] == pytest.approx(plain.returns.mean(), rel=1e-4)
         assert summary["effective_samples"] == pytest.approx(1 / (plain.weights**2).sum(), rel=1e-2)
         assert summary["failed_samples"] == 0
-        plain.actions = plan.actions.double().numpy()  # low temperatures would make differences grow
+        plain.knots = plan.knot_actions.double().numpy()  # low temperatures would make differences grow
+        if plan.adapted_noise is not None:
+            plain.deviation = plan.adapted_noise.double().numpy()
         plant.step(action[None])
     assert len(starts) == 5
 
