@@ -147,7 +147,9 @@ class MPPI:
         with wp.ScopedDevice(self.env.device):
             self._keys = wp.zeros(nworld, dtype=wp.uint32)
             shapes = {name: (self.config.models, self.env.state_space.parts[name]) for name in drawn}
-            fields = {n: wp.zeros((rows, part.stop - part.start), dtype=wp.float64) for n, (rows, part) in shapes.items()}
+            fields = {
+                n: wp.zeros((rows, part.stop - part.start), dtype=wp.float64) for n, (rows, part) in shapes.items()
+            }
         self.model_fields = {name: torch_view(rows) for name, rows in fields.items()}
         self._loop = OpenLoop(
             self.env, self.horizon, keys=self._keys, nominal_model=self.config.nominal_model, models=fields

@@ -112,12 +112,13 @@ def test_a_configuration_replaces_the_settings_of_the_task() -> None:
 
 
 def test_flat_settings_replace_single_ones() -> None:
-    assert arguments("reach", samples=7)[0] == dataclasses.replace(
-        task_config(find_task("reach")), samples=7
-    ).completed()
-    assert arguments("reach", MPPIConfig(horizon=3, samples=8), samples=7)[0] == MPPIConfig(
-        horizon=3, samples=7
-    ).completed()
+    assert (
+        arguments("reach", samples=7)[0] == dataclasses.replace(task_config(find_task("reach")), samples=7).completed()
+    )
+    assert (
+        arguments("reach", MPPIConfig(horizon=3, samples=8), samples=7)[0]
+        == MPPIConfig(horizon=3, samples=7).completed()
+    )
 
 
 def test_a_flat_setting_of_none_is_not_given() -> None:
