@@ -219,7 +219,8 @@ def show(console: Console, options: Options, episodes: list[Episode]) -> None:
             table.add_row(
                 planner, f"{statistics.mean(returns):.1f} ({min(returns):.0f} to {max(returns):.0f})",
                 f"{statistics.mean(differences):+.1f} ± {error(differences):.1f}",
-                f"{good}/{len(chosen)} ({low:.0%} to {high:.0%})", f"{statistics.mean(e.final_eval for e in chosen):.3g}",
+                f"{good}/{len(chosen)} ({low:.0%} to {high:.0%})",
+                f"{statistics.mean(e.final_eval for e in chosen):.3g}",
                 f"{statistics.mean(e.effective_samples for e in chosen):.1f}",
                 f"{statistics.median(e.plan_ms for e in chosen):.1f}",
             )  # fmt: skip

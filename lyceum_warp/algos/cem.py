@@ -26,15 +26,16 @@ class CEM(MPPI):
     The new plan is the mean of the best samples, and their standard deviation becomes that of the noise, which is kept
     between calls and starts again with ``reset``. In the names of other packages:
 
-    ======================== ============ ============= =====================
-    here                     hydrax       judo          MuJoCo MPC
-    ======================== ============ ============= =====================
-    ``samples``              num_samples  num_rollouts  sampling_trajectories
-    ``elites``               num_elites   num_elites    n_elite
-    ``noise`` (at first)     sigma_start  sigma_max     std_initial
-    ``min_noise``            sigma_min    sigma_min     std_min
-    ``knots``                num_knots    num_nodes     sampling_spline_points
-    ======================== ============ ============= =====================
+    ============= =============== ========================
+    here          hydrax          judo
+    ============= =============== ========================
+    ``samples``   num_samples     num_rollouts
+    ``elites``    num_elites      num_elites
+    ``noise``     sigma_start     at most sigma_max
+    ``min_noise`` sigma_min       sigma_min
+    ``knots``     num_knots       num_nodes
+    ``spline``    spline_type     spline_order
+    ============= =============== ========================
 
     Args:
         task: Name of a task, a file with one, or its class.

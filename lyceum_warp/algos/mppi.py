@@ -170,7 +170,7 @@ class MPPI:
         if not (drawn := [field.name for field in bound.dynamics if field.name in written]):
             raise ValueError(
                 f"models={self.config.models} needs a task that draws model fields, and {bound.name!r} draws none: "
-                "write them in its startup or randomize, as s.body_mass[i] *= lw.uniform(rng, 0.8, 1.2)"
+                "write them in its startup or randomize, as s.body_mass[1] = s.body_mass[1] * lw.uniform(rng, 0.8, 1.2)"
             )
         return drawn
 
@@ -236,7 +236,8 @@ class MPPI:
             self._summary = wp.zeros(4, dtype=float)
             self._seed, self._count, self._shift, self._phase = (wp.zeros(1, dtype=int) for _ in range(4))
             self._passed = wp.zeros(1, dtype=int) if config.knots else self._shift
-            self._samples = self._world_actions = wp.from_torch(loop.actions)
+            self._world_actions: Any = wp.from_torch(loop.actions)
+            self._samples: Any = self._world_actions
             if config.knots or config.models > 1:
                 self._samples = wp.zeros((count, self.samples, nact), dtype=float)
             self._return = self._world_return if config.models == 1 else wp.zeros(self.samples, dtype=float)
@@ -309,13 +310,13 @@ class MPPI:
         bounds = [self._smoothing, bool(config.include_plan), self._low, self._high, self._samples]
         if config.update == "cem":
             self._shifted(first, self._deviation, self._first_deviation, False, self._nominal_deviation)
-            noise = [self._nominal, self._noise, self._nominal_deviation]
-            wp.launch(planning.perturb_adapted, dim, [*noise, *bounds], device=device)
+            around = [self._nominal, self._noise, self._nominal_deviation, *bounds]
+            wp.launch(planning.perturb_adapted, dim, around, device=device)
         else:
-            noise = [self._nominal, self._noise, self._scale, self._diagonal]
-            wp.launch(planning.perturb, dim, [*noise, *bounds], device=device)
+            around = [self._nominal, self._noise, self._scale, self._diagonal, *bounds]
+            wp.launch(planning.perturb, dim, around, device=device)
         if self._samples is not self._world_actions:
-            self._interpolate_rows(self._samples, self._world_actions)
+            self._interpolate_samples(self._samples, self._world_actions)
 
     def _shifted(self, first: bool, rows: wp.array, fill: wp.array, repeat: bool, target: wp.array) -> None:
         """Rows of a plan, moved forward in time by the first improvement."""
@@ -328,10 +329,10 @@ class MPPI:
     def _interpolate(self, rows: wp.array, actions: wp.array) -> None:
         """The actions of a plan with knots; without them, rows and actions are one array."""
         if self.config.knots:
-            single = [array.reshape((array.shape[0], 1, array.shape[1])) for array in (rows, actions)]
-            self._interpolate_rows(*single)
+            single: list[Any] = [array.reshape((array.shape[0], 1, array.shape[1])) for array in (rows, actions)]
+            self._interpolate_samples(*single)
 
-    def _interpolate_rows(self, rows: wp.array, actions: wp.array) -> None:
+    def _interpolate_samples(self, rows: wp.array, actions: wp.array) -> None:
         args = [rows, self._phase, self.config.knots or self.horizon, self._order, self._low, self._high, actions]
         wp.launch(knots.interpolate, actions.shape, args, device=self.env.device)
 

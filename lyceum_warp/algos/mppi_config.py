@@ -117,8 +117,9 @@ class MPPIConfig:
         Raises:
             ValueError: A value is of the wrong type or out of range.
         """
-        old = {} if settings.get("update", self.update) == self.update else dict.fromkeys(_OF_CEM)
-        return dataclasses.replace(self, **(old | dict(settings)))
+        other = settings.get("update", self.update) != self.update
+        words: dict[str, Any] = {**(dict.fromkeys(_OF_CEM) if other else {}), **settings}
+        return dataclasses.replace(self, **words)
 
     def completed(self, value: object = None) -> "MPPIConfig":
         """The same settings with those that are None chosen, except ``knots`` and what the update does not use.

@@ -14,7 +14,7 @@ from lyceum_warp.task import Task
 
 
 class PredictiveSampling(MPPI):
-    """Predictive sampling: ``lw.PredictiveSampling(task, ...)`` is ``lw.MPPI(task, update="predictive_sampling", ...)``.
+    """Predictive sampling: ``lw.MPPI`` with ``update="predictive_sampling"``.
 
     The best sample is the new plan. Howell et al. (2022), hydrax, judo and MuJoCo MPC plan with knots: give ``knots``
     and ``spline``.

@@ -66,8 +66,8 @@ class Plan:
 
     The folder then holds config.json, versions.json, a file for each episode (episode-000.npz: states, actions,
     rewards, evaluations, times; numpy reads it), report.json, plan.png and video.mp4 of the first episode. Settings of
-    the planner that are not given come from the task. After Ctrl-C the episode that was interrupted has a file, too, but is
-    not in the report.
+    the planner that are not given come from the task. After Ctrl-C the episode that was interrupted has a file, too,
+    but is not in the report.
 
     Options of the physics (--integrator, --solver, ...) are the planner's: the controlled world keeps its own.
 
@@ -124,7 +124,8 @@ def plan(options: Plan) -> int:
     every = whole_number("replan_every", options.replan_every, low=1)
     if every > 1 and options.real_time:
         raise ValueError(
-            f"--replan-every {every} has no effect with --real-time, where the planner is never idle: leave out one of them"
+            f"--replan-every {every} has no effect with --real-time, where plans follow one another without a break: "
+            "leave out one of them"
         )
     if options.value is not None:
         _check_value_task(options.value, options.task)

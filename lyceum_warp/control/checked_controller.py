@@ -97,8 +97,8 @@ class CheckedController:
         if (needed := self.steps(steps - 1) + 1) > horizon:
             plan = f"a plan of {horizon} actions" if hasattr(self._controller, "actions") else "no plan, but one action"
             raise ValueError(
-                f"replan_every={steps} needs a plan of {needed} actions, and the controller has {plan}: plan more often, "
-                "or give it a longer horizon"
+                f"replan_every={steps} needs a plan of {needed} actions, and the controller has {plan}: plan more "
+                "often, or give it a longer horizon"
             )
 
     def description(self) -> dict[str, Any]:

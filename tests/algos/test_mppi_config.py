@@ -52,7 +52,7 @@ def test_a_configuration_cannot_be_changed_or_given_by_position() -> None:
         ("update", ["x", True, None, ["cem"]], "update must be 'mppi', 'cem' or 'predictive_sampling'"),
         ("elites", [0, -1, 2.5, "a"], "elites must be a whole number from 1"),
         ("elites", [65], "elites=65 must be at most samples, which is 64"),
-        ("min_noise", [-1, math.nan, [1, -1], [], [[1.0]], "a", True], "min_noise must be a standard deviation, or one"),
+        ("min_noise", [-1, math.nan, [1, -1], [], [[1.0]], "a", True], "min_noise must be a standard deviation, or"),
         ("include_plan", [1, "yes"], "include_plan must be True, False or None"),
         ("knots", [0, 2.5, "a"], "knots must be a whole number from 1"),
         ("knots", [33], "knots=33 must be at most horizon, which is 32"),
