@@ -14,7 +14,7 @@ from lyceum_warp import Row
 pytestmark = pytest.mark.gpu
 
 UPDATES: dict[str, dict[str, Any]] = {
-    "mppi with knots": dict(knots=4, include_plan=True),
+    "mppi with knots": dict(knots=4, spline="linear", include_plan=True),
     "cem": dict(update="cem", elites=20),
     "cem with knots": dict(update="cem", knots=4, spline="linear"),
     "predictive sampling": dict(update="predictive_sampling", knots=4, spline="zero"),
