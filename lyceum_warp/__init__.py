@@ -5,6 +5,7 @@ import warp as _wp
 if _wp.config.log_level == _wp.LOG_INFO:  # Warp's default, at which it greets and reports every kernel
     _wp.config.log_level = _wp.LOG_WARNING
 
+from lyceum_warp.actuators import follow_velocity
 from lyceum_warp.algos.cem import CEM
 from lyceum_warp.algos.evaluation import Episodes, evaluate
 from lyceum_warp.algos.mppi import MPPI
@@ -52,6 +53,7 @@ from lyceum_warp.kernels.terms import (
     inside,
     local_velocity,
     put,
+    put_upright,
     sum_squares,
     tolerance,
 )
@@ -122,6 +124,7 @@ __all__ = [
     "dof",
     "equality",
     "evaluate",
+    "follow_velocity",
     "geom",
     "grasp_terms",
     "gymnasium_model",
@@ -137,6 +140,7 @@ __all__ = [
     "normal",
     "package_model",
     "put",
+    "put_upright",
     "qpos",
     "quat",
     "quat_angle",
