@@ -92,7 +92,8 @@ class Plan:
     real_time: bool = False
     """Let the world run at its own rate while the planner plans, instead of waiting for each plan."""
     rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
-    """Plans per second, which sets the deadline of each plan in the report; by default one per step."""
+    """Plans per second, which sets the deadline of each plan in the report; by default one per step, or one in the
+    steps of --replan-every."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """The folder, new or empty; runs/plan-TASK-DATE by default."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
@@ -244,6 +245,13 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
     return _report(run, plant, done, options)
 
 
+def _rate(options: Plan, episode: Trajectory) -> float | None:
+    """The plans per second that set the deadline; None for one per step."""
+    if options.rate is not None or options.replan_every == 1:
+        return options.rate
+    return 1 / (options.replan_every * episode.timestep)
+
+
 def _planner_name(planner: MPPI) -> str:
     return {"mppi": "MPPI", "cem": "CEM", "predictive_sampling": "predictive sampling"}[planner.config.update]
 
@@ -265,13 +273,13 @@ def _file(run: Run, episode: int) -> Path:
 def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
     """Write the last episode and the report of all."""
     done[-1].save(_file(run, len(done) - 1))
-    control_report(done, rate=options.rate).write(run.folder / "report.json")
+    control_report(done, rate=_rate(options, done[0])).write(run.folder / "report.json")
 
 
 def _report(run: Run, plant: Env, done: list[Trajectory], options: Plan) -> int:
     """Print the report, draw the plot and the video, and list the files."""
     console = make_console()
-    console.print(report_table(control_report(done, rate=options.rate)))
+    console.print(report_table(control_report(done, rate=_rate(options, done[0]))))
     paths = [("episodes", str(run.folder / "episode-*.npz")), ("report", str(run.folder / "report.json"))]
     if options.plot:
         paths.append(("plot", plotted_control(done, run.folder / "plan.png")))

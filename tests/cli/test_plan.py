@@ -144,6 +144,7 @@ def test_every_update_plans_and_is_named(tmp_path: Path, capsys: pytest.CaptureF
         assert (config["algorithm"], config["replan_every"], planner["update"]) == (update, 3, update)
         assert (planner["knots"], planner["spline"], planner["include_plan"]) == (4, "linear", True)
         assert Trajectory.load(tmp_path / update / "episode-000.npz").plan_steps.tolist() == [0, 3, 6]
+        assert json.loads((tmp_path / update / "report.json").read_text())["deadline_ms"] == pytest.approx(60.0)
     assert (planner["elites"], planner["min_noise"]) == (None, None)
 
 
