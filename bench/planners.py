@@ -1,7 +1,7 @@
 """The updates of the planner side by side: MPPI, CEM and predictive sampling at equal samples and horizon.
 
-    python bench/planners.py --processes 16 --stop-after 400 --out bench/results/planners.json
-    python bench/planners.py --tasks all --planners mppi mppi+plan --processes 16 --stop-after 400 --out plan.json
+    python bench/planners.py --processes 16 --stop-after 300 --out bench/results/planners.json
+    python bench/planners.py --tasks all --planners mppi mppi+plan --processes 16 --stop-after 300 --out plan.json
 
 Every planner has the settings of the task's planning and differs in its own alone. Episodes go in rounds: a round has
 as many episodes of each task, with the same seeds for all planners, as take about equally long. Each process has one
@@ -45,7 +45,7 @@ PLANNERS: dict[str, dict[str, Any]] = {
 """Settings of the planners in the table. Knots lie ``Options.knot_steps`` steps apart."""
 
 TASKS: dict[str, tuple[int, int]] = {
-    "adroit_pen": (75, 1), "hopper": (150, 2), "half_cheetah": (150, 4), "cartpole_swingup": (200, 4),
+    "adroit_pen": (75, 1), "hopper": (150, 1), "half_cheetah": (150, 4), "cartpole_swingup": (200, 4),
     "reach": (75, 20), "adroit_door": (75, 1), "adroit_hammer": (75, 1), "adroit_relocate": (75, 1),
     "aloha_lift": (150, 2), "arm_hand_pickup": (200, 2), "panda_lift": (150, 4), "herb_reach": (100, 4),
     "cartpole": (200, 8),
@@ -74,7 +74,7 @@ class Options:
     processes: int = 1
     """Jobs at the same time."""
     stop_after: float = math.inf
-    """Seconds after which no further job starts. The last ones take up to two minutes longer."""
+    """Seconds after which no further job starts. The last ones take up to three minutes longer."""
     out: Path | None = None
     """JSON file for the episodes."""
 
