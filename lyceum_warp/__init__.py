@@ -6,6 +6,7 @@ if _wp.config.log_level == _wp.LOG_INFO:  # Warp's default, at which it greets a
     _wp.config.log_level = _wp.LOG_WARNING
 
 from lyceum_warp.actuators import follow_velocity
+from lyceum_warp.algos.cem import CEM
 from lyceum_warp.algos.evaluation import Episodes, evaluate
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_config import MPPIConfig
@@ -14,6 +15,7 @@ from lyceum_warp.algos.npg_config import NPGConfig
 from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.policy_export import export_policy
+from lyceum_warp.algos.predictive_sampling import PredictiveSampling
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.binding.registry import register, task_names
@@ -84,6 +86,7 @@ from lyceum_warp.training import train
 __version__ = "0.1.0"
 
 __all__ = [
+    "CEM",
     "MPPI",
     "NPG",
     "ControlProgress",
@@ -102,6 +105,7 @@ __all__ = [
     "PhysicsOptions",
     "Planning",
     "PlanningController",
+    "PredictiveSampling",
     "Rollout",
     "Row",
     "Sigmoid",

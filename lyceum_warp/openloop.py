@@ -33,6 +33,8 @@ class OpenLoop:
             default every world has the key in ``state``, and so draws what ``env.step`` would draw from there.
         nominal_model: Whether model fields that differ between worlds have their nominal values instead of those in
             ``state``.
+        models: Values of model fields that differ between worlds, by name, each (n, size) float64 on the environment's
+            device, read in every run: world w has row w % n instead of the values in ``state``.
 
     Raises:
         ValueError: The environment resets its worlds automatically, ``keys`` has another shape, type or device, or the
@@ -56,7 +58,10 @@ class OpenLoop:
     phases: tuple[Phase, ...]
     """What ``run`` does, in order, for a caller that puts more into the same graph."""
 
-    def __init__(self, env: Env, horizon: int, *, keys: wp.array | None = None, nominal_model: bool = False) -> None:
+    def __init__(
+        self, env: Env, horizon: int, *, keys: wp.array | None = None, nominal_model: bool = False,
+        models: Mapping[str, wp.array] | None = None,
+    ) -> None:  # fmt: skip
         if env.autoreset:
             raise ValueError("open-loop rollouts need worlds that do not reset: make(..., autoreset=False)")
         self.env, self.worlds = env, env.worlds
@@ -67,7 +72,7 @@ class OpenLoop:
                 f"keys must be a wp.array of shape ({n},) and type uint32 on {env.device}, not of shape {keys.shape} "
                 f"and type {wp.types.type_repr(keys.dtype)} on {keys.device}"
             )
-        self._keys, self._nominal_model = keys, nominal_model
+        self._keys, self._nominal_model, self._models = keys, nominal_model, dict(models or {})
         rows = self.horizon * n
         stepwise = task.functions["control"] is not None or task.functions["substep"] is not None
         check_fit(self._bytes_per_world(env, self.horizon), n, env.device)
@@ -159,6 +164,9 @@ class OpenLoop:
         wp.launch(planning.broadcast, worlds.state.shape, [self._state, worlds.state], device=device)
         if self._nominal_model:
             self._overwrite_model()
+        for name, rows in self._models.items():
+            args = [rows, self.env.state_space.parts[name].start, worlds.state]
+            wp.launch(planning.overwrite_rows, (self.env.nworld, rows.shape[1]), args, device=device)
         rest = worlds.state[:, self.env.engine.state_size :]
         worlds.restore_counters(worlds.everyone, rest)
         if self._keys is not None:

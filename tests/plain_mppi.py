@@ -1,6 +1,7 @@
-"""MPPI by its definition, in NumPy and with one world's step at a time: what the planner must agree with."""
+"""MPPI, CEM and predictive sampling by their definitions, in NumPy and with one step of all worlds at a time."""
 
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Any
 
 import mujoco
@@ -18,8 +19,45 @@ def smoothed(noise: np.ndarray, betas: tuple[float, ...]) -> np.ndarray:
     return result
 
 
+def hermite(before: Any, left: Any, right: Any, after: Any, f: float) -> Any:
+    """A cubic Hermite spline by its basis functions, with slopes by central differences."""
+    slopes = (right - before) / 2, (after - left) / 2
+    basis = 2 * f**3 - 3 * f**2 + 1, f**3 - 2 * f**2 + f, -2 * f**3 + 3 * f**2, f**3 - f**2
+    return basis[0] * left + basis[1] * slopes[0] + basis[2] * right + basis[3] * slopes[1]
+
+
+class Grid:
+    """Knots at fixed times on a line: knot j of a plan with K knots over H steps is at step j H / K."""
+
+    def __init__(self, horizon: int, knots: int, spline: str) -> None:
+        self.horizon, self.distance, self.spline, self.now = horizon, Fraction(horizon, knots), spline, 0
+
+    def first(self) -> int:
+        """Number of the first knot that the plan depends on."""
+        return self.now // self.distance - (self.spline == "cubic")
+
+    def actions(self, knots: np.ndarray) -> np.ndarray:
+        """Actions of all steps; the first of ``knots``, (n, ...), is ``first()``."""
+        result = []
+        for t in range(self.horizon):
+            place = (self.now + t) / self.distance
+            j, f = place // 1 - self.first(), float(place % 1)
+            if self.spline == "zero":
+                result.append(knots[j])
+            elif self.spline == "linear":
+                result.append((1 - f) * knots[j] + f * knots[j + 1] if f else knots[j])
+            else:
+                result.append(hermite(*knots[j - 1 : j + 3], f))
+        return np.array(result)
+
+
 class Plain:
-    """MPPI by its definition, in float64. It is given standard normal numbers, and does everything else itself."""
+    """A planner by its definition, in float64. It is given standard normal numbers, and does everything else itself.
+
+    Args:
+        knots: Knots over the horizon, and ``count`` of them in a plan; None for a number of its own at each step.
+        fields: Rows of model fields by name, (models, size), which worlds get in turn.
+    """
 
     def __init__(
         self,
@@ -35,9 +73,21 @@ class Plain:
         fill: Any = "zero",
         termination: str = "stop",
         value: Callable[[torch.Tensor], torch.Tensor] | None = None,
+        update: str = "mppi",
+        elites: int = 1,
+        min_noise: Any = 0.0,
+        include_plan: bool = False,
+        knots: int | None = None,
+        spline: str = "cubic",
+        count: int | None = None,
+        fields: dict[str, np.ndarray] | None = None,
+        risk: str = "mean",
         **options: Any,
     ) -> None:
-        self.env = lw.make(task, engine=engine, nworld=samples, autoreset=False, horizon=0, **options)
+        self.fields = fields or {}
+        self.models = max([len(rows) for rows in self.fields.values()], default=1)
+        nworld = samples * self.models
+        self.env = lw.make(task, engine=engine, nworld=nworld, autoreset=False, horizon=0, **options)
         self.low, self.high = self.env.action_space.low, self.env.action_space.high
         nu = len(self.low)
         array = np.asarray(noise, dtype=float)
@@ -45,39 +95,83 @@ class Plain:
         self.temperature, self.smoothing, self.discount = temperature, smoothing, discount
         self.stop, self.value, self.repeat = termination == "stop", value, isinstance(fill, str) and fill == "repeat"
         self.fill = np.zeros(nu) if isinstance(fill, str) else np.asarray(fill, dtype=float)
-        self.actions = np.tile(np.clip(self.fill, self.low, self.high), (horizon, 1))
+        self.update, self.elites, self.min_noise, self.risk = update, elites, min_noise, risk
+        self.include_plan = include_plan
+        self.grid = None if knots is None else Grid(horizon, knots, spline)
+        if self.grid:
+            self.smoothing = (1.0, 0.0, 0.0)
+        self.knots = np.tile(np.clip(self.fill, self.low, self.high), (count or horizon, 1))
+        self.deviation = np.tile(np.diag(self.factor), (len(self.knots), 1))
+        # what smoothing leaves of the deviation of independent noise, from its answers to impulses
+        self.spread = np.sqrt((smoothed(np.eye(len(self.knots)), self.smoothing) ** 2).sum(1))[:, None]
+
+    @property
+    def actions(self) -> np.ndarray:
+        return self.interpolated(self.knots)
+
+    def interpolated(self, knots: np.ndarray) -> np.ndarray:
+        return knots if self.grid is None else np.clip(self.grid.actions(knots), self.low, self.high)
 
     def __call__(self, state: torch.Tensor, noises: list[np.ndarray], shift: int = 1) -> None:
-        for _ in range(shift):
-            last = self.actions[-1] if self.repeat else np.clip(self.fill, self.low, self.high)
-            self.actions = np.vstack([self.actions[1:], last])
+        passed = shift
+        if self.grid is not None:
+            before = self.grid.first()
+            self.grid.now += shift
+            passed = self.grid.first() - before
+        for _ in range(passed):
+            last = self.knots[-1] if self.repeat else np.clip(self.fill, self.low, self.high)
+            self.knots = np.vstack([self.knots[1:], last])
+            self.deviation = np.vstack([self.deviation[1:], np.diag(self.factor)])
         for z in noises:
             self.improve(state, z)
 
     def improve(self, state: torch.Tensor, z: np.ndarray) -> None:
-        noise = smoothed(np.einsum("ij,tkj->tki", self.factor, z), self.smoothing)
-        self.sampled = np.clip(self.actions[:, None] + noise, self.low, self.high)
+        if self.update == "cem":
+            noise = self.deviation[:, None] * smoothed(z, self.smoothing)
+        else:
+            noise = smoothed(np.einsum("ij,tkj->tki", self.factor, z), self.smoothing)
+        if self.include_plan:
+            noise[:, 0] = 0
+        drawn = np.clip(self.knots[:, None] + noise, self.low, self.high)
+        self.sampled = self.interpolated(drawn)
         rewards, ended, values = self.roll_out(state)
-        self.returns = np.zeros(z.shape[1])
-        for k in range(len(self.returns)):
+        returns = self.add_up(rewards, ended, values).reshape(-1, self.models)
+        self.returns = returns.min(1) if self.risk == "worst" else returns.mean(1)
+        best = np.argsort(-self.returns, kind="stable")
+        if self.update == "mppi":
+            weights = np.exp((self.returns - self.returns.max()) / self.temperature)
+        else:
+            weights = np.zeros(len(self.returns))
+            weights[best[: self.elites if self.update == "cem" else 1]] = 1
+        self.weights = weights / weights.sum()
+        self.knots = np.einsum("k,tki->ti", self.weights, drawn)
+        if self.update == "cem":
+            fitted = drawn[:, best[: self.elites]].std(axis=1) / self.spread
+            self.deviation = np.maximum(fitted, self.min_noise)
+
+    def add_up(self, rewards: np.ndarray, ended: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """The returns of all worlds."""
+        result = np.zeros(rewards.shape[1])
+        for k in range(len(result)):
             weight, going = 1.0, True
             for reward, end in zip(rewards[:, k], ended[:, k], strict=True):
                 if going:
-                    self.returns[k] += weight * reward
+                    result[k] += weight * reward
                     weight *= self.discount
                     going = not (self.stop and end)
             if going:
-                self.returns[k] += weight * values[k]
-        weights = np.exp((self.returns - self.returns.max()) / self.temperature)
-        self.weights = weights / weights.sum()
-        self.actions = np.einsum("k,tki->ti", self.weights, self.sampled)
+                result[k] += weight * values[k]
+        return result
 
     def roll_out(self, state: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rewards and ends of each step, and the values of the states after the last one."""
         env = self.env
-        env.set_state(state.expand(env.nworld, -1).contiguous())
-        rewards, ended = np.zeros((2, *self.sampled.shape[:2]))
-        for t, actions in enumerate(self.sampled):
+        states = state.repeat(env.nworld, 1)
+        for name, rows in self.fields.items():
+            states[:, env.state_space.parts[name]] = torch.as_tensor(np.tile(rows, (env.nworld // len(rows), 1)))
+        env.set_state(states)
+        rewards, ended = np.zeros((2, len(self.sampled), env.nworld))
+        for t, actions in enumerate(np.repeat(self.sampled, self.models, axis=1)):
             env.step(torch.as_tensor(actions, dtype=torch.float32))
             rewards[t], ended[t] = env.reward.numpy(), env.terminated.numpy()
         self.ended = ended

@@ -1,17 +1,22 @@
-"""Model predictive path integral control (MPPI): planning by weighted averages of random rollouts.
+"""Planning by random rollouts: model predictive path integral control (MPPI), and two other updates of its plan.
 
 Each call improves a plan, a sequence of actions u_t, from the state that it is given:
 
 1. shift: the plan of the last call moves forward in time, and its end is filled;
 2. perturb: sample k adds smoothed noise e_t^k to the plan and is clipped to the actions' bounds; it gets a random
    stream of its own, for what the task draws in it;
-3. roll out: each sample earns the return R_k, its discounted rewards and the value of the state where it ends;
+3. roll out: each sample earns the return R_k, its discounted rewards and the value of the state where it ends; in
+   several models, the mean or the smallest of its returns;
 4. weigh: w_k = exp((R_k - max R) / temperature), divided by their sum;
 5. average: the new plan is u_t = sum_k w_k u_t^k.
 
 The formulation is that of Williams et al. (2017, "Information theoretic MPC for model-based reinforcement learning")
 without a cost on the controls, as in Lyceum (Summers et al. 2020) and in trajopt, which also is the source of the
 smoothing. Returns are divided by the temperature: the 5 of Summers et al. for their arm, an inverse, is 0.2 here.
+
+``update`` chooses other weights in step 4. CEM (``cem.py``) weighs the best samples equally, and fits the noise to them
+afterwards. Predictive sampling (``predictive_sampling.py``) takes the best sample. With knots all of this happens to
+the knots of a spline, from which the actions of steps 3 and 5 are interpolated (``kernels/knots.py``).
 """
 
 from collections.abc import Callable, Mapping
@@ -32,13 +37,19 @@ from lyceum_warp.binding.registry import find_task
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.capture import Calls, Phase
-from lyceum_warp.kernels import planning
+from lyceum_warp.kernels import knots, planning
 from lyceum_warp.openloop import OpenLoop
 from lyceum_warp.task import Task
 from lyceum_warp.validate import described, whole_number
 
 _BLOCK = 256
-_BUFFERS = ("actions", "nominal", "standard_noise", "sampled", "returns", "weights")
+_BUFFERS = (
+    "actions", "nominal", "knot_actions", "standard_noise", "adapted_noise", "sampled", "model_returns", "returns",
+    "weights", "model_fields",
+)  # fmt: skip
+_MODELS = 0x6D6F64656C73  # "models": makes other seeds of the planner's
+_DRAWING = ("startup", "initialize", "randomize")
+"""The functions of a task that can draw model fields for a planner."""
 
 Value: TypeAlias = ValueFunction | wp.Function | Callable[[torch.Tensor], torch.Tensor]
 
@@ -66,7 +77,8 @@ class MPPI:
         seed: Seed of the noise.
         params: Parameters of the task, for names that are also settings.
         words: Single settings, by the names of ``lw.MPPIConfig`` (None leaves one as it is); options of the planner's
-            worlds, as for ``lw.make``; and parameters of the task. With a CUDA device and engine="auto", the C engine
+            worlds, as for ``lw.make``; and parameters of the task. (One value for each world: the worlds of a sample,
+            one for each model, follow one another.) With a CUDA device and engine="auto", the C engine
             on the CPU rolls out few samples, because it is faster there; plans and actions then lie on the CPU.
 
     Raises:
@@ -79,13 +91,23 @@ class MPPI:
     settings: dict[str, Any]
     """The same settings with the options and parameters of the planner's worlds, as JSON can hold them."""
     actions: torch.Tensor
-    """The plan, (horizon, nact); the first row is what the last call returned."""
+    """The plan, (horizon, nact); the first row is what the last call returned. To start from another plan, write into
+    it; with knots, into ``knot_actions``."""
     nominal: torch.Tensor
     """The plan that the last improvement started from, (horizon, nact)."""
+    knot_actions: torch.Tensor
+    """The plan's knots, (nknot, nact), some of which lie beyond the horizon; without knots, ``actions``."""
     standard_noise: torch.Tensor
-    """The last improvement's standard normal numbers, (horizon, samples, nact)."""
+    """The last improvement's standard normal numbers, (horizon, samples, nact), or (nknot, samples, nact)."""
+    adapted_noise: torch.Tensor | None
+    """The standard deviations that CEM adapted for the next improvement, (horizon, nact) or (nknot, nact), before
+    smoothing. None for other updates."""
     sampled: torch.Tensor
     """The last improvement's actions, (horizon, samples, nact)."""
+    model_fields: dict[str, torch.Tensor]
+    """The model fields of each model, (models, size) float64; empty with one model. A call reads them."""
+    model_returns: torch.Tensor
+    """The samples' returns in each model, (samples, models); minus infinity for those that failed."""
     returns: torch.Tensor
     """The samples' returns, (samples,); minus infinity for those that failed."""
     weights: torch.Tensor
@@ -111,7 +133,9 @@ class MPPI:
         self.termination = self.config.termination
 
         self.settings = plain(options.given() | own_params | vars(self.config))
-        self.env = Env(task, options, nworld=self.samples, autoreset=False, horizon=0, **own_params)
+        nworld = self.samples * self.config.models
+        self.env = Env(task, options, nworld=nworld, autoreset=False, horizon=0, **own_params)
+        drawn = self._drawn_fields()
         self.env.reset()
         self.timestep = self.env.timestep
         self._initial = self.env.get_state()[0]
@@ -121,22 +145,64 @@ class MPPI:
         ) in self.env.engine.nominal.items():  # a robot has the nominal model, not one that startup drew
             self._initial[self.env.state_space.parts[name]] = torch_view(flat(nominal))[0].double()
         with wp.ScopedDevice(self.env.device):
-            self._keys = wp.zeros(self.samples, dtype=wp.uint32)
-        self._loop = OpenLoop(self.env, self.horizon, keys=self._keys, nominal_model=self.config.nominal_model)
+            self._keys = wp.zeros(nworld, dtype=wp.uint32)
+            shapes = {name: (self.config.models, self.env.state_space.parts[name]) for name in drawn}
+            fields = {
+                n: wp.zeros((rows, part.stop - part.start), dtype=wp.float64) for n, (rows, part) in shapes.items()
+            }
+        self.model_fields = {name: torch_view(rows) for name, rows in fields.items()}
+        self._loop = OpenLoop(
+            self.env, self.horizon, keys=self._keys, nominal_model=self.config.nominal_model, models=fields
+        )
         self._allocate()
-        self.value = moved(value, self.env) if isinstance(value, ValueFunction) else value
-        self._value_kernel = planning.value_kernel(value) if isinstance(value, wp.Function) else None
-        self._value_in_torch = value is not None and self._value_kernel is None
-        if self._value_in_torch:
-            try:
-                self._torch_values()
-            except RuntimeError as error:  # its weights lie elsewhere, or it takes other observations
-                observations = described(self._loop.final_obs)
-                raise ValueError(f"value cannot take observations {observations}: {error}") from error
+        self._take_value(value)
         first, others = self._program(first=True), self._program(first=False)
         self._calls = first + others * (self.iterations - 1)
         self.reset(seed)
         self._made = True
+
+    def _drawn_fields(self) -> list[str]:
+        """Names of the model fields that differ between the planner's models."""
+        if self.config.models == 1:
+            return []
+        bound = self.env.task
+        written = frozenset().union(*(bound.writes.get(name, frozenset()) for name in _DRAWING))
+        if not (drawn := [field.name for field in bound.dynamics if field.name in written]):
+            raise ValueError(
+                f"models={self.config.models} needs a task that draws model fields, and {bound.name!r} draws none: "
+                "write them in its startup or randomize, as s.body_mass[1] = s.body_mass[1] * lw.uniform(rng, 0.8, 1.2)"
+            )
+        return drawn
+
+    def _take_value(self, value: Value | None) -> None:
+        """Take the value function, and check that it fits the task's observations."""
+        self.value = value
+        self._value_kernel, self._value_in_torch = None, False
+        group = getattr(value, "group", "policy") if isinstance(value, ValueFunction) else "policy"
+        if group not in self._loop.final_obs_groups:
+            groups = ", ".join(map(repr, self._loop.final_obs_groups))
+            raise ValueError(
+                f"value takes the observations {group!r}, and the task {self.env.task.name!r} has {groups}: give a "
+                "value function that was trained on this task"
+            )
+        self._value_obs = self._loop.final_obs_groups[group]
+        if isinstance(value, ValueFunction):
+            self.value = moved(value, self.env)
+            wanted, found = value.shape["nobs"], self._value_obs.shape[1]
+            if wanted != found:
+                raise ValueError(
+                    f"value takes {wanted} observations, and the task {self.env.task.name!r} has {found}: give a value "
+                    "function that was trained on this task"
+                )
+        if isinstance(value, wp.Function):
+            self._value_kernel = planning.value_kernel(value)
+        elif value is not None:
+            self._value_in_torch = True
+            try:
+                self._torch_values()
+            except RuntimeError as error:  # its weights lie elsewhere, or it takes other observations
+                observations = described(self._value_obs)
+                raise ValueError(f"value cannot take observations {observations}: {error}") from error
 
     def __setattr__(self, name: str, value: Any) -> None:
         if "_made" in self.__dict__:
@@ -149,26 +215,52 @@ class MPPI:
         super().__setattr__(name, value)
 
     def _allocate(self) -> None:
-        space, loop = self.env.action_space, self._loop
-        factor = self.config.noise_factor(space.size)
+        config, space, loop = self.config, self.env.action_space, self._loop
+        nact, nworld = space.size, self.env.nworld
+        factor = config.noise_factor(nact)
         self._diagonal = not np.tril(factor, -1).any()
-        self._repeat = self.config.fill == "repeat"
-        self._smoothing = wp.vec3(*self.config.smoothing)
+        self._repeat = config.fill == "repeat"
+        self._smoothing = wp.vec3(1.0, 0.0, 0.0) if config.knots else wp.vec3(*config.smoothing)
+        # without knots the plan has a knot for each step
+        self._order = knots.ORDERS[config.spline] if config.knots else 0
+        count = knots.knot_count(self.horizon, config.knots, config.spline) if config.knots else self.horizon
         with wp.ScopedDevice(self.env.device):
             self._low: wp.array = wp.array(space.low, dtype=float)
             self._high: wp.array = wp.array(space.high, dtype=float)
-            self._fill: wp.array = wp.array(self.config.fill_action(space), dtype=float)
+            self._fill: wp.array = wp.array(config.fill_action(space), dtype=float)
             self._scale: wp.array = wp.array(factor, dtype=float)
-            self._plan, self._nominal = (wp.zeros((self.horizon, space.size), dtype=float) for _ in range(2))
-            self._noise = wp.zeros((self.horizon, self.samples, space.size), dtype=float)
-            self._terminal, self._return, self._weight = (wp.zeros(self.samples, dtype=float) for _ in range(3))
+            self._plan, self._nominal = (wp.zeros((count, nact), dtype=float) for _ in range(2))
+            self._noise = wp.zeros((count, self.samples, nact), dtype=float)
+            self._terminal, self._world_return = (wp.zeros(nworld, dtype=float) for _ in range(2))
+            self._weight = wp.zeros(self.samples, dtype=float)
             self._summary = wp.zeros(4, dtype=float)
-            self._seed, self._count, self._shift = (wp.zeros(1, dtype=int) for _ in range(3))
-        self._samples = wp.from_torch(loop.actions)
+            self._seed, self._count, self._shift, self._phase = (wp.zeros(1, dtype=int) for _ in range(4))
+            self._passed = wp.zeros(1, dtype=int) if config.knots else self._shift
+            self._world_actions: Any = wp.from_torch(loop.actions)
+            self._samples: Any = self._world_actions
+            if config.knots or config.models > 1:
+                self._samples = wp.zeros((count, self.samples, nact), dtype=float)
+            self._return = self._world_return if config.models == 1 else wp.zeros(self.samples, dtype=float)
+            self._actions, self._nominal_actions = (
+                [wp.zeros((self.horizon, nact), dtype=float) for _ in range(2)]
+                if config.knots
+                else [self._plan, self._nominal]
+            )
+            if config.update != "mppi":
+                self._rank = wp.zeros(self.samples, dtype=int)
+            if config.update == "cem":
+                self._first_deviation: wp.array = wp.array(np.diag(factor), dtype=float)
+                self._smallest: wp.array = wp.array(config.smallest_noise(nact), dtype=float)
+                self._spread: wp.array = wp.array(config.spread(count), dtype=float)
+                self._deviation, self._nominal_deviation = (wp.zeros((count, nact), dtype=float) for _ in range(2))
         self._earned = [wp.from_torch(buffer) for buffer in (loop.reward, loop.terminated, loop.fault)]
-        self.actions, self.nominal = torch_view(self._plan), torch_view(self._nominal)
-        self.standard_noise, self.sampled = torch_view(self._noise), loop.actions
+        self.actions, self.nominal = torch_view(self._actions), torch_view(self._nominal_actions)
+        self.knot_actions = torch_view(self._plan)
+        self.standard_noise = torch_view(self._noise)
+        self.sampled = loop.actions[:, :: config.models]
+        self.adapted_noise = torch_view(self._deviation) if config.update == "cem" else None
         self.returns, self.weights = torch_view(self._return), torch_view(self._weight)
+        self.model_returns = torch_view(self._world_return).view(self.samples, config.models)
         self._terminal_view, self._shift_view = torch_view(self._terminal), torch_view(self._shift)
 
     @torch.no_grad()
@@ -205,58 +297,100 @@ class MPPI:
 
     def _perturb(self, first: bool) -> None:
         """The plan to start from, and the samples around it."""
-        device, dim = self.env.device, (self.samples, self._plan.shape[1])
-        if first:
-            shifted = [self._plan, self._shift, self._fill, self._repeat, self._nominal]
-            wp.launch(planning.shift_plan, self._plan.shape, shifted, device=device)
-        else:
-            wp.copy(self._nominal, self._plan)
+        config, device = self.config, self.env.device
+        if first and config.knots:
+            passed = [self._shift, self.horizon, config.knots, self._phase, self._passed]
+            wp.launch(knots.pass_knots, 1, passed, device=device)
+        self._shifted(first, self._plan, self._fill, self._repeat, self._nominal)
+        self._interpolate(self._nominal, self._nominal_actions)
+        dim = (self.samples, self._plan.shape[1])
         wp.launch(planning.draw_noise, dim, [self._seed, self._count, self._noise], device=device)
-        wp.launch(planning.draw_keys, self.samples, [self._seed, self._count, self._keys], device=device)
+        wp.launch(planning.draw_keys, self.env.nworld, [self._seed, self._count, self._keys], device=device)
         wp.launch(planning.count_up, 1, [self._count], device=device)
-        noise = [self._noise, self._scale, self._diagonal, self._smoothing]
-        bounds = [self._low, self._high]
-        wp.launch(planning.perturb, dim, [self._nominal, *noise, *bounds, self._samples], device=device)
+        bounds = [self._smoothing, bool(config.include_plan), self._low, self._high, self._samples]
+        if config.update == "cem":
+            self._shifted(first, self._deviation, self._first_deviation, False, self._nominal_deviation)
+            around = [self._nominal, self._noise, self._nominal_deviation, *bounds]
+            wp.launch(planning.perturb_adapted, dim, around, device=device)
+        else:
+            around = [self._nominal, self._noise, self._scale, self._diagonal, *bounds]
+            wp.launch(planning.perturb, dim, around, device=device)
+        if self._samples is not self._world_actions:
+            self._interpolate_samples(self._samples, self._world_actions)
+
+    def _shifted(self, first: bool, rows: wp.array, fill: wp.array, repeat: bool, target: wp.array) -> None:
+        """Rows of a plan, moved forward in time by the first improvement."""
+        if first:
+            shifted = [rows, self._passed, fill, repeat, target]
+            wp.launch(planning.shift_plan, rows.shape, shifted, device=self.env.device)
+        else:
+            wp.copy(target, rows)
+
+    def _interpolate(self, rows: wp.array, actions: wp.array) -> None:
+        """The actions of a plan with knots; without them, rows and actions are one array."""
+        if self.config.knots:
+            single: list[Any] = [array.reshape((array.shape[0], 1, array.shape[1])) for array in (rows, actions)]
+            self._interpolate_samples(*single)
+
+    def _interpolate_samples(self, rows: wp.array, actions: wp.array) -> None:
+        args = [rows, self._phase, self.config.knots or self.horizon, self._order, self._low, self._high, actions]
+        wp.launch(knots.interpolate, actions.shape, args, device=self.env.device)
 
     def _weigh(self) -> None:
         """Returns of the samples that were rolled out, and their weights."""
-        device = self.env.device
+        config, device = self.config, self.env.device
         if self._value_kernel is not None:
-            values = [wp.from_torch(self._loop.final_obs), self._terminal]
-            wp.launch(self._value_kernel, self.samples, values, device=device)
-        returns = [*self._earned, self._terminal, self.discount, self.termination == "stop", self._return]
-        wp.launch(planning.add_up, self.samples, returns, device=device)
-        weights = [self._return, self.temperature, self._weight, self._summary]
-        wp.launch_tiled(planning.weigh, dim=[1], inputs=weights, block_dim=_BLOCK, device=device)
+            values = [wp.from_torch(self._value_obs), self._terminal]
+            wp.launch(self._value_kernel, self.env.nworld, values, device=device)
+        returns = [*self._earned, self._terminal, self.discount, self.termination == "stop", self._world_return]
+        wp.launch(planning.add_up, self.env.nworld, returns, device=device)
+        if config.models > 1:
+            combined = [self._world_return, config.risk == "worst", self._return]
+            wp.launch(planning.combine_models, self.samples, combined, device=device)
+        if config.update == "mppi":
+            weights = [self._return, self.temperature, self._weight, self._summary]
+            wp.launch_tiled(planning.weigh, dim=[1], inputs=weights, block_dim=_BLOCK, device=device)
+        else:
+            wp.launch(planning.rank, self.samples, [self._return, self._rank], device=device)
+            elites = 1 if config.elites is None else config.elites
+            weights = [self._return, self._rank, elites, self._weight, self._summary]
+            wp.launch_tiled(planning.weigh_elites, dim=[1], inputs=weights, block_dim=_BLOCK, device=device)
 
     def _average(self) -> None:
-        """The new plan, the weighted mean of the samples' actions."""
+        """The new plan, the weighted mean of the samples' actions, and CEM's noise around it."""
         plan = [self._weight, self._samples, self._nominal, self._summary, self._plan]
-        device = self.env.device
-        wp.launch_tiled(planning.average, dim=[self._plan.size], inputs=plan, block_dim=_BLOCK, device=device)
+        device, dim = self.env.device, [self._plan.size]
+        wp.launch_tiled(planning.average, dim=dim, inputs=plan, block_dim=_BLOCK, device=device)
+        self._interpolate(self._plan, self._actions)
+        if self.config.update == "cem":
+            fitted = [
+                self._weight, self._samples, self._plan, self._spread, self._smallest, self._nominal_deviation,
+                self._summary, self._deviation,
+            ]  # fmt: skip
+            wp.launch_tiled(planning.fit_deviation, dim=dim, inputs=fitted, block_dim=_BLOCK, device=device)
 
     def _evaluate(self) -> None:
         self._terminal_view.copy_(self._torch_values())
 
     def _torch_values(self) -> torch.Tensor:
         """Values of the states where the samples end, (samples,)."""
-        obs = self._loop.final_obs
+        obs, nworld = self._value_obs, self.env.nworld
         if isinstance(self.value, ValueFunction):
             step = self._loop.state[self.env.state_space.parts["step"]] + self.horizon
-            values = self.value(obs, step.float().expand(self.samples))
+            values = self.value(obs, step.float().expand(nworld))
         else:
             values = self.value(obs)  # type: ignore[misc]
-        if not isinstance(values, torch.Tensor) or values.numel() != self.samples:
+        if not isinstance(values, torch.Tensor) or values.numel() != nworld:
             raise ValueError(
-                f"value must return {self.samples} numbers for {tuple(obs.shape)} observations, not {described(values)}"
+                f"value must return {nworld} numbers for {tuple(obs.shape)} observations, not {described(values)}"
             )
-        return values.view(self.samples)
+        return values.view(nworld)
 
     def reset(self, seed: int | None = None) -> None:
-        """Forget the plan, and start the noise again.
+        """Forget the plan and the adapted noise, and start the noise again.
 
         Args:
-            seed: Another seed.
+            seed: Another seed, also of the models that the planner draws.
 
         Raises:
             ValueError: The seed is not a whole number from 0.
@@ -264,8 +398,21 @@ class MPPI:
         if seed is not None:
             self.__dict__["seed"] = whole_number("seed", seed, low=0)
             self._seed.fill_(self.seed)
+            if self.model_fields:
+                self._draw_models()
         self._count.zero_()
-        self.actions.copy_(torch_view(self._fill).expand_as(self.actions))
+        self._phase.zero_()
+        for plan in (self.knot_actions, self.actions):
+            plan.copy_(torch_view(self._fill).expand_as(plan))
+        if self.adapted_noise is not None:
+            self.adapted_noise.copy_(torch_view(self._first_deviation).expand_as(self.adapted_noise))
+
+    def _draw_models(self) -> None:
+        """Draw the planner's models with the task's functions, from streams that no plant of this seed has."""
+        self.env.rand_reset(int(np.random.SeedSequence([self.seed, _MODELS]).generate_state(1)[0]) >> 1)
+        states = self.env.get_state()[: self.config.models]
+        for name, rows in self.model_fields.items():
+            rows.copy_(states[:, self.env.state_space.parts[name]])
 
     def state_of(self, **parts: Any) -> torch.Tensor:
         """A state from its parts, as a robot knows them; the rest is as the task's fixed reset leaves it.

@@ -73,13 +73,10 @@ def planner_arguments(
                 f"{word!r} is a setting of MPPI and a parameter of the task {name!r}: give the setting as "
                 f"config=lw.MPPIConfig({word}=...), or the parameter as params={{{word!r}: ...}}"
             )
-    config = dataclasses.replace(
-        task_config(task, value) if config is None else config,
-        **{word: words[word] for word in words if word in SETTINGS and words[word] is not None},
+    config = (task_config(task, value) if config is None else config).changed(
+        {word: words[word] for word in words if word in SETTINGS and words[word] is not None}
     )
-    if config.discount is None:
-        discount = getattr(value, "discount", None)
-        config = dataclasses.replace(config, discount=1.0 if discount is None else discount)
+    config = config.completed(value)
 
     given = {word: words[word] for word in words if word in OPTIONS and word not in SETTINGS}
     _check_options(given)
@@ -91,10 +88,21 @@ def planner_arguments(
         if word not in known:
             raise ValueError(f"the task {name!r} has no parameter {word!r}: {_hint(word, known)}")
     place = place_samples(
-        options.engine, options.device, nthread=options.nthread, samples=config.samples,
+        options.engine, options.device, nthread=options.nthread, samples=config.samples * config.models,
         has_noslip=lambda: _has_noslip(task, options),
     )  # fmt: skip
     return config, options.changed(place), dict(planning.params if value is None else {}) | rest
+
+
+def words_of_update(update: str, words: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of a call of CEM or predictive sampling as those of a call of MPPI.
+
+    Raises:
+        ValueError: They ask for another update.
+    """
+    if words.get("update", update) != update:
+        raise ValueError(f"update={words['update']!r} is another planner than {update!r}: call lw.MPPI with it")
+    return {**words, "update": update}
 
 
 def plain(value: Any) -> Any:
@@ -113,7 +121,7 @@ def plain(value: Any) -> Any:
 
 
 _OWN_OPTIONS = {
-    "nworld": "samples is the number of its worlds",
+    "nworld": "samples is the number of its worlds, for each of its models",
     "autoreset": "its worlds never reset",
     "horizon": "episodes of its worlds have no limit, and the horizon of a plan is a setting",
     "seed": "every sample starts from the state to plan from",

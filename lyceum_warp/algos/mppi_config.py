@@ -1,14 +1,15 @@
-"""The settings of MPPI and their checks."""
+"""The settings of MPPI, CEM and predictive sampling, and their checks."""
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import torch
 
 from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.kernels.knots import ORDERS
 from lyceum_warp.spaces import Space
 from lyceum_warp.validate import whole_number
 
@@ -21,7 +22,7 @@ _SMALLEST = float(np.finfo(np.float32).tiny)
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MPPIConfig:
-    """Settings of MPPI. Arrays and tensors are stored as tuples of floats.
+    """Settings of MPPI, CEM and predictive sampling. Arrays and tensors are stored as tuples of floats.
 
     Raises:
         ValueError: A value is of the wrong type or out of range.
@@ -30,15 +31,31 @@ class MPPIConfig:
     horizon: int = 32
     """Steps of a plan."""
     samples: int = 64
-    """Samples for each improvement of the plan; each is rolled out in a world of its own."""
+    """Samples for each improvement of the plan; each is rolled out in a world of its own for each model."""
+    update: Literal["mppi", "cem", "predictive_sampling"] = "mppi"
+    """How samples become the new plan: their mean with weights exp(return / temperature) ("mppi"), the mean of the best
+    ones ("cem", the cross-entropy method), or the best one ("predictive_sampling")."""
     temperature: float = 0.1
-    """Temperature of the weights, in units of reward: a low one follows the best sample, a high one averages all."""
+    """Temperature of MPPI's weights, in units of reward: a low one follows the best sample, a high one averages all."""
+    elites: int | None = None
+    """Number of the best samples, for CEM. None is a tenth of the samples, and at least two."""
     noise: Numbers = 0.5
     """Noise around the plan, in units of the action: its standard deviation, as one number or one for each action, or
-    its covariance, (nact, nact)."""
+    its covariance, (nact, nact). CEM starts with these standard deviations and adapts them."""
+    min_noise: float | Sequence[float] | None = None
+    """The smallest standard deviation to which CEM adapts its noise, as one number or one for each action. None is a
+    tenth of ``noise``."""
+    include_plan: bool | None = None
+    """Whether the first sample is the plan itself, without noise. None is True for predictive sampling alone."""
     smoothing: tuple[float, float, float] = (0.25, 0.8, 0.0)
     """Weights (b0, b1, b2) that smooth the noise n over time: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) from the third
-    step on. (1, 0, 0) is white noise."""
+    step on. (1, 0, 0) is white noise. Noise of knots is not smoothed."""
+    knots: int | None = None
+    """Knots of a plan that is a spline: noise is added to this many numbers over the horizon for each action, and the
+    actions of all steps are interpolated. None is a plan with a number of its own for each step."""
+    spline: Literal["zero", "linear", "cubic"] = "cubic"
+    """Interpolation between knots: each holds until the next ("zero"), straight lines ("linear"), or a cubic Hermite
+    spline ("cubic")."""
     discount: float | None = None
     """Discount of rewards and of the terminal value for each step. None is that of the value function, or else 1."""
     iterations: int = 1
@@ -52,11 +69,17 @@ class MPPIConfig:
     nominal_model: bool = False
     """Whether samples have the nominal values of model fields that differ between worlds, or those of the state to
     plan from (default)."""
+    models: int = 1
+    """Models in which each sample is rolled out. More than one take model fields that the planner draws with the task's
+    ``startup``, ``initialize`` and ``randomize``, instead of those of the state to plan from."""
+    risk: Literal["mean", "worst"] = "mean"
+    """The return of a sample in several models: their mean, or the smallest one."""
 
     def __post_init__(self) -> None:
         """Check everything that does not depend on the task."""
         checked: dict[str, Any] = {
-            name: whole_number(name, getattr(self, name), low=1) for name in ("horizon", "samples", "iterations")
+            name: whole_number(name, getattr(self, name), low=1)
+            for name in ("horizon", "samples", "iterations", "models")
         }
         checked["temperature"] = _number("temperature", self.temperature, _SMALLEST)
         checked["noise"] = _noise(self.noise)
@@ -64,12 +87,66 @@ class MPPIConfig:
         if self.discount is not None:
             checked["discount"] = _number("discount", self.discount, 0.0, 1.0)
         checked["fill"] = _fill(self.fill)
-        if not isinstance(self.termination, str) or self.termination not in ("stop", "ignore"):
-            raise ValueError(f"termination must be 'stop' or 'ignore', not {self.termination!r}")
+        for name, words in _WORDS.items():
+            _one_of(name, getattr(self, name), words)
         if not isinstance(self.nominal_model, bool):
             raise ValueError(f"nominal_model must be True or False, not {self.nominal_model!r}")
+        if self.include_plan is not None and not isinstance(self.include_plan, bool):
+            raise ValueError(f"include_plan must be True, False or None, not {self.include_plan!r}")
+        if self.min_noise is not None:
+            checked["min_noise"] = _deviations("min_noise", self.min_noise)
+        for name, most in (("elites", "samples"), ("knots", "horizon")):
+            if (value := getattr(self, name)) is not None:
+                checked[name] = whole_number(name, value, low=1)
+                if checked[name] > checked[most]:
+                    raise ValueError(f"{name}={checked[name]} must be at most {most}, which is {checked[most]}")
+        if self.spline != "cubic" and self.knots is None:
+            raise ValueError(f"spline={self.spline!r} interpolates between knots: give their number, as knots=4")
+        if checked["models"] == 1 and self.risk != "mean":
+            raise ValueError(f"risk={self.risk!r} compares models: give their number, as models=4")
+        if checked["models"] > 1 and self.nominal_model:
+            raise ValueError(
+                f"models={checked['models']} draws model fields, and nominal_model=True does not: leave out one of them"
+            )
         for name, value in checked.items():
             object.__setattr__(self, name, value)
+
+    def changed(self, settings: Mapping[str, Any]) -> "MPPIConfig":
+        """The same settings with some changed. With another update, settings of the old one have their defaults.
+
+        Raises:
+            ValueError: A value is of the wrong type or out of range.
+        """
+        other = settings.get("update", self.update) != self.update
+        words: dict[str, Any] = {**(dict.fromkeys(_OF_CEM) if other else {}), **settings}
+        return dataclasses.replace(self, **words)
+
+    def completed(self, value: object = None) -> "MPPIConfig":
+        """The same settings with those that are None chosen, except ``knots`` and what the update does not use.
+
+        Args:
+            value: The planner's value function; its ``discount``, if it has one, is the default.
+
+        Raises:
+            ValueError: A setting does not apply to the update.
+        """
+        discount = getattr(value, "discount", None)
+        chosen: dict[str, Any] = {
+            "discount": 1.0 if discount is None else discount,
+            "include_plan": self.update == "predictive_sampling",
+        }
+        if self.update == "cem":
+            if np.ndim(self.noise) == 2:
+                raise ValueError(f"noise of update='cem' must be standard deviations, not a covariance {self.noise!r}")
+            chosen["elites"] = min(self.samples, max(2, self.samples // 10))
+            chosen["min_noise"] = _tuples(0.1 * np.asarray(self.noise))
+        else:
+            for name in _OF_CEM:
+                if (given := getattr(self, name)) is not None:
+                    raise ValueError(f"{name}={given!r} is a setting of update='cem', not of {self.update!r}")
+        return dataclasses.replace(
+            self, **{name: default for name, default in chosen.items() if getattr(self, name) is None}
+        )
 
     def noise_factor(self, nact: int) -> np.ndarray:
         """The lower Cholesky factor of the noise's covariance, (nact, nact).
@@ -87,6 +164,31 @@ class MPPIConfig:
             f"not {self.noise!r}"
         )
 
+    def smallest_noise(self, nact: int) -> np.ndarray:
+        """The smallest standard deviation of CEM's noise for each action, (nact,).
+
+        Raises:
+            ValueError: ``min_noise`` is not for ``nact`` actions.
+        """
+        smallest = np.asarray(self.min_noise)
+        if smallest.shape not in ((), (nact,)):
+            raise ValueError(f"min_noise must be a standard deviation or {nact} of them, not {self.min_noise!r}")
+        return np.broadcast_to(smallest, nact)
+
+    def spread(self, count: int) -> np.ndarray:
+        """The standard deviation that smoothing gives standard normal noise, (count,) from the first step on.
+
+        For e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) the variances v_t and the covariances c_t of e_t and e_(t-1) follow
+        v_t = b0^2 + b1^2 v_(t-1) + b2^2 v_(t-2) + 2 b1 b2 c_(t-1) and c_t = b1 v_(t-1) + b2 c_(t-1).
+        """
+        b0, b1, b2 = (1.0, 0.0, 0.0) if self.knots is not None else self.smoothing
+        variance, covariance = [1.0, 1.0], 0.0
+        for _ in range(2, count):
+            new = b0 * b0 + b1 * b1 * variance[-1] + b2 * b2 * variance[-2] + 2 * b1 * b2 * covariance
+            covariance = b1 * variance[-1] + b2 * covariance
+            variance.append(new)
+        return np.sqrt(np.maximum(variance[:count], _SMALLEST))
+
     def fill_action(self, space: Space) -> np.ndarray:
         """The action that fills the end of a plan and the whole first plan, within bounds, (nu,).
 
@@ -98,6 +200,15 @@ class MPPIConfig:
             raise ValueError(f"fill must be 'zero', 'repeat', a number or {space.size} of them, not {self.fill!r}")
         return np.clip(np.broadcast_to(fill, space.size), space.low, space.high)
 
+
+_WORDS = {
+    "update": ("mppi", "cem", "predictive_sampling"), "termination": ("stop", "ignore"), "spline": tuple(ORDERS),
+    "risk": ("mean", "worst"),
+}  # fmt: skip
+"""The values of the settings that are words."""
+
+_OF_CEM = ("elites", "min_noise")
+"""Settings of CEM alone."""
 
 SETTINGS = tuple(field.name for field in dataclasses.fields(MPPIConfig))
 """Names of the settings."""
@@ -127,6 +238,19 @@ def _array(value: Any) -> np.ndarray | None:
 def _tuples(array: np.ndarray) -> Any:
     """Numbers of any shape as a float or as tuples, which a frozen dataclass can compare and hash."""
     return array.item() if array.ndim == 0 else tuple(map(_tuples, array))
+
+
+def _one_of(name: str, value: Any, words: Sequence[str]) -> None:
+    if not isinstance(value, str) or value not in words:
+        *others, last = map(repr, words)
+        raise ValueError(f"{name} must be {', '.join(others)} or {last}, not {value!r}")
+
+
+def _deviations(name: str, value: Any) -> Any:
+    array = _array(value)
+    if array is None or array.ndim > 1 or not array.size or (array < 0).any():
+        raise ValueError(f"{name} must be a standard deviation, or one for each action, not {value!r}")
+    return _tuples(array)
 
 
 def _noise(noise: Any) -> Any:

@@ -3,6 +3,7 @@
 import dataclasses
 import datetime
 import signal
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,9 +13,10 @@ import tyro
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.mppi_config import MPPIConfig
-from lyceum_warp.binding.registry import find_task, task_name
+from lyceum_warp.binding.registry import find_task, snake_case, task_name
 from lyceum_warp.cli.arguments import Physics, Placement, Repeated, given, optional_flags, parameters, portable
 from lyceum_warp.cli.display import PlanDisplay, make_console, plotted_control, report_table, states_video
+from lyceum_warp.control.checked_controller import CheckedController
 from lyceum_warp.control.control_report import control_report
 from lyceum_warp.control.loop import control
 from lyceum_warp.control.real_time import control_async
@@ -27,7 +29,7 @@ from lyceum_warp.validate import whole_number
 
 @optional_flags(MPPIConfig, default="(default: the task's)")
 class Settings:
-    """How MPPI plans. Settings that are left out are those of the task."""
+    """How the planner plans. Settings that are left out are those of the task."""
 
     noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
     """Standard deviation of the noise around the plan, in units of the action: one number or one for each action (its
@@ -35,6 +37,11 @@ class Settings:
     smoothing: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="B0 B1 B2")] = None
     fill: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="WORD|FLOAT ...")] = None
     termination: Annotated[str | None, tyro.conf.arg(metavar="stop|ignore")] = None
+    update: Annotated[str | None, tyro.conf.arg(metavar="mppi|cem|predictive_sampling")] = None
+    min_noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
+    include_plan: Annotated[bool | None, tyro.conf.arg(metavar="True|False")] = None
+    spline: Annotated[str | None, tyro.conf.arg(metavar="zero|linear|cubic")] = None
+    risk: Annotated[str | None, tyro.conf.arg(metavar="mean|worst")] = None
 
     def on_top_of(self, config: MPPIConfig) -> MPPIConfig:
         """A configuration with the settings that were given.
@@ -45,25 +52,29 @@ class Settings:
         settings = given(self)
         if self.fill is not None:
             settings["fill"] = _fill(self.fill)
-        if self.noise is not None and len(self.noise) == 1:
-            settings["noise"] = self.noise[0]
-        return dataclasses.replace(config, **settings)
+        for name in ("noise", "min_noise"):
+            if name in settings and len(settings[name]) == 1:
+                settings[name] = settings[name][0]
+        return config.changed(settings)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Plan:
-    """Control a task with MPPI: plan again at every step, and report rewards, success and planning times.
+    """Control a task by planning again at every step, and report rewards, success and planning times.
+
+    The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling.
 
     The folder then holds config.json, versions.json, a file for each episode (episode-000.npz: states, actions,
     rewards, evaluations, times; numpy reads it), report.json, plan.png and video.mp4 of the first episode. Settings of
-    MPPI that are not given come from the task. After Ctrl-C the episode that was interrupted has a file, too, but is
-    not in the report.
+    the planner that are not given come from the task. After Ctrl-C the episode that was interrupted has a file, too,
+    but is not in the report.
 
     Options of the physics (--integrator, --solver, ...) are the planner's: the controlled world keeps its own.
 
     $ lyceum-warp plan reach
     $ lyceum-warp plan reach --real-time --episodes 10
     $ lyceum-warp plan half_cheetah --steps 200 --samples 128 --temperature 1
+    $ lyceum-warp plan reach --update predictive_sampling --knots 4 --replan-every 2
     $ lyceum-warp plan hopper --steps 300 --horizon 16 --value runs/hopper-20260101-120000 --discount 0.995
     $ lyceum-warp plan adroit_pen --device cuda:0 --samples 1024 --solver noslip_iterations=0
     """
@@ -74,16 +85,19 @@ class Plan:
     """Number of episodes."""
     steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Steps of an episode; by default the task's horizon."""
+    replan_every: int = 1
+    """Steps from one plan to the next; the steps between apply the plan's further actions."""
     seed: int = 0
     """Seed of the first episode's initial state and noise; the next episode has the next number."""
     real_time: bool = False
     """Let the world run at its own rate while the planner plans, instead of waiting for each plan."""
     rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
-    """Plans per second, which sets the deadline of each plan in the report; by default one per step."""
+    """Plans per second, which sets the deadline of each plan in the report; by default one per step, or one in the
+    steps of --replan-every."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """The folder, new or empty; runs/plan-TASK-DATE by default."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """NPG run whose value function gives the value of the state where a plan ends."""
+    """NPG run of this task whose value function gives the value of the state where a plan ends."""
     param: Repeated = ()
     """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf, a table as NAME=file.npy; may be given several
     times."""
@@ -108,6 +122,14 @@ def plan(options: Plan) -> int:
     whole_number("seed of the last episode", options.seed + options.episodes - 1, low=0)
     if options.rate is not None and not 0 < options.rate < float("inf"):
         raise ValueError(f"rate must be a positive number of plans per second, not {options.rate}")
+    every = whole_number("replan_every", options.replan_every, low=1)
+    if every > 1 and options.real_time:
+        raise ValueError(
+            f"--replan-every {every} has no effect with --real-time, where plans follow one another without a break: "
+            "leave out one of them"
+        )
+    if options.value is not None:
+        _check_value_task(options.value, options.task)
     out = options.out or Path(
         "runs", f"plan-{task_name(find_task(options.task))}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
     )
@@ -116,15 +138,40 @@ def plan(options: Plan) -> int:
     torch.set_num_threads(1)
     params, planner_params = _parameters(options)
     plant, planner = _worlds(options, params, planner_params)
+    CheckedController(planner, plant).check_horizon(planner.horizon, every)
     config = {
-        "algorithm": "mppi", "task": portable(options.task), "params": params,
+        "algorithm": planner.config.update, "task": portable(options.task), "params": params,
         "planner": planner.settings, "planner_params": planner_params,
         "planner_model": options.planner_model and str(_model(options.planner_model)),
         "value": options.value and str(options.value.resolve()), **vars(options.planner),
         "engine": planner.env.engine.name, "episodes": options.episodes, "steps": options.steps,
-        "seed": options.seed, "real_time": options.real_time, "rate": options.rate,
+        "replan_every": every, "seed": options.seed, "real_time": options.real_time, "rate": options.rate,
     }  # fmt: skip
     return _run(Run.create(out, config, device=options.planner.device), plant, planner, options)
+
+
+def _check_value_task(run: Path, task: str) -> None:
+    """Refuse the value function of a run of another task.
+
+    Raises:
+        ValueError: The run's configuration names another task.
+    """
+    try:
+        config = Run.open(run.parent if run.is_file() else run).config
+    except FileNotFoundError:
+        return  # loading reports what is missing, and a file may be anywhere
+    found = str(config.get("task"))
+    names = {_stem(found), snake_case(found.partition(":")[2]), str(config.get("kept", {}).get("name"))}
+    if not names & {_stem(task), task_name(find_task(task))}:
+        raise ValueError(
+            f"--value {run} is a run of the task {found!r}, not of {task!r}: a value function applies to the task that "
+            "it was trained on"
+        )
+
+
+def _stem(task: str) -> str:
+    """The name of a task, or of its file."""
+    return Path(task.partition(":")[0]).stem
 
 
 def _parameters(options: Plan) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -170,14 +217,14 @@ def _model(path: Path) -> Path:
 def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
     console, simulated = make_console(), planner.env
     console.print(
-        f"[bold]{plant.task.name}[/]: {planner.samples} samples of {planner.horizon} steps "
+        f"[bold]{plant.task.name}[/]: {_planner_name(planner)}, {planner.samples} samples of {planner.horizon} steps "
         f"({planner.horizon * planner.timestep:.3g} s), {simulated.engine.name} engine on {simulated.device.alias}; "
         f"{'real time' if options.real_time else 'the world waits'}; files in {run.folder}",
         soft_wrap=True,
     )  # fmt: skip
     done: list[Trajectory] = []
     aborted: list[Trajectory] = []
-    method: Any = control_async if options.real_time else control
+    method: Any = control_async if options.real_time else partial(control, replan_every=options.replan_every)
     shown: dict[str, Any] = dict(steps=plant.horizon, timestep=plant.timestep, real_time=options.real_time)
     try:
         for episode in range(options.episodes):
@@ -198,6 +245,17 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
     return _report(run, plant, done, options)
 
 
+def _rate(options: Plan, episode: Trajectory) -> float | None:
+    """The plans per second that set the deadline; None for one per step."""
+    if options.rate is not None or options.replan_every == 1:
+        return options.rate
+    return 1 / (options.replan_every * episode.timestep)
+
+
+def _planner_name(planner: MPPI) -> str:
+    return {"mppi": "MPPI", "cem": "CEM", "predictive_sampling": "predictive sampling"}[planner.config.update]
+
+
 def _left(run: Run, whole: int, aborted: list[Trajectory], path: Path | None) -> str:
     """The files that an interrupted run leaves, after so many whole episodes."""
     steps = f"after {aborted[0].steps} step{'s' * (aborted[0].steps != 1)}" if aborted else "before its first step"
@@ -215,13 +273,13 @@ def _file(run: Run, episode: int) -> Path:
 def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
     """Write the last episode and the report of all."""
     done[-1].save(_file(run, len(done) - 1))
-    control_report(done, rate=options.rate).write(run.folder / "report.json")
+    control_report(done, rate=_rate(options, done[0])).write(run.folder / "report.json")
 
 
 def _report(run: Run, plant: Env, done: list[Trajectory], options: Plan) -> int:
     """Print the report, draw the plot and the video, and list the files."""
     console = make_console()
-    report = control_report(done, rate=options.rate)
+    report = control_report(done, rate=_rate(options, done[0]))
     console.print(report_table(report, success=plant.task.functions["success"] is not None))
     paths = [("episodes", str(run.folder / "episode-*.npz")), ("report", str(run.folder / "report.json"))]
     if options.plot:

@@ -77,9 +77,29 @@ class CheckedController:
         """Convert steps of the plant to steps of the controller, rounded."""
         return math.floor(plant_steps * self._ratio + 0.5 + 1e-9)
 
+    def passed(self, before: int, now: int) -> int:
+        """Steps of the controller between two steps of the plant's episode.
+
+        They add up: those of two intervals are together those of the whole.
+        """
+        return self.steps(now) - self.steps(before)
+
     def index(self, plant_steps: int, horizon: int) -> int:
         """Index in a plan of the action to apply so many steps of the plant after the plan's state."""
         return min(self.steps(plant_steps), horizon - 1)
+
+    def check_horizon(self, horizon: int, steps: int) -> None:
+        """Check that a plan has an action for so many steps of the plant.
+
+        Raises:
+            ValueError: It ends before.
+        """
+        if (needed := self.steps(steps - 1) + 1) > horizon:
+            plan = f"a plan of {horizon} actions" if hasattr(self._controller, "actions") else "no plan, but one action"
+            raise ValueError(
+                f"replan_every={steps} needs a plan of {needed} actions, and the controller has {plan}: plan more "
+                "often, or give it a longer horizon"
+            )
 
     def description(self) -> dict[str, Any]:
         """Name, settings, engine and device of the controller; see ``Trajectory.controller``."""

@@ -43,9 +43,10 @@ class PlanningController(Controller, Protocol):
         Args:
             state: See ``Controller``.
             obs: See ``Controller``.
-            shift: Steps of length ``timestep`` since the state of the last plan: 0 for the first plan after a reset, 1
-                for the first plan of a run with ``reset=False``. The loops pass it to controllers that have an argument
-                of this name.
+            shift: Steps of length ``timestep`` since the state of the last plan, 0 for the first plan after a reset.
+                With ``reset=False`` the last plan is taken to have been made in the step before, or in the last step in
+                which a run with the same ``replan_every`` makes one. The loops pass it to controllers that have an
+                argument of this name.
 
         Returns:
             The first action of the plan, (nu,). The loops read ``actions`` instead, if it is there.

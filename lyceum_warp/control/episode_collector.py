@@ -84,6 +84,11 @@ def begin_episode(env: Env, controller: CheckedController, seed: int | None, *, 
         raise ValueError("the episode is over before its first step: reset the environment, or leave out reset=False")
 
 
+def first_step(env: Env, *, reset: bool) -> int:
+    """The step of the episode at which a run begins."""
+    return 0 if reset else int(env.episode_step.item())
+
+
 class EpisodeCollector:
     """Collects the states, actions, outcomes and plans of an episode, and makes a ``Trajectory`` of them.
 

@@ -12,10 +12,12 @@ from lyceum_warp.control.episode_collector import (
     OnStep,
     TimedPlan,
     begin_episode,
+    first_step,
     step_limit,
 )
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
+from lyceum_warp.validate import whole_number
 
 
 @torch.no_grad()
@@ -24,6 +26,7 @@ def control(
     controller: Controller,
     *,
     steps: int | None = None,
+    replan_every: int = 1,
     seed: int | None = None,
     reset: bool = True,
     on_step: OnStep | None = None,
@@ -35,9 +38,11 @@ def control(
         env: The plant: one world, made with ``autoreset=False``.
         controller: Called once a step; see ``lw.Controller``. It must not step ``env``.
         steps: Steps after which to stop if the episode has not ended.
+        replan_every: Steps from one plan to the next. The steps between apply the plan's further actions, so that a
+            controller of more than 1 must have ``actions``.
         seed: Seed of the initial state and of the controller.
         reset: Whether to reset the plant and the controller first. With False the run continues from the plant's
-            state and the controller's last plan.
+            state and the controller's last plan, which is taken for one of a run with the same ``replan_every``.
         on_step: Called with a ``ControlProgress`` after each step. Its time counts as no plan's time.
         on_abort: Called with the trajectory of the complete steps, if there are any, when an exception ends the run
             (Ctrl-C included). ``done_reason`` of that trajectory is 0. The exception is raised afterwards.
@@ -47,26 +52,34 @@ def control(
 
     Raises:
         ValueError: The environment has several worlds or automatic resets, the episode is over or may never end, or
-            the controller does not return a finite action of the right shape.
+            the controller does not return a finite action of the right shape, or its plan ends before the next one.
     """
     limit = step_limit(env, steps)
+    every = whole_number("replan_every", replan_every, low=1)
     checked = CheckedController(controller, env)
     begin_episode(env, checked, seed, reset=reset)
     episode = EpisodeCollector(env, checked, mode="sync", period=env.timestep, seed=seed)
-    shift = 0 if reset else 1
+    # steps count from the reset, so that a run in parts shifts its plans as one run does
+    first = first_step(env, reset=reset)
+    planned = max(first - 1, 0) // every * every
+    plan = None
     try:
         for k in range(limit):
-            begun = time.perf_counter()
-            actions = checked(episode.states[k], episode.obs[k], shift, k)
-            plan = TimedPlan(k, k, begun, time.perf_counter() - begun, actions)
-            env.action[0] = actions[0]
-            episode.before_step(plan, episode.elapsed(), time.perf_counter() - begun, late=False)
-            episode.add_plan(plan, checked.quality())
+            begun, step = time.perf_counter(), first + k
+            if plan is None or step % every == 0:
+                actions = checked(episode.states[k], episode.obs[k], checked.passed(planned, step), k)
+                index = 0 if plan is None else plan.index + 1
+                plan, planned = TimedPlan(index, k, begun, time.perf_counter() - begun, actions), step
+                checked.check_horizon(len(actions), every)
+                quality = checked.quality()
+            env.action[0] = plan.actions[min(checked.passed(planned, step), len(plan.actions) - 1)]
+            episode.before_step(plan, episode.elapsed(), time.perf_counter() - plan.begun, late=False)
+            if plan.step == k:
+                episode.add_plan(plan, quality)
             env.step()
             episode.after_step(on_step)
             if env.done.item():
                 break
-            shift = checked.steps(k + 1) - checked.steps(k)
         return episode.trajectory(episode.elapsed(), int(env.done_reason.item()))
     except BaseException:
         episode.abort(on_abort, episode.elapsed())

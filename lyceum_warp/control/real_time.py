@@ -21,6 +21,7 @@ from lyceum_warp.control.episode_collector import (
     OnStep,
     TimedPlan,
     begin_episode,
+    first_step,
     step_limit,
 )
 from lyceum_warp.control.trajectory import Trajectory
@@ -101,7 +102,7 @@ def control_async(
     _capture_graphs(env)
     clock = Clock()
     episode = EpisodeCollector(env, checked, mode="async", period=period, seed=seed, now=clock.now)
-    planner = _PlannerThread(checked, clock, seed, reset=reset)
+    planner = _PlannerThread(checked, clock, seed, first_step(env, reset=reset), reset=reset)
     with _frequent_thread_switches():
         try:
             planner.publish(0, episode.states[0], episode.obs[0])
@@ -204,11 +205,14 @@ class _PlannerThread:
         controller: The controller.
         clock: The clock of the run.
         seed: Seed of the run.
+        first: Step of the episode at which the run begins.
         reset: Whether the run began with a reset.
     """
 
-    def __init__(self, controller: CheckedController, clock: Clock, seed: int | None, *, reset: bool) -> None:
-        self._controller, self._clock, self._seed, self._reset = controller, clock, seed, reset
+    def __init__(
+        self, controller: CheckedController, clock: Clock, seed: int | None, first: int, *, reset: bool
+    ) -> None:  # fmt: skip
+        self._controller, self._clock, self._seed, self._first, self._reset = controller, clock, seed, first, reset
         self._plans: list[TimedPlan] = []
         self._qualities: list[tuple[float, float]] = []  # of the plans; that of the last one may not be there yet
         self._error: BaseException | None = None
@@ -281,12 +285,13 @@ class _PlannerThread:
     def _plan(self, step: int, state: torch.Tensor, obs: torch.Tensor, last: int) -> None:
         controller = self._controller
         if not self._plans:
-            controller(state, obs, 0 if self._reset else 1, step)
+            controller(state, obs, controller.passed(max(self._first - 1, 0), self._first), step)
             controller(state, obs, 0, step)
             if self._reset:
                 controller.reset(self._seed)
         begun = self._clock.now()
-        actions = controller(state, obs, controller.steps(step) - controller.steps(last), step)
+        shift = controller.passed(self._first + last, self._first + step)
+        actions = controller(state, obs, shift, step)
         self._plans.append(TimedPlan(len(self._plans), step, begun, self._clock.now() - begun, actions))
         self._qualities.append(controller.quality())  # after the plan, for which the plant may be waiting
 

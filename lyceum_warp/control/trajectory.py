@@ -63,7 +63,7 @@ class Trajectory:
     """When each action was applied, (steps,) float64, seconds."""
     ages: torch.Tensor
     """Age of each action when it was applied, (steps,) float64, seconds: the time since the plant was in the state from
-    which the action was planned. In a synchronous run this is the planning time."""
+    which the action was planned. In a synchronous run this is the planning time, for the first action of a plan."""
     late: torch.Tensor
     """Whether a step began late because the step before it was not finished in time, (steps,) bool. Always False in a
     synchronous run."""

@@ -1,6 +1,7 @@
 """Planning by sampling: controls of open-loop rollouts, noise around a plan, weights, and the weighted mean.
 
-Actions of samples are (horizon, nsample, nact), plans (horizon, nact).
+Actions of samples are (horizon, nsample, nact), plans (horizon, nact). A plan with knots holds (knots, nact) numbers
+instead, and so do its samples: kernels that do not name a horizon take both.
 """
 
 import warp as wp
@@ -27,6 +28,13 @@ def overwrite(row_in: wp.array2d[float], first: int, state_out: wp.array2d[wp.fl
     """Copy one row of float32 into columns of every world's state, from ``first`` on; launched over (nworld, size)."""
     w, i = wp.tid()
     state_out[w, first + i] = wp.float64(row_in[0, i])
+
+
+@wp.kernel(enable_backward=False)
+def overwrite_rows(rows_in: wp.array2d[wp.float64], first: int, state_out: wp.array2d[wp.float64]):
+    """Copy some rows in turn into columns of the worlds' states, from ``first`` on; launched over (nworld, size)."""
+    w, i = wp.tid()
+    state_out[w, first + i] = rows_in[w % rows_in.shape[0], i]
 
 
 @wp.kernel(enable_backward=False)
@@ -81,12 +89,11 @@ def shift_plan(
     plan_in: wp.array2d[float], steps_in: wp.array[int], fill_in: wp.array[float], repeat: bool,
     nominal_out: wp.array2d[float],
 ):  # fmt: skip
-    """Move a plan forward in time and fill its end; launched over (horizon, nact)."""
+    """Move a plan forward in time and fill its end; launched over (horizon, nact), or over (knots, nact)."""
     t, i = wp.tid()
     last = plan_in.shape[0] - 1
-    source = t + steps_in[0]
-    if source <= last:
-        nominal_out[t, i] = plan_in[source, i]
+    if steps_in[0] <= last - t:
+        nominal_out[t, i] = plan_in[t + steps_in[0], i]
     else:
         nominal_out[t, i] = wp.where(repeat, plan_in[last, i], fill_in[i])
 
@@ -118,6 +125,7 @@ def perturb(
     scale_in: wp.array2d[float],
     diagonal: bool,
     smoothing: wp.vec3,
+    include_plan: bool,
     low_in: wp.array[float],
     high_in: wp.array[float],
     action_out: wp.array3d[float],
@@ -125,7 +133,8 @@ def perturb(
     """Add coloured, smoothed noise to a plan and clip the sum to the bounds; launched over (nsample, nact).
 
     ``scale_in`` is the lower Cholesky factor L of the noise's covariance: n_t = L z_t for standard normal z_t.
-    Smoothing follows trajopt: e_t = n_t in the first two steps, then e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2).
+    Smoothing follows trajopt: e_t = n_t in the first two steps, then e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2). With
+    ``include_plan`` the first sample is the plan without noise.
     """
     k, i = wp.tid()
     last, before_last = float(0.0), float(0.0)
@@ -138,6 +147,34 @@ def perturb(
             e = smoothing[0] * e + smoothing[1] * last + smoothing[2] * before_last
         before_last = last
         last = e
+        if include_plan and k == 0:
+            e = 0.0
+        action_out[t, k, i] = wp.clamp(nominal_in[t, i] + e, low_in[i], high_in[i])
+
+
+@wp.kernel(enable_backward=False)
+def perturb_adapted(
+    nominal_in: wp.array2d[float],
+    noise_in: wp.array3d[float],
+    deviation_in: wp.array2d[float],
+    smoothing: wp.vec3,
+    include_plan: bool,
+    low_in: wp.array[float],
+    high_in: wp.array[float],
+    action_out: wp.array3d[float],
+):
+    """The same with a standard deviation for each number of the plan, which scales smoothed standard normal noise."""
+    k, i = wp.tid()
+    last, before_last = float(0.0), float(0.0)
+    for t in range(noise_in.shape[0]):
+        s = noise_in[t, k, i]
+        if t >= 2:
+            s = smoothing[0] * s + smoothing[1] * last + smoothing[2] * before_last
+        before_last = last
+        last = s
+        e = deviation_in[t, i] * s
+        if include_plan and k == 0:
+            e = 0.0
         action_out[t, k, i] = wp.clamp(nominal_in[t, i] + e, low_in[i], high_in[i])
 
 
@@ -174,6 +211,22 @@ def add_up(
 
 
 @wp.kernel(enable_backward=False)
+def combine_models(world_return_in: wp.array[float], worst: bool, return_out: wp.array[float]):
+    """The mean or the smallest of each sample's returns in several models; launched over (nsample,).
+
+    The worlds of a sample follow one another. A sample that failed in one model fails.
+    """
+    k = wp.tid()
+    models = world_return_in.shape[0] // return_out.shape[0]
+    total, smallest = float(0.0), float(wp.inf)
+    for w in range(k * models, (k + 1) * models):
+        total += world_return_in[w] / float(models)
+        smallest = wp.min(smallest, world_return_in[w])
+    total = wp.where(worst, smallest, total)
+    return_out[k] = wp.where(wp.isfinite(total), total, -wp.inf)
+
+
+@wp.kernel(enable_backward=False)
 def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[float], summary_out: wp.array[float]):
     """Weigh samples by w = exp((R - max R) / temperature), divided by the sum; launched as one block.
 
@@ -207,6 +260,80 @@ def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[f
         summary_out[1] = mean / good
         summary_out[2] = total * total / square
         summary_out[3] = float(n) - good
+
+
+@wp.kernel(enable_backward=False)
+def rank(return_in: wp.array[float], rank_out: wp.array[int]):
+    """Count the better samples of each, of equal ones those with smaller numbers; launched over (nsample,)."""
+    k = wp.tid()
+    own = return_in[k]
+    better = int(0)
+    for j in range(return_in.shape[0]):
+        if return_in[j] > own or (return_in[j] == own and j < k):
+            better += 1
+    rank_out[k] = better
+
+
+@wp.kernel(enable_backward=False)
+def weigh_elites(
+    return_in: wp.array[float],
+    rank_in: wp.array[int],
+    elites: int,
+    weight_out: wp.array[float],
+    summary_out: wp.array[float],
+):
+    """Weigh the best samples equally and the others by zero; launched as one block. The summary is that of ``weigh``.
+
+    Samples that failed have no weight, also where fewer than ``elites`` are left.
+    """
+    _, lane = wp.tid()
+    n = return_in.shape[0]
+    best, mean, good = float(-wp.inf), float(0.0), float(0.0)
+    for k in range(lane, n, wp.block_dim()):
+        if return_in[k] > -wp.inf:
+            best = wp.max(best, return_in[k])
+            mean += return_in[k]
+            good += 1.0
+    best = wp.tile_extract(wp.tile_max(wp.tile(best)), 0)
+    mean = wp.tile_extract(wp.tile_sum(wp.tile(mean)), 0)
+    good = wp.tile_extract(wp.tile_sum(wp.tile(good)), 0)
+    count = wp.min(float(elites), good)
+    for k in range(lane, n, wp.block_dim()):
+        weight_out[k] = wp.where(rank_in[k] < elites and return_in[k] > -wp.inf, 1.0 / count, 0.0)
+    if lane == 0:
+        summary_out[0] = best
+        summary_out[1] = mean / good
+        summary_out[2] = count
+        summary_out[3] = float(n) - good
+
+
+@wp.kernel(enable_backward=False)
+def fit_deviation(
+    weight_in: wp.array[float],
+    action_in: wp.array3d[float],
+    plan_in: wp.array2d[float],
+    spread_in: wp.array[float],
+    smallest_in: wp.array[float],
+    deviation_in: wp.array2d[float],
+    summary_in: wp.array[float],
+    deviation_out: wp.array2d[float],
+):
+    """Fit the noise's standard deviation to the weighted samples; launched as one block for each number of the plan.
+
+    It is that of the samples around their mean, the plan, divided by the spread that smoothing gives standard normal
+    noise in this step, and at least the smallest one. Where every sample failed it stays as it is.
+    """
+    number, lane = wp.tid()
+    t = number // plan_in.shape[1]
+    i = number % plan_in.shape[1]
+    total = float(0.0)
+    for k in range(lane, weight_in.shape[0], wp.block_dim()):
+        distance = action_in[t, k, i] - plan_in[t, i]
+        total += weight_in[k] * distance * distance
+    total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
+    if lane == 0:
+        fitted = wp.max(wp.sqrt(total) / spread_in[t], smallest_in[i])
+        deviation_out[t, i] = wp.where(summary_in[0] > -wp.inf, fitted, deviation_in[t, i])
 
 
 @wp.kernel(enable_backward=False)

@@ -14,13 +14,33 @@ import warp as wp
 from coin_tasks import TossedAfter, TossedAfterWithControl, TossedBefore
 from plain_mppi import Plain, PlainReach
 from rail_task import Picky, rail
+from varied_task import Params as VariedParams
+from varied_task import Varied
+from varied_task import World as VariedWorld
 
 import lyceum_warp as lw
 import lyceum_warp.tasks
 from lyceum_warp import MPPI, Row
 
 ENGINES = ["mujoco", "warp"]
+UPDATES: dict[str, dict[str, Any]] = {
+    "mppi with knots": dict(knots=3, spline="linear", include_plan=True),
+    "cem": dict(update="cem", elites=4),
+    "cem with knots": dict(update="cem", elites=4, knots=4),
+    "predictive sampling": dict(update="predictive_sampling"),
+}
 BUFFERS = ("actions", "nominal", "standard_noise", "sampled", "returns", "weights")
+
+
+@wp.func
+def weighed(s0: VariedWorld, action: Row[float], s1: VariedWorld, p: VariedParams) -> float:
+    return s1.qpos[0] - 0.05 * action[0] * action[0] + s1.body_pos[p.arm][2]
+
+
+class Weighed(Varied):
+    """A task whose rewards depend on the masses and lengths that are drawn."""
+
+    reward = weighed
 
 
 def place(obs: torch.Tensor) -> torch.Tensor:
@@ -63,11 +83,26 @@ CASES: dict[str, dict[str, Any]] = {
     "negative": POINT | dict(noise=[[0.3, -0.2], [-0.2, 0.25]], discount=0.5, iterations=3),
     "frame_skip": REACH | dict(frame_skip=3),
     "model": REACH | dict(model=heavy_arm),
+    "include_plan": REACH | dict(include_plan=True),
+    "predictive_sampling": REACH | dict(update="predictive_sampling", include_plan=True),
+    "without_plan": POINT | dict(update="predictive_sampling", include_plan=False, noise=0.4, iterations=2),
+    "cem": POINT | dict(update="cem", noise=[0.3, 0.6], elites=5, min_noise=[0.02, 0.05], iterations=2),
+    "cem_smoothed": REACH | dict(update="cem", elites=6, min_noise=0.3, smoothing=(0.5, 0.3, 0.2)),
+    "cem_of_one": POINT | dict(update="cem", noise=0.4, elites=1, min_noise=0.1, include_plan=True),
+    "zero": REACH | dict(knots=5, spline="zero"),
+    "linear": POINT | dict(noise=0.4, knots=4, spline="linear", fill=[0.5, -0.25], iterations=2),
+    "cubic": REACH | dict(knots=4, spline="cubic"),
+    "cubic_cem": POINT | dict(update="cem", noise=0.4, knots=3, elites=4, min_noise=0.05, fill="repeat"),
+    "knot_for_each_step": POINT | dict(knots=9, spline="linear", noise=[[0.3, 0.2], [0.2, 0.25]]),
+    "one_knot": POINT | dict(update="predictive_sampling", noise=0.4, knots=1, include_plan=True),
 }
+SAME_ON_WARP = {"without_plan", "cem", "cem_of_one", "zero", "cubic", "knot_for_each_step", "one_knot"}
+"""Cases whose kernels other cases run on the Warp engine."""
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case, engine", [(c, e) for c in CASES for e in ENGINES if e == "mujoco" or c not in SAME_ON_WARP]
+)
 def test_plans_equal_those_of_the_plain_version(case: str, engine: str) -> None:
     """In actions, returns and weights, call after call, while the plant moves."""
     check_against(Plain, engine, **CASES[case])
@@ -81,9 +116,10 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
     if callable(settings.get("model")):
         settings["model"] = settings["model"]()
     plan = MPPI(task, engine=engine, seed=5, iterations=iterations, **settings)
-    plain = kind(task, engine=engine, **settings)
+    plain = kind(task, engine=engine, count=len(plan.knot_actions), **settings)
     # random numbers depend on the seed and on how many came before: a twin draws those of every iteration
-    twin = MPPI(task, seed=5, samples=plan.samples, horizon=plan.horizon, iterations=1)
+    knots = {name: settings[name] for name in ("knots", "spline") if name in settings}
+    twin = MPPI(task, seed=5, samples=plan.samples, horizon=plan.horizon, iterations=1, **knots)
     plant = lw.make(task, engine=engine, seed=3, autoreset=False)
     if task == "hopper":
         falling_hopper(plant)
@@ -95,7 +131,7 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
         for _ in range(iterations):
             twin(twin.state_of())
             noises.append(twin.standard_noise.double().numpy())
-        shift = (1, 1, 2, 0, 1)[call]
+        shift = (1, 1, 2, 0, 5)[call]
         action = plan(state, shift=shift)
         assert np.array_equal(plan.standard_noise.numpy(), noises[-1])
         plain(state, noises, shift)
@@ -107,12 +143,16 @@ def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1
         np.testing.assert_allclose(plan.returns, plain.returns, atol=5e-5, rtol=5e-6, err_msg=f"returns of call {call}")
         np.testing.assert_allclose(plan.weights, plain.weights, atol=1e-4, err_msg=f"weights of call {call}")
         np.testing.assert_allclose(plan.actions, plain.actions, atol=2e-4, err_msg=f"plan of call {call}")
+        if plan.adapted_noise is not None:
+            np.testing.assert_allclose(plan.adapted_noise, plain.deviation, atol=2e-4, err_msg=f"noise of call {call}")
         summary = plan.summary
         assert summary["best_return"] == pytest.approx(plain.returns.max(), rel=1e-4)
         assert summary["mean_return"] == pytest.approx(plain.returns.mean(), rel=1e-4)
         assert summary["effective_samples"] == pytest.approx(1 / (plain.weights**2).sum(), rel=1e-2)
         assert summary["failed_samples"] == 0
-        plain.actions = plan.actions.double().numpy()  # low temperatures would make differences grow
+        plain.knots = plan.knot_actions.double().numpy()  # low temperatures would make differences grow
+        if plan.adapted_noise is not None:
+            plain.deviation = plan.adapted_noise.double().numpy()
         plant.step(action[None])
     assert len(starts) == 5
 
@@ -170,6 +210,92 @@ def test_reset_starts_the_plan_and_the_noise_again() -> None:
     assert same(numbers(plan, state), numbers(other, state))
 
 
+@pytest.mark.parametrize("update", UPDATES)
+def test_a_reset_planner_of_every_update_repeats_its_plans(update: str) -> None:
+    plan = MPPI("reach", horizon=8, samples=10, seed=4, **UPDATES[update])
+    _, state = reached(0)
+    first = numbers(plan, state)
+    spread = None if plan.adapted_noise is None else plan.adapted_noise.clone()
+    plan(state)
+    plan.reset(4)
+    if plan.adapted_noise is not None:
+        assert (plan.adapted_noise == 1.0).all(), "the noise at first is that of the task"
+    assert same(first, numbers(plan, state))
+    assert spread is None or torch.equal(spread, plan.adapted_noise)
+
+
+def test_the_noise_of_cem_becomes_small_where_the_best_samples_agree() -> None:
+    plan = MPPI("reach", update="cem", iterations=8, elites=5, min_noise=0.05, seed=1)
+    _, state = reached(0)
+    plan(state)
+    assert plan.adapted_noise is not None
+    assert plan.adapted_noise.min() == pytest.approx(0.05) and plan.adapted_noise[:8].mean() < 0.6
+    assert plan.summary["effective_samples"] == pytest.approx(5)
+
+
+def test_predictive_sampling_never_replaces_a_plan_by_a_worse_one() -> None:
+    plan = MPPI("reach", update="predictive_sampling", samples=4, noise=0.5)
+    _, state = reached(0)
+    best = -np.inf
+    for _ in range(6):
+        plan(state, shift=0)
+        assert torch.equal(plan.sampled[:, 0], plan.nominal), "the plan is among the samples"
+        assert plan.summary["best_return"] >= best
+        best = plan.summary["best_return"]
+        assert torch.equal(plan.actions, plan.sampled[:, plan.returns.argmax()])
+
+
+# several models
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("risk", ["mean", "worst"])
+def test_plans_in_several_models_equal_those_of_the_plain_version(risk: Any, engine: str) -> None:
+    settings = dict(horizon=6, samples=8, noise=1.0, smoothing=(1, 0, 0), temperature=0.5, update="mppi", risk=risk)
+    plan = MPPI(Weighed, engine=engine, models=3, seed=2, **settings)
+    fields = {name: rows.numpy() for name, rows in plan.model_fields.items()}
+    assert set(fields) == {"body_mass", "geom_size", "body_pos"}
+    assert len(np.unique(fields["body_mass"], axis=0)) == len(np.unique(fields["body_pos"], axis=0)) == 3
+    plain = Plain(Weighed, engine=engine, fields=fields, **settings)
+    for _ in range(3):
+        plan(state := plan.state_of(qpos=[0.1]))
+        plain(state, [plan.standard_noise.double().numpy()])
+        np.testing.assert_allclose(plan.returns, plain.returns, atol=1e-5)
+        np.testing.assert_allclose(plan.actions, plain.actions, atol=1e-4)
+        combined = plan.model_returns.mean(1) if risk == "mean" else plan.model_returns.amin(1)
+        torch.testing.assert_close(plan.returns, combined)
+        assert (plan.model_returns.std(1) > 1e-4).all(), "a sample earns the same in all models"
+        plain.knots = plan.actions.double().numpy()
+
+
+def test_models_depend_on_the_seed_and_are_none_of_a_plants() -> None:
+    plan, twin, other = (MPPI(Varied, horizon=2, samples=3, models=4, seed=seed) for seed in (1, 1, 2))
+    masses = plan.model_fields["body_mass"].clone()
+    assert torch.equal(masses, twin.model_fields["body_mass"])
+    assert not torch.equal(masses, other.model_fields["body_mass"])
+    other.reset(1)
+    assert torch.equal(masses, other.model_fields["body_mass"])
+    plant = lw.make(Varied, nworld=12, autoreset=False, seed=1)
+    plant.rand_reset(1)
+    drawn = plant.get_state()[:, plant.state_space.parts["body_mass"]]
+    assert not torch.isin(masses[:, 1], drawn[:, 1]).any()
+
+
+def test_planning_in_drawn_models_ignores_the_model_fields_of_the_state() -> None:
+    light, heavy = (MPPI(Varied, horizon=3, samples=4, models=2, seed=1) for _ in range(2))
+    state = light.state_of()
+    changed = light.state_of(body_mass=3 * state[light.env.state_space.parts["body_mass"]])
+    assert torch.equal(light(state), heavy(changed)) and torch.equal(light.model_returns, heavy.model_returns)
+
+
+def test_a_sample_that_fails_in_one_model_fails() -> None:
+    plan = MPPI(Varied, horizon=3, samples=4, models=2)
+    plan.model_fields["body_mass"][1, 1] = torch.nan
+    plan(plan.state_of())
+    assert torch.isinf(plan.model_returns[:, 1]).all() and torch.isinf(plan.returns).all()
+    assert torch.isfinite(plan.model_returns[:, 0]).all()
+
+
 def test_an_action_is_a_copy_of_the_plans_first_row() -> None:
     plan = MPPI("reach", horizon=8, samples=10)
     action = plan(reached(0)[1])
@@ -211,19 +337,37 @@ def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_plan_whose_samples_all_fail_only_moves_forward(engine: str) -> None:
-    plan = MPPI(Picky, engine=engine, horizon=5, samples=8, noise=0.1, limit=10.0, seed=3)
+@pytest.mark.parametrize("update", ["mppi", "cem", "predictive_sampling"])
+def test_a_plan_whose_samples_all_fail_only_moves_forward(update: str, engine: str) -> None:
+    plan = MPPI(Picky, engine=engine, horizon=5, samples=8, noise=0.1, limit=10.0, seed=3, update=update)
     plan(plan.state_of())
     for _ in range(3):
         old = plan.actions.clone()
+        spread = None if plan.adapted_noise is None else plan.adapted_noise.clone()
         plan.env.set_params(limit=-10.0)
         action = plan(plan.state_of())
         assert torch.equal(plan.actions, torch.cat([old[1:], torch.zeros(1, 1)]))
         assert torch.equal(action, old[1]) and not plan.weights.any()
         assert plan.summary["failed_samples"] == 8 and plan.summary["best_return"] == -np.inf
+        if spread is not None and plan.adapted_noise is not None:
+            assert torch.equal(plan.adapted_noise, torch.cat([spread[1:], torch.full((1, 1), 0.1)]))
         plan.env.set_params(limit=10.0)
         plan(plan.state_of())
         assert plan.summary["failed_samples"] == 0 and torch.isfinite(plan.actions).all()
+
+
+@pytest.mark.parametrize("update, elites", [("cem", 3), ("cem", 7), ("predictive_sampling", None)])
+def test_failed_samples_are_not_among_the_best(update: str, elites: int | None) -> None:
+    plan = MPPI(Picky, horizon=4, samples=8, noise=0.3, limit=0.2, update=update, elites=elites, seed=1)
+    plan(plan.state_of())
+    good = torch.isfinite(plan.returns)
+    assert 0 < good.sum() < 7 and plan.summary["failed_samples"] == 8 - good.sum()
+    count = min(elites or 1, int(good.sum()))
+    best = plan.returns.argsort(descending=True, stable=True)[:count]
+    assert plan.weights.nonzero().ravel().tolist() == sorted(best.tolist())
+    torch.testing.assert_close(plan.weights[best], torch.full((count,), 1 / count))
+    torch.testing.assert_close(plan.actions, plan.sampled[:, best].mean(1))
+    assert plan.summary["effective_samples"] == pytest.approx(count)
 
 
 def test_samples_may_have_parameters_of_their_own() -> None:
@@ -275,6 +419,47 @@ def test_a_shift_that_is_not_a_whole_number_is_refused(shift: Any) -> None:
     plan = MPPI("point_mass", horizon=3, samples=2)
     with pytest.raises(ValueError, match="shift must be a whole number from 0"):
         plan(plan.state_of(), shift=shift)
+
+
+@pytest.mark.parametrize("spline", ["zero", "linear", "cubic"])
+@pytest.mark.parametrize("knots", [1, 3, 5, 8, 12])
+def test_a_plan_with_knots_that_moves_forward_keeps_its_actions(knots: int, spline: Any) -> None:
+    """Those of the steps that remain, also where fewer steps pass than lie between two knots."""
+    plan = MPPI("point_mass", horizon=12, samples=4, knots=knots, spline=spline, fill="repeat", noise=0.3, seed=1)
+    plan(plan.state_of())
+    for shift in (0, 1, 1, 1, 2, 7, 1):
+        old = plan.actions.clone()
+        plan(plan.state_of(), shift=shift)
+        remaining = 12 - shift
+        torch.testing.assert_close(plan.nominal[:remaining], old[shift:], atol=1e-6, rtol=0)
+    plan(plan.state_of(), shift=100)
+    assert (plan.nominal == plan.nominal[0]).all(), "the last knot fills the plan"
+
+
+@pytest.mark.parametrize("spline, shifts", [("zero", (1, 2, 0)), ("linear", (0, 0))])
+def test_a_plan_with_a_knot_for_each_step_equals_one_without_knots(spline: Any, shifts: tuple[int, ...]) -> None:
+    """Of lines, until the knot beyond the horizon enters it, which has noise of its own."""
+    settings = dict(horizon=7, samples=6, noise=0.4, smoothing=(1, 0, 0))
+    knots, plain = MPPI("point_mass", knots=7, spline=spline, **settings), MPPI("point_mass", **settings)
+    for shift in shifts:
+        state = plain.state_of(qpos=[0.1, 0.2, -0.5, 0.3])
+        assert torch.equal(knots(state, shift=shift), plain(state, shift=shift))
+        assert torch.equal(knots.actions, plain.actions)
+
+
+def test_plans_with_knots_are_smoother() -> None:
+    _, state = reached(0)
+    rough, smooth = (MPPI("reach", samples=8, seed=2, smoothing=(1, 0, 0), knots=knots) for knots in (None, 4))
+    rough(state), smooth(state)
+    assert smooth.sampled.diff(dim=0).abs().mean() < 0.5 * rough.sampled.diff(dim=0).abs().mean()
+
+
+def test_steps_beyond_every_plan_leave_only_the_fill() -> None:
+    for knots in (None, 4):
+        plan = MPPI("point_mass", horizon=8, samples=4, knots=knots, fill=0.25)
+        plan(plan.state_of())
+        plan(plan.state_of(), shift=2**31 - 1)
+        assert (plan.nominal == 0.25).all()
 
 
 def test_a_fill_beyond_the_bounds_becomes_the_nearest_action() -> None:
@@ -350,6 +535,19 @@ def test_a_value_function_gets_the_step_at_the_end_of_the_plan(engine: str) -> N
             assert not torch.allclose(plan.returns, wrong.returns, atol=1e-3)
 
 
+def test_a_value_function_gets_the_observations_of_its_group() -> None:
+    """Of the group that it was trained on; another number of observations is refused."""
+    group, other = (lw.ValueFunction(n, (8,), generator=torch.Generator().manual_seed(0)) for n in (2, 3))
+    group.group = "policy"  # type: ignore[assignment]
+    plan = MPPI(Picky, horizon=3, samples=4, value=group)
+    plan(plan.state_of())
+    with pytest.raises(ValueError, match="value takes 3 observations, and the task 'picky' has 2: give a value func"):
+        MPPI(Picky, horizon=3, samples=4, value=other)
+    group.group = "critic"  # type: ignore[assignment]
+    with pytest.raises(ValueError, match="value takes the observations 'critic', and the task 'picky' has 'policy'"):
+        MPPI(Picky, horizon=3, samples=4, value=group)
+
+
 @pytest.mark.parametrize(
     ("value", "message"),
     [
@@ -373,6 +571,15 @@ def test_a_value_that_does_not_fit_is_refused_when_the_planner_is_made(value: An
 def test_plans_with_and_without_graphs_are_equal(value: Any, engine: str) -> None:
     settings = POINT | dict(engine=engine, noise=0.5, iterations=3, value=value)
     replayed, direct = (MPPI(graphs=graphs, **settings) for graphs in (True, False))
+    state = replayed.state_of(qpos=[0.1, 0.2, -0.5, 0.3])
+    assert same(numbers(replayed, state, 5), numbers(direct, state, 5))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("update", UPDATES)
+def test_plans_of_every_update_with_and_without_graphs_are_equal(update: str, engine: str) -> None:
+    settings = dict(engine=engine, horizon=9, samples=12, noise=0.5, iterations=2, **UPDATES[update])
+    replayed, direct = (MPPI("point_mass", graphs=graphs, **settings) for graphs in (True, False))
     state = replayed.state_of(qpos=[0.1, 0.2, -0.5, 0.3])
     assert same(numbers(replayed, state, 5), numbers(direct, state, 5))
 
@@ -516,14 +723,15 @@ def test_rollouts_step_by_step_draw_as_those_of_a_whole_horizon() -> None:
 
 
 @pytest.mark.parametrize("name", ["horizon", "samples", "temperature", "noise", "smoothing", "discount", "iterations",
-                                  "fill", "termination", "nominal_model", "config", "value", "seed"])  # fmt: skip
+                                  "fill", "termination", "nominal_model", "config", "value", "seed", "update", "knots",
+                                  "elites", "models", "risk"])  # fmt: skip
 def test_settings_cannot_be_assigned(name: str) -> None:
     plan = MPPI("point_mass", horizon=3, samples=2)
     with pytest.raises(AttributeError, match=rf"make another MPPI with {name}=2\.0"):
         setattr(plan, name, 2.0)
 
 
-@pytest.mark.parametrize("name", ["actions", "nominal", "standard_noise", "sampled", "returns", "weights"])
+@pytest.mark.parametrize("name", [*BUFFERS, "knot_actions", "adapted_noise", "model_fields", "model_returns"])
 def test_buffers_cannot_be_replaced(name: str) -> None:
     plan = MPPI("point_mass", horizon=3, samples=2)
     with pytest.raises(AttributeError, match=rf"plan.{name} is a buffer of fixed address: write into it"):

@@ -50,7 +50,7 @@ def arguments(task: Any, config: MPPIConfig | None = None, value: Any = None, pa
 
 def test_planning_gives_settings_options_and_parameters() -> None:
     plan = MPPI("hopper", horizon=2, samples=2)
-    assert plan.config == MPPIConfig(horizon=2, samples=2, noise=0.1, discount=1.0)
+    assert plan.config == MPPIConfig(horizon=2, samples=2, noise=0.1).completed()
     assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     assert plan.env.task.params["healthy_reward"] == 2.0 and plan.env.task.params["forward_reward_weight"] == 0.2
     assert lw.make("hopper").task.params["healthy_reward"] == 1.0
@@ -64,7 +64,7 @@ def test_words_replace_parts_of_planning() -> None:
 
 
 def test_a_task_without_planning_has_the_defaults() -> None:
-    assert MPPI("point_mass").config == MPPIConfig(discount=1.0)
+    assert MPPI("point_mass").config == MPPIConfig().completed()
     assert task_config(find_task("point_mass")) == MPPIConfig()
     assert task_config(find_task("reach")) == MPPIConfig(horizon=16, samples=30, temperature=0.2, noise=1.0)
 
@@ -107,16 +107,17 @@ def test_a_part_of_planning_must_be_a_dict(part: str) -> None:
 
 def test_a_configuration_replaces_the_settings_of_the_task() -> None:
     config, options, params = arguments("hopper", MPPIConfig(horizon=3))
-    assert config == MPPIConfig(horizon=3, discount=1.0)
+    assert config == MPPIConfig(horizon=3).completed()
     assert options.physics.integrator == "euler" and params["healthy_reward"] == 2.0
 
 
 def test_flat_settings_replace_single_ones() -> None:
-    assert arguments("reach", samples=7)[0] == dataclasses.replace(
-        task_config(find_task("reach")), samples=7, discount=1.0
+    assert (
+        arguments("reach", samples=7)[0] == dataclasses.replace(task_config(find_task("reach")), samples=7).completed()
     )
-    assert arguments("reach", MPPIConfig(horizon=3, samples=8), samples=7)[0] == MPPIConfig(
-        horizon=3, samples=7, discount=1.0
+    assert (
+        arguments("reach", MPPIConfig(horizon=3, samples=8), samples=7)[0]
+        == MPPIConfig(horizon=3, samples=7).completed()
     )
 
 
@@ -127,7 +128,7 @@ def test_a_flat_setting_of_none_is_not_given() -> None:
 def test_words_are_sorted_into_settings_options_and_parameters() -> None:
     task = planned(settings={"noise": 0.2}, options={"integrator": "euler", "cone": "elliptic"}, params={"limit": 2.0})
     config, options, params = arguments(task, samples=3, integrator="rk4", nthread=2, wrong=5.0)
-    assert config == MPPIConfig(noise=0.2, samples=3, discount=1.0)
+    assert config == MPPIConfig(noise=0.2, samples=3).completed()
     assert options.given() == {"integrator": "rk4", "cone": "elliptic", "nthread": 2}
     assert params == {"limit": 2.0, "wrong": 5.0}
 
@@ -210,6 +211,58 @@ def test_the_discount_is_the_given_one_or_else_that_of_the_value_function(
     assert arguments(planned(settings={"discount": 0.8}), value=value, **words)[0].discount == expected
 
 
+def test_another_update_than_the_tasks_drops_the_settings_of_the_tasks_update() -> None:
+    task = planned(settings={"update": "cem", "elites": 5, "min_noise": 0.1, "samples": 20})
+    assert (arguments(task)[0].elites, arguments(task)[0].min_noise) == (5, 0.1)
+    other = arguments(task, update="predictive_sampling")[0]
+    assert (other.elites, other.min_noise, other.samples, other.include_plan) == (None, None, 20, True)
+
+
+def test_settings_that_are_left_out_follow_from_the_update() -> None:
+    def chosen(**words: Any) -> tuple[Any, ...]:
+        config = arguments("reach", noise=[0.5] * 7, **words)[0]
+        return config.include_plan, config.elites, config.min_noise
+
+    assert chosen() == chosen(update="mppi") == (False, None, None)
+    assert chosen(update="predictive_sampling") == (True, None, None)
+    assert chosen(update="cem", samples=50) == (False, 5, (0.05,) * 7)
+    assert [chosen(update="cem", samples=n)[1] for n in (1, 2, 19, 40)] == [1, 2, 2, 4]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"elites": 4}, "elites=4 is a setting of update='cem', not of 'mppi'"),
+        ({"update": "predictive_sampling", "min_noise": 0.1}, "min_noise=0.1 is a setting of update='cem', not of"),
+        ({"update": "cem", "noise": np.eye(7)}, "noise of update='cem' must be standard deviations, not a covariance"),
+        ({"update": "cem", "min_noise": [0.1, 0.1]}, "min_noise must be a standard deviation or 7 of them, not"),
+        ({"models": 4}, "models=4 needs a task that draws model fields, and 'reach' draws none: write them in its"),
+    ],
+)
+def test_settings_that_do_not_fit_the_update_or_the_task_are_refused(words: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as raised:
+        MPPI("reach", **words)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("planner, update", [(lw.CEM, "cem"), (lw.PredictiveSampling, "predictive_sampling")])
+def test_cem_and_predictive_sampling_are_mppi_with_another_update(planner: type[MPPI], update: Any) -> None:
+    config = MPPIConfig(horizon=3, samples=6)
+    one, other = planner("reach", config, seed=1), MPPI("reach", config, update=update, seed=1)
+    assert one.config == other.config and one.config.update == update
+    assert torch.equal(one(one.state_of()), other(other.state_of()))
+    with pytest.raises(ValueError, match=f"update='mppi' is another planner than '{update}': call lw.MPPI with it"):
+        planner("reach", update="mppi")
+
+
+def test_models_multiply_the_samples_that_are_placed(monkeypatch: pytest.MonkeyPatch) -> None:
+    cuda = types.SimpleNamespace(is_cuda=True), types.SimpleNamespace(is_cuda=False)
+    monkeypatch.setattr(placement, "find_device", lambda name: cuda[not str(name).startswith("cuda")])
+    for models, engine in ((1, "mujoco"), (4, "warp")):
+        options = arguments("reach", samples=40, models=models, device="cuda:0", nthread=2)[1]
+        assert options.engine == engine
+
+
 # where samples are rolled out
 
 
@@ -254,6 +307,8 @@ def test_settings_are_what_json_can_hold() -> None:
     assert json.loads(json.dumps(plan.settings)) == plan.settings == {
         "horizon": 2, "samples": 2, "temperature": 0.1, "noise": [[0.5]], "smoothing": [0.25, 0.8, 0.0],
         "discount": 1.0, "iterations": 1, "fill": [0.1], "termination": "stop", "nominal_model": False,
+        "update": "mppi", "elites": None, "min_noise": None, "include_plan": False, "knots": None, "spline": "cubic",
+        "models": 1, "risk": "mean",
         "solver": {"iterations": 3},
         "model": "MjSpec 'MuJoCo Model'", "limit": [1.0, 2.0], "wrong": 3.0, "fields": ["xpos"],
     }  # fmt: skip

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from plain_mppi import smoothed
 
 import lyceum_warp as lw
 from lyceum_warp import MPPI, MPPIConfig
@@ -17,7 +18,8 @@ from lyceum_warp.spaces import Space
 def test_defaults_are_those_of_the_documentation() -> None:
     assert MPPIConfig() == MPPIConfig(
         horizon=32, samples=64, temperature=0.1, noise=0.5, smoothing=(0.25, 0.8, 0.0), discount=None, iterations=1,
-        fill="zero", termination="stop", nominal_model=False,
+        fill="zero", termination="stop", nominal_model=False, update="mppi", elites=None, min_noise=None,
+        include_plan=None, knots=None, spline="cubic", models=1, risk="mean",
     )  # fmt: skip
 
 
@@ -47,6 +49,18 @@ def test_a_configuration_cannot_be_changed_or_given_by_position() -> None:
         ("smoothing", [(1, 0), 1, (1, 0, math.nan), "abc", [1, [2, 3], 4], None], "smoothing must be 3 finite numbers"),
         ("fill", ["x", [1, math.nan], ["a", "b"], [[1.0]], [], None, math.inf], "fill must be 'zero', 'repeat' or"),
         ("termination", ["x", True, 3, ["stop"]], "termination must be 'stop' or 'ignore'"),
+        ("update", ["x", True, None, ["cem"]], "update must be 'mppi', 'cem' or 'predictive_sampling'"),
+        ("elites", [0, -1, 2.5, "a"], "elites must be a whole number from 1"),
+        ("elites", [65], "elites=65 must be at most samples, which is 64"),
+        ("min_noise", [-1, math.nan, [1, -1], [], [[1.0]], "a", True], "min_noise must be a standard deviation, or"),
+        ("include_plan", [1, "yes"], "include_plan must be True, False or None"),
+        ("knots", [0, 2.5, "a"], "knots must be a whole number from 1"),
+        ("knots", [33], "knots=33 must be at most horizon, which is 32"),
+        ("spline", ["quintic", 3, None], "spline must be 'zero', 'linear' or 'cubic'"),
+        ("spline", ["zero"], "spline='zero' interpolates between knots: give their number, as knots=4"),
+        ("models", [0, -1, 2.5, "a", None], "models must be a whole number from 1"),
+        ("risk", ["x", True, None], "risk must be 'mean' or 'worst'"),
+        ("risk", ["worst"], "risk='worst' compares models: give their number, as models=4"),
         ("nominal_model", [1, "yes", None], "nominal_model must be True or False"),
     ],
 )  # fmt: skip
@@ -55,6 +69,20 @@ def test_a_setting_out_of_range_is_refused_by_name(name: str, wrong: list[Any], 
         with pytest.raises(ValueError, match=message):
             MPPIConfig(**{name: value})
             pytest.fail(f"{name}={value!r} was accepted")
+
+
+def test_drawn_models_exclude_the_nominal_one() -> None:
+    with pytest.raises(ValueError, match="models=4 draws model fields, and nominal_model=True does not: leave out one"):
+        MPPIConfig(models=4, nominal_model=True)
+
+
+@pytest.mark.parametrize("betas", [(0.25, 0.8, 0.0), (1.0, 0.0, 0.0), (0.5, 0.3, 0.2), (0.5, -0.9, -0.3)])
+@pytest.mark.parametrize("count", [1, 2, 12])
+def test_spread_is_what_smoothing_leaves_of_standard_normal_noise(betas: tuple[float, ...], count: int) -> None:
+    answers = smoothed(np.eye(count), betas)  # the answer of every step to an impulse at every other
+    spread = MPPIConfig(smoothing=betas).spread(count)  # type: ignore[arg-type]
+    np.testing.assert_allclose(spread, np.sqrt((answers**2).sum(1)))
+    assert (MPPIConfig(smoothing=betas, knots=4).spread(count) == 1).all()  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("smoothing", [(0.25, 0.8, 0.3), (1, 1, 0), (1, 0, 1), (1, 0, -1), (1, -1.5, 0), (1, 1.9, -1)])

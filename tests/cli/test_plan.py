@@ -96,6 +96,10 @@ def test_a_value_function_of_a_run_changes_plans(tmp_path: Path, capsys: pytest.
     assert plan(tmp_path / "none", "--value", str(tmp_path / "nowhere")) == 2
     refused(capsys, "nowhere")
     assert not (tmp_path / "none").exists()
+    assert plan(tmp_path / "none", "--value", str(run), task="reach") == 2
+    refused(capsys, f"--value {run} is a run of the task 'point_mass', not of 'reach'")
+    with pytest.raises(ValueError, match="value takes 6 observations, and the task 'reach' has 20"):
+        lw.MPPI("reach", value=lw.load_value(run))
 
 
 def test_a_planner_param_changes_the_planner_alone(tmp_path: Path) -> None:
@@ -126,6 +130,24 @@ def test_options_of_the_physics_change_the_planner_alone(
     assert (settings["integrator"], settings["deterministic"]) == (name, True)
 
 
+def test_every_update_plans_and_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = ["--knots", "4", "--spline", "linear", "--include-plan", "True", "--replan-every", "3", "--steps", "9"]
+    shown = {
+        ("cem", "--elites", "3", "--min-noise", "0.02"): "CEM, 8 samples",
+        ("predictive_sampling",): "predictive sampling, 8 samples",
+    }
+    for (update, *more), text in shown.items():
+        assert plan(tmp_path / update, *QUIET, *flags, "--update", update, *more) == 0
+        assert text in capsys.readouterr().out
+        config = json.loads((tmp_path / update / "config.json").read_text())
+        planner = config["planner"]
+        assert (config["algorithm"], config["replan_every"], planner["update"]) == (update, 3, update)
+        assert (planner["knots"], planner["spline"], planner["include_plan"]) == (4, "linear", True)
+        assert Trajectory.load(tmp_path / update / "episode-000.npz").plan_steps.tolist() == [0, 3, 6]
+        assert json.loads((tmp_path / update / "report.json").read_text())["deadline_ms"] == pytest.approx(60.0)
+    assert (planner["elites"], planner["min_noise"]) == (None, None)
+
+
 @pytest.mark.parametrize("options, words", [
     (["--horizon", "0"], ["horizon", "0"]),
     (["--samples", "0"], ["samples", "0"]),
@@ -137,6 +159,17 @@ def test_options_of_the_physics_change_the_planner_alone(
     (["--discount", "1.5"], ["discount", "1.5"]),
     (["--fill", "hold"], ["fill", "hold"]),
     (["--termination", "maybe"], ["termination", "maybe"]),
+    (["--update", "cma"], ["update", "cma", "'cem'"]),
+    (["--elites", "3"], ["elites=3", "update='cem'"]),
+    (["--update", "cem", "--elites", "9"], ["elites=9", "samples, which is 8"]),
+    (["--update", "cem", "--min-noise", "1", "2", "3"], ["min_noise", "2 of them"]),
+    (["--knots", "11"], ["knots=11", "horizon, which is 10"]),
+    (["--spline", "zero"], ["spline='zero'", "knots=4"]),
+    (["--models", "3"], ["models=3", "'point_mass' draws none"]),
+    (["--risk", "worst"], ["risk='worst'", "models=4"]),
+    (["--replan-every", "0"], ["replan_every", "0"]),
+    (["--replan-every", "11"], ["replan_every=11", "a plan of 10 actions"]),
+    (["--replan-every", "2", "--real-time"], ["--replan-every 2", "--real-time"]),
     (["--episodes", "0"], ["episodes", "0"]),
     (["--steps", "0"], ["steps", "0"]),
     (["--rate", "0"], ["rate", "0"]),

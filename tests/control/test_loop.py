@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from toy_controllers import StepPlanner, towards
+from toy_controllers import StepPlanner, hundredths, towards
 
 import lyceum_warp as lw
 from lyceum_warp.control.episode_collector import ControlProgress
@@ -70,6 +70,61 @@ def test_without_a_reset_the_episode_continues_with_shift_one(env: lw.Env) -> No
     episode = control(env, planner, steps=3, reset=False)
     assert planner.shifts[4:] == [1, 1, 1] and planner.resets == [4]
     assert torch.allclose(episode.actions[:, 0], torch.tensor([0.04, 0.05, 0.06]))
+
+
+@pytest.mark.parametrize("ratio, shifts", [(2.0, [0, 1, 0, 1, 0, 1, 0]), (0.25, [0, 4, 4, 4, 4, 4, 4])])
+def test_a_run_in_two_parts_shifts_as_one_run(env: lw.Env, ratio: float, shifts: list[int]) -> None:
+    planner = StepPlanner(env)
+    planner.timestep = ratio * env.timestep
+    control(env, planner, steps=3)
+    control(env, planner, steps=4, reset=False)
+    assert planner.shifts == shifts
+
+
+def test_replanning_every_n_steps_applies_the_actions_of_the_plan_in_between(env: lw.Env) -> None:
+    planner = StepPlanner(env)
+    episode = control(env, planner, steps=8, replan_every=3)
+    assert planner.shifts == [0, 3, 3] and episode.plan_steps.tolist() == [0, 3, 6]
+    assert hundredths(episode.actions[:, 0]) == [0, 0, 0, 3, 3, 3, 6, 6]
+    assert hundredths(episode.actions[:, 1]) == [0, 1, 2, 0, 1, 2, 0, 1]
+    assert episode.age_steps.tolist() == [0, 1, 2, 0, 1, 2, 0, 1] and (episode.ages.diff()[:2] > 0).all()
+    assert lw.control_report(episode).plans == 2
+    control(env, planner, steps=4, reset=False, replan_every=3)
+    assert planner.shifts[3:] == [2, 1], "plans of the steps 8, the first of the run, and 9"
+
+
+def test_replanning_counts_steps_of_the_plant(env: lw.Env) -> None:
+    planner = StepPlanner(env)
+    planner.timestep = 2 * env.timestep
+    episode = control(env, planner, steps=8, replan_every=4)
+    assert planner.shifts == [0, 2]
+    assert hundredths(episode.actions[:, 1]) == [0, 1, 1, 2, 0, 1, 1, 2]
+
+
+def test_an_mppi_plan_is_played_until_the_next_one() -> None:
+    plant = lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
+    plan = lw.MPPI("point_mass", horizon=6, samples=8)
+    whole = control(plant, plan, seed=1, steps=4, replan_every=4)
+    plan.reset(1)
+    plan(whole.states[0], shift=0)
+    assert torch.equal(whole.actions, plan.actions[:4])
+
+
+@pytest.mark.parametrize(
+    ("replan_every", "message"),
+    [
+        (0, "replan_every must be a whole number from 1"),
+        (9, "replan_every=9 needs a plan of 9 actions, and the controller has a plan of 8 actions: plan more often"),
+    ],
+)
+def test_replanning_after_the_end_of_the_plan_is_refused(env: lw.Env, replan_every: int, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        control(env, StepPlanner(env), steps=20, replan_every=replan_every)
+
+
+def test_replanning_of_a_controller_without_a_plan_is_refused(env: lw.Env) -> None:
+    with pytest.raises(ValueError, match="replan_every=2 needs a plan of 2 actions, and the controller has no plan"):
+        control(env, towards, steps=20, replan_every=2)
 
 
 def test_shift_counts_steps_of_the_controller(env: lw.Env) -> None:

@@ -1,14 +1,24 @@
 """Planning on a GPU."""
 
+from typing import Any
+
 import pytest
 import torch
 import warp as wp
 from test_gpu import CUDA, nothing_waits
+from varied_task import Varied
 
 import lyceum_warp as lw
 from lyceum_warp import Row
 
 pytestmark = pytest.mark.gpu
+
+UPDATES: dict[str, dict[str, Any]] = {
+    "mppi with knots": dict(knots=4, spline="linear", include_plan=True),
+    "cem": dict(update="cem", elites=20),
+    "cem with knots": dict(update="cem", knots=4, spline="linear"),
+    "predictive sampling": dict(update="predictive_sampling", knots=4, spline="zero"),
+}
 
 
 @wp.func
@@ -38,6 +48,64 @@ def test_plans_agree_with_those_of_the_cpu(task: str, horizon: int) -> None:
         torch.testing.assert_close(action.cpu(), other, rtol=1e-2, atol=1e-2)
         cpu.actions.copy_(gpu.actions)
         env.step(other[None])
+
+
+@pytest.mark.parametrize("update", UPDATES)
+def test_every_update_on_a_gpu_equals_that_on_the_cpu_for_the_same_returns(update: str) -> None:
+    """The first improvement's returns differ by rounding, and the order of samples that are almost equal may, too."""
+    gpu, cpu = (
+        lw.MPPI("reach", device=device, engine=engine, samples=200, seed=3, **UPDATES[update])
+        for device, engine in ((CUDA, "warp"), ("cpu", "mujoco"))
+    )
+    state = plant("reach").get_state()[0]
+    gpu(state), cpu(state)
+    torch.testing.assert_close(gpu.sampled.cpu(), cpu.sampled, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(gpu.returns.cpu(), cpu.returns, rtol=2e-2, atol=2e-2)
+    weights = gpu.weights.cpu()
+    if gpu.config.update != "mppi":
+        count = gpu.config.elites or 1
+        best = gpu.returns.cpu().argsort(descending=True, stable=True)[:count]
+        assert weights.nonzero().ravel().tolist() == sorted(best.tolist())
+    mean = torch.einsum("k,tki->ti", weights, gpu.sampled.cpu())
+    torch.testing.assert_close(gpu.actions.cpu(), mean, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("update", UPDATES)
+def test_replayed_plans_of_every_update_equal_those_without_graphs(update: str) -> None:
+    env = plant("reach")
+    replayed, direct = (
+        lw.MPPI("reach", device=CUDA, engine="warp", deterministic=True, graphs=graphs, iterations=2, **UPDATES[update])
+        for graphs in (True, False)
+    )
+    for shift in (1, 1, 2, 0):
+        state = env.get_state()[0]
+        assert torch.equal(replayed(state, shift=shift), direct(state, shift=shift))
+        assert torch.equal(replayed.knot_actions, direct.knot_actions)
+        env.step(replayed.actions[:1].cpu())
+
+
+@pytest.mark.parametrize("update", UPDATES)
+def test_plans_of_every_update_allocate_nothing_and_do_not_wait(update: str) -> None:
+    plan = lw.MPPI("reach", device=CUDA, engine="warp", samples=256, **UPDATES[update])
+    state = plan.state_of(mocap_pos=[0.1, 0.1, 0.2])
+    for _ in range(3):
+        plan(state)
+    memory = torch.cuda.memory_allocated(), wp.get_mempool_used_mem_current(CUDA)
+    with nothing_waits():
+        for _ in range(20):
+            plan(state)
+    assert (torch.cuda.memory_allocated(), wp.get_mempool_used_mem_current(CUDA)) == memory
+
+
+@pytest.mark.parametrize("risk", ["mean", "worst"])
+def test_plans_in_several_models_on_a_gpu_equal_those_on_the_cpu(risk: Any) -> None:
+    gpu, cpu = (
+        lw.MPPI(Varied, device=device, engine=engine, horizon=4, samples=20, models=3, risk=risk, temperature=10.0)
+        for device, engine in ((CUDA, "warp"), ("cpu", "mujoco"))
+    )
+    torch.testing.assert_close(gpu.model_fields["body_mass"].cpu(), cpu.model_fields["body_mass"])
+    torch.testing.assert_close(gpu(gpu.state_of()).cpu(), cpu(cpu.state_of()), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(gpu.model_returns.cpu(), cpu.model_returns, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("iterations", [1, 3])

@@ -1,0 +1,69 @@
+"""Plans as splines: a few knots, from which the actions of all steps are interpolated.
+
+K knots over a horizon of H steps lie H / K steps apart, on a grid that is fixed in time. The horizon moves over the
+grid, so that a plan that moves forward in time keeps the actions of the steps that remain. (MuJoCo MPC calls this a
+sliding plan.) Positions are counted in units of 1 / H of the distance of two knots, which makes them whole numbers: a
+step advances by K of them, and the phase, that of the first step, is from 0 to H - 1.
+"""
+
+import math
+
+import warp as wp
+
+ORDERS = {"zero": 0, "linear": 1, "cubic": 3}
+"""Names of the interpolations, with their orders."""
+
+_NEEDED = {"zero": 1, "linear": 2, "cubic": 4}
+"""Knots that a value depends on."""
+
+
+def knot_count(horizon: int, knots: int, spline: str) -> int:
+    """The number of knots that a plan needs, at whatever phase its horizon lies on the grid."""
+    largest_phase = horizon - math.gcd(horizon, knots)
+    return ((horizon - 1) * knots + largest_phase) // horizon + _NEEDED[spline]
+
+
+@wp.kernel(enable_backward=False)
+def pass_knots(
+    steps_in: wp.array[int], horizon: int, knots: int, phase_inout: wp.array[int], passed_out: wp.array[int]
+):
+    """Move the phase forward by some steps, and count the knots that are passed; launched over (1,)."""
+    place = wp.int64(phase_inout[0]) + wp.int64(steps_in[0]) * wp.int64(knots)
+    passed = place // wp.int64(horizon)
+    phase_inout[0] = int(place - passed * wp.int64(horizon))
+    passed_out[0] = int(wp.min(passed, wp.int64(2147483647)))
+
+
+@wp.kernel(enable_backward=False)
+def interpolate(
+    knot_in: wp.array3d[float],
+    phase_in: wp.array[int],
+    knots: int,
+    order: int,
+    low_in: wp.array[float],
+    high_in: wp.array[float],
+    action_out: wp.array3d[float],
+):
+    """Interpolate actions between knots and clip them to the bounds; launched over (horizon, nworld, nact).
+
+    The worlds of a sample follow one another. Order 0 holds each knot until the next one, order 1 is linear. Order 3 is
+    a cubic Hermite spline whose slope at a knot is half the difference of its neighbours (Catmull and Rom 1974); its
+    first knot lies one before the grid's.
+    """
+    t, w, i = wp.tid()
+    k = w // (action_out.shape[1] // knot_in.shape[1])
+    horizon = wp.int64(action_out.shape[0])
+    place = wp.int64(t) * wp.int64(knots) + wp.int64(phase_in[0])
+    j = int(place // horizon)
+    f = float(place - wp.int64(j) * horizon) / float(horizon)
+    value = knot_in[j, k, i]
+    if order == 1:
+        value += f * (knot_in[j + 1, k, i] - value)
+    elif order == 3:
+        before, here, after = value, knot_in[j + 1, k, i], knot_in[j + 2, k, i]
+        slope, next_slope = 0.5 * (after - before), 0.5 * (knot_in[j + 3, k, i] - here)
+        rise = after - here
+        # here + slope f + (3 rise - 2 slope - next_slope) f^2 + (slope + next_slope - 2 rise) f^3
+        bend = 3.0 * rise - 2.0 * slope - next_slope
+        value = here + f * (slope + f * (bend + f * (slope + next_slope - 2.0 * rise)))
+    action_out[t, w, i] = wp.clamp(value, low_in[i], high_in[i])

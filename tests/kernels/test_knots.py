@@ -1,0 +1,80 @@
+"""Plans as splines: the interpolation between knots, and the grid that the horizon moves over."""
+
+import numpy as np
+import pytest
+import warp as wp
+from plain_mppi import Grid
+
+from lyceum_warp.kernels import knots
+
+SPLINES = ["zero", "linear", "cubic"]
+
+
+def interpolated(
+    values: np.ndarray, horizon: int, count: int, spline: str, phase: int = 0, models: int = 1, limit: float = np.inf
+) -> np.ndarray:
+    """Actions from knots, (nknot, samples, nact)."""
+    _, samples, nact = values.shape
+    out = wp.zeros((horizon, samples * models, nact), dtype=float, device="cpu")
+    bounds = [wp.array(np.full(nact, sign * limit), dtype=float, device="cpu") for sign in (-1, 1)]
+    phases = wp.array([phase], dtype=int, device="cpu")
+    args = [wp.array(values, dtype=float, device="cpu"), phases, count, knots.ORDERS[spline], *bounds, out]
+    wp.launch(knots.interpolate, out.shape, args, device="cpu")
+    return out.numpy()
+
+
+@pytest.mark.parametrize("spline", SPLINES)
+@pytest.mark.parametrize("horizon, count", [(12, 4), (13, 4), (7, 5), (5, 5), (9, 1)])
+def test_actions_between_knots_are_those_of_the_plain_version_at_every_phase(
+    horizon: int, count: int, spline: str
+) -> None:
+    number = knots.knot_count(horizon, count, spline)
+    values = np.random.default_rng(1).normal(size=(number, 3, 2)).astype(np.float32)
+    grid = Grid(horizon, count, spline)
+    for grid.now in range(horizon + 3):
+        found = interpolated(values, horizon, count, spline, phase=grid.now * count % horizon)
+        np.testing.assert_allclose(found, grid.actions(values), atol=1e-5, err_msg=f"step {grid.now}")
+
+
+@pytest.mark.parametrize("spline, degree", [("zero", 0), ("linear", 1), ("cubic", 2)])
+def test_knots_of_a_polynomial_give_the_polynomial(spline: str, degree: int) -> None:
+    """A cubic spline with slopes by central differences has parabolas."""
+    horizon, count = 12, 3
+    number = knots.knot_count(horizon, count, spline)
+    places = np.arange(number) - (spline == "cubic")
+    steps = np.arange(horizon) * count / horizon
+    found = interpolated((0.7 * places**degree)[:, None, None], horizon, count, spline)
+    np.testing.assert_allclose(found[:, 0, 0], 0.7 * steps**degree, atol=1e-5)
+
+
+def test_interpolated_actions_stay_within_the_bounds() -> None:
+    values = np.array([0.0, 1.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0])[:, None, None]
+    free, bounded = (interpolated(values, 12, 4, "cubic", limit=limit) for limit in (np.inf, 1.0))
+    assert free.max() > 1.05
+    np.testing.assert_allclose(bounded, np.minimum(free, 1.0))
+
+
+def test_the_worlds_of_a_sample_follow_one_another() -> None:
+    values = np.arange(10.0).reshape(5, 2, 1)
+    found = interpolated(values, 4, 4, "zero", models=3)
+    np.testing.assert_array_equal(found[..., 0], np.repeat(values[:4, :, 0], 3, axis=1))
+
+
+@pytest.mark.parametrize("horizon, count", [(12, 4), (13, 4), (7, 5), (5, 5), (9, 1)])
+def test_passed_knots_add_up_over_steps(horizon: int, count: int) -> None:
+    phase, passed, steps = (wp.zeros(1, dtype=int, device="cpu") for _ in range(3))
+    time = total = 0
+    for shift in (0, 1, 1, 3, horizon, 2 * horizon + 1, 1):
+        steps.fill_(shift)
+        wp.launch(knots.pass_knots, 1, [steps, horizon, count, phase, passed], device="cpu")
+        time, total = time + shift, total + int(passed.numpy()[0])
+        assert total == time * count // horizon and phase.numpy()[0] == time * count % horizon
+
+
+@pytest.mark.parametrize("spline", SPLINES)
+@pytest.mark.parametrize("horizon, count", [(12, 4), (13, 4), (7, 5), (5, 5), (9, 1), (128, 32)])
+def test_a_plan_has_the_knots_of_its_last_step_at_every_phase(horizon: int, count: int, spline: str) -> None:
+    number = knots.knot_count(horizon, count, spline)
+    last = max(((horizon - 1) * count + time * count % horizon) // horizon for time in range(horizon))
+    assert number == last + {"zero": 1, "linear": 2, "cubic": 4}[spline]
+    assert number <= count + 4
