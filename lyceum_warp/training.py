@@ -464,9 +464,10 @@ class Keeper:
     def save_boundary(self) -> None:
         """Save the complete state at the boundary, unless it is saved."""
         if self._saved != self.iteration and self._state is not None:
-            self.guarded(Keeper._save)
+            self.guarded(Keeper.save_state)
 
-    def _save(self) -> None:
+    def save_state(self) -> None:
+        """Save the complete state at the boundary."""
         start = time.perf_counter()
         assert self._state is not None
         self.run.save_policy(self._content)

@@ -7,6 +7,7 @@ from metered_task import Metered
 from varied_task import Varied
 
 import lyceum_warp as lw
+from lyceum_warp.algos.evaluation import evaluation_seed
 
 
 def test_evaluate_leaves_no_gradients() -> None:
@@ -20,7 +21,7 @@ def test_evaluate_takes_the_same_number_of_episodes_of_every_world() -> None:
     env = lw.make("hopper", nworld=4, horizon=60)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
     got = lw.evaluate(env, policy, 8, seed=3)
-    env.rand_reset(3)
+    env.rand_reset(evaluation_seed(3))
     total, lengths, expected = torch.zeros(4), [0] * 4, [[] for _ in range(4)]
     while min(map(len, expected)) < 2:
         with torch.no_grad():
