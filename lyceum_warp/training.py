@@ -21,7 +21,7 @@ from lyceum_warp.runs import PolicyContent, Run, policy_content
 from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
 from lyceum_warp.validate import whole_number
 
-SHARE = 200
+SHARE = 400
 """The complete state is saved once training has taken this many times as long as the last such save."""
 
 Callback = Callable[[Iteration], Any]
@@ -51,7 +51,7 @@ def train(
 
     The policy and the value function are saved after every iteration. The complete state, from which a run continues
     exactly, is larger. It is saved at the start, at the end, after an error or a signal, and whenever training has
-    taken 200 times as long as the last such save, or every ``save_every`` iterations. A run that is killed continues
+    taken 400 times as long as the last such save, or every ``save_every`` iterations. A run that is killed continues
     from the last one, to the same numbers.
 
     Args:

@@ -100,7 +100,7 @@ class Train:
     always kept."""
     save_every: int = 0
     """Iterations between two saves of the complete state, from which a run that was killed continues; 0 for a number
-    that keeps their time below 0.5 %."""
+    that keeps their time below 0.25 %."""
     tensorboard: bool = False
     """Whether to write the metrics for TensorBoard, too, into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
