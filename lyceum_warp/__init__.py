@@ -12,6 +12,7 @@ from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig
 from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.policy_export import export_policy
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.binding.registry import register, task_names
@@ -119,6 +120,7 @@ __all__ = [
     "dof",
     "equality",
     "evaluate",
+    "export_policy",
     "geom",
     "grasp_terms",
     "gymnasium_model",

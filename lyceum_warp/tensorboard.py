@@ -28,7 +28,7 @@ _TAGS = {
     "iteration": "time/iteration", "samples": "time/samples", "samples_per_second": "time/samples_per_second",
     "length_mean": "episode/length", "terminal_reward": "episode/terminal_reward", "eval_mean": "episode/eval",
     "success": "episode/success", "faults": "episode/faults", "outliers": "episode/outliers", "std_mean": "policy/std",
-    "explained_variance": "value/explained_variance",
+    "reward_mean": "return/reward", "explained_variance": "value/explained_variance",
 }  # fmt: skip
 """Names of curves that do not follow from the columns."""
 
@@ -80,7 +80,7 @@ class TensorBoard:
         for column, number in iteration.row().items():
             if number is not None and math.isfinite(number):
                 values.append(Summary.Value(tag=tag(column), simple_value=number))
-        self._write(Summary(value=values), iteration.samples)
+        self._write(Summary(value=values), iteration.samples, replaced=iteration.samples)
 
     def video(self, path: str | Path, samples: int) -> None:
         """Add a video, reduced to a picture of 320 pixels and 15 frames per second that the tab IMAGES plays.
@@ -98,7 +98,8 @@ class TensorBoard:
         picture = _animation(Path(path))
         width, height = struct.unpack("<HH", picture[6:10])
         image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=picture)
-        self._write(Summary(value=[Summary.Value(tag="video", image=image)]), samples)
+        video = Summary(value=[Summary.Value(tag="video", image=image)])
+        self._write(video, samples, replaced=samples + 1)  # the curves of this iteration stay
 
     def close(self) -> None:
         """Close the file. A later iteration opens another one."""
@@ -106,15 +107,15 @@ class TensorBoard:
             file, self._file = self._file, None
             file.close()
 
-    def _write(self, summary: Any, samples: int) -> None:
+    def _write(self, summary: Any, samples: int, *, replaced: int) -> None:
         from tensorboard.compat.proto.event_pb2 import Event
 
         if self._file is None:
-            self._open(samples)
+            self._open(replaced)
         self._add(Event(step=samples, summary=summary))
         self._file.flush()
 
-    def _open(self, samples: int) -> None:
+    def _open(self, replaced: int) -> None:
         """Open a file. torch's and TensorBoard's own writers would write it in a thread, which hides a full disk."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
         from torch.utils.tensorboard import RecordWriter
@@ -124,7 +125,7 @@ class TensorBoard:
         self._file = RecordWriter((self._folder / name).open("xb"))
         self._add(Event(file_version="brain.Event:2"))
         if number:  # TensorBoard leaves out points of earlier files from this step on
-            self._add(Event(step=samples, session_log=SessionLog(status=SessionLog.START)))
+            self._add(Event(step=replaced, session_log=SessionLog(status=SessionLog.START)))
         else:
             for summary in _hyperparameters(self._config):
                 self._add(Event(summary=summary))

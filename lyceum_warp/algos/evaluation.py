@@ -1,7 +1,7 @@
 """Evaluation of policies: whole episodes under the mean action."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 
@@ -49,7 +49,14 @@ class Episodes:
 
 
 @torch.no_grad()
-def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | None = None) -> Episodes:
+def evaluate(
+    env: Env,
+    policy: torch.nn.Module,
+    episodes: int,
+    *,
+    seed: int | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> Episodes:
     """Run a policy's mean action for whole episodes from random initial states.
 
     Every world contributes the same number of episodes, its first ones. Otherwise worlds with short episodes would
@@ -61,6 +68,7 @@ def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | No
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
         seed: Seed of the initial states, which differ from those of an environment made with the same seed; by default
             the worlds continue their random streams.
+        progress: Called every 50 steps with the number of finished episodes and that of all.
 
     Raises:
         ValueError: The task has no horizon, or the environment was made with ``autoreset=False``.
@@ -87,8 +95,12 @@ def evaluate(env: Env, policy: torch.nn.Module, episodes: int, *, seed: int | No
         results[:, slot, worlds] = torch.where(wanted, now, results[:, slot, worlds])
         total.masked_fill_(env.done, 0.0)
         count += wanted
-        if t % 50 == 49 and bool((count >= each).all()):
-            break
+        if t % 50 == 49:
+            finished = int(count.sum())
+            if progress is not None:
+                progress(finished, each * env.nworld)
+            if finished == each * env.nworld:
+                break
     returns, lengths, rewards, evals, success, *sums = results.flatten(1).cpu()
     return Episodes(returns, lengths, rewards, evals, success, dict(zip(env.episode_metrics, sums, strict=True)))
 

@@ -115,7 +115,7 @@ class Normalizer(nn.Module):
 
         A policy's actions and a value function's predictions then do not depend on when the statistics are updated,
         except for observations that are clipped. The first update leaves the layer as it is: it was not trained yet.
-        A layer that is not linear cannot compensate later ones, so that they are left out.
+        A layer that is not linear, or has no bias, cannot compensate later ones, so that they are left out.
 
         Args:
             layer: The layer whose first inputs are the normalised observations.
@@ -124,7 +124,7 @@ class Normalizer(nn.Module):
         """
         first, before = self.count == 0, {name: buffer.clone() for name, buffer in self.named_buffers()}
         self.update(obs, team)
-        if not isinstance(layer, nn.Linear):
+        if not isinstance(layer, nn.Linear) or layer.bias is None:
             for name, buffer in self.named_buffers():
                 buffer.copy_(torch.where(first, buffer, before[name]))
             return

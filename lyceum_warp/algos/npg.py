@@ -7,6 +7,7 @@ step of a fixed length in the metric of the Fisher information.
 
 import copy
 import logging
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -199,7 +200,8 @@ class NPG:
         # One copy brings the numbers of all processes to the host.
         update = UpdateNumbers(
             finite=finite, kl=kl, step_norm=step.norm(), step_fraction=fraction, gradient_norm=gradient.norm(),
-            std_mean=self.policy.log_std.detach().exp().mean(), faults=rollout.faults.sum(), outliers=outliers,
+            std_mean=self.policy.log_std.detach().exp().mean(), reward=rollout.reward.double().mean(),
+            faults=rollout.faults.sum(), outliers=outliers,
         )  # fmt: skip
         packed = ProcessNumbers(update, prediction, finished(rollout), finished_metrics(rollout)).pack()
         processes = [ProcessNumbers.unpack(numbers) for numbers in team.gather(packed[None]).tolist()]
@@ -221,11 +223,14 @@ class NPG:
             mean = self._evaluate_mean(self.policy)
         timer.mark()
 
+        statistics = summary(processes, len(obs), self.env.task.task.metrics)
+        if self.env.task.functions["success"] is None:
+            statistics["success"], mean["mean_success"] = math.nan, None
         time_sample, time_gradient, time_solve, time_value, time_mean = timer.seconds()
         return Iteration(
             iteration=self.iteration,
             samples=self.samples,
-            **summary(processes, len(obs), self.env.task.task.metrics),
+            **statistics,
             **mean,
             time_sample=time_sample,
             time_gradient=time_gradient,

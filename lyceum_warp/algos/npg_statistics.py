@@ -27,6 +27,8 @@ class Iteration:
     """Number of the iteration, from 1."""
     samples: int
     """Samples in all iterations so far."""
+    reward_mean: float
+    """Mean reward of a step, over all samples."""
     return_mean: float
     """Mean return (sum of an episode's rewards) of the stochastic policy."""
     return_std: float
@@ -42,7 +44,7 @@ class Iteration:
     eval_mean: float
     """Mean evaluation metric at the end of an episode."""
     success: float
-    """Share of the episodes that ended with the goal met."""
+    """Share of the episodes that ended with the goal met; nan for a task without a success."""
     mean_return: float | None
     """Mean return of the mean policy; None in iterations without an evaluation of it."""
     mean_length: float | None
@@ -52,7 +54,7 @@ class Iteration:
     mean_eval: float | None
     """Mean evaluation metric at the end of an episode of the mean policy, or None."""
     mean_success: float | None
-    """Share of the mean policy's episodes that ended with the goal met, or None."""
+    """Share of the mean policy's episodes that ended with the goal met, or None; None for a task without a success."""
     kl: float
     """KL divergence from the old to the new policy, averaged over the samples."""
     step_norm: float
@@ -112,6 +114,8 @@ class UpdateNumbers(NamedTuple):
     """Euclidean length of the gradient; all processes have the same."""
     std_mean: Scalar
     """Mean standard deviation of the policy's actions; all processes have the same."""
+    reward: Scalar
+    """Mean reward of the process's samples."""
     faults: Scalar
     """Faults of the process's worlds."""
     outliers: Scalar
@@ -243,6 +247,7 @@ def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence
     """
     update = processes[0].update
     return {
+        "reward_mean": sum(process.update.reward for process in processes) / len(processes),
         **episode_statistics([process.episodes for process in processes]),
         "kl": update.kl,
         "step_norm": update.step_norm,

@@ -1,4 +1,4 @@
-"""The command line: tasks, new, check, train, eval, plan, warmup."""
+"""The command line: tasks, new, check, train, eval, export, plan, warmup."""
 
 import importlib.metadata
 import os
@@ -10,6 +10,7 @@ import tyro
 
 from lyceum_warp.cli.check import Check, check
 from lyceum_warp.cli.evaluate import Eval, evaluate_run
+from lyceum_warp.cli.export import Export, export
 from lyceum_warp.cli.list_tasks import Tasks, list_tasks
 from lyceum_warp.cli.new_task import New, new_task
 from lyceum_warp.cli.plan import Plan, plan
@@ -23,6 +24,7 @@ _Command = Annotated[Tasks, tyro.conf.subcommand("tasks")] \
     | Annotated[Check, tyro.conf.subcommand("check")] \
     | Annotated[Train, tyro.conf.subcommand("train")] \
     | Annotated[Eval, tyro.conf.subcommand("eval")] \
+    | Annotated[Export, tyro.conf.subcommand("export")] \
     | Annotated[Plan, tyro.conf.subcommand("plan")] \
     | Annotated[Warmup, tyro.conf.subcommand("warmup")]  # fmt: skip
 
@@ -33,6 +35,7 @@ $ lyceum-warp new my_task --model robot.xml
 $ lyceum-warp check my_task.py
 $ lyceum-warp train hopper --iterations 100
 $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
+$ lyceum-warp export runs/hopper-20260101-120000 --to policy.onnx
 $ lyceum-warp plan reach --real-time
 $ lyceum-warp warmup hopper --device cuda:0
 """
@@ -60,6 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return check(command)
             if isinstance(command, Eval):
                 return evaluate_run(command)
+            if isinstance(command, Export):
+                return export(command)
             if isinstance(command, Plan):
                 return plan(command)
             if isinstance(command, Warmup):

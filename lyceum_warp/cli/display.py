@@ -2,6 +2,7 @@
 
 import math
 import sys
+import time
 from pathlib import Path
 
 import rich.box
@@ -11,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from lyceum_warp.algos.networks import moved
+from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.control.control_report import ControlReport
@@ -18,6 +20,7 @@ from lyceum_warp.control.episode_collector import ControlProgress
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs import Run
+from lyceum_warp.tensorboard import TensorBoard
 
 _TABLE_ROWS = 15
 
@@ -62,36 +65,103 @@ class Display:
         if it.mean_return is not None:
             self.mean = it.mean_return
         shown = self.mean if self.console.is_terminal else math.nan if it.mean_return is None else self.mean
-        mean = "" if math.isnan(shown) else f" (mean policy {shown:.4g})"
-        ended = "-" if math.isnan(it.return_mean) else f"{it.return_mean:.4g}"
-        text = f"return {ended}{mean} {it.samples_per_second / 1000:.3g}k"
+        # until an episode has ended, the reward shows how the policy does
+        result = f"reward {it.reward_mean:.3g} a step" if math.isnan(it.return_mean) else f"return {it.return_mean:.4g}"
+        mean = "" if math.isnan(shown) else f"(mean policy {shown:.4g})"
+        success = "" if math.isnan(it.success) else f"success {it.success:.0%}"
+        bad = [counted(it.faults, "fault"), counted(it.outliers, "outlier")]
+        rate = f"{it.samples_per_second / 1000:.3g}k"
         if self.console.is_terminal:
-            self.progress.update(self.bar, completed=it.iteration, text=f"{text}/s")
+            most = [result, mean, success, *bad, f"{rate}/s"]
+            less = (most[:-1], [result, success, *bad], [result, *bad])
+            text = _first_that_fits([most, *less], self.console.width - _BAR_WIDTH)
+            self.progress.update(self.bar, completed=it.iteration, text=text)
         else:
-            line = f"iteration {it.iteration:4d}/{self.total}  {text} samples/s"
-            self.console.print(line, soft_wrap=True)
+            text = _first_that_fits([[result, mean, success, *bad, f"{rate} samples/s"]], 1)
+            self.console.print(f"iteration {it.iteration:4d}/{self.total}  {text}", soft_wrap=True)
             sys.stdout.flush()
 
 
+_BAR_WIDTH = 36
+"""Columns that the bar, the number of the iteration and the times take."""
+
+
+def _first_that_fits(lines: list[list[str]], width: int) -> str:
+    """The first of some lines, each given in parts, that fits into a width; the last one if none does."""
+    texts = [" ".join(part for part in parts if part) for parts in lines]
+    return next((text for text in texts if len(text) <= width), texts[-1])
+
+
+def counted(number: int, what: str) -> str:
+    """A number of things in words; empty for 0."""
+    return f"{number:,d} {what}{'s' if number > 1 else ''}" if number else ""
+
+
+class LongWork:
+    """Progress of work that may take long: a passing bar on a terminal, now and then a line elsewhere.
+
+    Work that takes less than three seconds shows nothing where there is no terminal.
+
+    Args:
+        text: What is done.
+        unit: What is counted, as "frames".
+        console: Where it is shown.
+        quiet: Whether to show nothing.
+    """
+
+    def __init__(self, text: str, unit: str, console: Console | None = None, *, quiet: bool = False) -> None:
+        self.text, self.unit, self.console, self.quiet = text, unit, console or make_console(), quiet
+        self.progress = Progress(
+            TextColumn("{task.description}"), BarColumn(bar_width=12), MofNCompleteColumn(), TextColumn(unit),
+            TimeElapsedColumn(), console=self.console, transient=True, disable=quiet or not self.console.is_terminal,
+        )  # fmt: skip
+        self.bar = self.progress.add_task(text, total=None)
+        self.start, self.next = time.monotonic(), 3.0
+
+    def __enter__(self) -> "LongWork":
+        self.progress.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.progress.stop()
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show that a part of the work is done."""
+        self.progress.update(self.bar, completed=done, total=total)
+        seconds = time.monotonic() - self.start
+        if not (self.quiet or self.console.is_terminal) and seconds >= self.next and done < total:
+            self.console.print(f"{self.text}: {done} of {total} {self.unit}, {seconds:.0f} s", soft_wrap=True)
+            sys.stdout.flush()
+            self.next = seconds + 10.0
+
+
 def curve_table(rows: list[dict[str, float | None]]) -> Table:
-    """A run's iterations, at most 15 of them."""
+    """A run's iterations, at most 15 of them; columns without a number are left out."""
     columns = [("iter", "iteration", "d"), ("samples", "samples", ",d"), ("return", "return_mean", ".1f"),
                ("± std", "return_std", ".1f"), ("mean\npolicy", "mean_return", ".1f"), ("length", "length_mean", ".0f"),
                ("eval", "eval_mean", ".3g"), ("success", "success", ".0%"), ("KL", "kl", ".3f"),
                ("samples/s", "samples_per_second", ",.0f")]  # fmt: skip
+    if any(_missing(row, "return_mean") for row in rows):  # no episode ended
+        columns.insert(2, ("reward\na step", "reward_mean", ".3g"))
+    columns = [column for column in columns if not all(_missing(row, column[1]) for row in rows)]
     table = Table(box=rich.box.SIMPLE, padding=0, pad_edge=False)  # whole on 80 columns
     for heading, _, _ in columns:
         table.add_column(heading, justify="right", no_wrap=True)
     for row in _spread(rows):
         cells = []
         for _, name, form in columns:
-            value = row.get(name)
-            if value is None or math.isnan(value):
-                cells.append("")
-            else:
-                cells.append(format(int(value) if form.endswith("d") else value, form))
+            value = math.nan if _missing(row, name) else row[name] or 0.0
+            cells.append("" if math.isnan(value) else format(int(value) if form.endswith("d") else value, form))
         table.add_row(*cells)
+    totals = [(round(sum(row.get(name + "s") or 0.0 for row in rows)), name) for name in ("fault", "outlier")]
+    if bad := " and ".join(counted(number, name) for number, name in totals if number):
+        table.caption = f"{bad} in all {len(rows)} iterations"
     return table
+
+
+def _missing(row: dict[str, float | None], name: str) -> bool:
+    value = row.get(name)
+    return value is None or math.isnan(value)
 
 
 def _spread(rows: list[dict[str, float | None]]) -> list[dict[str, float | None]]:
@@ -114,25 +184,65 @@ def plotted(run: Run) -> str:
         return f"none: {error}"
 
 
-def policy_video(env: Env, policy: GaussianPolicy, path: Path, seed: int) -> str:
-    """Write a video of an episode under a policy; returns its path, or the reason why there is none."""
+def policy_video(env: Env, policy: GaussianPolicy, path: Path, seed: int, *, quiet: bool = False) -> str:
+    """Write a video of an episode under a policy; returns its path, or the reason why there is none.
+
+    Args:
+        env: The policy's environment; the episode runs in a world of its own.
+        policy: The policy.
+        path: The mp4 file.
+        seed: Seed of the initial state.
+        quiet: Whether to show no progress, as while another progress is shown.
+    """
     from lyceum_warp.viz import video
 
     one = env.replicate_few(1, autoreset=False)
     try:
-        return states_video(one, video.episode(one, moved(policy, one), seed=seed), path)
+        with LongWork("running an episode for the video", "steps", quiet=quiet) as work:
+            states = video.episode(one, moved(policy, one), seed=seed, progress=work)
+        return states_video(one, states, path, quiet=quiet)
     except ValueError as error:
         return f"none: {error}"
 
 
-def states_video(env: Env, states: torch.Tensor, path: Path) -> str:
+def states_video(env: Env, states: torch.Tensor, path: Path, *, quiet: bool = False) -> str:
     """Write a video of given states; returns its path, or the reason why there is none."""
     from lyceum_warp.viz import video
 
     try:
-        return str(video.write_video(env, states, path))
+        with LongWork("drawing the video", "frames", quiet=quiet) as work:
+            return str(video.write_video(env, states, path, progress=work))
     except (video.NoVideoError, ValueError) as error:
         return f"none: {error}"
+
+
+class Videos:
+    """Writes a video of the mean policy every few iterations, and shows it in TensorBoard.
+
+    A machine that cannot draw is reported once, and gets no further video.
+
+    Args:
+        npg: The algorithm.
+        folder: Folder of the videos, which have the numbers of their iterations.
+        every: Iterations between two videos; 0 for none.
+        seed: Seed of the initial state, the same for all videos.
+        board: TensorBoard's writer, if there is one.
+    """
+
+    def __init__(self, npg: NPG, folder: Path, every: int, seed: int, board: TensorBoard | None) -> None:
+        self.npg, self.folder, self.every, self.seed, self.board = npg, folder, every, seed, board
+
+    def __call__(self, iteration: Iteration) -> None:
+        """Write a video after an iteration, if it is time for one."""
+        if not self.every or iteration.iteration % self.every:
+            return
+        path = self.folder / f"{iteration.iteration:06d}.mp4"
+        result = policy_video(self.npg.env, self.npg.policy, path, self.seed, quiet=True)
+        if result != str(path):
+            note(f"no videos every {self.every} iterations ({result.removeprefix('none: ')})")
+            self.every = 0
+        elif self.board is not None:
+            self.board.video(path, iteration.samples)
 
 
 # plans
@@ -185,11 +295,17 @@ class PlanDisplay:
         sys.stdout.flush()
 
 
-def report_table(report: ControlReport) -> Table:
-    """A controller's report."""
+def report_table(report: ControlReport, *, success: bool = True) -> Table:
+    """A controller's report.
+
+    Args:
+        report: The report.
+        success: Whether the task has a success.
+    """
     table = Table(box=rich.box.SIMPLE, show_header=False)
     for row in report.rows():
-        table.add_row(*row)
+        if success or row[0] != "success":
+            table.add_row(*row)
     return table
 
 

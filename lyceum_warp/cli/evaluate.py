@@ -11,7 +11,7 @@ from rich.table import Table
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed
 from lyceum_warp.binding.registry import find_task, task_name
 from lyceum_warp.cli.arguments import NO_FLAGS, Repeated, given, optional_flags, parameters, run_options
-from lyceum_warp.cli.display import make_console, note, policy_video
+from lyceum_warp.cli.display import LongWork, make_console, note, policy_video
 from lyceum_warp.engines.placement import options_for_few_worlds
 from lyceum_warp.kept_task import run_env
 from lyceum_warp.options import EnvOptions
@@ -84,7 +84,8 @@ def evaluate_run(options: Eval) -> int:
     env = run_env(run, known, params, note=note, task=options.task)
     policy = load(run, which=options.which, device=env.obs.device)
     check_sizes(policy, env, path)
-    episodes = evaluate(env, policy, options.episodes, seed=options.seed).first(options.episodes)
+    with LongWork("evaluating the policy", "episodes") as work:
+        episodes = evaluate(env, policy, options.episodes, seed=options.seed, progress=work).first(options.episodes)
     table = Table(box=rich.box.SIMPLE)
     for heading in ("", "mean", "std", "min", "max"):
         table.add_column(heading, justify="right" if heading else "left")

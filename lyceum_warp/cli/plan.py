@@ -221,7 +221,8 @@ def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
 def _report(run: Run, plant: Env, done: list[Trajectory], options: Plan) -> int:
     """Print the report, draw the plot and the video, and list the files."""
     console = make_console()
-    console.print(report_table(control_report(done, rate=options.rate)))
+    report = control_report(done, rate=options.rate)
+    console.print(report_table(report, success=plant.task.functions["success"] is not None))
     paths = [("episodes", str(run.folder / "episode-*.npz")), ("report", str(run.folder / "report.json"))]
     if options.plot:
         paths.append(("plot", plotted_control(done, run.folder / "plan.png")))

@@ -17,6 +17,7 @@ from lyceum_warp.algos.evaluation import Episodes, evaluate, evaluation_seed
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
+from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.cli.arguments import (
     EnvFlags,
@@ -29,7 +30,16 @@ from lyceum_warp.cli.arguments import (
     run_options,
     spelled,
 )
-from lyceum_warp.cli.display import Display, curve_table, make_console, note, plotted, policy_video
+from lyceum_warp.cli.display import (
+    Display,
+    LongWork,
+    Videos,
+    curve_table,
+    make_console,
+    note,
+    plotted,
+    policy_video,
+)
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted
@@ -115,6 +125,9 @@ class Train:
     times."""
     video: bool = True
     """Whether to write a video of one episode of the trained policy at the end."""
+    video_every: int = 0
+    """Iterations between two further videos of the mean policy, videos/000100.mp4 and so on in the run's folder, which
+    TensorBoard shows, too; 0 for none."""
     plot: bool = True
     """Whether to draw the learning curve at the end."""
     require_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
@@ -299,7 +312,8 @@ def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, NPG]:
 def _settings(options: Train) -> dict[str, Any]:
     """The settings that a resumed run must keep."""
     free = ("iterations", "out", "resume", "video", "plot", "require_return", "npg", "param", "env", "physics",
-            "from_run", "which", "target_return", "keep_every", "save_every", "tensorboard")  # fmt: skip
+            "from_run", "which", "target_return", "keep_every", "save_every", "tensorboard",
+            "video_every")  # fmt: skip
     settings = {f.name: getattr(options, f.name) for f in dataclasses.fields(options) if f.name not in free}
     settings["task"] = portable(options.task or "")
     settings["param"] = parameters(options.param, options)
@@ -353,15 +367,23 @@ def _engine(config: dict[str, Any]) -> str:
 def _learn(run: Run | None, npg: NPG, options: Train) -> int:
     """Iterate; the process that has the run writes files and messages."""
     console = make_console()
-    display = board = None
+    display = videos = board = None
     if run is not None:
         board = TensorBoard(run.folder, run.config) if options.tensorboard else None
         console.print(_headline(run, npg, options), soft_wrap=True)
         display = Display(console, npg.iteration, options.iterations)
+        seed = evaluation_seed(options.seed + 1)
+        videos = Videos(npg, run.folder / "videos", options.video_every, seed, board)
+
+    def show(iteration: Iteration) -> None:
+        if display is not None and videos is not None:
+            display(iteration)
+            videos(iteration)
+
     try:
         with display or contextlib.nullcontext():
             learn(
-                run, npg, iterations=options.iterations, callback=display, board=board,
+                run, npg, iterations=options.iterations, callback=show, board=board,
                 target_return=options.target_return, keep_every=options.keep_every, save_every=options.save_every,
             )  # fmt: skip
     except Interrupted as signalled:
@@ -394,7 +416,8 @@ def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:
     rows = run.rows()
     console.print(curve_table(rows))
     few = npg.env.replicate_few(_FINAL_EPISODES)
-    episodes = evaluate(few, moved(npg.policy, few), _FINAL_EPISODES, seed=options.seed + 1)
+    with LongWork("evaluating the mean policy", "episodes", console) as work:
+        episodes = evaluate(few, moved(npg.policy, few), _FINAL_EPISODES, seed=options.seed + 1, progress=work)
     console.print(f"mean policy, {len(episodes.returns)} new episodes: {_returns(episodes)}", soft_wrap=True)
     paths = [("checkpoint", str(run.checkpoint)), ("metrics", str(run.metrics))]
     if (best := run.best_score()) is not None:
@@ -404,7 +427,11 @@ def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:
         paths.append(("curve", plotted(run)))
     if options.video:
         seed = evaluation_seed(options.seed + 1)
-        paths.append(("video", policy_video(npg.env, npg.policy, run.folder / "video.mp4", seed)))
+        video = policy_video(npg.env, npg.policy, run.folder / "video.mp4", seed)
+        paths.append(("video", video))
+        if options.tensorboard and Path(video).is_file():
+            with TensorBoard(run.folder, run.config) as board:
+                board.video(video, npg.samples)
     for name, path in paths:
         console.print(f"{name + ':':<12}{path}", soft_wrap=True, markup=False)
     final = episodes.returns.mean().item()

@@ -16,6 +16,7 @@ from lyceum_warp.fields import Field
 from lyceum_warp.machine import cpu_cores
 from lyceum_warp.model_fields import ModelField
 from lyceum_warp.options import EnvOptions
+from lyceum_warp.warp_log import start_warp
 
 _ENGINES = {
     "mujoco": ("lyceum_warp.engines.c.mujoco_engine", "MujocoEngine"),
@@ -42,7 +43,7 @@ def find_device(device: str | None) -> wp.Device:
     Raises:
         ValueError: This machine has no such device.
     """
-    name, error = str(device or "cpu"), None
+    name, error, remarks = str(device or "cpu"), None, start_warp()
     if wp.is_cuda_available() or not name.startswith("cuda"):  # without a driver, Warp would print before it fails
         try:
             found = wp.get_device(name)
@@ -56,9 +57,10 @@ def find_device(device: str | None) -> wp.Device:
                 )
             return found
     names = ", ".join(repr(d.alias) for d in wp.get_devices())
+    reason = f"; {remarks[0]}" if remarks and name.startswith("cuda") else ""
     raise ValueError(
         f"there is no device {name!r} on this machine; it has {names} (for a GPU, check that nvidia-smi shows it "
-        "and that its driver is recent enough for Warp)"
+        f"and that its driver is recent enough for Warp{reason})"
     ) from error
 
 

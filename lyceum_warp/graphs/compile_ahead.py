@@ -19,6 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from lyceum_warp.graphs.rehearsal import rehearse
 from lyceum_warp.machine import cpu_cores
+from lyceum_warp.warp_log import start_warp
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +89,7 @@ def _is_there(module: Any, block: int, device: wp.Device) -> bool:
 
 def cached() -> dict[Path, int]:
     """The compiled modules in Warp's cache, and their sizes in bytes."""
-    wp.init()  # finds the cache's folder
+    start_warp()  # finds the cache's folder
     files = Path(wp.config.kernel_cache_dir or "").glob("*/*")
     return {path: path.stat().st_size for path in files if path.suffix in (".o", ".ptx", ".cubin")}
 

@@ -70,7 +70,8 @@ def main(job_path: str, model_path: str, out: str) -> int:
     options: Any = dict(fps=float(job["fps"]), codec="libx264", pixelformat="yuv420p", quality=8, macro_block_size=2)
     writer: Any = imageio.get_writer(out, format="FFMPEG", **options)
     with writer:
-        for i in range(len(job["qpos"])):
+        frames = len(job["qpos"])
+        for i in range(frames):
             if any(i == 0 or (rows[i] != rows[i - 1]).any() for rows in fields.values()):
                 change_model(mujoco, model, {name: rows[i] for name, rows in fields.items()})
             data.qpos[:] = job["qpos"][i]
@@ -80,6 +81,7 @@ def main(job_path: str, model_path: str, out: str) -> int:
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, view)
             writer.append_data(renderer.render())
+            print(f"frame {i + 1} of {frames}", flush=True)  # video.py reads it
     renderer.close()
     return 0
 

@@ -3,12 +3,13 @@
 import importlib.util
 import math
 import os
+import re
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
@@ -17,6 +18,9 @@ import torch
 from lyceum_warp.env import Env
 from lyceum_warp.viz import EXTRA
 from lyceum_warp.viz.render import CANNOT_DRAW, MODEL_FIELD
+
+Progress: TypeAlias = Callable[[int, int], object]
+"""Called with how much is done, and how much there is in all."""
 
 _MAX_RATE = 60  # frames per second; screens rarely show more
 _POSES = ("qpos", "mocap_pos", "mocap_quat")
@@ -27,13 +31,20 @@ class NoVideoError(RuntimeError):
 
 
 @torch.no_grad()
-def episode(env: Env, policy: Callable[[torch.Tensor], torch.Tensor], *, seed: int | None = None) -> torch.Tensor:
+def episode(
+    env: Env,
+    policy: Callable[[torch.Tensor], torch.Tensor],
+    *,
+    seed: int | None = None,
+    progress: Progress | None = None,
+) -> torch.Tensor:
     """Run one episode under a policy, and return all its states, (steps + 1, state_space.size), on the CPU.
 
     Args:
         env: An environment of one world, made with ``autoreset=False`` so that the last state is kept.
         policy: Called with observations, (1, nobs); returns actions, (1, nact).
         seed: Seed of the initial state.
+        progress: Called now and then with the number of steps so far and the horizon.
 
     Raises:
         ValueError: The environment has several worlds or automatic resets, or its episodes may never end.
@@ -51,11 +62,19 @@ def episode(env: Env, policy: Callable[[torch.Tensor], torch.Tensor], *, seed: i
         env.action.copy_(policy(env.obs))
         env.step()
         states.append(env.get_state())
+        if progress is not None and len(states) % 10 == 0:
+            progress(len(states), env.horizon)
     return torch.cat(states).cpu()
 
 
 def write_video(
-    env: Env, states: torch.Tensor, out: str | Path, *, size: tuple[int, int] = (640, 480), speed: float = 1.0
+    env: Env,
+    states: torch.Tensor,
+    out: str | Path,
+    *,
+    size: tuple[int, int] = (640, 480),
+    speed: float = 1.0,
+    progress: Progress | None = None,
 ) -> Path:
     """Draw states into an mp4 file, each with the model fields that belong to it.
 
@@ -69,6 +88,7 @@ def write_video(
         out: The file. It is overwritten.
         size: Width and height in pixels, even numbers.
         speed: Simulated seconds per second of the video.
+        progress: Called after each frame with the number of frames so far and in all.
 
     Returns:
         The file's path.
@@ -93,7 +113,7 @@ def write_video(
         job, model, video = Path(folder, "job.npz"), Path(folder, "model.mjb"), Path(folder, "video.mp4")
         np.savez(job, fps=rate / stride, size=size, **rows)
         mujoco.mj_saveModel(env.model, str(model), None)
-        _draw([str(job), str(model), str(video)])
+        _draw([str(job), str(model), str(video)], progress)
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_bytes(video.read_bytes())
     return out
@@ -116,7 +136,7 @@ def _libraries() -> list[str]:
     return list(dict.fromkeys([given, *others] if given else others))
 
 
-def _draw(arguments: list[str]) -> None:
+def _draw(arguments: list[str], progress: Progress | None = None) -> None:
     """Run ``render.py`` with each graphics library until one works."""
     failures = []
     for library in _libraries():
@@ -125,15 +145,33 @@ def _draw(arguments: list[str]) -> None:
             environment["MUJOCO_GL"] = library
         # -P keeps the folder of render.py off the path, where its other modules could shadow packages
         command = [sys.executable, "-P", str(Path(__file__).with_name("render.py")), *arguments]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True)
-        if done.returncode == 0:
+        code, errors = _run(command, environment, progress)
+        if code == 0:
             return
-        lines = done.stderr.strip().splitlines()
-        reason = lines[-1].strip()[:160] if lines else f"it ended with code {done.returncode}"
+        lines = errors.strip().splitlines()
+        reason = lines[-1].strip()[:160] if lines else f"it ended with code {code}"
         failures.append(f"{library or 'OpenGL'}: {reason}")
-        if done.returncode > 0 and done.returncode != CANNOT_DRAW:  # another graphics library would fail, too
+        if code > 0 and code != CANNOT_DRAW:  # another graphics library would fail, too
             raise NoVideoError(f"the video could not be written ({reason})")
     raise NoVideoError(
         f"this machine cannot draw off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
         "libegl1 and libgl1-mesa-dri) or OSMesa (libosmesa6), or set MUJOCO_GL to a library that works"
     )
+
+
+def _run(command: list[str], environment: dict[str, str], progress: Progress | None) -> tuple[int, str]:
+    """Run ``render.py``, which prints a line for each frame; returns its exit code and its errors."""
+    with (
+        tempfile.TemporaryFile("w+", errors="replace") as errors,
+        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
+    ):
+        try:
+            for line in process.stdout or ():
+                if progress is not None and (frame := re.fullmatch(r"frame (\d+) of (\d+)\n", line)):
+                    progress(int(frame[1]), int(frame[2]))
+        except BaseException:  # Ctrl-C
+            process.kill()
+            raise
+        code = process.wait()
+        errors.seek(0)
+        return code, errors.read()

@@ -132,24 +132,24 @@ def test_a_row_of_metrics_has_a_column_for_each_metric() -> None:
 
 def process(first: float, faults: float) -> ProcessNumbers:
     """Numbers that count upwards from the first."""
-    numbers = iter(torch.arange(first, first + 21))
+    numbers = iter(torch.arange(first, first + 22))
     parts = [kind(*(next(numbers) for _ in kind._fields)) for kind in (UpdateNumbers, ValueSums, EpisodeSums)]
     return ProcessNumbers(*parts)._replace(update=parts[0]._replace(faults=torch.tensor(faults)))  # type: ignore[arg-type,call-arg]
 
 
 def test_packed_numbers_are_unpacked_under_their_names() -> None:
     packed = process(1.0, 4).pack()
-    assert (packed.dtype, packed.shape) == (torch.float64, (21,))
+    assert (packed.dtype, packed.shape) == (torch.float64, (22,))
     unpacked = ProcessNumbers.unpack(packed.tolist())
     assert unpacked == process(1.0, 4)
-    assert (unpacked.update.kl, unpacked.update.faults, unpacked.values.return_mean) == (2.0, 4.0, 9.0)
-    assert (unpacked.episodes.episodes, unpacked.episodes.success) == (13.0, 21.0)
+    assert (unpacked.update.kl, unpacked.update.faults, unpacked.values.return_mean) == (2.0, 4.0, 10.0)
+    assert (unpacked.episodes.episodes, unpacked.episodes.success) == (14.0, 22.0)
 
 
 def test_summary_sums_faults_and_outliers_and_sets_attributes_of_an_iteration() -> None:
     both = summary([ProcessNumbers.unpack(process(*numbers).pack().tolist()) for numbers in ((1, 4), (3, 5))], 10)
-    assert (both["faults"], both["outliers"]) == (9, 18)
-    assert (both["kl"], both["step_norm"], both["return_max"]) == (2.0, 3.0, 19.0)
+    assert (both["faults"], both["outliers"]) == (9, 20)
+    assert (both["kl"], both["step_norm"], both["return_max"]) == (2.0, 3.0, 20.0)
     others = {"iteration", "samples", "samples_per_second"}
     names = {field.name for field in dataclasses.fields(lw.Iteration)} - others
     assert both.keys() == {name for name in names if not name.startswith(("time_", "mean_"))}
@@ -157,3 +157,18 @@ def test_summary_sums_faults_and_outliers_and_sets_attributes_of_an_iteration() 
 
 def test_help_describes_every_attribute_of_an_iteration() -> None:
     assert all(f"    {field.name}: " in (lw.Iteration.__doc__ or "") for field in dataclasses.fields(lw.Iteration))
+
+
+def test_the_mean_reward_covers_all_samples_also_where_no_episode_ended() -> None:
+    env = lw.make("point_mass", nworld=4, horizon=1000)
+    npg = lw.NPG(env, config=lw.NPGConfig(samples=40, rollout="segments", hidden=(4,), value_hidden=(4,)))
+    iteration = next(npg)
+    assert iteration.reward_mean == pytest.approx(npg.rollout.reward.mean().item())
+
+
+def test_a_task_without_a_success_has_no_share_of_successes() -> None:
+    env = lw.make("hopper", nworld=2, horizon=10)
+    config = lw.NPGConfig(samples=40, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2)
+    iteration = next(lw.NPG(env, config=config))
+    assert math.isnan(iteration.success) and iteration.mean_success is None
+    assert iteration.mean_return is not None and math.isfinite(iteration.return_mean)

@@ -1,6 +1,61 @@
-"""Tables on the terminal."""
+"""Progress and tables on the terminal."""
 
+import dataclasses
+import io
+import math
+import re
+
+import pytest
+from rich.console import Console
+
+import lyceum_warp as lw
 from lyceum_warp.cli import display
+
+
+@pytest.fixture(scope="module")
+def first() -> lw.Iteration:
+    """The first iteration on worlds whose episodes have not ended yet."""
+    config = lw.NPGConfig(samples=40, rollout="segments", hidden=(4,), value_hidden=(4,))
+    return next(lw.NPG(lw.make("half_cheetah", nworld=4), config=config))
+
+
+def line(iteration: lw.Iteration, **changes: object) -> str:
+    """What is shown of an iteration where there is no terminal."""
+    console = Console(file=io.StringIO(), width=120, highlight=False)
+    with display.Display(console, 0, 10) as shown:
+        shown(dataclasses.replace(iteration, samples_per_second=29_412.0, **changes))
+    return console.file.getvalue()
+
+
+def test_the_first_line_shows_the_reward_where_no_episode_has_ended(first: lw.Iteration) -> None:
+    assert math.isnan(first.return_mean)
+    assert line(first, reward_mean=-0.8125) == "iteration    1/10  reward -0.812 a step 29.4k samples/s\n"
+
+
+def test_a_line_shows_what_there_is(first: lw.Iteration) -> None:
+    common = {"return_mean": 3072.4, "mean_return": 3117.2}
+    assert line(first, **common) == "iteration    1/10  return 3072 (mean policy 3117) 29.4k samples/s\n"
+    assert "(mean policy 3117) success 25% 29.4k" in line(first, **common, success=0.25)
+    assert "success" not in line(first, **common, success=math.nan)
+    assert "(mean policy 3117) 1 fault 1,200 outliers 29.4k" in line(first, **common, faults=1, outliers=1200)
+
+
+@pytest.mark.parametrize("changes", [{}, {"success": 0.25}, {"success": 1.0, "faults": 12_345, "outliers": 12_345}])
+def test_the_bar_fits_into_80_columns(first: lw.Iteration, changes: dict[str, object]) -> None:
+    console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system=None)
+    last = dataclasses.replace(first, iteration=100, return_mean=-123.4567, mean_return=-123.4567, **changes)
+    with display.Display(console, 0, 100) as shown:
+        shown(last)
+    lines = re.sub(r"\x1b\[[^a-zA-Z]*[a-zA-Z]", "", console.file.getvalue()).replace("\r", "\n").splitlines()
+    assert max(len(text.rstrip()) for text in lines) <= 80
+    assert any("100/100" in text and "return -123.5" in text for text in lines)
+    assert all(not changes.get("faults") or "12,345 faults" in text for text in lines if "return" in text)
+
+
+def table(rows: list[dict[str, float | None]]) -> str:
+    console = Console(file=io.StringIO(), width=80)
+    console.print(display.curve_table(rows))
+    return console.file.getvalue()
 
 
 def test_the_table_of_a_run_has_at_most_15_rows_with_evaluations_first() -> None:
@@ -11,3 +66,40 @@ def test_the_table_of_a_run_has_at_most_15_rows_with_evaluations_first() -> None
     for i in range(9, 100, 10):
         rows[i]["mean_return"] = 1.0
     assert [row["iteration"] for row in display._spread(rows)] == [1, *range(10, 101, 10)]
+
+
+def test_the_table_leaves_out_what_the_task_does_not_have(first: lw.Iteration) -> None:
+    row = first.row()  # of HalfCheetah, which has no success, with no ended episode
+    shown = table([row])
+    assert "reward" in shown and f"{first.reward_mean:.3g}" in shown
+    assert not any(word in shown for word in ("success", "return", "policy"))
+    shown = table([row | {"success": 0.5, "return_mean": 7.25}])
+    assert "50%" in shown and "7.2" in shown and "a step" not in shown
+    assert max(map(len, shown.splitlines())) <= 80
+
+
+def test_the_table_counts_faults_and_outliers_of_all_iterations(first: lw.Iteration) -> None:
+    row = first.row() | {"faults": 1.0, "outliers": 3.0}
+    assert "2 faults and 6 outliers in all 2 iterations" in " ".join(table([row, row]).split())
+    assert "fault" not in table([first.row(), {"iteration": 2.0}])  # a row of an earlier release
+
+
+def test_long_work_prints_a_line_now_and_then() -> None:
+    console = Console(file=io.StringIO(), width=120)
+    with display.LongWork("drawing the video", "frames", console) as work:
+        work(1, 500)
+        assert console.file.getvalue() == ""
+        start = work.start
+        for seconds in (4.0, 4.5, 15.0):
+            work.start = start - seconds
+            work(int(20 * seconds), 500)
+    assert console.file.getvalue().splitlines() == [
+        "drawing the video: 80 of 500 frames, 4 s", "drawing the video: 300 of 500 frames, 15 s",
+    ]  # fmt: skip
+
+
+def test_long_work_is_a_passing_bar_on_a_terminal() -> None:
+    console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system=None)
+    with display.LongWork("evaluating", "episodes", console) as work:
+        work(3, 32)
+    assert "3/32" in console.file.getvalue() and "episodes" in console.file.getvalue()

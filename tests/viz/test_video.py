@@ -40,11 +40,16 @@ def test_episode_refuses_automatic_resets(shared_env: SharedEnv) -> None:
 
 def test_write_video_writes_a_frame_for_each_state(env: lw.Env, tmp_path: Path) -> None:
     pytest.importorskip("imageio")
-    states = video.episode(env, still, seed=4)
+    steps: list[tuple[int, int]] = []
+    frames: list[tuple[int, int]] = []
+    states = video.episode(env, still, seed=4, progress=lambda *counts: steps.append(counts))
+    assert steps == [(10, 20), (20, 20)]
+    progress = lambda *counts: frames.append(counts)  # noqa: E731
     try:
-        path = video.write_video(env, states, tmp_path / "video.mp4", size=(160, 120))
+        path = video.write_video(env, states, tmp_path / "video.mp4", size=(160, 120), progress=progress)
     except video.NoVideoError as error:
         pytest.skip(str(error))
+    assert frames == [(i, len(states)) for i in range(1, len(states) + 1)]
     # in a small process: imageio forks, and after all other tests there may be too little memory to fork this one
     program = """
 import json, sys
@@ -70,7 +75,7 @@ def test_a_video_has_the_model_fields_of_its_states(tmp_path: Path, monkeypatch:
     assert sizes.unique().numel() == 2
     jobs = []
 
-    def drawn(arguments: list[str]) -> None:
+    def drawn(arguments: list[str], progress: object) -> None:
         with np.load(arguments[0]) as job:
             jobs.append(dict(job))
         Path(arguments[2]).write_bytes(b"")

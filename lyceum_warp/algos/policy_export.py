@@ -1,0 +1,99 @@
+"""Policies as files that run without this package: ONNX, or torch's own format."""
+
+import contextlib
+import copy
+import importlib.util
+import logging
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.files import replaced
+from lyceum_warp.validate import check_kind
+
+EXTRA = "pip install 'lyceum-warp[export]'"
+"""Command that installs the packages for ONNX."""
+
+_SUFFIXES = (".onnx", ".pt2")
+
+
+def export_policy(policy: GaussianPolicy, path: str | Path) -> Path:
+    """Write a policy to a file that runs without this package: observations in, mean actions out.
+
+    The normaliser of observations is part of the file. The number of observations, (n, nobs) float32, is free. Actions
+    are those of ``policy(obs)``; an environment also clips controls to the ranges of the model's actuators.
+
+    ===========  ======================================================================================
+    ``.onnx``    input ``obs``, output ``action``; for ONNX Runtime, TensorRT, OpenVINO, ...
+    ``.pt2``     ``torch.export.load(path).module()(obs)``, without further packages; also for C++ (AOTInductor)
+    ===========  ======================================================================================
+
+    Example:
+        >>> export_policy(load("runs/mine"), "policy.onnx")
+        >>> session = onnxruntime.InferenceSession("policy.onnx")
+        >>> (action,) = session.run(["action"], {"obs": obs})  # NumPy arrays, (n, nobs) and (n, nact)
+
+    Args:
+        policy: The policy, on any device.
+        path: The file, which is replaced if it exists.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        ImportError: The extra ``export``, which ``.onnx`` needs, is not installed.
+        ValueError: The file has another suffix, or the policy's network cannot be exported.
+    """
+    check_kind("policy", policy, GaussianPolicy, "as lw.load(run) returns it")
+    path = Path(path)
+    check_export(path)
+    alone = copy.deepcopy(policy).cpu().eval().requires_grad_(False)
+    example, shapes = (torch.zeros(2, policy.nobs),), ({0: torch.export.Dim("batch")},)
+    try:
+        with _quiet():
+            program: Any = torch.export.export(alone, example, dynamic_shapes=shapes)
+            if path.suffix == ".onnx":
+                program = torch.onnx.export(program, input_names=["obs"], output_names=["action"], verbose=False)
+    except Exception as error:  # of many types, from torch
+        first = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+        raise ValueError(f"the policy's network cannot be exported to {path.suffix} ({first})") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replaced(path) as temporary:
+        if path.suffix == ".onnx":
+            program.save(str(temporary), external_data=False)
+        else:
+            with temporary.open("wb") as file:
+                torch.export.save(program, file)
+    return path
+
+
+def check_export(path: Path) -> None:
+    """Check that a policy can be written to a file of this name.
+
+    Raises:
+        ImportError: The packages for the file's format are not installed.
+        ValueError: The format is not known.
+    """
+    if path.suffix not in _SUFFIXES:
+        raise ValueError(f"{path} must end with {' or '.join(_SUFFIXES)}")
+    missing = [name for name in ("onnx", "onnxscript") if importlib.util.find_spec(name) is None]
+    if path.suffix == ".onnx" and missing:
+        raise ImportError(f"export to ONNX needs {' and '.join(missing)}: {EXTRA}")
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence torch's exporter, which warns of its own parts and of absent packages."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)

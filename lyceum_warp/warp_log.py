@@ -1,0 +1,65 @@
+"""Warp's remarks on the CUDA driver in Python's log."""
+
+import contextlib
+import logging
+import os
+import sys
+import tempfile
+import threading
+
+import warp as wp
+
+log = logging.getLogger(__name__)
+
+_REMARKS = ("Warp CUDA warning: ", "Warp CUDA error: Warp requires CUDA driver ")
+_lock = threading.Lock()
+_remarks: list[str] | None = None
+
+
+def start_warp() -> list[str]:
+    """Initialise Warp, and send what it finds amiss with the CUDA driver to the log.
+
+    Warp's library prints such remarks to stderr on every machine without a GPU, also where only CPUs are used. Other
+    output is printed as usual.
+
+    Returns:
+        The remarks, for the error message of a caller that wants a CUDA device.
+    """
+    global _remarks
+    with _lock:
+        if _remarks is None:
+            level = wp.config.log_level
+            wp.config.log_level = max(level, wp.LOG_ERROR)  # Python code of Warp repeats one of them
+            try:
+                printed = _stderr_of_start()
+            finally:
+                wp.config.log_level = level
+            _remarks = [line for line in printed if line.startswith(_REMARKS)]
+            for line in _remarks:
+                log.info("%s", line)
+            if others := [line for line in printed if not line.startswith(_REMARKS)]:
+                print(*others, sep="\n", file=sys.stderr)
+        return _remarks
+
+
+def _stderr_of_start() -> list[str]:
+    """The lines that reach the process's stderr while Warp is initialised."""
+    with contextlib.ExitStack() as restored:
+        try:
+            stderr = os.dup(2)
+        except OSError:  # closed, as under pythonw
+            wp.init()
+            return []
+        restored.callback(os.close, stderr)
+        file = restored.enter_context(tempfile.TemporaryFile())
+        if sys.stderr is not None:
+            sys.stderr.flush()
+        os.dup2(file.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            if sys.stderr is not None:
+                sys.stderr.flush()
+            os.dup2(stderr, 2)
+        file.seek(0)
+        return file.read().decode(errors="replace").splitlines()

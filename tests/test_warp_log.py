@@ -1,0 +1,58 @@
+"""Warp starts without remarks on a CUDA driver that no code asked for."""
+
+import subprocess
+import sys
+
+import pytest
+import warp as wp
+
+WITHOUT_GPU = pytest.mark.skipif(wp.is_cuda_available(), reason="needs a machine without a GPU")
+
+
+def printed(program: str) -> tuple[str, str]:
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    return done.stdout, done.stderr
+
+
+@WITHOUT_GPU
+def test_an_environment_on_the_cpu_prints_nothing() -> None:
+    assert printed("import lyceum_warp as lw; lw.make('point_mass').step()") == ("", "")
+
+
+@WITHOUT_GPU
+def test_warp_prints_the_remark_without_the_package() -> None:
+    """Otherwise the test above shows nothing."""
+    assert "CUDA" in printed("import warp as wp; wp.config.log_level = wp.LOG_WARNING; wp.init()")[1]
+
+
+def test_other_output_of_the_start_and_the_log_keep_everything() -> None:
+    program = """
+import logging, os, sys
+logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
+import lyceum_warp
+from lyceum_warp import warp_log
+init = warp_log.wp.init
+def loud():
+    os.write(2, b"native line\\nWarp CUDA warning: no driver\\n")
+    sys.stderr.write("line of Python\\n")
+    init()
+warp_log.wp.init = loud
+assert "Warp CUDA warning: no driver" in warp_log.start_warp()
+assert warp_log.start_warp() == warp_log.start_warp()
+"""
+    out, error = printed(program)
+    assert error == "native line\nline of Python\n"
+    assert "Warp CUDA warning: no driver" in out.splitlines()
+
+
+def test_warp_starts_where_stderr_is_closed() -> None:
+    program = "import os; os.close(2); from lyceum_warp import warp_log; print(warp_log.start_warp())"
+    assert printed(program) == ("[]\n", "")
+
+
+@WITHOUT_GPU
+def test_a_cuda_device_without_a_driver_is_one_line_with_the_cause() -> None:
+    out, error = printed("import sys; from lyceum_warp.cli import main; main(['warmup', 'hopper', '--device', 'cuda'])")
+    assert out == "" and error.count("\n") == 1
+    assert error.startswith("lyceum-warp: there is no device 'cuda' on this machine; it has 'cpu' (")
+    assert "NVIDIA CUDA driver" in error
