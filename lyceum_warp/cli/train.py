@@ -397,7 +397,13 @@ def _learn(run: Run | None, npg: NPG, options: Train) -> int:
                 text += f"; continue with\n  lyceum-warp train --resume {run.folder} --iterations {options.iterations}"
             console.print(text, soft_wrap=True, markup=False)
         return 128 + signalled.number
-    return 0 if run is None else _report(run, npg, options, console)
+    if run is None:
+        return 0
+    reached = run.config.get("reached", {})
+    if reached.get("iteration") == npg.iteration < options.iterations:
+        text = f"the target return is reached: {reached['return']:.6g} in iteration {npg.iteration}"
+        console.print(text, soft_wrap=True, markup=False)
+    return _report(run, npg, options, console)
 
 
 def _headline(run: Run, npg: NPG, options: Train) -> str:

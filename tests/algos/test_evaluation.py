@@ -20,7 +20,9 @@ def test_evaluate_takes_the_same_number_of_episodes_of_every_world() -> None:
     """Worlds with short episodes contribute no more of them; the numbers are those of a plain loop."""
     env = lw.make("hopper", nworld=4, horizon=60)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
-    got = lw.evaluate(env, policy, 8, seed=3)
+    counts: list[tuple[int, int]] = []
+    got = lw.evaluate(env, policy, 8, seed=3, progress=lambda *now: counts.append(now))
+    assert counts == sorted(counts) and 0 < counts[-1][0] <= counts[-1][1] == 8
     env.rand_reset(evaluation_seed(3))
     total, lengths, expected = torch.zeros(4), [0] * 4, [[] for _ in range(4)]
     while min(map(len, expected)) < 2:
