@@ -14,8 +14,8 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constrain
 demo: $(VENV)/installed-viz
 	$(BIN)/lyceum-warp train hopper --iterations 80 --out runs/demo-$$(date +%Y%m%d-%H%M%S) --require-return 1000
 
-# Several processes, each with whole files, whose tests share environments.
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile
+# Several processes, each with whole files, whose tests share environments. The folders with the longest files begin.
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 test: $(VENV)/installed-dev
 	$(PYTEST)

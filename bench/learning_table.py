@@ -71,8 +71,9 @@ def case(options: Options, task: str) -> learning.Options:
     config = dataclasses.replace(options.config, **own)
     each = -(-(config.samples or 10_000) // nworld) * nworld
     iterations = -(-options.samples // each)
-    # an evaluation after about every hundredth of the samples, and one after the last
-    every = next(n for n in range(max(1, iterations // 100), iterations + 1) if iterations % n == 0)
+    # evaluations step, too: about twenty of them, the last one at the end
+    every = max(1, iterations // 20)
+    iterations = -(-iterations // every) * every
     config = dataclasses.replace(config, mean_every=every)
     return learning.Options(task, config=config, iterations=iterations, nworld=nworld, processes=2)
 

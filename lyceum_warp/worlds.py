@@ -48,7 +48,9 @@ def own_bytes_per_world(task: BoundTask) -> int:
 
 def own_parts(task: BoundTask) -> dict[str, int]:
     """The parts of a state that ``Worlds`` keeps beside the counters, and their sizes."""
-    sizes = {name: getattr(task.task, name) for name in MEMORIES} | {"metrics": len(task.task.metrics)}
+    form = task.task
+    sizes = {name: getattr(form, name) for name in MEMORIES}
+    sizes |= {"metrics": len(form.metrics), "success_steps": int(form.success_steps > 1)}
     return {name: size for name, size in sizes.items() if size}
 
 
@@ -81,7 +83,10 @@ class Worlds:
         self._lasting_before = wp.zeros((n, task.lasting_memory), dtype=float)
         self.metric_sums = wp.zeros((n, len(task.metrics)), dtype=float)
         """Sums of the metrics over the episode so far."""
-        self._zeros = {name: wp.zeros_like(getattr(self, name)) for name in ("memory", "lasting_memory", "metric_sums")}
+        self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
+        """Steps in a row with the goal met, up to ``success_steps``; without a column where one step is enough."""
+        own = ("memory", "lasting_memory", "metric_sums", "success_counts")
+        self._zeros = {name: wp.zeros_like(getattr(self, name)) for name in own}
         # the fields of the state that a step leads to, live, and copies of those of the state before
         self.after, self.before = kernels.Batch(), kernels.Batch()
         self._copies: dict[str, wp.array] = {}
@@ -328,11 +333,18 @@ class Worlds:
             keep_reason, fault, action_fault, self.outcome, self.metric_sums, self.obs, self.final_obs,
             self.restarting,
         ], device=self.device)  # fmt: skip
+        self._hold_success(mask, transition=transition)
+
+    def _hold_success(self, mask: wp.array, *, transition: bool) -> None:
+        """Ask for several steps in a row with the goal met, where the task does so."""
+        if self.success_counts.size:
+            args = [mask, transition, self.task.task.success_steps, self.success_counts, self.outcome.success]
+            wp.launch(steps.hold_success, self.nworld, args, device=self.device)
 
     def _restart(self, mask: wp.array, *, randomly: bool, again: bool = False) -> None:
         """Put the masked worlds into an initial state of the task."""
         self.engine.reset(mask)
-        self._clear(mask, "memory", *([] if again else ["metric_sums"]))
+        self._clear(mask, "memory", *([] if again else ["metric_sums", "success_counts"]))
         if self.task.kernels.reject_worlds is not None:  # a rejected draw changes nothing else
             kept, live = self._lasting_before, self.lasting_memory
             launch_rows(state.copy_rows, mask, *((kept, live) if again else (live, kept)))
@@ -418,9 +430,10 @@ class Worlds:
 
     def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
         """Arrays that belong to the state beside the engine's and the counters, with their columns."""
+        arrays = {name: getattr(self, name) for name in MEMORIES}
+        arrays |= {"metrics": self.metric_sums, "success_steps": self.success_counts}
         for name in own_parts(self.task):
-            array = self.metric_sums if name == "metrics" else getattr(self, name)
-            yield array, self.state[:, self.state_space.parts[name]]
+            yield arrays[name], self.state[:, self.state_space.parts[name]]
 
     # parts of phases, and preparations, for environments and open-loop rollouts
 

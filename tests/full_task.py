@@ -167,6 +167,7 @@ class Full(lw.Task):
     memory, lasting_memory = 2, 1
     keyframe = "start"
     horizon = 20
+    success_steps = 3
 
 
 class Settled(Full):

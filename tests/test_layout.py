@@ -15,7 +15,7 @@ TESTS = Path(__file__).parent
 LEVELS = {
     "docstrings": -1, "arrays": 0, "done": 0, "files": 0, "forks": 0, "interrupts": 0, "machine": 0, "model_files": 0,
     "mujoco_log": 0, "validate": 0, "versions": 0, "warp_log": 0,
-    "fields": 1, "kernels": 1, "model_fields": 1, "options": 1, "task": 1,
+    "actuators": 1, "fields": 1, "kernels": 1, "model_fields": 1, "options": 1, "task": 1,
     "graphs": 2, "spaces": 2,
     "binding": 3, "engines": 3,
     "worlds": 4,

@@ -58,6 +58,20 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it() -> None:
         lw.package_model("no_robots", "arm.xml", install="no-robots==3").path()
 
 
+def test_a_python_on_which_an_extra_installs_nothing_is_named_with_a_command_that_works_there() -> None:
+    here = f"{sys.version_info.major}.{sys.version_info.minor}"
+    with pytest.raises(FileNotFoundError, match="which is not installed: pip install 'lyceum-warp.robots.'$"):
+        lw.package_model("no_robots", "arm.xml", install="lyceum-warp[robots]", before_python="3.99").path()
+    for before in (here, "3.10"):
+        model = lw.package_model("no_robots", "arm.xml", install="lyceum-warp[robots]", before_python=before)
+        with pytest.raises(
+            FileNotFoundError,
+            match=rf"lyceum-warp\[robots\] installs only on Python before {before}, and this is Python {here}: "
+            "use an older Python, or .*: pip install --no-deps no-robots$",
+        ):
+            model.path()
+
+
 def test_a_model_that_is_broken_is_named(menagerie: Path) -> None:
     (menagerie / "leg" / "scene.xml").write_text("<mujoco>")
     with pytest.raises(ValueError, match=r"can't read the model .*leg/scene\.xml"):

@@ -1,5 +1,8 @@
 """Worlds: the phases of a step, a reset and a restored state, and what they leave in the arrays."""
 
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
 import warp as wp
@@ -8,8 +11,16 @@ from metered_task import Metered
 
 import lyceum_warp as lw
 from lyceum_warp.kernels import steps
+from lyceum_warp.tasks.point_mass import PointMass
 
 ENGINES = ["mujoco", "warp"]
+
+
+class Held(PointMass):
+    """The point must stay at its target for three steps."""
+
+    model = lw.package_model("lyceum_warp", "tasks/point_mass.xml")
+    success_steps = 3
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -24,6 +35,87 @@ def test_phases_run_by_hand_have_the_numbers_of_a_step(engine: str) -> None:
         for name in steps.OUTCOMES:
             assert torch.equal(getattr(env, name), getattr(by_hand, name)), f"{name} at step {i}"
     assert torch.equal(env.get_state(), by_hand.get_state())
+
+
+def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.Env, lw.Env]:
+    """The task whose success needs three steps and the one in which one is enough; points move fast, goals differ."""
+    goals = {"success_distance": np.linspace(0.3, 2.5, nworld)}
+    held, plain = (lw.make(task, engine=engine, nworld=nworld, **goals, **options) for task in (Held, PointMass))
+    for env in (held, plain):
+        state = env.get_state()
+        env.state_space.split(state)["qvel"][:, :2] = torch.linspace(-9.0, 9.0, nworld)[:, None]
+        env.set_state(state)
+    return held, plain
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_held_success_needs_its_steps_in_a_row_within_an_episode(engine: str) -> None:
+    """Ends of episodes and a fault start the count again; all other numbers are those of the plain task."""
+    held, plain = held_and_plain(engine, horizon=12)
+    rows, rises, falls = torch.zeros(16), 0, 0
+    generator = torch.Generator().manual_seed(0)
+    for i in range(40):
+        action = 2.0 * torch.rand(held.action.shape, generator=generator) - 1.0
+        if i == 20:
+            action[-1] = torch.nan
+        before = held.success.clone()
+        for env in (held, plain):
+            env.step(action)
+        rows = torch.where(plain.success, rows + 1, 0.0)
+        assert torch.equal(held.success, rows >= 3), i
+        rises, falls = rises + int((held.success & ~before).sum()), falls + int((~held.success & before).sum())
+        for name in ("obs", "final_obs", "reward", "eval", "done_reason"):
+            assert torch.equal(getattr(held, name), getattr(plain, name)), f"{name} at step {i}"
+        rows[plain.done] = 0.0
+        state = held.get_state()
+        column = held.state_space.parts["success_steps"]
+        assert torch.equal(state[:, column].squeeze(1), rows.double().clamp(max=3)), i
+        assert torch.equal(state[:, : column.start], plain.get_state())
+    assert rises > 20 and falls > 20
+    assert "success_steps" not in plain.state_space.parts
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_state_goes_on_with_the_steps_of_a_success_and_a_reset_does_not(engine: str) -> None:
+    goals = np.array([0.0, 99.0, 99.0])
+    env = lw.make(Held, engine=engine, nworld=3, horizon=0, autoreset=False, success_distance=goals)
+    for _ in range(2):
+        env.step()
+    state = env.get_state()
+    assert not env.success.any()
+    for _ in range(4):
+        env.step()
+        assert env.success.tolist() == [False, True, True]
+    full = env.get_state()
+    env.reset(torch.tensor([False, False, True]))
+    assert env.success.tolist() == [False, True, False]
+    env.set_state(state)
+    assert not env.success.any()
+    env.step()
+    assert env.success.tolist() == [False, True, True]
+    env.set_state(full)
+    assert env.success.tolist() == [False, True, True]
+    env.set_params(success_distance=0.0)  # a state is a success only where it meets the goal itself
+    env.set_state(full)
+    assert not env.success.any()
+
+
+def test_rollouts_and_plans_do_not_depend_on_the_steps_of_a_success() -> None:
+    held, plain = held_and_plain("mujoco", nworld=4, autoreset=False)
+    actions = torch.rand(5, 4, 2, generator=torch.Generator().manual_seed(0))
+    rewards, plans = [], []
+    for env in (held, plain):
+        env.step()
+        rollouts = lw.OpenLoop(env.replicate(), 5)
+        rollouts.state.copy_(env.get_state()[0])
+        rollouts.actions.copy_(actions)
+        rollouts.run()
+        rewards.append(rollouts.reward.clone())
+        planner = lw.MPPI(env.task.task, horizon=4, samples=8, seed=3)
+        plans.append([planner(env.get_state()[0]).clone() for _ in range(2)])
+    assert torch.equal(*rewards)
+    for one, other in zip(*plans, strict=True):
+        assert torch.equal(one, other) and one.any()
 
 
 def test_metrics_of_a_step_and_of_its_episode_are_two_arrays() -> None:

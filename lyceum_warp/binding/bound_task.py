@@ -35,6 +35,9 @@ _UNWRITTEN = 7.25e33
 _SPARE = 64
 """Places after the end of a row in which a write that goes too far is found."""
 
+_MOST_SUCCESS_STEPS = 2**24
+"""Up to here a float32, as counts are kept, holds every whole number."""
+
 _MISSING = {"obs": 'the parts of its observation, as obs = {"position": 5}', "model": 'a model, as model = "robot.xml"'}
 
 
@@ -273,6 +276,7 @@ class BoundTask:
             if not hasattr(task, name) and (name == "obs" or model is None):
                 raise ValueError(f"the task {self.name!r} has no {name}: add {_MISSING[name]} to its class")
         whole_number(f"horizon of the task {self.name!r}", task.horizon, low=0)
+        self._check_success_steps()
         if task.action_range is not None:
             try:
                 low, high = map(float, task.action_range)
@@ -283,6 +287,18 @@ class BoundTask:
                     f"action_range of the task {self.name!r} must be two finite numbers, lowest first, as (-1.0, 1.0), "
                     f"not {task.action_range!r}"
                 )
+
+    def _check_success_steps(self) -> None:
+        task = self.task
+        name = f"success_steps of the task {self.name!r}"
+        steps = whole_number(name, task.success_steps, low=1, high=_MOST_SUCCESS_STEPS)
+        if steps > 1 and self.functions["success"] is None:
+            raise ValueError(f"{name} is {steps}, but the task has no {FUNCTIONS['success'].signature}: add it")
+        if steps > task.horizon > 0:
+            raise ValueError(
+                f"{name} is {steps}, but its episodes have {task.horizon} steps, so that none could be a success: "
+                "choose a smaller one, or a larger horizon"
+            )
 
     def _check_metrics(self) -> None:
         metrics: Any = self.task.metrics
@@ -333,7 +349,10 @@ class BoundTask:
             return error
         # which kernel is compiled first, and so which of its lines is in the message, differs from run to run
         flat = " ".join(text.split())
-        call = re.search(r"\b(reward|evaluate|terminated|success)\((?:s0|s1|view)\b", flat)
+        # the last function that is named holds the line that fails: where a kernel does not call it, the mistake lies
+        # within a function
+        innermost = flat.rpartition("while parsing function")[2]
+        call = re.search(r"\b(reward|evaluate|terminated|success)\((?:s0|s1|view)\b", innermost)
         kind = re.search(r"value argument type \((.+?)\) must be|with different type \(<class '[\w.]*?(\w+)'>\)", flat)
         if call and kind:
             signature, returned = FUNCTIONS[call.group(1)].signature, kind.group(1) or kind.group(2)

@@ -102,13 +102,13 @@ def list_tasks(options: Tasks) -> int:
 def _entry(name: str) -> _Entry:
     try:
         task = find_task(name)
-    except (ImportError, OSError, ValueError) as error:
+    except Exception as error:  # a broken file may raise any
         return _Entry(name, None, "", _UNKNOWN, _reason(error))
     about = (inspect.getdoc(sys.modules[task.__module__]) or "").partition("\n")[0]
     about = (about.partition(": ")[2] or about).rstrip(".")
     try:
         return _Entry(name, task, about, _source(task), "")
-    except (ImportError, OSError, ValueError) as error:
+    except Exception as error:
         return _Entry(name, task, about, _UNKNOWN, _reason(error))
 
 
@@ -117,16 +117,16 @@ def _row(entry: _Entry) -> tuple[tuple[str, ...], str]:
     task, note = entry.task, entry.note
     if task is None:
         return (entry.name, *[_UNKNOWN] * (len(_HEADINGS) - 2), entry.source), note
-    obs = sum(obs_layouts(task, defaults(TaskSource(task, entry.name).params))["policy"].values())
-    actions = _UNKNOWN if task.actions is None else str(sum(task.actions.values()))
-    timestep = _UNKNOWN
+    obs = actions = timestep = _UNKNOWN
     try:
+        actions = _UNKNOWN if task.actions is None else str(sum(task.actions.values()))
+        obs = str(sum(obs_layouts(task, defaults(TaskSource(task, entry.name).params))["policy"].values()))
         spec = task_spec(task)
         actions = str(_controls(spec)) if task.actions is None else actions
         timestep = f"{spec.option.timestep * task.frame_skip:g} s"
-    except (ImportError, OSError, ValueError) as error:  # such as a package that is not installed, with a model's files
+    except Exception as error:  # a package that is not installed, with a model's files, or a mistake in the task
         note = note or _reason(error)
-    numbers = (str(obs), actions, str(task.frame_skip), timestep, str(task.horizon or "none"))
+    numbers = (obs, actions, str(task.frame_skip), timestep, str(task.horizon or "none"))
     return (entry.name, *numbers, entry.source), note
 
 
@@ -156,4 +156,6 @@ def _reason(error: Exception) -> str:
     """An error in one line; the command that fixes it alone, where the error names one."""
     text = " ".join(str(error).split())
     command = text.rpartition(": ")[2]
-    return f"needs: {command}" if command.startswith("pip install") else text
+    if command.startswith("pip install"):
+        return f"needs: {command}"
+    return text if isinstance(error, ImportError | OSError | ValueError) else f"{type(error).__name__}: {text}"

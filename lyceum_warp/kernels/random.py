@@ -27,7 +27,7 @@ def substream(base: wp.uint32, number: int) -> wp.uint32:
 
 @wp.func
 def uniform(rng: wp.array[wp.uint32], low: float, high: float) -> float:
-    """Draw from U(low, high) and advance the stream.
+    """Draw from U(low, high) and advance the stream; with vectors, draw each element in turn between their elements.
 
     The stream is a row of one element: a number passed by value would not advance in the caller, so that two draws
     would be equal.
@@ -35,6 +35,22 @@ def uniform(rng: wp.array[wp.uint32], low: float, high: float) -> float:
     state = rng[0]
     value = wp.randf(state, low, high)
     rng[0] = state
+    return value
+
+
+@wp.func
+def uniform(rng: wp.array[wp.uint32], low: wp.vec2, high: wp.vec2) -> wp.vec2:
+    value = wp.vec2()
+    for i in range(2):
+        value[i] = uniform(rng, low[i], high[i])
+    return value
+
+
+@wp.func
+def uniform(rng: wp.array[wp.uint32], low: wp.vec3, high: wp.vec3) -> wp.vec3:
+    value = wp.vec3()
+    for i in range(3):
+        value[i] = uniform(rng, low[i], high[i])
     return value
 
 

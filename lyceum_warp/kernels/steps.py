@@ -105,6 +105,25 @@ def count_faults(fault_in: wp.array[int], count_out: wp.array[int]):
 
 
 @wp.kernel(enable_backward=False)
+def hold_success(
+    mask_in: wp.array[bool],
+    transition: bool,
+    needed: int,
+    count_inout: wp.array2d[float],
+    success_inout: wp.array[bool],
+):
+    """Let a success count only after ``needed`` steps in a row, in the masked worlds; launched over (nworld,).
+
+    A transition goes on with the count, (nworld, 1), up to ``needed``, or clears it; a state alone keeps it.
+    """
+    w = wp.tid()
+    if mask_in[w]:
+        if transition:
+            count_inout[w, 0] = wp.where(success_inout[w], wp.min(count_inout[w, 0] + 1.0, float(needed)), 0.0)
+        success_inout[w] = success_inout[w] and count_inout[w, 0] >= float(needed)
+
+
+@wp.kernel(enable_backward=False)
 def mark_changes(
     mask_in: wp.array[bool], before_in: wp.array2d[float], after_in: wp.array2d[float], changed_inout: wp.array[bool]
 ):

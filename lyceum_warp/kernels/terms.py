@@ -5,7 +5,7 @@ from typing import Any
 
 import warp as wp
 
-from lyceum_warp.kernels.rotations import quat_rotate_inverse
+from lyceum_warp.kernels.rotations import quat_from_axis_angle, quat_rotate_inverse
 
 
 class Sigmoid(enum.IntEnum):
@@ -82,6 +82,20 @@ def put(row: wp.array[float], at: int, value: Any) -> int:
     for i in range(len(value)):
         row[at + i] = value[i]
     return at + len(value)
+
+
+@wp.func
+def put_upright(qpos: wp.array[float], at: int, position: wp.vec3, yaw: float) -> int:
+    """Write the pose of an upright body into the coordinates of its free joint; returns the index after them.
+
+    Args:
+        qpos: The coordinates of a world.
+        at: Where those of the joint begin, as ``lw.qpos`` names it.
+        position: The place of the body, in m.
+        yaw: The angle by which the body is turned about the vertical, z, in radians.
+    """
+    k = put(qpos, at, position)
+    return put(qpos, k, quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw))
 
 
 @wp.func

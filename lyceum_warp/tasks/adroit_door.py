@@ -83,8 +83,7 @@ def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[fl
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    for i in range(3):
-        s.mocap_pos[p.frame][i] = lw.uniform(rng, p.frame_low[i], p.frame_high[i])
+    s.mocap_pos[p.frame] = lw.uniform(rng, p.frame_low, p.frame_high)
 
 
 @lw.register

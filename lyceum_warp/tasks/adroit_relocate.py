@@ -83,10 +83,8 @@ def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[fl
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    for i in range(2):
-        s.qpos[p.ball_x + i] = lw.uniform(rng, p.ball_low[i], p.ball_high[i])  # from the body's place, above (0, 0)
-    for i in range(3):
-        s.mocap_pos[p.target][i] = lw.uniform(rng, p.target_low[i], p.target_high[i])
+    lw.put(s.qpos, p.ball_x, lw.uniform(rng, p.ball_low, p.ball_high))  # from the body's place, above (0, 0)
+    s.mocap_pos[p.target] = lw.uniform(rng, p.target_low, p.target_high)
 
 
 @lw.register

@@ -21,14 +21,12 @@ class World:
     xmat: Row[wp.mat33]
     site_xpos: Row[wp.vec3]
     site_xmat: Row[wp.mat33]
-    memory: Row[float]  # steps since the pot was last under the goal's height
 
 
 @wp.struct
 class Params:
     dt: float
     goal_height: float = 0.1
-    goal_steps: float = 10.0
     rest_height: float = 0.0658  # of the pot on the table
     place: wp.vec3 = wp.vec3(0.03, 0.03, 0.25)  # of the pot at the start: x, y and yaw, each plus or minus this
     pot: int = lw.body("partnet_100015/")
@@ -64,8 +62,7 @@ def arm(s: World, grip: int, handle: int, finger: int) -> wp.vec4:
 
 @wp.func
 def terms(s: World, p: Params) -> wp.vec4:
-    left = arm(s, p.left_grip, p.left_handle, 6)
-    right = arm(s, p.right_grip, p.right_handle, 14)
+    left, right = arm(s, p.left_grip, p.left_handle, 6), arm(s, p.right_grip, p.right_handle, 14)
     mean, upright = 0.5 * (left + right), wp.max(s.xmat[p.pot][2, 2], 0.0)
     lift = wp.min(left[3], right[3]) * upright * wp.clamp(evaluate(s, p) / (1.5 * p.goal_height), 0.0, 1.0)
     return wp.vec4(mean[0], mean[1], mean[2], lift)
@@ -82,27 +79,20 @@ def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[fl
 
 
 @wp.func
-def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    s1.memory[0] = wp.where(evaluate(s1, p) > p.goal_height, s0.memory[0] + 1.0, 0.0)
-
-
-@wp.func
 def success(s: World, p: Params) -> bool:
-    return s.memory[0] >= p.goal_steps
+    return evaluate(s, p) > p.goal_height
 
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    x, y = lw.uniform(rng, -p.place[0], p.place[0]), lw.uniform(rng, -p.place[1], p.place[1])
-    k = lw.put(s.qpos, 16, wp.vec3(x, y, p.rest_height))
-    yaw = 0.5 * wp.pi + lw.uniform(rng, -p.place[2], p.place[2])  # a handle for each arm
-    lw.put(s.qpos, k, lw.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw))
+    d = lw.uniform(rng, -p.place, p.place)
+    lw.put_upright(s.qpos, 16, wp.vec3(d[0], d[1], p.rest_height), 0.5 * wp.pi + d[2])  # a handle for each arm
 
 
 @lw.register
 class AlohaLift(lw.Task):
     model = lw.package_model("mujoco_warp", "test_data/aloha_pot/scene.xml", install="mujoco-warp>=4.0,<5")
-    keyframe, frame_skip, horizon, memory = "start", 8, 150, 1
+    keyframe, frame_skip, horizon, success_steps = "start", 8, 150, 10
     obs = {"position": 16, "velocity": 22, "target": 14, "pot": 3, "pot_axes": 9, "handles_from_grips": 6}
     metrics, action_range = ("reach", "orient", "grasp", "lift"), (-1.0, 1.0)
     planning = lw.Planning(settings={"horizon": 16, "samples": 128, "temperature": 0.5, "noise": 0.6})
@@ -112,9 +102,7 @@ class AlohaLift(lw.Task):
         """Let simple shapes collide, and turn the servos into ones that follow velocities."""
         spec.option.timestep, spec.option.integrator = 0.005, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         for servo in spec.actuators:
-            servo.set_to_intvelocity(kp=servo.gainprm[0], kv=-servo.biasprm[2])
-            speed = 0.1 if servo.name.endswith("gripper") else 1.0  # m/s or rad/s
-            servo.actrange, servo.ctrlrange = servo.ctrlrange, (-speed, speed)
+            lw.follow_velocity(servo, 0.1 if servo.name.endswith("gripper") else 1.0)  # m/s or rad/s
         for geom in spec.geoms:
             geom.contype = geom.conaffinity = 0
             if geom.classname.name == "collision" and geom.name != "table":
@@ -129,4 +117,4 @@ class AlohaLift(lw.Task):
             spec.body(part.name).add_frame().attach_body(part, "lift/", "")
         arm = [0, -1.05, 1.06, 0, 0.78, 1.57, 0.035, 0.035]  # beside a handle, one finger above the other
         pot = [0, 0, 0.0658, 0.7071068, 0, 0, 0.7071068, 0]
-        spec.add_key(name="start", qpos=arm + arm + pot, act=arm[:7] + arm[:7])
+        spec.add_key(name="start", qpos=arm + arm + pot, act=2 * arm[:7])

@@ -19,14 +19,12 @@ class World:
     qvel: Row[float]
     site_xpos: Row[wp.vec3]
     mocap_pos: Row[wp.vec3]
-    memory: Row[float]  # steps in a row with both palms at their targets
 
 
 @wp.struct
 class Params:
     dt: float
     success_distance: float = 0.05
-    success_steps: float = 10.0
     precision_weight: float = 0.5
     ctrl_cost_weight: float = 0.01
     target_low: wp.vec3 = wp.vec3(0.6, 0.1, 0.7)  # of the left target; the right one's box is its mirror image in y
@@ -84,13 +82,8 @@ def evaluate(s: World, p: Params) -> float:
 
 
 @wp.func
-def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    s1.memory[0] = wp.where(evaluate(s1, p) < p.success_distance, s0.memory[0] + 1.0, 0.0)
-
-
-@wp.func
 def success(s: World, p: Params) -> bool:
-    return s.memory[0] >= p.success_steps
+    return evaluate(s, p) < p.success_distance
 
 
 @wp.func
@@ -116,5 +109,5 @@ class HerbReach(lw.Task):
     obs = {"position": 30, "velocity": 30, "palms": 6, "errors": 6}
     metrics = ("reaching", "precision", "effort")
     horizon = 100
-    memory = 1
+    success_steps = 10
     planning = lw.Planning(settings={"horizon": 12, "samples": 64, "noise": 2 * (ARM_NOISE + FINGER_NOISE)})

@@ -24,14 +24,12 @@ class World:
     xmat: Row[wp.mat33]
     site_xpos: Row[wp.vec3]
     site_xmat: Row[wp.mat33]
-    memory: Row[float]  # steps since the cube was last under the goal's height
 
 
 @wp.struct
 class Params:
     dt: float
     goal_height: float = 0.1
-    goal_steps: float = 10.0
     half_size: float = 0.02  # of the cube, in m
     area: wp.vec4 = wp.vec4(0.45, 0.65, -0.15, 0.15)  # of the cube at the start: x from, to, y from, to
     cube: int = lw.body("table/cube")
@@ -77,26 +75,21 @@ def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[fl
 
 
 @wp.func
-def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    s1.memory[0] = wp.where(evaluate(s1, p) > p.goal_height, s0.memory[0] + 1.0, 0.0)
-
-
-@wp.func
 def success(s: World, p: Params) -> bool:
-    return s.memory[0] >= p.goal_steps
+    return evaluate(s, p) > p.goal_height
 
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     x, y = lw.uniform(rng, p.area[0], p.area[1]), lw.uniform(rng, p.area[2], p.area[3])
-    k = lw.put(s.qpos, p.cube_qpos, wp.vec3(x, y, p.half_size - 1e-4))  # at rest, its weight presses it into the table
-    lw.put(s.qpos, k, lw.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), lw.uniform(rng, -wp.pi, wp.pi)))
+    place = wp.vec3(x, y, p.half_size - 1e-4)  # at rest, its weight presses it into the table
+    lw.put_upright(s.qpos, p.cube_qpos, place, lw.uniform(rng, -wp.pi, wp.pi))
 
 
 @lw.register
 class PandaLift(lw.Task):
     model = lw.package_model("robopal", "assets/models/manipulators/Panda/panda.xml", install="lyceum-warp[robots]")
-    keyframe, frame_skip, horizon, memory = "start", 8, 150, 1
+    keyframe, frame_skip, horizon, success_steps = "start", 8, 150, 10
     obs = {"position": 9, "velocity": 15, "target": 8, "cube": 3, "cube_axes": 9, "cube_from_grip": 3}
     metrics = ("reach", "orient", "grasp", "lift")
     action_range = (-1.0, 1.0)
@@ -108,8 +101,9 @@ class PandaLift(lw.Task):
         spec.option.timestep, spec.option.cone = 0.005, mujoco.mjtCone.mjCONE_ELLIPTIC
         for i, (motor, joint) in enumerate(zip(spec.actuators, spec.joints, strict=True)):
             kp, force = (4500.0, 87.0) if i < 4 else (2000.0, 12.0)  # the published limits of torque
-            motor.set_to_intvelocity(kp=kp, kv=0.05 * kp)
-            motor.actrange, motor.ctrlrange, motor.forcerange = joint.range, (-1.0, 1.0), (-force, force)  # rad/s
+            motor.set_to_position(kp=kp, kv=0.05 * kp)
+            motor.ctrlrange, motor.forcerange = joint.range, (-force, force)
+            lw.follow_velocity(motor, 1.0)  # rad/s
         for geom in spec.geoms:
             if geom.classname.name == "panda/collision":
                 geom.type, geom.contype, geom.parent.gravcomp = mujoco.mjtGeom.mjGEOM_CAPSULE, 0, 1.0

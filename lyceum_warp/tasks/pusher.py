@@ -74,7 +74,7 @@ def success(s: World, p: Params) -> bool:
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     offset = wp.vec2(0.0, 0.0)
     while wp.length(offset) <= 0.17:  # not near the goal
-        offset = wp.vec2(lw.uniform(rng, -0.3, 0.0), lw.uniform(rng, -0.2, 0.2))
+        offset = lw.uniform(rng, wp.vec2(-0.3, -0.2), wp.vec2(0.0, 0.2))
     lw.put(s.qpos, 7, offset)
     for i in range(7):
         s.qvel[i] += lw.uniform(rng, -0.005, 0.005)

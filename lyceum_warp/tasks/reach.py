@@ -83,8 +83,7 @@ def initialize(s: World, p: Params):
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    for i in range(3):
-        s.mocap_pos[p.target][i] = lw.uniform(rng, -p.target_range[i], p.target_range[i])
+    s.mocap_pos[p.target] = lw.uniform(rng, -p.target_range, p.target_range)
     if p.random_start:
         for i in range(7):
             s.qpos[i] = lw.uniform(rng, s.jnt_range[i][0], s.jnt_range[i][1])

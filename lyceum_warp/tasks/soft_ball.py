@@ -20,7 +20,6 @@ class World:
     site_xpos: Row[wp.vec3]
     flexvert_xpos: Row[wp.vec3]
     mocap_pos: Row[wp.vec3]
-    memory: Row[float]  # seconds that the ball has spent at the target without a break
 
 
 @wp.struct
@@ -89,13 +88,8 @@ def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[fl
 
 
 @wp.func
-def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    s1.memory[0] = wp.where(evaluate(s1, p) < p.success_distance, s0.memory[0] + p.dt, 0.0)
-
-
-@wp.func
 def success(s: World, p: Params) -> bool:
-    return s.memory[0] > 0.49
+    return evaluate(s, p) < p.success_distance
 
 
 @wp.func
@@ -114,7 +108,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @lw.register
 class SoftBall(lw.Task):
-    model, frame_skip, horizon, memory = "soft_ball.xml", 4, 200, 1
+    model, frame_skip, horizon, success_steps = "soft_ball.xml", 4, 200, 25
     obs = {"gripper": 3, "gripper_speed": 3, "ball": 3, "ball_velocity": 3, "widths": 3, "to_grip": 3, "to_target": 3}
     metrics = ("near", "lifted", "squeezed")
     action_range = (-1.0, 1.0)

@@ -55,6 +55,7 @@ CHECKS: tuple[Callable[[Context], None], ...] = (
     form.check_groups,
     form.check_noise,
     form.check_metrics,
+    form.check_success_steps,
     form.check_events,
     form.check_substep,
     form.check_lasting_memory,

@@ -110,6 +110,42 @@ def check_metrics(ctx: Context) -> None:
                 ctx.that((values == 0).all(), f"the sums of {name} after {reset.__name__} are {values.tolist()}")
 
 
+def check_success_steps(ctx: Context) -> None:
+    """``success`` is True at the end of so many steps in a row, the count belongs to the state, and a reset clears it.
+
+    Whether the goal is met in a state is what ``set_state`` shows where the count in that state is already full.
+    """
+    a, b, needed = ctx.a, ctx.b, int(ctx.a.task.task.success_steps)
+    if needed == 1:
+        return
+    column = a.state_space.parts["success_steps"]
+    with ctx.changed(a, b, horizon=0, autoreset=False):
+        ctx.restart()
+        state = a.get_state()
+        state[:, column] = torch.arange(a.nworld, dtype=state.dtype, device=state.device)[:, None] % needed
+        a.set_state(state)
+        count = state[:, column].squeeze(1)
+        ctx.equal(a.get_state(), state, "the state with another count after set_state (world, column)")
+        ctx.that(not a.success.any(), f"success is {a.success.tolist()} in states with the counts {count.tolist()}")
+        for i, action in enumerate(ctx.actions(SHORT + needed)):
+            a.step(action)
+            state = a.get_state()
+            found, good = state[:, column].squeeze(1), (a.done_reason & int(FAULTS)) == 0
+            full = state.clone()
+            full[:, column] = float(needed)
+            b.set_state(full)
+            calm = ctx.calm(a) & good  # an event's state is not the one that was judged
+            count = torch.where(calm & b.success, (count + 1).clamp(max=needed), 0.0)
+            ctx.equal(found[calm], count[calm], f"the count of steps in a row after step {i}")
+            ctx.equal(a.success[good], found[good] == needed, f"success of step {i} with the counts {found.tolist()}")
+            count = found
+        for reset in (a.reset, a.rand_reset):
+            a.set_state(full)
+            reset()
+            found = a.get_state()[:, column]
+            ctx.that((found == 0).all(), f"the counts after {reset.__name__} are {found.squeeze(1).tolist()}")
+
+
 def check_events(ctx: Context) -> None:
     """An event happens after a step is judged: it changes the state and the next observation, in some worlds.
 

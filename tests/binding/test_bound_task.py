@@ -28,6 +28,17 @@ def bound(file: Path, **options: Any) -> BoundTask:
         ("memory = 1", "the task 'tiny' needs both, memory = ... in the class and memory in World"),
         ("lagged = ('qvel',)", "the task 'tiny' wants 'qvel' lagged but does not list it in World"),
         ("frame_skip = 0", "frame_skip of the task 'tiny' must be a whole number from 1 to .*, not 0"),
+        *(
+            (
+                f"success_steps = {bad}",
+                rf"^success_steps of the task 'tiny' must be a whole number from 1 to \d+, not {bad}$",
+            )
+            for bad in ("0", "-1", "2.5", "True", "'ten'", "None")
+        ),
+        (
+            "success_steps = 2",
+            r"^success_steps of the task 'tiny' is 2, but the task has no success\(s: World, p: Params\)",
+        ),
         ("horizon = -1", "horizon of the task 'tiny' must be a whole number from 0 to .*, not -1"),
         ("action_range = 1.0", r"must be two finite numbers, lowest first, as \(-1.0, 1.0\), not 1.0"),
         ("action_range = (1.0, -1.0)", r"action_range of the task 'tiny' must be .* not \(1.0, -1.0\)"),
@@ -146,6 +157,11 @@ NOT_COMPILED = {
         f"{REWARD}:\n    r = (1.0, 2.0)\n    return r",
         r"returns tuple\w*(\(.*\))?: it must be written as reward|: a function returns one number, not a tuple",
     ),
+    "helper": (
+        f"def height(s: World):\n    h = s.qpos[0]\n    for i in range(2):\n        h = 1\n    return h\n\n\n@wp.func\n"
+        f"{REWARD} -> float:\n    return height(s1)",
+        "can't compile the functions of the task 'tiny': .*\"height\"",
+    ),
     "declared tuple": (
         f"{REWARD} -> float:\n    r = (1.0, 2.0)\n    return r", ": a function returns one number, not a tuple"
     ),
@@ -193,6 +209,14 @@ def test_task_spec_gives_the_tasks_own_model_unless_another_one_is_given(tmp_pat
     task = find_task(tiny_task.write(tmp_path, tiny_task.TINY))
     assert task_spec(task).modelname == "hopper"
     assert task_spec(task, "swimmer.xml").modelname == "swimmer"
+
+
+def test_more_success_steps_than_an_episode_has_are_refused(tmp_path: Path) -> None:
+    source = tiny_task.with_function("def success(s: World, p: Params) -> bool:\n    return True")
+    for horizon, steps in ((0, 6), (6, 6), (6, 1)):
+        bound(tiny_task.write(tmp_path, f"{source}    horizon, success_steps = {horizon}, {steps}\n"))
+    with pytest.raises(ValueError, match="success_steps of the task 'tiny' is 7, but its episodes have 6 steps"):
+        bound(tiny_task.write(tmp_path, f"{source}    horizon, success_steps = 6, 7\n"))
 
 
 def test_an_observation_has_one_size_in_all_worlds() -> None:

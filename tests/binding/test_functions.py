@@ -119,6 +119,7 @@ def test_a_class_in_the_place_of_a_struct_is_refused(name: str, tmp_path: Path) 
     ("line", "message"),
     [
         ("frameskip = 5", "'frameskip' in its class: did you mean frame_skip"),
+        ("sucess_steps = 10", "'sucess_steps' in its class: did you mean success_steps"),
         ("horzon = 10", "'horzon' in its class: did you mean horizon"),
     ],
 )

@@ -99,6 +99,24 @@ def test_a_task_whose_extra_is_missing_is_listed_with_all_that_is_known_without_
     assert lines[row + 2] == f"    needs: {INSTALL}"
 
 
+@pytest.mark.parametrize(
+    ("broken", "shown"),
+    [
+        (staticmethod(lambda p: {"x": p.missing}), "missing"),
+        (staticmethod(lambda p: {"x": {}["far"]}), "KeyError: 'far'"),
+        (7, "obs of the task 'hopper' is 7: add the parts of its observation"),
+    ],
+)
+def test_a_broken_task_is_listed_with_its_mistake_and_ends_no_list(
+    broken: object, shown: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(find_task("hopper"), "obs", broken)
+    assert cli.main(["tasks", "hop"]) == 0
+    out, error = capsys.readouterr()
+    assert error == "" and rows(out)["hopper"][0] == "-"
+    assert shown in out
+
+
 @pytest.mark.parametrize("command", ["train", "plan", "warmup"])
 def test_a_task_whose_extra_is_missing_is_refused_and_nothing_is_written(
     command: str, without_the_hand: Path, capsys: pytest.CaptureFixture[str]

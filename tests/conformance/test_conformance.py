@@ -7,11 +7,20 @@ from toy_engine import ToyEngine
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.testing import CHECKS, check_task
+from lyceum_warp.testing import buffer_rules as buffers
+from lyceum_warp.testing import state_rules as state
 from lyceum_warp.testing.episode_rules import check_memory
 
-WITH_MEMORY = ("hopper", "humanoid", "adroit_pen", "soft_ball")
-"""Tasks for which the rule about memory, which takes longest and depends little on the task, is always checked."""
-WITHOUT_MEMORY = tuple(check for check in CHECKS if check is not check_memory)
+EVERY_RULE = ("hopper", "humanoid", "adroit_pen", "soft_ball")
+"""Tasks for which all rules are always checked, on both engines. Together they use most of what a model can have."""
+OF_THE_TASK = tuple(check for check in CHECKS if check is not check_memory)
+"""For other tasks on the C engine: without the rule about memory, which takes long and depends little on the task."""
+OF_THE_STATE = (
+    buffers.check_addresses, buffers.check_getters, state.check_restoring, state.check_purity, state.check_determinism,
+    state.check_reset,
+)  # fmt: skip
+"""For other tasks on the Warp engine, whose steps take milliseconds on a CPU: whether it keeps and restores states of
+their models. Their functions are checked on the C engine, and their numbers by the comparison of the engines."""
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
 
 
@@ -34,16 +43,18 @@ def options(task: str, engine: str) -> dict[str, int]:
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("task", PACKAGE)
 def test_a_task_keeps_the_rules(task: str, engine: str) -> None:
-    checks = CHECKS if task in WITH_MEMORY else WITHOUT_MEMORY
+    checks = CHECKS if task in EVERY_RULE else OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     report = check_task(task, engine=engine, checks=checks, **options(task, engine))
     assert list(report.seconds) == [check.__name__.removeprefix("check_") for check in checks]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-@pytest.mark.parametrize("task", [task for task in PACKAGE if task not in WITH_MEMORY])
-def test_a_task_leaves_no_memory_behind(task: str, engine: str) -> None:
-    check_task(task, engine=engine, checks=[check_memory], **options(task, engine))
+@pytest.mark.parametrize("task", [task for task in PACKAGE if task not in EVERY_RULE])
+def test_a_task_keeps_the_other_rules(task: str, engine: str) -> None:
+    done = OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
+    checks = [check for check in CHECKS if check not in done]
+    check_task(task, engine=engine, checks=checks, **options(task, engine))
 
 
 @pytest.mark.parametrize("task", ["hopper", "point_mass", "humanoid"])

@@ -25,6 +25,20 @@ def draw(
     value_out[i, 3] = normal(rng)
 
 
+@wp.kernel(enable_backward=False)
+def draw_vectors(rng_inout: wp.array2d[wp.uint32], one_out: wp.array2d[float], many_out: wp.array2d[float]):
+    """Draw five numbers one by one, then the same ones as two vectors from a copy of the stream."""
+    i = wp.tid()
+    for k in range(5):
+        one_out[i, k] = uniform(rng_inout[2 * i], float(-k), float(k + 1))
+    two = uniform(rng_inout[2 * i + 1], wp.vec2(0.0, -1.0), wp.vec2(1.0, 2.0))
+    three = uniform(rng_inout[2 * i + 1], wp.vec3(-2.0, -3.0, -4.0), wp.vec3(3.0, 4.0, 5.0))
+    for k in range(2):
+        many_out[i, k] = two[k]
+    for k in range(3):
+        many_out[i, 2 + k] = three[k]
+
+
 def draws(counters: np.ndarray) -> np.ndarray:
     """Four draws of each row (seed, world, episode, step)."""
     columns = [wp.array(column, dtype=int, device="cpu") for column in counters.T]
@@ -38,6 +52,17 @@ def test_the_same_counters_give_the_same_draws_in_any_order() -> None:
     counters = np.array(list(itertools.product(range(3), range(4), range(3), range(3))))
     order = np.random.default_rng(0).permutation(len(counters))
     np.testing.assert_array_equal(draws(counters)[order], draws(counters[order]))
+
+
+def test_a_vector_has_the_draws_of_its_elements_in_turn() -> None:
+    rng = wp.array(np.repeat(np.arange(100), 2)[:, None], dtype=wp.uint32, device="cpu")
+    one, many = (wp.zeros((100, 5), dtype=float, device="cpu") for _ in range(2))
+    wp.launch(draw_vectors, 100, [rng, one, many], device="cpu")
+    np.testing.assert_array_equal(many.numpy(), one.numpy())
+    k = np.arange(5)
+    check_uniform((one.numpy() - 0.5) / (k + 0.5))
+    ends = rng.numpy()[:, 0]
+    np.testing.assert_array_equal(ends[::2], ends[1::2])
 
 
 def test_different_counters_give_different_draws() -> None:

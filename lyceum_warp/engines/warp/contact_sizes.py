@@ -5,7 +5,9 @@ import hashlib
 import logging
 
 import mujoco
+import mujoco_warp as mjw
 import numpy as np
+import warp as wp
 from mujoco.batch import Batch, SimulationError
 
 log = logging.getLogger(__name__)
@@ -27,6 +29,9 @@ def probe_sizes(model: mujoco.MjModel) -> tuple[int, int]:
 
     Returns:
         (nconmax, njmax), multiples of 8: each at least 8, with a flex at least 256 and 512.
+
+    Raises:
+        NotImplementedError, ValueError: MuJoCo Warp refuses the model.
     """
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
@@ -37,6 +42,8 @@ def probe_sizes(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 def _probe(model: mujoco.MjModel) -> tuple[int, int]:
+    with wp.ScopedDevice("cpu"):
+        mjw.put_model(model)  # a model that is refused is not worth a probe, which may take a minute
     batch = Batch(model, _WORLDS)
     rng = np.random.default_rng(0)
     ncon, nefc = batch.bind("ncon"), batch.bind("nefc")

@@ -364,11 +364,11 @@ def _refusals() -> Iterator[None]:
 
 def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied: Collection[str]) -> tuple[int, int]:
     """Contacts and constraints that each world has room for: those given, and probed ones for those that are not."""
-    with _refusals():
-        _check_sdf_plugins(model)  # now: probing such a model takes long
     given = {"nconmax": nconmax, "njmax": njmax}
     sizes = [size if size is None else whole_number(name, size, low=1) for name, size in given.items()]
-    probed = probe_sizes(_with_friction_losses(model, varied)) if None in sizes else (0, 0)
+    with _refusals():
+        _check_sdf_plugins(model)
+        probed = probe_sizes(_with_friction_losses(model, varied)) if None in sizes else (0, 0)
     contacts, constraints = (other if size is None else size for size, other in zip(sizes, probed, strict=True))
     return contacts, constraints
 

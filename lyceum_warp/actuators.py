@@ -1,0 +1,32 @@
+"""Changes to a model's actuators, for a task's ``edit_model``."""
+
+import mujoco
+
+from lyceum_warp.validate import positive_number
+
+
+def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:
+    """Turn a position servo into one whose target moves with a velocity, which becomes its control.
+
+    The servo keeps its gains. Its target, one of the model's activations (``act``), stays within the former control
+    range.
+
+    Args:
+        actuator: A position servo with a control range; changed in place.
+        speed: The range of the control becomes plus or minus this, in m/s or rad/s.
+
+    Raises:
+        ValueError: The actuator is not such a servo, or the speed is not positive.
+
+    Example:
+        >>> for servo in spec.actuators:
+        ...     lw.follow_velocity(servo, 1.0)
+    """
+    name, kp = f"the actuator {actuator.name!r}", actuator.gainprm[0]
+    if actuator.biastype != mujoco.mjtBias.mjBIAS_AFFINE or actuator.biasprm[1] != -kp or kp <= 0.0:
+        raise ValueError(f"{name} is not a position servo: make it one, as <position kp=...> or by set_to_position")
+    if actuator.ctrlrange[0] >= actuator.ctrlrange[1]:
+        raise ValueError(f"{name} has no range for its target: set its ctrlrange first")
+    speed = positive_number("speed", speed, "m/s or rad/s")
+    actuator.set_to_intvelocity(kp=kp, kv=-actuator.biasprm[2])
+    actuator.actrange, actuator.ctrlrange = actuator.ctrlrange, (-speed, speed)

@@ -1,0 +1,56 @@
+"""Position servos that follow velocities."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import lyceum_warp as lw
+
+XML = """
+<mujoco>
+  <worldbody><body><joint name="hinge" axis="0 1 0" damping=".1"/><geom size=".1" mass="1"/></body></worldbody>
+  <actuator>
+    <position name="servo" joint="hinge" kp="4" kv=".2" ctrlrange="-.5 .4"/>
+    <position name="free" joint="hinge" kp="400"/>
+    <motor name="motor" joint="hinge"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_a_servo_follows_a_velocity_up_to_its_former_range() -> None:
+    spec = mujoco.MjSpec.from_string(XML)
+    for name in ("free", "motor"):
+        spec.delete(spec.actuator(name))
+    lw.follow_velocity(spec.actuator("servo"), 0.25)
+    model = spec.compile()
+    servo = model.actuator("servo")
+    np.testing.assert_array_equal(servo.ctrlrange, (-0.25, 0.25))
+    np.testing.assert_array_equal(servo.actrange, (-0.5, 0.4))
+    assert servo.actlimited and servo.ctrllimited
+    assert (servo.gainprm[0], *servo.biasprm[:3]) == (4.0, 0.0, -4.0, -0.2)
+    data = mujoco.MjData(model)
+    found = []
+    for _ in range(3):
+        for _ in range(500):
+            data.ctrl[0] = 9.0  # clipped
+            mujoco.mj_step(model, data)
+        found.append(float(data.act[0]))
+    np.testing.assert_allclose(found, (0.25, 0.4, 0.4), atol=1e-3)
+    assert abs(data.qpos[0] - 0.4) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("name", "speed", "message"),
+    [
+        ("motor", 1.0, "the actuator 'motor' is not a position servo: make it one, as <position kp="),
+        ("free", 1.0, "the actuator 'free' has no range for its target: set its ctrlrange first"),
+        ("servo", -1.0, "speed must be a positive number of m/s or rad/s, not -1.0"),
+    ],
+)
+def test_another_actuator_or_speed_is_refused_and_left_as_it_is(name: str, speed: float, message: str) -> None:
+    spec = mujoco.MjSpec.from_string(XML)
+    before = spec.to_xml()
+    with pytest.raises(ValueError, match=message):
+        lw.follow_velocity(spec.actuator(name), speed)
+    assert spec.to_xml() == before
