@@ -354,6 +354,8 @@ class Run:
                 cause = str(error).rpartition(": ")[0]
                 note(f"{cause}: {self.previous}, of iteration {content['iteration']}, is used instead")
                 return content
+            if isinstance(error, ValueError) and (self.folder / _LAST).is_file():
+                raise ValueError(f"{error}, or begin with the run's policy: --from {self.folder}") from error
             raise
 
 

@@ -21,7 +21,7 @@ from lyceum_warp.runs import PolicyContent, Run, policy_content
 from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
 from lyceum_warp.validate import whole_number
 
-SHARE = 200
+SHARE = 400
 """The complete state is saved once training has taken this many times as long as the last such save."""
 
 Callback = Callable[[Iteration], Any]
@@ -51,7 +51,7 @@ def train(
 
     The policy and the value function are saved after every iteration. The complete state, from which a run continues
     exactly, is larger. It is saved at the start, at the end, after an error or a signal, and whenever training has
-    taken 200 times as long as the last such save, or every ``save_every`` iterations. A run that is killed continues
+    taken 400 times as long as the last such save, or every ``save_every`` iterations. A run that is killed continues
     from the last one, to the same numbers.
 
     Args:
@@ -405,6 +405,7 @@ class Keeper:
         self._content = policy_content(npg.iteration, npg.policy, npg.value)
         self._state: dict[str, Any] | None = None
         self._saved = npg.iteration if npg.iteration else -1
+        self._complete: tuple[PolicyContent, dict[str, Any]] | None = None
         self._best = run.best_score()
         self._best_content: PolicyContent | None = None
         self._files = run.files()
@@ -464,13 +465,16 @@ class Keeper:
     def save_boundary(self) -> None:
         """Save the complete state at the boundary, unless it is saved."""
         if self._saved != self.iteration and self._state is not None:
-            self.guarded(Keeper._save)
+            self.guarded(Keeper.save_state)
 
-    def _save(self) -> None:
+    def save_state(self) -> None:
+        """Save the complete state at the boundary."""
         start = time.perf_counter()
         assert self._state is not None
         self.run.save_policy(self._content)
         self.run.save_state(self._content, self._state)
+        # of several processes, this is all that can be saved elsewhere
+        self._complete = None if self.npg.team.size == 1 else (self._content, self._state)
         self._saved, self._when = self.iteration, time.perf_counter()
         self._seconds = self._when - start
 
@@ -500,7 +504,8 @@ class Keeper:
                 if (rescued := self._copied(place, whole=whole)) is None:
                     continue
                 if whole:
-                    return f"{text}: the whole run is in {rescued}; continue it with --resume {rescued}"
+                    what = "the whole run" if self._state is not None else f"the run up to iteration {self._saved}"
+                    return f"{text}: {what} is in {rescued}; continue it with --resume {rescued}"
                 return f"{text}: its policy is in {rescued / 'policy.pt'}{self._left()}"
         return f"{text}, nor in another folder{self._left()}"
 
@@ -531,9 +536,10 @@ class Keeper:
                 run.save_best(self._best_content, self._score_name, self._best[1])
             run.save_policy(self._content)
             if whole:
-                if self._state is None:
-                    raise OSError("the worlds of several processes are not at hand")
-                run.save_state(self._content, self._state)
+                complete = self._complete if self._state is None else (self._content, self._state)
+                if complete is None:
+                    raise OSError("there is no complete state")
+                run.save_state(*complete)
             return made
         except OSError:
             if made is not None:

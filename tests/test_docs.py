@@ -51,6 +51,7 @@ BLOCK = re.compile(r"^```(\w+)(?: title=(\S+))?\n(.*?)^```$", re.MULTILINE | re.
 QUICK = {
     "check": ["--nworld", "2", "--rule", "spaces", "--rule", "restoring"],
     "train": ["--iterations", "2", *TINY, "--no-video"],
+    "train --resume": ["--iterations", "3", "--no-video"],
     "eval": ["--episodes", "2", "--no-video"],
     "plan": ["--steps", "3", "--samples", "4", "--no-video"],
 }
@@ -94,7 +95,8 @@ class Walkthrough:
             case ["lyceum-warp", command, *options]:
                 if self.quick and "warp" in options:
                     return
-                more = QUICK.get(command, []) if self.quick else []
+                kind = f"{command} --resume" if "--resume" in options else command
+                more = QUICK.get(kind, []) if self.quick else []
                 assert cli.main([command, *options, *more]) == 0, words
             case _:
                 pytest.fail(f"{words} is a command that this test does not know")

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import resource
 from pathlib import Path
 
 import pytest
@@ -142,17 +143,29 @@ def test_load_returns_the_same_policy(run: Run) -> None:
         assert not loaded(obs).requires_grad
 
 
-def test_a_failed_save_keeps_the_old_checkpoint(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(content: object, path: Path) -> None:
-        path.write_bytes(b"PK half")
-        raise OSError("no space left on device")
-
-    before = run.checkpoint.read_bytes()
-    monkeypatch.setattr(torch, "save", broken)
-    with pytest.raises(OSError, match="no space"):
-        run.save(1, GaussianPolicy(3, 2), {})
+def test_a_failed_save_keeps_the_old_checkpoint(run: Run) -> None:
+    """As on a full disk: no file may grow beyond half of the checkpoint."""
+    before, limits = run.checkpoint.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            run.save(1, GaussianPolicy(3, 2), {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert run.checkpoint.read_bytes() == before
     assert not list(run.folder.glob("*.tmp"))
+
+
+def test_a_checkpoint_keeps_the_one_before_it(run: Run, caplog: pytest.LogCaptureFixture) -> None:
+    run.save(1, GaussianPolicy(3, 2), {"counter": 6})
+    assert run.read()["iteration"] == 1
+    run.checkpoint.write_bytes(b"PK half")
+    assert run.read()["iteration"] == 0 and f"{run.previous}, of iteration 0, is used instead" in caplog.text
+    run.checkpoint.unlink()
+    assert run.read()["iteration"] == 0
+    run.previous.write_bytes(b"PK half")
+    with pytest.raises(FileNotFoundError, match=r"there is no checkpoint .*checkpoint\.pt"):
+        run.read()
 
 
 class Foreign:

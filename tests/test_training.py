@@ -17,7 +17,7 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.runs import Run
-from lyceum_warp.training import Keeper, NotSavedError
+from lyceum_warp.training import SHARE, Keeper, NotSavedError
 
 CONFIG = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=2, mean_episodes=2)
 
@@ -221,7 +221,7 @@ def test_complete_states_take_a_small_share_of_the_time(env: lw.Env, tmp_path: P
     keeper.take(npg.state_dict())
     keeper.save_boundary()
     assert not keeper.due()
-    keeper._when -= 201 * keeper._seconds
+    keeper._when -= 1.1 * SHARE * keeper._seconds
     assert keeper.due()
     assert [Keeper(run, npg, save_every=n).due() for n in (1, 2)] == [True, False]
 

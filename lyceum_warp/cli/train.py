@@ -110,7 +110,7 @@ class Train:
     always kept."""
     save_every: int = 0
     """Iterations between two saves of the complete state, from which a run that was killed continues; 0 for a number
-    that keeps their time below 0.5 %."""
+    that keeps their time below 0.25 %."""
     tensorboard: bool = False
     """Whether to write the metrics for TensorBoard, too, into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
@@ -397,7 +397,13 @@ def _learn(run: Run | None, npg: NPG, options: Train) -> int:
                 text += f"; continue with\n  lyceum-warp train --resume {run.folder} --iterations {options.iterations}"
             console.print(text, soft_wrap=True, markup=False)
         return 128 + signalled.number
-    return 0 if run is None else _report(run, npg, options, console)
+    if run is None:
+        return 0
+    reached = run.config.get("reached", {})
+    if reached.get("iteration") == npg.iteration < options.iterations:
+        text = f"the target return is reached: {reached['return']:.6g} in iteration {npg.iteration}"
+        console.print(text, soft_wrap=True, markup=False)
+    return _report(run, npg, options, console)
 
 
 def _headline(run: Run, npg: NPG, options: Train) -> str:

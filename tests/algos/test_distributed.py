@@ -139,20 +139,20 @@ from lyceum_warp import NPG
 from lyceum_warp.cli import main
 
 where, rank = sys.argv.pop(1), sys.argv.pop(1)
-state_dict = NPG.state_dict
+iterate = NPG.__next__
 
 def interrupting(npg):
-    state = state_dict(npg)
+    iteration = iterate(npg)
     if npg.iteration == 2:
         signal.raise_signal(signal.SIGTERM)
-    return state
+    return iteration
 
-def interrupted(*args):
+def interrupted(*args, **words):
     signal.raise_signal(signal.SIGTERM)
 
 if os.environ["RANK"] == rank:
     if where == "learning":
-        NPG.state_dict = interrupting
+        NPG.__next__ = interrupting
     else:
         sys.modules["lyceum_warp.cli.train"]._algorithm = interrupted
 sys.exit(main())
