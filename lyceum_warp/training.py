@@ -24,6 +24,9 @@ from lyceum_warp.validate import whole_number
 SHARE = 400
 """The complete state is saved once training has taken this many times as long as the last such save."""
 
+POLICY_SHARE = 200
+"""The same for the policy, and for the copy of the complete state that is kept in memory."""
+
 Callback = Callable[[Iteration], Any]
 
 
@@ -49,7 +52,8 @@ def train(
     the mean policy's where the configuration has it evaluated (``mean_every``), otherwise the mean return of the
     episodes that ended in an iteration, which were sampled with the policy before it.
 
-    The policy and the value function are saved after every iteration. The complete state, from which a run continues
+    The policy and the value function are saved after every iteration; where iterations take less than about a second,
+    whenever training has taken 200 times as long as the last such save. The complete state, from which a run continues
     exactly, is larger. It is saved at the start, at the end, after an error or a signal, and whenever training has
     taken 400 times as long as the last such save, or every ``save_every`` iterations. A run that is killed continues
     from the last one, to the same numbers.
@@ -274,6 +278,7 @@ def learn(
     """
     alone = npg.team.size == 1
     keeper = None if run is None else Keeper(run, npg, keep_every=keep_every, save_every=save_every)
+    loop = None
     try:
         with postponed(not alone) as noted:
             loop = _Loop(keeper, npg, noted, [board, callback], target_return)
@@ -285,6 +290,8 @@ def learn(
     except BaseException as error:
         if alone and keeper is not None and not isinstance(error, NotSavedError):
             with postponed():
+                if loop is not None and not loop.iterating:
+                    keeper.take(npg.state_dict())
                 keeper.save_boundary()
             if isinstance(error, Exception):
                 error.add_note(f"the run in {keeper.run.folder} is saved up to iteration {keeper.iteration}")
@@ -312,17 +319,21 @@ class _Loop:
         self.keeper, self.npg, self.noted, self.target_return = keeper, npg, noted, target_return
         self.callbacks = [function for function in callbacks if function is not None]
         self.alone = npg.team.size == 1
-        self.due = self.ended = False
+        self.due = self.ended = self.iterating = False
         self.saved = npg.iteration if npg.iteration else -1
         self.error: Exception | None = None
 
     def step(self) -> None:
         """Make an iteration, keep it, and decide whether it was the last."""
         complete = self.due
+        self.iterating = True
         iteration = next(self.npg)
+        self.iterating = False
+        start = time.perf_counter()
+        renewed = complete or (self.keeper is not None and self.keeper.policy_due())
         # the worlds of several processes are brought together only to be saved
-        state = self.npg.state_dict() if complete or self.alone else None
-        self._write(lambda keeper: keeper.keep(iteration, state))
+        state = self.npg.state_dict() if complete or (renewed and self.alone) else None
+        self._write(lambda keeper: keeper.keep(iteration, state, renewed=renewed, start=start))
         if complete:
             self._write_state()
         self._decide(iteration)
@@ -346,7 +357,7 @@ class _Loop:
             return
         with postponed(self.alone):
             try:
-                self.keeper.guarded(action)
+                self.keeper.guarded(action, between=self.alone)
             except Exception as error:
                 self.error = error
 
@@ -386,8 +397,8 @@ class _Loop:
 class Keeper:
     """Writes a run's files after each iteration, and, where its folder cannot be written, the whole run elsewhere.
 
-    It keeps the boundary: the state after the last complete iteration. Whatever happens within the next one, that state
-    can be saved.
+    It keeps the boundary: the state after the last complete iteration, or after one at most two seconds before where
+    iterations are shorter than that. Whatever happens later, that state can be saved.
 
     Args:
         run: The run.
@@ -397,12 +408,12 @@ class Keeper:
     """
 
     iteration: int
-    """Number of the last complete iteration."""
+    """Number of the boundary's iteration."""
 
     def __init__(self, run: Run, npg: NPG, *, keep_every: int = 0, save_every: int = 0) -> None:
         self.run, self.npg, self.keep_every, self.save_every = run, npg, keep_every, save_every
         self.iteration = npg.iteration
-        self._content = policy_content(npg.iteration, npg.policy, npg.value)
+        self._content = self._latest = policy_content(npg.iteration, npg.policy, npg.value)
         self._state: dict[str, Any] | None = None
         self._saved = npg.iteration if npg.iteration else -1
         self._complete: tuple[PolicyContent, dict[str, Any]] | None = None
@@ -410,12 +421,19 @@ class Keeper:
         self._best_content: PolicyContent | None = None
         self._files = run.files()
         self._rows: list[dict[str, Any]] = []
-        self._seconds, self._when = 0.0, time.perf_counter()
+        self._seconds = self._policy_seconds = 0.0
+        self._when = self._policy_when = time.perf_counter()
+
+    def policy_due(self) -> bool:
+        """Whether this iteration's policy is to be saved, and a copy of the complete state to be kept."""
+        if self.keep_every and self.npg.iteration % self.keep_every == 0:
+            return True
+        return time.perf_counter() - self._policy_when >= POLICY_SHARE * self._policy_seconds
 
     def due(self) -> bool:
         """Whether the next iteration's complete state is to be saved."""
         if self.save_every:
-            return (self.iteration + 1) % self.save_every == 0
+            return (self.npg.iteration + 1) % self.save_every == 0
         return time.perf_counter() - self._when >= SHARE * self._seconds
 
     def return_of(self, iteration: Iteration) -> float | None:
@@ -434,25 +452,36 @@ class Keeper:
             self._content = policy_content(self.iteration, self.npg.policy, self.npg.value)
         self._state = state
 
-    def keep(self, iteration: Iteration, state: dict[str, Any] | None) -> None:
+    def keep(
+        self, iteration: Iteration, state: dict[str, Any] | None, *, renewed: bool = True, start: float | None = None
+    ) -> None:
         """Write the row of an iteration, and its policy.
 
         Args:
             iteration: The iteration.
             state: The algorithm's state after it, where it may be saved.
+            renewed: Whether the boundary moves to this iteration, and its policy is saved.
+            start: When the copy of the state began (``time.perf_counter``).
         """
-        before = self._content
-        self.iteration, self._state = self.npg.iteration, state
-        self._content = policy_content(self.iteration, self.npg.policy, self.npg.value)
+        start = time.perf_counter() if start is None else start
         self._rows.append(iteration.row())
         self.run.write(self._rows[-1])
         score = self.return_of(iteration)
-        if score is not None and (self._best is None or score > self._best[1]):
+        better = score is not None and (self._best is None or score > self._best[1])
+        before = self._latest
+        if renewed or better or not self._by_mean:
+            self._latest = policy_content(self.npg.iteration, self.npg.policy, self.npg.value)
+        if score is not None and better:
             # the iteration's own episodes were sampled with the policy before its step
-            self._best_content = self._content if self._by_mean else before
+            self._best_content = self._latest if self._by_mean else before
             self._best = self._best_content["iteration"], score
             self.run.save_best(self._best_content, self._score_name, score)
+        if not renewed:
+            return
+        self.iteration, self._state, self._content = self.npg.iteration, state, self._latest
         self.run.save_policy(self._content, number=bool(self.keep_every) and self.iteration % self.keep_every == 0)
+        self._policy_when = time.perf_counter()
+        self._policy_seconds = self._policy_when - start
 
     @property
     def _score_name(self) -> str:
@@ -480,8 +509,12 @@ class Keeper:
 
     # where the folder cannot be written
 
-    def guarded(self, action: Callable[["Keeper"], None]) -> None:
+    def guarded(self, action: Callable[["Keeper"], None], *, between: bool = False) -> None:
         """Write files; if that fails, save the run elsewhere.
+
+        Args:
+            action: Writes the files.
+            between: Whether the algorithm is between two iterations, so that its present state can be saved.
 
         Raises:
             NotSavedError: It failed.
@@ -491,6 +524,8 @@ class Keeper:
         except NotSavedError:
             raise
         except OSError as error:
+            if between and self.iteration != self.npg.iteration:
+                self.take(self.npg.state_dict())
             raise NotSavedError(self._rescued(error)) from error
 
     def _rescued(self, error: OSError) -> str:

@@ -17,7 +17,7 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.runs import Run
-from lyceum_warp.training import SHARE, Keeper, NotSavedError
+from lyceum_warp.training import POLICY_SHARE, SHARE, Keeper, NotSavedError
 
 CONFIG = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=2, mean_episodes=2)
 
@@ -214,7 +214,7 @@ def test_a_run_continues_from_the_last_complete_state_to_the_same_numbers(six: P
         assert torch.equal(mean_action(lw.load(folder, which=which)), mean_action(lw.load(six, which=which)))
 
 
-def test_complete_states_take_a_small_share_of_the_time(env: lw.Env, tmp_path: Path) -> None:
+def test_files_take_a_small_share_of_the_time(env: lw.Env, tmp_path: Path) -> None:
     npg = algorithm(env)
     run = Run.create(tmp_path / "run", {})
     keeper = Keeper(run, npg)
@@ -224,6 +224,10 @@ def test_complete_states_take_a_small_share_of_the_time(env: lw.Env, tmp_path: P
     keeper._when -= 1.1 * SHARE * keeper._seconds
     assert keeper.due()
     assert [Keeper(run, npg, save_every=n).due() for n in (1, 2)] == [True, False]
+    keeper.keep(next(npg), npg.state_dict())
+    assert not keeper.policy_due()
+    keeper._policy_when -= 1.1 * POLICY_SHARE * keeper._policy_seconds
+    assert keeper.policy_due()
 
 
 # a new run from the policy of another
@@ -411,4 +415,4 @@ def test_a_command_reports_a_folder_that_cannot_be_written_in_one_line(
 
     monkeypatch.setattr(Run, "write", deleting)
     assert cli.main([*arguments, "--out", str(folder), *QUIET]) == 2
-    refused(capsys, f"the run in {folder} could not be saved after iteration 2", f"--resume {folder}-rescued")
+    refused(capsys, f"the run in {folder} could not be saved after iteration", f"--resume {folder}-rescued")
