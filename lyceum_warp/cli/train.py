@@ -71,8 +71,8 @@ class Train:
     """Train a policy on a task with the natural policy gradient.
 
     The run's folder then holds config.json, versions.json, metrics.csv (one row for each iteration), policy.pt,
-    best.pt, checkpoint.pt, curve.png and video.mp4. Ctrl-C loses at most the current
-    iteration, or two seconds of short ones.
+    best.pt, checkpoint.pt, curve.png and video.mp4. Ctrl-C loses at most the current iteration, or two seconds of
+    short ones.
 
     $ lyceum-warp train hopper --iterations 100 --seed 1
     $ lyceum-warp train half_cheetah --param ctrl_cost_weight=0.05 --param reset_noise_scale=0 --hidden 32 32
