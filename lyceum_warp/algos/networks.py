@@ -66,6 +66,9 @@ def mlp(
     return nn.Sequential(*layers)
 
 
+_Applied: TypeAlias = tuple[torch.Tensor, torch.Tensor]
+
+
 class Normalizer(nn.Module):
     """Normalises observations by their running mean and variance; the identity until the first update.
 
@@ -110,28 +113,16 @@ class Normalizer(nn.Module):
         self.scale.copy_((self.square / total).sqrt().clamp_min(1e-4).reciprocal())
 
     @torch.no_grad()
-    def update_before(self, layer: nn.Module, obs: torch.Tensor, team: Team | None = None) -> None:
-        """Update, and change the layer that takes the normalised observations so that its output stays the same.
-
-        A policy's actions and a value function's predictions then do not depend on when the statistics are updated,
-        except for observations that are clipped. The first update leaves the layer as it is: it was not trained yet.
-        A layer that is not linear, or has no bias, cannot compensate later ones, so that they are left out.
+    def interpolate(self, before: _Applied, after: _Applied, part: torch.Tensor) -> None:
+        """Apply only a part of an update: the running mean and variance stay, and later updates make the rest.
 
         Args:
-            layer: The layer whose first inputs are the normalised observations.
-            obs: Observations, (..., size).
-            team: The processes; each brings the same number of observations.
+            before: ``shift`` and ``scale`` before the update.
+            after: ``shift`` and ``scale`` after it.
+            part: The part of the change that is applied, from 0 to 1.
         """
-        first, before = self.count == 0, {name: buffer.clone() for name, buffer in self.named_buffers()}
-        self.update(obs, team)
-        if not isinstance(layer, nn.Linear) or layer.bias is None:
-            for name, buffer in self.named_buffers():
-                buffer.copy_(torch.where(first, buffer, before[name]))
-            return
-        shift, scale = before["shift"], before["scale"]
-        weight = layer.weight[:, : len(shift)]  # of scale (x - shift) before, and of self.scale (x - self.shift) now
-        layer.bias.add_(((self.shift - shift) * scale).masked_fill(first, 0.0) @ weight.T)
-        weight.mul_((scale / self.scale).masked_fill(first, 1.0))
+        self.shift.copy_(torch.lerp(before[0], after[0], part))
+        self.scale.copy_(torch.lerp(before[1].log(), after[1].log(), part).exp())
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Normalised observations, (..., size)."""

@@ -17,6 +17,7 @@ import warp as wp
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
 from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, flatten
+from lyceum_warp.algos.networks import Normalizer
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
 from lyceum_warp.algos.npg_statistics import (
     Iteration,
@@ -42,7 +43,10 @@ from lyceum_warp.validate import check_kind
 log = logging.getLogger(__name__)
 
 _SHORTER = 4
-"""How often a step is shortened at most."""
+"""How often a step, and a change of the statistics, is shortened at most."""
+
+_DRIFT = 0.2
+"""The largest part of the wanted KL divergence that new statistics of observations may cause."""
 
 
 @document_attributes
@@ -175,10 +179,9 @@ class NPG:
         self.sample()
         timer.mark()
 
-        # 2. Statistics that normalise observations; policy and value stay the same functions.
+        # 2. Statistics that normalise the policy's observations.
         obs, value_obs = rollout.obs.flatten(0, 1), rollout.obs_groups[self.value.group].flatten(0, 1)
-        self.policy.observe(obs, team)
-        self.value.observe(value_obs, team)
+        old_mean = self.observe(obs)
 
         # 3. Advantages, from the value function that was not yet fitted to these samples.
         advantage, target, prediction, outliers = self.advantages()
@@ -194,7 +197,7 @@ class NPG:
         fisher = self.fisher(obs)
         direction = conjugate_gradient(fisher, gradient, config.cg_iterations)
         step = direction * torch.sqrt(config.delta / (gradient @ direction + 1e-20))
-        finite, fraction, kl = self.move(step, obs)
+        finite, fraction, kl = self.move(step, obs, old_mean)
         timer.mark()
 
         # One copy brings the numbers of all processes to the host.
@@ -211,7 +214,9 @@ class NPG:
                 f"{rollout.explain_not_finite()}"
             )
 
-        # 6. The value function, on the returns of these samples.
+        # 6. The value function, on the returns of these samples. Its statistics change just before, so that the fit
+        # corrects what they do to its predictions.
+        self.value.observe(value_obs, team)
         self.fit(value_obs, rollout.step.flatten(), target.flatten(), self.generator)
         timer.mark()
 
@@ -279,6 +284,34 @@ class NPG:
             advantage = advantage / (variance.sqrt() + 1e-6 * self.value.scale.float())
         return advantage, target, prediction, outliers
 
+    @torch.no_grad()
+    def observe(self, obs: torch.Tensor) -> torch.Tensor:
+        """Update the statistics that normalise the policy's observations, in steps that hardly change the policy.
+
+        A change that would move the policy by more than a fifth of the wanted KL divergence is made in part; later
+        iterations make the rest. The divergence of the whole iteration includes it.
+
+        Args:
+            obs: Observations of this process's worlds, (samples, nobs).
+
+        Returns:
+            The mean actions before, (samples, nact).
+        """
+        old_mean, normalizer = self.policy(obs), self.policy.normalizer
+        if isinstance(normalizer, Normalizer):
+            before = normalizer.shift.clone(), normalizer.scale.clone()
+            self.policy.observe(obs, self.team)
+            after = normalizer.shift.clone(), normalizer.scale.clone()
+            limit, part = _DRIFT * 0.5 * self.config.delta, torch.ones_like(after[0][0])
+            for _ in range(_SHORTER):
+                normalizer.interpolate(before, after, part)
+                square = (old_mean - self.policy(obs)).square()
+                kl = 0.5 * (square * torch.exp(-2 * self.policy.log_std)).sum(-1).mean()
+                kl = self.team.sum(kl) / self.team.size
+                part = torch.where(kl <= limit, part, part * (limit / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5))
+            normalizer.interpolate(before, after, part)
+        return old_mean
+
     def fisher(self, obs: torch.Tensor) -> FisherProduct:
         """Products with the Fisher information, averaged over a share of the samples that is drawn at random.
 
@@ -298,7 +331,9 @@ class NPG:
         )
 
     @torch.no_grad()
-    def move(self, step: torch.Tensor, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def move(
+        self, step: torch.Tensor, obs: torch.Tensor, old_mean: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Add a step, or a part of it, to the policy's parameters.
 
         The Fisher information describes the KL divergence to second order only, and only on some of the samples. Where
@@ -309,6 +344,7 @@ class NPG:
         Args:
             step: The step, (parameters,).
             obs: Observations, (samples, nobs).
+            old_mean: The mean actions of the policy that sampled, (samples, nact).
 
         Returns:
             Whether the step is finite; the share of it that was made; and the KL divergence from the old policy to the
@@ -319,7 +355,7 @@ class NPG:
         parameters = [p for p in self.policy.parameters() if p.requires_grad]
         old = [p.clone() for p in parameters]
         steps = [part.view_as(p) for part, p in zip(step.split([p.numel() for p in parameters]), old, strict=True)]
-        old_mean, old_log_std = self.policy(obs), self.policy.log_std.clone()
+        old_log_std = self.policy.log_std.clone()
         lowest = old_log_std.clamp_max(self.config.min_log_std)
 
         def divergence(fraction: torch.Tensor) -> torch.Tensor:

@@ -101,18 +101,14 @@ class GaussianPolicy(nn.Module):
         return torch.addcmul(self(obs), noise, self.log_std.exp(), out=out)
 
     def observe(self, obs: torch.Tensor, team: Team | None = None) -> None:
-        """Take observations into the normaliser's statistics; after the first call the mean actions stay the same.
-
-        The first layer compensates a change of the statistics. A network of your own can do so if it is an
-        ``nn.Sequential`` that begins with an ``nn.Linear``; otherwise the statistics stay those of the first call.
+        """Take observations into the normaliser's statistics, where it has one; this changes the mean actions.
 
         Args:
             obs: Observations, (..., nobs).
             team: The processes; each brings the same number of observations.
         """
         if isinstance(self.normalizer, Normalizer):
-            first = self.network[0] if isinstance(self.network, nn.Sequential) else self.network
-            self.normalizer.update_before(first, obs, team)
+            self.normalizer.update(obs, team)
 
     def log_prob(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Log-density of actions, (...,)."""

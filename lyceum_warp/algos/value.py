@@ -95,14 +95,14 @@ class ValueFunction(nn.Module):
         return self.network(self.features(obs, step)).squeeze(-1) * self.scale.float() + self.shift.float()
 
     def observe(self, obs: torch.Tensor, team: Team | None = None) -> None:
-        """Take observations into the normaliser's statistics; after the first call the predictions stay the same.
+        """Take observations into the normaliser's statistics, where it has one; this changes the predictions.
 
         Args:
             obs: Observations, (..., nobs).
             team: The processes; each brings the same number of observations.
         """
         if isinstance(self.normalizer, Normalizer):
-            self.normalizer.update_before(self.network[0], obs, team)
+            self.normalizer.update(obs, team)
 
     @torch.no_grad()
     def rescale(self, returns: torch.Tensor, *, first: bool = False, team: Team | None = None) -> None:
@@ -110,31 +110,33 @@ class ValueFunction(nn.Module):
 
         The last layer compensates the change (Pop-Art; van Hasselt et al. 2016, "Learning values across many orders of
         magnitude"). Outliers are bounded: a return counts as at most ``BOUND`` scales away from the shift, and the
-        scale changes by at most that factor. Returns that are all equal leave the scale as it is.
+        scale changes by at most that factor. Where more than a quarter of the returns lie beyond that bound, as after a
+        change of the task, they are not outliers: the bound then follows from their quartiles. Returns that are all
+        equal leave the scale as it is.
 
         Args:
             returns: Returns, of any shape.
-            first: Whether the function was never fitted. The bound then is 20 times the range between the quartiles,
-                and the scale may change by any factor.
+            first: Whether the function was never fitted, so that its scale means nothing.
             team: The processes; each brings the same number of returns.
         """
         team = team or Team()
         returns = returns.flatten().double()
-        low, high = self.shift - BOUND * self.scale, self.shift + BOUND * self.scale
-        if first:
-            ordered = team.gather(returns).nan_to_num().sort().values
-            quartile, median, other = (ordered[i * (len(ordered) - 1) // 4] for i in (1, 2, 3))
-            width = 20.0 * (other - quartile)
-            width.masked_fill_(width == 0.0, torch.inf)  # as where few rewards are not zero
-            low, high = median - width, median + width
-        returns = torch.minimum(torch.maximum(returns, low), high).nan_to_num()
         count = len(returns) * team.size
+        low, high = self.shift - BOUND * self.scale, self.shift + BOUND * self.scale
+        beyond = team.sum(((returns < low) | (returns > high)).double().sum())
+        new = (beyond > 0.25 * count) | first
+        ordered = team.gather(returns).nan_to_num().sort().values
+        quartile, median, other = (ordered[i * (len(ordered) - 1) // 4] for i in (1, 2, 3))
+        width = 20.0 * (other - quartile)
+        width.masked_fill_(width == 0.0, torch.inf)  # as where few rewards are not zero
+        low, high = torch.where(new, median - width, low), torch.where(new, median + width, high)
+        returns = torch.minimum(torch.maximum(returns, low), high).nan_to_num()
         mean = team.sum(returns.sum()) / count
         std = (team.sum((returns - mean).square().sum()) / count).sqrt()
         # float32 returns differ by rounding alone where they are equal
         scale = torch.where(std > 1e-6 * mean.abs(), torch.maximum(std, 1e-3 * mean.abs()), self.scale)
-        if not first:
-            scale = torch.minimum(torch.maximum(scale, self.scale / BOUND), self.scale * BOUND)
+        near = torch.minimum(torch.maximum(scale, self.scale / BOUND), self.scale * BOUND)
+        scale = torch.where(new, scale, near)
         last = self.network[-1]
         assert isinstance(last, nn.Linear)
         last.weight.mul_(self.scale / scale)

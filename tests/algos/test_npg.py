@@ -1,5 +1,6 @@
 """NPG as a whole: steps of the right length, exact resumption, and a task that it can learn."""
 
+import copy
 import dataclasses
 import math
 from collections.abc import Callable
@@ -22,7 +23,7 @@ def env() -> lw.Env:
 
 def test_a_step_has_the_kl_divergence_that_delta_sets(env: lw.Env) -> None:
     env.rand_reset(0)
-    npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=3200, delta=1e-3), seed=0)
+    npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=3200, delta=1e-3, normalize=False), seed=0)
     before = torch.cat([p.detach().flatten() for p in npg.policy.parameters()])
     it = next(npg)
     after = torch.cat([p.detach().flatten() for p in npg.policy.parameters()])
@@ -109,6 +110,45 @@ def test_a_step_that_the_fisher_information_misjudges_is_shortened(env: lw.Env) 
     assert min(it.step_fraction for it in iterations) < 0.5
     free = lw.NPG(env, config=dataclasses.replace(one_sample, kl_limit=1e9), seed=0)
     assert max(next(free).kl for _ in range(4)) > 0.2
+
+
+def test_statistics_of_observations_count_as_a_part_of_the_step() -> None:
+    """Observations move far away in iteration 4; the divergence between the policies that sample stays in its limit."""
+    env = lw.make("hopper", nworld=16, seed=1, nthread=1)
+    config = lw.NPGConfig(samples=1600, hidden=(16,), value_hidden=(16,), mean_every=0, log_std=-2.0)
+    npg = lw.NPG(env, config=config, seed=0)
+    collect = npg.rollout.collect
+
+    def changed(policy: lw.GaussianPolicy, noise: torch.Tensor) -> None:
+        collect(policy, noise)
+        if npg.iteration == 3:
+            npg.rollout.obs.mul_(20.0)
+
+    npg.rollout.collect = changed  # type: ignore[method-assign]
+    for _ in range(6):
+        before, scale = copy.deepcopy(npg.policy), npg.policy.normalizer.scale.clone()
+        it = next(npg)
+        obs = npg.rollout.obs.flatten(0, 1)
+        with torch.no_grad():
+            old, new = (
+                torch.distributions.Normal(policy(obs), policy.log_std.exp()) for policy in (before, npg.policy)
+            )
+            kl = torch.distributions.kl_divergence(old, new).sum(-1).mean().item()
+        assert it.kl == pytest.approx(kl, rel=1e-3, abs=1e-5) and kl <= 1.5 * 0.05 + 1e-4
+        assert not torch.equal(npg.policy.normalizer.scale, scale)
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-3])
+def test_a_value_function_follows_returns_of_another_scale(factor: float) -> None:
+    """As after a change of the task, where all returns of the new one lie outside the range of the old one."""
+    value = lw.ValueFunction(3)
+    returns = 50.0 + 10.0 * torch.randn(1000, generator=torch.Generator().manual_seed(0))
+    value.rescale(returns, first=True)
+    assert value.scale.item() == pytest.approx(10.0, rel=0.1)
+    for _ in range(4):
+        value.rescale(factor * returns)
+    assert value.scale.item() == pytest.approx(factor * 10.0, rel=0.1)
+    assert value.shift.item() == pytest.approx(factor * 50.0, rel=0.1)
 
 
 def test_the_fisher_information_takes_other_samples_each_time(env: lw.Env) -> None:
