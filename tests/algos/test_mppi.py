@@ -635,12 +635,14 @@ def test_reach_succeeds(seed: int) -> None:
     assert evals[-10:].mean() < 0.05 and rewards.sum() > -250
 
 
+@pytest.mark.long
 def test_cartpole_swings_up_and_stays_up() -> None:
     _, _, evals = drive("cartpole_swingup", 200, 0)
     assert evals[0] < 0
     assert evals[-20:].min() > 0.9, evals[-20:]
 
 
+@pytest.mark.long
 def test_half_cheetah_runs() -> None:
     _, _, evals = drive("half_cheetah", 50, 1)
     assert evals[-1] - evals[0] > 2.5
