@@ -71,7 +71,7 @@ class MPPI:
         task: Name of a task, a file with one, or its class.
         config: Settings in place of the task's.
         value: Adds the value of the state where a sample ends to its return: a ``ValueFunction``, or a function from
-            (nsample, nobs) observations to (nsample,) values, or a Warp function of one observation,
+            (nworld, nobs) observations to (nworld,) values, or a Warp function of one observation,
             ``value(obs: Row[float]) -> float``, which becomes part of the graph on the Warp engine. With a value the
             parameters in ``planning`` do not apply, because the value function was fitted to the task's own rewards.
         seed: Seed of the noise.

@@ -118,7 +118,7 @@ class MPPIConfig:
             ValueError: A value is of the wrong type or out of range.
         """
         other = settings.get("update", self.update) != self.update
-        words: dict[str, Any] = {**(dict.fromkeys(_OF_CEM) if other else {}), **settings}
+        words: dict[str, Any] = {**(dict.fromkeys((*_OF_CEM, "include_plan")) if other else {}), **settings}
         return dataclasses.replace(self, **words)
 
     def completed(self, value: object = None) -> "MPPIConfig":

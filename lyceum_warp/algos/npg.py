@@ -99,6 +99,9 @@ class NPG:
     ) -> None:
         check_kind("env of NPG", env, Env, "as lw.make(...) makes it")
         check_kind("config of NPG", config, NPGConfig | None, "as lw.NPGConfig(samples=10000)")
+        check_kind("value of NPG", value, ValueFunction | None, "as lw.load_value(run) returns it")
+        if value is not None:
+            _check_value(value, env)
         self.env = env
         self.team = team = team or Team()
         self.config = config = config or NPGConfig()
@@ -415,6 +418,22 @@ class NPG:
         self.rollout.running_return.copy_(state["returns"][self._own])
         self.iteration = state["iteration"]
         self.samples = state["samples"]
+
+
+def _check_value(value: ValueFunction, env: Env) -> None:
+    """Check that a value function takes observations of an environment."""
+    name = env.task.name
+    if value.group not in env.obs_groups:
+        raise ValueError(
+            f"the value function takes the group {value.group!r} of observations, which the task {name!r} lacks: it has "
+            f"{', '.join(env.obs_groups)}"
+        )
+    size, wanted = value.shape["nobs"], env.obs_spaces[value.group].size
+    if size != wanted:
+        raise ValueError(
+            f"the value function takes {size} observations, but the group {value.group!r} of the task {name!r} has "
+            f"{wanted}"
+        )
 
 
 def _value_group(env: Env, config: NPGConfig) -> str:

@@ -110,7 +110,7 @@ def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.ar
 
 @wp.kernel(enable_backward=False)
 def draw_keys(seed_in: wp.array[int], count_in: wp.array[int], key_out: wp.array[wp.uint32]):
-    """Make the samples' stream keys from (seed, sample, count); launched over (nsample,).
+    """Make the samples' stream keys from (seed, sample, count); launched over (nworld,).
 
     A plant's keys are those of (seed, world) alone, so that no sample draws what the plant will draw.
     """
@@ -188,7 +188,7 @@ def add_up(
     stop: bool,
     return_out: wp.array[float],
 ):
-    """Add up the samples' discounted rewards and terminal values; launched over (nsample,).
+    """Add up the worlds' discounted rewards and terminal values; launched over (nworld,).
 
     With ``stop`` a sample earns nothing after the end of its episode, also no terminal value. The return of a sample
     with a fault, or of one that is not finite, is minus infinity.
@@ -377,7 +377,7 @@ def value_kernel(value: wp.Function) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False)
     def values(obs_in: wp.array2d[float], value_out: wp.array[float]):
-        """Evaluate the samples' last observations; launched over (nsample,)."""
+        """Evaluate the worlds' last observations; launched over (nworld,)."""
         k = wp.tid()
         value_out[k] = value(obs_in[k])
 

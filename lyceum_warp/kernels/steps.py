@@ -264,7 +264,7 @@ def make_kernels(
         Writes the reward, the metrics, the evaluation, termination, success and the observations.
 
         A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and the last good
-        observations. It counts as terminated, so that no learner bootstraps from it.
+        observations. It counts as terminated, so that no learner takes it for a time limit.
         """
         w = wp.tid()
         if not mask_in[w]:

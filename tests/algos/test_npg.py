@@ -247,6 +247,12 @@ def test_wrong_arguments_are_refused(env: lw.Env) -> None:
         lw.NPG("hopper")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"config of NPG .* of type NPGConfig .* not dict"):
         lw.NPG(env, config={"samples": 3})  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="value function takes 7 observations, but the group 'policy' .* has 6"):
+        lw.NPG(env, value=lw.ValueFunction(7))
+    with pytest.raises(ValueError, match=r"value of NPG .* not Linear"):
+        lw.NPG(env, value=torch.nn.Linear(6, 1))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="takes the group 'critic' of observations, which the task 'point_mass' lacks"):
+        lw.NPG(env, value=lw.ValueFunction(6, group="critic"))
     with pytest.raises(ValueError, match="autoreset=True"):
         lw.NPG(lw.make("point_mass", autoreset=False))
 

@@ -321,7 +321,7 @@ def assert_continues(out: Path, output: str, trained: Path) -> None:
     assert f"lyceum-warp train --resume {out} --iterations 100000" in output
     rows = metrics(out)
     assert [int(row["iteration"]) for row in rows] == list(range(1, done + 1))
-    assert rows[:3] == metrics(trained)[:3]
+    assert rows[:3] == metrics(trained)[: min(3, done)]  # of short iterations, the last few may be lost
     assert cli.main(["train", "--resume", str(out), "--iterations", str(done + 1), *QUIET]) == 0
     assert len(metrics(out)) == done + 1
 
