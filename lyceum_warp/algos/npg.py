@@ -425,8 +425,8 @@ def _check_value(value: ValueFunction, env: Env) -> None:
     name = env.task.name
     if value.group not in env.obs_groups:
         raise ValueError(
-            f"the value function takes the group {value.group!r} of observations, which the task {name!r} lacks: it has "
-            f"{', '.join(env.obs_groups)}"
+            f"the value function takes the group {value.group!r} of observations, which the task {name!r} lacks: it "
+            f"has {', '.join(env.obs_groups)}"
         )
     size, wanted = value.shape["nobs"], env.obs_spaces[value.group].size
     if size != wanted:
