@@ -249,7 +249,7 @@ def test_a_command_begins_with_the_policy_of_a_run(
     arguments = ["train", "--from", str(six), "--which", "4", "--param", "success_distance=0.5", "--iterations", "1"]
     assert cli.main([*arguments, "--out", str(out), "--keep-every", "1", *QUIET]) == 0
     config = Run.open(out).config
-    assert config["from"] == {"run": str(six / "policies"), "which": "4", "iteration": 4}
+    assert config["from"] == {"run": str(six), "which": "4", "iteration": 4}
     assert (config["task"], config["params"], config["nworld"]) == ("point_mass", {"success_distance": 0.5}, 2)
     assert config["npg"] == Run.open(six).config["npg"]
     state = Run.open(out).read()["state"]

@@ -20,6 +20,7 @@ from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
 from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.cli.arguments import (
+    NO_FLAGS,
     EnvFlags,
     Physics,
     Repeated,
@@ -143,12 +144,15 @@ def train(options: Train) -> int:
     with join(options.env.device) as team:
         with team.together():
             # every mistake in the options is found before the folder is made
-            origin = _origin(options)
-            config, out = _config(options, team, origin), _folder(options)
+            origin, source = _origin(options), None
+            if options.from_run is not None and options.task is None:
+                source = Run.open(options.from_run)
+                options = dataclasses.replace(options, task=run_task(source, note=_silent))
+            config, out = _config(options, team, origin, source), _folder(options)
             run = None
             if team.leads:
                 Run.check_free(out)
-            npg = _algorithm(config, team, origin=origin)
+            npg = _algorithm(config, team, run=source, origin=origin)
             if team.leads:
                 kept = KeptTask.of(npg.env)
                 run = Run.create(out, config | kept.config, device=options.env.device)
@@ -164,7 +168,17 @@ def _origin(options: Train) -> tuple[PolicyContent, Path] | None:
     return read_checkpoint(path, parts=("iteration", "policy", "value")), path
 
 
-def _config(options: Train, team: Team, origin: tuple[PolicyContent, Path] | None = None) -> dict[str, Any]:
+def _config(
+    options: Train, team: Team, origin: tuple[PolicyContent, Path] | None = None, run: Run | None = None
+) -> dict[str, Any]:
+    """The configuration of a new run.
+
+    Args:
+        options: The options.
+        team: The processes.
+        origin: The content and the file of the policy that the run begins with.
+        run: The run whose task is used.
+    """
     if options.task is None:
         raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
     _check_iterations(options.iterations)
@@ -176,13 +190,15 @@ def _config(options: Train, team: Team, origin: tuple[PolicyContent, Path] | Non
         target_return=options.target_return, keep_every=options.keep_every, save_every=options.save_every
     )
     source = {}
-    if origin is not None:
+    if origin is not None and options.from_run is not None:
         npg = _fitted(npg, *origin)
-        place = {"run": str(origin[1].parent.resolve()), "which": options.which, "iteration": origin[0]["iteration"]}
+        place = {"run": str(options.from_run.resolve()), "which": options.which, "iteration": origin[0]["iteration"]}
         source = {"from": place}
     if nworld is None:
         nworld = 4096 * team.size if options.env.device.startswith("cuda") else 64
     others = {name: value for name, value in given(options.env).items() if name not in ("engine", "device")}
+    if run is not None:  # a run of Python may have options without flags
+        others |= {name: value for name, value in run.config.get("options", {}).items() if name in NO_FLAGS}
     return {
         "algorithm": "npg",
         "task": portable(options.task),
@@ -264,8 +280,8 @@ def origin_options(given: Train) -> Train:
     same = given.task is None or task_name(find_task(given.task)) == run.task_name
     params = run_params(run, run_options(run.config)[1]) if same else {}
     return dataclasses.replace(
-        saved, task=run_task(run, note=note) if given.task is None else given.task, resume=None, target_return=None,
-        from_run=given.from_run, param=tuple(f"{name}={spelled(value)}" for name, value in params.items()),
+        saved, task=given.task, resume=None, target_return=None, from_run=given.from_run,
+        param=tuple(f"{name}={spelled(value)}" for name, value in params.items()),
     )  # fmt: skip
 
 
@@ -333,7 +349,8 @@ def _algorithm(
     Args:
         config: The configuration.
         team: The processes.
-        run: The run that is continued, whose folder may hold a copy of the task.
+        run: The run whose task it is, and whose folder may hold a copy of it: the run that is continued, or the one
+            that a new run begins with.
         origin: The content and the file with the networks; new networks without it.
     """
     if config["threads"] < 1:
