@@ -218,12 +218,16 @@ class Run:
         An interrupted run may have written a row, or a part of one, without its checkpoint.
 
         Args:
-            iteration: Number of the last iteration to keep; the first one is 1.
+            iteration: Number of the last iteration to keep. The first row may have another number than 1.
         """
         if not self.metrics.exists():
             return
         lines = self.metrics.read_text().splitlines(keepends=True)
-        kept = [line for line in lines[: iteration + 1] if line.endswith("\n")]
+        column = next((i for i, name in enumerate(_cells(lines[0])) if name == "iteration"), None) if lines else None
+        kept = [
+            line for i, line in enumerate(lines)
+            if line.endswith("\n") and (i == 0 or _number_of_row(line, column, i) <= iteration)
+        ]  # fmt: skip
         if kept != lines:
             _write(self.metrics, "".join(kept))
 
@@ -559,6 +563,18 @@ def _check_format(path: Path, number: Any) -> None:
 def _write(path: Path, text: str) -> None:
     with replaced(path) as temporary:
         temporary.write_text(text)
+
+
+def _cells(line: str) -> list[str]:
+    return next(csv.reader([line]), [])
+
+
+def _number_of_row(line: str, column: int | None, otherwise: int) -> float:
+    """The iteration of a row; another number where it has no such column."""
+    try:
+        return otherwise if column is None else float(_cells(line)[column])
+    except (ValueError, IndexError, csv.Error):  # read_metrics names the line
+        return otherwise
 
 
 def _serialized(content: Any) -> memoryview:

@@ -102,7 +102,10 @@ def train(
         reopen(run, npg, iterations=iterations, **settings)
     board = TensorBoard(folder, run.config) if tensorboard and team.leads else None
     with ending():
-        learn(run if team.leads else None, npg, iterations=iterations, callback=callback, board=board, **settings)
+        learn(
+            run if team.leads else None, npg, iterations=iterations, callback=callback, board=board, resumed=resume,
+            **settings,
+        )  # fmt: skip
     return run
 
 
@@ -256,6 +259,7 @@ def learn(
     keep_every: int = 0,
     save_every: int = 0,
     board: Any = None,
+    resumed: bool = False,
 ) -> None:
     """Iterate, and write a run's files.
 
@@ -271,19 +275,21 @@ def learn(
         keep_every: Iterations between two numbered policies; 0 for none.
         save_every: Iterations between two complete states; 0 for a number that follows from their time.
         board: TensorBoard's writer.
+        resumed: Whether the run holds the algorithm's present state.
 
     Raises:
         NotSavedError: The folder could no longer be written.
         Interrupted: One of several processes received a signal.
     """
     alone = npg.team.size == 1
-    keeper = None if run is None else Keeper(run, npg, keep_every=keep_every, save_every=save_every)
+    keeper = None if run is None else Keeper(
+        run, npg, keep_every=keep_every, save_every=save_every, resumed=resumed
+    )  # fmt: skip
     loop = None
     try:
         with postponed(not alone) as noted:
-            loop = _Loop(keeper, npg, noted, [board, callback], target_return)
-            if npg.iteration == 0:
-                loop.save()
+            loop = _Loop(keeper, npg, noted, [board, callback], target_return, resumed=resumed)
+            loop.save()
             while npg.iteration < iterations and not loop.ended:
                 loop.step()
             loop.save()
@@ -310,17 +316,18 @@ class _Loop:
         noted: Signals that this process received and postponed.
         callbacks: Called with each iteration; some may be None.
         target_return: The return at which training ends.
+        resumed: Whether the run holds the algorithm's present state.
     """
 
     def __init__(
         self, keeper: "Keeper | None", npg: NPG, noted: list[int], callbacks: list[Callback | None],
-        target_return: float | None,
+        target_return: float | None, *, resumed: bool,
     ) -> None:  # fmt: skip
         self.keeper, self.npg, self.noted, self.target_return = keeper, npg, noted, target_return
         self.callbacks = [function for function in callbacks if function is not None]
         self.alone = npg.team.size == 1
         self.due = self.ended = self.iterating = False
-        self.saved = npg.iteration if npg.iteration else -1
+        self.saved = npg.iteration if resumed else -1
         self.error: Exception | None = None
 
     def step(self) -> None:
@@ -328,12 +335,14 @@ class _Loop:
         complete = self.due
         self.iterating = True
         iteration = next(self.npg)
-        self.iterating = False
-        start = time.perf_counter()
-        renewed = complete or (self.keeper is not None and self.keeper.policy_due())
-        # the worlds of several processes are brought together only to be saved
-        state = self.npg.state_dict() if complete or (renewed and self.alone) else None
-        self._write(lambda keeper: keeper.keep(iteration, state, renewed=renewed, start=start))
+        # a signal counts either before the iteration or after its row, so that the table and the state agree
+        with postponed(self.alone):
+            start = time.perf_counter()
+            renewed = complete or (self.keeper is not None and self.keeper.policy_due())
+            # the worlds of several processes are brought together only to be saved
+            state = self.npg.state_dict() if complete or (renewed and self.alone) else None
+            self._write(lambda keeper: keeper.keep(iteration, state, renewed=renewed, start=start))
+            self.iterating = False
         if complete:
             self._write_state()
         self._decide(iteration)
@@ -405,17 +414,20 @@ class Keeper:
         npg: The algorithm.
         keep_every: Iterations between two numbered policies; 0 for none.
         save_every: Iterations between two complete states; 0 for a number that follows from their time.
+        resumed: Whether the run holds the algorithm's present state.
     """
 
     iteration: int
     """Number of the boundary's iteration."""
 
-    def __init__(self, run: Run, npg: NPG, *, keep_every: int = 0, save_every: int = 0) -> None:
+    def __init__(
+        self, run: Run, npg: NPG, *, keep_every: int = 0, save_every: int = 0, resumed: bool = False
+    ) -> None:
         self.run, self.npg, self.keep_every, self.save_every = run, npg, keep_every, save_every
         self.iteration = npg.iteration
         self._content = self._latest = policy_content(npg.iteration, npg.policy, npg.value)
         self._state: dict[str, Any] | None = None
-        self._saved = npg.iteration if npg.iteration else -1
+        self._saved = npg.iteration if resumed else -1
         self._complete: tuple[PolicyContent, dict[str, Any]] | None = None
         self._best = run.best_score()
         self._best_content: PolicyContent | None = None

@@ -105,6 +105,13 @@ def test_rows_come_back_with_every_digit(run: Run) -> None:
     assert [row["mean"] for row in read] == [None, 1e-30, None]
 
 
+def test_cut_counts_iterations_and_not_rows(run: Run) -> None:
+    for i in (4, 5, 6):
+        run.write({"value": 0.5, "iteration": i})
+    run.cut(5)
+    assert [row["iteration"] for row in run.rows()] == [4, 5]
+
+
 def test_cut_drops_rows_without_a_checkpoint(run: Run) -> None:
     run.cut(2)  # without a table
     for i in (1, 2, 3):

@@ -78,6 +78,26 @@ def test_python_resumes_a_run_to_the_same_numbers(six: Path, tmp_path: Path) -> 
         lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
 
 
+def test_an_algorithm_that_has_iterated_begins_a_whole_run(six: Path, tmp_path: Path) -> None:
+    npg, folder = algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run"
+    for _ in range(3):
+        next(npg)
+    assert lw.train(npg, tmp_path / "three", iterations=3).read()["iteration"] == 3
+    assert lw.load(tmp_path / "three").nact == 2
+    begun = []
+
+    def callback(iteration: lw.Iteration) -> bool:
+        begun.append(Run.open(folder).read()["iteration"])
+        return iteration.iteration == 5
+
+    lw.train(npg, folder, iterations=9, callback=callback, save_every=100)
+    assert begun == [3, 3]
+    previous = folder / "previous.pt"  # as after kill -9 in iteration 6
+    previous.replace(folder / "checkpoint.pt")
+    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
+    assert metrics(folder) == metrics(six)[3:]
+
+
 def test_bad_arguments_leave_no_folder(env: lw.Env, tmp_path: Path) -> None:
     npg = algorithm(env)
     for words, message in [

@@ -403,6 +403,7 @@ def _learn(run: Run | None, npg: NPG, options: Train) -> int:
             learn(
                 run, npg, iterations=options.iterations, callback=show, board=board,
                 target_return=options.target_return, keep_every=options.keep_every, save_every=options.save_every,
+                resumed=options.resume is not None,
             )  # fmt: skip
     except Interrupted as signalled:
         if run is not None and run.checkpoint.exists():

@@ -343,13 +343,13 @@ def test_a_terminated_run_continues(trained: Path, tmp_path: Path) -> None:
     assert_continues(out, rest, trained)
 
 
-@pytest.mark.parametrize("moment", ["step", "log_prob", "write", "save_state"])
+@pytest.mark.parametrize("moment", ["step", "log_prob", "state_dict", "write", "save_state"])
 def test_an_interrupted_run_continues(
     moment: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Within this process: while it samples, learns, or writes. The tests of plan interrupt a command from outside."""
     out = tmp_path / "run"
-    owner: Any = {"step": lw.Env, "log_prob": lw.GaussianPolicy}.get(moment, Run)
+    owner: Any = {"step": lw.Env, "log_prob": lw.GaussianPolicy, "state_dict": lw.NPG}.get(moment, Run)
     original, calls = getattr(owner, moment), []
 
     def interrupting(*args: Any, **words: Any) -> Any:
