@@ -15,8 +15,10 @@ import torch
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
 from lyceum_warp.algos.npg_statistics import Iteration
+from lyceum_warp.engines.placement import engine_name
+from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted, ending, postponed
-from lyceum_warp.kept_task import KeptTask, given_params, spelled_task
+from lyceum_warp.kept_task import KeptTask, given_params, note_changes, spelled_task
 from lyceum_warp.runs import PolicyContent, Run, policy_content
 from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
 from lyceum_warp.validate import whole_number
@@ -82,7 +84,8 @@ def train(
     iterations = whole_number("iterations", iterations, low=1)
     settings = checked_settings(target_return=target_return, keep_every=keep_every, save_every=save_every)
     team, folder = npg.team, Path(folder)
-    config = describe(npg) | {"iterations": iterations, **settings}
+    shown = {"tensorboard": tensorboard}
+    config = describe(npg) | {"iterations": iterations, **settings, **shown, "video_every": 0}
     with team.together():
         if tensorboard:
             check_tensorboard()
@@ -90,7 +93,9 @@ def train(
             run = Run.open(folder)
             content = run.read()
             check_resumable(run, content, iterations, target_return)
-            _check_equal(run, config)
+            _check_equal(run, config, npg.env)
+            if team.leads:
+                note_changes(run, npg.env)
             restore(run, npg, content)
         elif team.leads:
             kept = KeptTask.of(npg.env)
@@ -99,7 +104,7 @@ def train(
         else:
             run = Run(folder, config)
     if resume and team.leads:
-        reopen(run, npg, iterations=iterations, **settings)
+        reopen(run, npg, iterations=iterations, **settings, **shown)
     board = TensorBoard(folder, run.config) if tensorboard and team.leads else None
     with ending():
         learn(
@@ -134,6 +139,7 @@ def describe(npg: NPG) -> dict[str, Any]:
     others |= {name: list(names) for name in ("fields", "dynamics") if (names := getattr(options, name))}
     if isinstance(options.model, str | Path):
         others["model"] = str(Path(options.model).absolute()) if Path(options.model).is_file() else str(options.model)
+    seed = {} if npg.seed == options.seed else {"npg_seed": npg.seed}
     return {
         "algorithm": "npg",
         "task": spelled_task(env.task.task),
@@ -145,6 +151,7 @@ def describe(npg: NPG) -> dict[str, Any]:
         "nworld": env.nworld * npg.team.size,
         "threads": torch.get_num_threads(),
         "seed": options.seed,
+        **seed,
         "npg": dataclasses.asdict(config) | {"samples": enough_samples(config, env.nworld * npg.team.size)},
     }
 
@@ -191,11 +198,16 @@ def check_resumable(run: Run, content: Mapping[str, Any], iterations: int, targe
         )
 
 
-def _check_equal(run: Run, config: Mapping[str, Any]) -> None:
+def _check_equal(run: Run, config: Mapping[str, Any], env: Env) -> None:
     """Refuse an algorithm with other settings than the run's."""
     now = json.loads(json.dumps(config))  # lists in place of tuples
-    for part in ("params", "physics", "npg", "nworld"):
-        for name, then, given in _entries(part, run.config.get(part), now[part]):
+    names = [("task", run.config.get("kept", {}).get("name", env.task.name), env.task.name)]
+    names.append(("engine", *(engine_name(c["engine"], c["device"]) for c in (run.config, now))))
+    entries = [_entries(part, run.config.get(part), now[part]) for part in ("params", "physics", "npg", "nworld")]
+    options = _entries("options", run.config.get("options", {}), now["options"])
+    others = [entry for entry in options if entry[0] not in _FREE_OPTIONS]
+    for part in (names, *entries, others):
+        for name, then, given in part:
             if then != given:
                 raise ValueError(
                     f"the run in {run.folder} has {name} {then}, not {given}, and a run keeps its settings: make NPG "
@@ -210,6 +222,10 @@ def _entries(name: str, then: Any, now: Any) -> list[tuple[str, Any, Any]]:
     # an older run lacks the newest hyperparameters
     known = then if name == "npg" else {**then, **now}
     return [(entry, then.get(entry), now.get(entry)) for entry in known]
+
+
+_FREE_OPTIONS = ("nthread", "graphs", "model")
+"""Options that do not change a run's numbers, and the model, which is compared by its content."""
 
 
 def restore(run: Run, npg: NPG, content: Mapping[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -180,6 +181,26 @@ def test_a_run_of_python_keeps_a_model_that_was_made_there(tmp_path: Path, capsy
     assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2", "--task", "hopper"]) == 0
     assert before not in capsys.readouterr().out
     assert cli.main(["train", "--resume", str(tmp_path / "run"), "--iterations", "2", *QUIET]) == 0
+
+
+def test_python_names_a_task_and_a_model_that_have_changed(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The algorithm is made of them, so they are used as they are."""
+    file, table, out = folder / "mine" / "slide.py", folder / "mine" / "goal.npy", folder / "run"
+
+    def train(iterations: int, **words: Any) -> None:
+        env = lw.make(str(file), nworld=2, goal=table, horizon=10)
+        lw.train(lw.NPG(env, config=SMALL), out, iterations=iterations, **words)
+
+    train(1)
+    assert Run.open(out).config["params"] == {"goal": str(table)}
+    train(2, resume=True)
+    assert not caplog.messages
+    part = folder / "mine" / "robot" / "parts" / "block.xml"
+    part.write_text(PART.replace('type="slide"', 'type="slide" damping="9"'))
+    file.write_text(SOURCE.replace("-wp.abs(", "7.0 - wp.abs("))
+    train(3, resume=True)
+    changed = "has changed since the run began: it is used as it is now"
+    assert caplog.messages == [f"{file} {changed}", f"the model of the task 'slide' {changed}"]
 
 
 def test_a_task_of_a_program_is_evaluated_with_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,7 +17,7 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.runs import Run
-from lyceum_warp.training import POLICY_SHARE, SHARE, Keeper, NotSavedError
+from lyceum_warp.training import POLICY_SHARE, SHARE, Keeper, NotSavedError, describe
 
 CONFIG = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=2, mean_episodes=2)
 
@@ -76,6 +76,25 @@ def test_python_resumes_a_run_to_the_same_numbers(six: Path, tmp_path: Path) -> 
         lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), folder, iterations=9, resume=True)
     with pytest.raises(ValueError, match="already has 6 iterations"):
         lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
+
+
+def test_python_resumes_the_same_task_on_the_same_engine(six: Path, env: lw.Env, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(six, tmp_path / "other"))
+    Run.open(other).amend(engine="warp")
+    for folder, given, message in [
+        (six, lw.make("point_mass", nworld=2, horizon=9), "has horizon None, not 9, and a run keeps"),
+        (six, lw.make("cartpole", nworld=2), "has task point_mass, not cartpole"),
+        (other, env, "has engine warp, not mujoco"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            lw.train(algorithm(given), folder, iterations=9, resume=True)
+
+
+def test_a_seed_of_the_algorithm_alone_is_kept(env: lw.Env, tmp_path: Path) -> None:
+    assert "npg_seed" not in describe(algorithm(env))
+    run = lw.train(algorithm(env, seed=3), tmp_path / "run", iterations=1)
+    assert (run.config["seed"], run.config["npg_seed"]) == (0, 3)
+    assert cli.main(["train", "--resume", str(run.folder), "--iterations", "2", *QUIET]) == 0
 
 
 def test_an_algorithm_that_has_iterated_begins_a_whole_run(six: Path, tmp_path: Path) -> None:

@@ -74,6 +74,8 @@ class NPG:
     """The value function that is learned with it."""
     rollout: Rollout
     """The samples of the last iteration."""
+    seed: int
+    """Seed of new networks and of the noise."""
     count: int
     """Samples in an iteration, those of all processes."""
     segments: bool
@@ -95,7 +97,7 @@ class NPG:
     ) -> None:
         check_kind("env of NPG", env, Env, "as lw.make(...) makes it")
         check_kind("config of NPG", config, NPGConfig | None, "as lw.NPGConfig(samples=10000)")
-        self.env = env
+        self.env, self.seed = env, seed
         self.team = team = team or Team()
         self.config = config = config or NPGConfig()
         n, nworld = env.nworld, env.nworld * team.size

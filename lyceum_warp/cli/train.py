@@ -213,8 +213,14 @@ def _config(
         "iterations": options.iterations,
         "npg": dataclasses.asdict(npg) | {"samples": enough_samples(npg, nworld)},
         **settings,
+        **_shown(options),
         **source,
     }
+
+
+def _shown(options: Train) -> dict[str, Any]:
+    """What a run shows on its way, as config.json holds it."""
+    return {"tensorboard": options.tensorboard, "video_every": options.video_every}
 
 
 def _fitted(npg: NPGConfig, content: PolicyContent, path: Path) -> NPGConfig:
@@ -257,6 +263,7 @@ def saved_options(folder: Path) -> Train:
             param=tuple(f"{name}={spelled(value)}" for name, value in params.items()),
             target_return=config.get("target_return"), keep_every=config.get("keep_every", 0),
             save_every=config.get("save_every", 0),
+            tensorboard=config.get("tensorboard", False), video_every=config.get("video_every", 0),
             env=EnvFlags.of(known), physics=Physics.of(known.physics), npg=npg,
         )  # fmt: skip
     except (KeyError, TypeError, AttributeError, ValueError) as error:
@@ -302,7 +309,7 @@ def resume(options: Train, folder: Path) -> int:
             run, npg = _reopened(options, folder, team)
         if team.leads:
             _warn_of_versions(run)
-            reopen(run, npg, iterations=options.iterations, **settings)
+            reopen(run, npg, iterations=options.iterations, **settings, **_shown(options))
         return _learn(run if team.leads else None, npg, options)
 
 
@@ -370,7 +377,7 @@ def _algorithm(
     if origin is not None:
         policy, value = networks(*origin)
         check_sizes(policy, env, origin[1])
-    return NPG(env, policy, value, _hyperparameters(config), seed=config["seed"], team=team)
+    return NPG(env, policy, value, _hyperparameters(config), seed=config.get("npg_seed", config["seed"]), team=team)
 
 
 def _silent(line: str) -> None:
