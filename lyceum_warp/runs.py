@@ -81,22 +81,24 @@ class Run:
         return self.folder / "task"
 
     @staticmethod
-    def check_free(folder: str | Path, *, resumable: bool = True) -> None:
+    def check_free(folder: str | Path, *, resumable: bool = True, command: bool = True) -> None:
         """Check that a folder can be used for a new run.
 
         Args:
             folder: A folder, which need not exist.
             resumable: Whether the message may suggest to continue the run that is in the folder.
+            command: Whether the message names flags of the command line rather than arguments of ``train``.
 
         Raises:
             ValueError: The folder is not empty, or is a file.
         """
-        folder = Path(folder)
+        folder, other = Path(folder), "give another --out" if command else "give another folder"
         if (folder / _CONFIG).exists():
-            fix = f"continue it with --resume {folder}, or give another --out" if resumable else "give another --out"
+            way = f"--resume {folder}" if command else "resume=True"
+            fix = f"continue it with {way}, or {other}" if resumable else other
             raise ValueError(f"{folder} holds a run: {fix}")
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise ValueError(f"{folder} exists and is not an empty folder: give another --out")
+            raise ValueError(f"{folder} exists and is not an empty folder: {other}")
 
     @classmethod
     def create(cls, folder: str | Path, config: Mapping[str, Any], *, device: str = "cpu") -> "Run":
@@ -111,7 +113,7 @@ class Run:
             ValueError: The folder is not empty, or is a file.
         """
         folder = Path(folder)
-        cls.check_free(folder)
+        cls.check_free(folder, command=False)
         run = cls(folder, {"format": FORMAT, **config})
         text = json.dumps(run.config, indent=2)  # before the folder is made, because it may fail
         new = [path for path in (folder, *folder.parents) if not path.exists()]

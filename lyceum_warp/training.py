@@ -1,5 +1,6 @@
 """Training with a run's folder: the loop that the command line and ``lw.train`` share."""
 
+import collections
 import dataclasses
 import json
 import math
@@ -28,6 +29,9 @@ SHARE = 400
 
 POLICY_SHARE = 200
 """The same for the policy, and for the copy of the complete state that is kept in memory."""
+
+KEPT_ROWS = 1000
+"""Rows of the table that are kept in memory, for a folder in which it cannot be read any more."""
 
 Callback = Callable[[Iteration], Any]
 
@@ -80,6 +84,7 @@ def train(
         ValueError: The folder holds something else, an argument is out of range, or the run does not fit ``npg``.
         ImportError: The extra ``tensorboard`` is not installed.
         NotSavedError: The folder could no longer be written; the message says where the run was saved instead.
+        Interrupted: One of several processes received a signal.
     """
     iterations = whole_number("iterations", iterations, low=1)
     settings = checked_settings(target_return=target_return, keep_every=keep_every, save_every=save_every)
@@ -173,7 +178,9 @@ def fitted_config(config: NPGConfig, policy_shape: Mapping[str, Any], value_shap
 # continuing
 
 
-def check_resumable(run: Run, content: Mapping[str, Any], iterations: int, target_return: float | None) -> None:
+def check_resumable(
+    run: Run, content: Mapping[str, Any], iterations: int, target_return: float | None, *, command: bool = False
+) -> None:
     """Refuse to continue a run that is finished.
 
     Args:
@@ -181,6 +188,7 @@ def check_resumable(run: Run, content: Mapping[str, Any], iterations: int, targe
         content: The content of its checkpoint.
         iterations: Iterations in all.
         target_return: The return at which it will end.
+        command: Whether the message names a flag of the command line rather than an argument of ``train``.
 
     Raises:
         ValueError: The run has as many iterations, or has reached the return.
@@ -193,16 +201,16 @@ def check_resumable(run: Run, content: Mapping[str, Any], iterations: int, targe
         )
     done = content["iteration"]
     if iterations <= done:
-        raise ValueError(
-            f"the run in {run.folder} already has {done} iterations: give more, as in --iterations {2 * done}"
-        )
+        more = f"--iterations {2 * done}" if command else f"iterations={2 * done}"
+        raise ValueError(f"the run in {run.folder} already has {done} iterations: give more, as in {more}")
 
 
 def _check_equal(run: Run, config: Mapping[str, Any], env: Env) -> None:
     """Refuse an algorithm with other settings than the run's."""
     now = json.loads(json.dumps(config))  # lists in place of tuples
-    names = [("task", run.config.get("kept", {}).get("name", env.task.name), env.task.name)]
-    names.append(("engine", *(engine_name(c["engine"], c["device"]) for c in (run.config, now))))
+    engine, engine_now = (engine_name(c["engine"], c["device"]) for c in (run.config, now))
+    task = run.config.get("kept", {}).get("name", env.task.name)  # an older run lacks it
+    names = [("task", task, env.task.name), ("engine", engine, engine_now)]
     entries = [_entries(part, run.config.get(part), now[part]) for part in ("params", "physics", "npg", "nworld")]
     options = _entries("options", run.config.get("options", {}), now["options"])
     others = [entry for entry in options if entry[0] not in _FREE_OPTIONS]
@@ -422,8 +430,9 @@ class _Loop:
 class Keeper:
     """Writes a run's files after each iteration, and, where its folder cannot be written, the whole run elsewhere.
 
-    It keeps the boundary: the state after the last complete iteration, or after one at most two seconds before where
-    iterations are shorter than that. Whatever happens later, that state can be saved.
+    It keeps the boundary: the state after the last complete iteration, or, where iterations are short, after an earlier
+    one. The boundary moves whenever training has taken 200 times as long as the last such save, so that its saves take
+    at most a 200th of the time. Whatever happens later, that state can be saved.
 
     Args:
         run: The run.
@@ -436,9 +445,7 @@ class Keeper:
     iteration: int
     """Number of the boundary's iteration."""
 
-    def __init__(
-        self, run: Run, npg: NPG, *, keep_every: int = 0, save_every: int = 0, resumed: bool = False
-    ) -> None:
+    def __init__(self, run: Run, npg: NPG, *, keep_every: int = 0, save_every: int = 0, resumed: bool = False) -> None:
         self.run, self.npg, self.keep_every, self.save_every = run, npg, keep_every, save_every
         self.iteration = npg.iteration
         self._content = self._latest = policy_content(npg.iteration, npg.policy, npg.value)
@@ -448,7 +455,7 @@ class Keeper:
         self._best = run.best_score()
         self._best_content: PolicyContent | None = None
         self._files = run.files()
-        self._rows: list[dict[str, Any]] = []
+        self._rows: collections.deque[dict[str, Any]] = collections.deque(maxlen=KEPT_ROWS)
         self._seconds = self._policy_seconds = 0.0
         self._when = self._policy_when = time.perf_counter()
 
@@ -593,8 +600,7 @@ class Keeper:
                 path = made / name
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(content)
-            for row in self._rows:
-                run.write(row)
+            self._write_table(run)
             if self._best_content is not None and self._best is not None:
                 run.save_best(self._best_content, self._score_name, self._best[1])
             run.save_policy(self._content)
@@ -608,6 +614,26 @@ class Keeper:
             if made is not None:
                 shutil.rmtree(made, ignore_errors=True)
             return None
+
+    def _write_table(self, run: Run) -> None:
+        """Complete the table in another folder, which holds the rows before this training."""
+        try:
+            table = self.run.metrics.read_bytes()
+        except OSError:
+            table = b""
+        if run.metrics.exists() and len(table) < run.metrics.stat().st_size:
+            table = b""  # it was cut off
+        last: float = -1
+        try:
+            if table:
+                run.metrics.write_bytes(table)
+            run.cut(self.npg.iteration)
+            last = max((row["iteration"] or 0 for row in (run.rows() if run.metrics.exists() else [])), default=-1)
+        except (ValueError, KeyError):  # other content than a table
+            run.metrics.write_bytes(self._files.get(run.metrics.name, b""))
+        for row in self._rows:
+            if row["iteration"] > last:
+                run.write(row)
 
 
 def _free(folder: Path) -> Path:

@@ -39,12 +39,12 @@ def test_read_returns_the_saved_state(run: Run) -> None:
 
 def test_create_refuses_a_folder_with_content(run: Run, tmp_path: Path) -> None:
     before = {path: path.read_bytes() for path in run.folder.iterdir()}
-    with pytest.raises(ValueError, match=r"holds a run: continue it with --resume .*, or give another --out"):
+    with pytest.raises(ValueError, match=r"holds a run: continue it with resume=True, or give another folder"):
         Run.create(run.folder, {})
     assert before == {path: path.read_bytes() for path in run.folder.iterdir()}
     (tmp_path / "file").write_text("mine")
     for place in (tmp_path, tmp_path / "file"):
-        with pytest.raises(ValueError, match="is not an empty folder: give another --out"):
+        with pytest.raises(ValueError, match="is not an empty folder: give another folder"):
             Run.create(place, {})
 
 

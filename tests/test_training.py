@@ -14,7 +14,7 @@ from conftest import SharedEnv
 from training_runs import QUIET, metrics, refused
 
 import lyceum_warp as lw
-from lyceum_warp import cli
+from lyceum_warp import cli, training
 from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.runs import Run
 from lyceum_warp.training import POLICY_SHARE, SHARE, Keeper, NotSavedError, describe
@@ -74,7 +74,7 @@ def test_python_resumes_a_run_to_the_same_numbers(six: Path, tmp_path: Path) -> 
     with pytest.raises(ValueError, match="has gamma 0.995, not 0.9, and a run keeps its settings"):
         config = lw.NPGConfig(**{**vars(CONFIG), "gamma": 0.9})
         lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), folder, iterations=9, resume=True)
-    with pytest.raises(ValueError, match="already has 6 iterations"):
+    with pytest.raises(ValueError, match="already has 6 iterations: give more, as in iterations=12"):
         lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
 
 
@@ -371,6 +371,31 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(folder))
     return folder
+
+
+def test_a_rescued_run_has_the_rows_that_can_be_read(
+    env: lw.Env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "KEPT_ROWS", 2)
+    npg, run = algorithm(env), Run.create(tmp_path / "run", {})
+    keeper = Keeper(run, npg)
+    for _ in range(4):
+        keeper.keep(next(npg), None)
+
+    def rescued(name: str) -> list[float | None]:
+        folder = keeper._copied(tmp_path / name, whole=False)
+        assert folder is not None
+        return [row["iteration"] for row in Run.open(folder).rows()]
+
+    whole = run.metrics.read_text()
+    assert rescued("whole") == [1, 2, 3, 4]
+    run.metrics.write_text(whole[:-9])  # a full disk cuts the last row off
+    assert rescued("cut") == [1, 2, 3, 4]
+    for number, content in enumerate((b"mine\n1\n", b"\xff\n", b"iteration\n1,2\n")):
+        run.metrics.write_bytes(content)
+        assert rescued(f"other-{number}") == [3, 4]
+    shutil.rmtree(run.folder)
+    assert rescued("gone") == [3, 4]
 
 
 def test_a_folder_that_was_deleted_is_written_beside_it(six: Path, tmp_path: Path) -> None:

@@ -72,8 +72,8 @@ class Train:
     """Train a policy on a task with the natural policy gradient.
 
     The run's folder then holds config.json, versions.json, metrics.csv (one row for each iteration), policy.pt,
-    best.pt, checkpoint.pt, curve.png and video.mp4. Ctrl-C loses at most the current iteration, or two seconds of
-    short ones.
+    best.pt, checkpoint.pt, curve.png and video.mp4. Ctrl-C loses at most the current iteration; where iterations are
+    short, those since the policy was last saved, which is whenever training has taken 200 times as long as such a save.
 
     $ lyceum-warp train hopper --iterations 100 --seed 1
     $ lyceum-warp train half_cheetah --param ctrl_cost_weight=0.05 --param reset_noise_scale=0 --hidden 32 32
@@ -326,7 +326,7 @@ def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, NPG]:
     if options.out not in (None, folder):
         raise ValueError(f"a resumed run stays in its folder {folder}: omit --out")
     content = run.read(note=note if team.leads else _silent)
-    check_resumable(run, content, options.iterations, options.target_return)
+    check_resumable(run, content, options.iterations, options.target_return, command=True)
     origin = (content, run.checkpoint) if "from" in run.config else None
     npg = _algorithm(run.config, team, run=run, origin=origin)
     restore(run, npg, content)
