@@ -107,7 +107,7 @@ def given_params(env: Env) -> dict[str, Any]:
 
 def _plain(name: str, value: Any) -> Any:
     if (table := _table(value)) is not None:
-        return value if isinstance(value, str) else f"{name}.npy" if table.size else []
+        return str(value) if isinstance(value, str | Path) else f"{name}.npy" if table.size else []
     if isinstance(value, bool | int | float | str):
         return value
     return np.asarray(value.cpu() if hasattr(value, "cpu") else value).tolist()
@@ -200,6 +200,22 @@ def run_task(run: Run, *, note: Note = log.warning) -> str:
     else:
         return task
     return f"{copy}{colon}{attribute}"
+
+
+def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
+    """Note where an environment's task or its model is another than the run's; both are used as they are.
+
+    Args:
+        run: The run.
+        env: The environment.
+        note: Called with each line.
+    """
+    kept, file = run.config.get("kept", {}), _file(env.task.task)
+    hashed = None if kept.get("program") else kept.get("source_hash")  # a program that trains changes on its own
+    if file is not None and hashed not in (None, _digest(file.read_bytes())):
+        note(f"{file} has changed since the run began: it is used as it is now")
+    if _model_changed(run, kept, env):
+        note(f"the model of the task {env.task.name!r} has changed since the run began: it is used as it is now")
 
 
 def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:

@@ -81,22 +81,24 @@ class Run:
         return self.folder / "task"
 
     @staticmethod
-    def check_free(folder: str | Path, *, resumable: bool = True) -> None:
+    def check_free(folder: str | Path, *, resumable: bool = True, command: bool = True) -> None:
         """Check that a folder can be used for a new run.
 
         Args:
             folder: A folder, which need not exist.
             resumable: Whether the message may suggest to continue the run that is in the folder.
+            command: Whether the message names flags of the command line rather than arguments of ``train``.
 
         Raises:
             ValueError: The folder is not empty, or is a file.
         """
-        folder = Path(folder)
+        folder, other = Path(folder), "give another --out" if command else "give another folder"
         if (folder / _CONFIG).exists():
-            fix = f"continue it with --resume {folder}, or give another --out" if resumable else "give another --out"
+            way = f"--resume {folder}" if command else "resume=True"
+            fix = f"continue it with {way}, or {other}" if resumable else other
             raise ValueError(f"{folder} holds a run: {fix}")
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise ValueError(f"{folder} exists and is not an empty folder: give another --out")
+            raise ValueError(f"{folder} exists and is not an empty folder: {other}")
 
     @classmethod
     def create(cls, folder: str | Path, config: Mapping[str, Any], *, device: str = "cpu") -> "Run":
@@ -111,7 +113,7 @@ class Run:
             ValueError: The folder is not empty, or is a file.
         """
         folder = Path(folder)
-        cls.check_free(folder)
+        cls.check_free(folder, command=False)
         run = cls(folder, {"format": FORMAT, **config})
         text = json.dumps(run.config, indent=2)  # before the folder is made, because it may fail
         new = [path for path in (folder, *folder.parents) if not path.exists()]
@@ -218,12 +220,16 @@ class Run:
         An interrupted run may have written a row, or a part of one, without its checkpoint.
 
         Args:
-            iteration: Number of the last iteration to keep; the first one is 1.
+            iteration: Number of the last iteration to keep. The first row may have another number than 1.
         """
         if not self.metrics.exists():
             return
         lines = self.metrics.read_text().splitlines(keepends=True)
-        kept = [line for line in lines[: iteration + 1] if line.endswith("\n")]
+        column = next((i for i, name in enumerate(_cells(lines[0])) if name == "iteration"), None) if lines else None
+        kept = [
+            line for i, line in enumerate(lines)
+            if line.endswith("\n") and (i == 0 or _number_of_row(line, column, i) <= iteration)
+        ]  # fmt: skip
         if kept != lines:
             _write(self.metrics, "".join(kept))
 
@@ -559,6 +565,18 @@ def _check_format(path: Path, number: Any) -> None:
 def _write(path: Path, text: str) -> None:
     with replaced(path) as temporary:
         temporary.write_text(text)
+
+
+def _cells(line: str) -> list[str]:
+    return next(csv.reader([line]), [])
+
+
+def _number_of_row(line: str, column: int | None, otherwise: int) -> float:
+    """The iteration of a row; another number where it has no such column."""
+    try:
+        return otherwise if column is None else float(_cells(line)[column])
+    except (ValueError, IndexError, csv.Error):  # read_metrics names the line
+        return otherwise
 
 
 def _serialized(content: Any) -> memoryview:

@@ -1,5 +1,6 @@
 """Training with a run's folder: the loop that the command line and ``lw.train`` share."""
 
+import collections
 import dataclasses
 import json
 import math
@@ -15,8 +16,10 @@ import torch
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
 from lyceum_warp.algos.npg_statistics import Iteration
+from lyceum_warp.engines.placement import engine_name
+from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted, ending, postponed
-from lyceum_warp.kept_task import KeptTask, given_params, spelled_task
+from lyceum_warp.kept_task import KeptTask, given_params, note_changes, spelled_task
 from lyceum_warp.runs import PolicyContent, Run, policy_content
 from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
 from lyceum_warp.validate import whole_number
@@ -26,6 +29,9 @@ SHARE = 400
 
 POLICY_SHARE = 200
 """The same for the policy, and for the copy of the complete state that is kept in memory."""
+
+KEPT_ROWS = 1000
+"""Rows of the table that are kept in memory, for a folder in which it cannot be read any more."""
 
 Callback = Callable[[Iteration], Any]
 
@@ -78,11 +84,13 @@ def train(
         ValueError: The folder holds something else, an argument is out of range, or the run does not fit ``npg``.
         ImportError: The extra ``tensorboard`` is not installed.
         NotSavedError: The folder could no longer be written; the message says where the run was saved instead.
+        Interrupted: One of several processes received a signal.
     """
     iterations = whole_number("iterations", iterations, low=1)
     settings = checked_settings(target_return=target_return, keep_every=keep_every, save_every=save_every)
     team, folder = npg.team, Path(folder)
-    config = describe(npg) | {"iterations": iterations, **settings}
+    shown = {"tensorboard": tensorboard}
+    config = describe(npg) | {"iterations": iterations, **settings, **shown, "video_every": 0}
     with team.together():
         if tensorboard:
             check_tensorboard()
@@ -90,7 +98,9 @@ def train(
             run = Run.open(folder)
             content = run.read()
             check_resumable(run, content, iterations, target_return)
-            _check_equal(run, config)
+            _check_equal(run, config, npg.env)
+            if team.leads:
+                note_changes(run, npg.env)
             restore(run, npg, content)
         elif team.leads:
             kept = KeptTask.of(npg.env)
@@ -99,10 +109,13 @@ def train(
         else:
             run = Run(folder, config)
     if resume and team.leads:
-        reopen(run, npg, iterations=iterations, **settings)
+        reopen(run, npg, iterations=iterations, **settings, **shown)
     board = TensorBoard(folder, run.config) if tensorboard and team.leads else None
     with ending():
-        learn(run if team.leads else None, npg, iterations=iterations, callback=callback, board=board, **settings)
+        learn(
+            run if team.leads else None, npg, iterations=iterations, callback=callback, board=board, resumed=resume,
+            **settings,
+        )  # fmt: skip
     return run
 
 
@@ -131,6 +144,7 @@ def describe(npg: NPG) -> dict[str, Any]:
     others |= {name: list(names) for name in ("fields", "dynamics") if (names := getattr(options, name))}
     if isinstance(options.model, str | Path):
         others["model"] = str(Path(options.model).absolute()) if Path(options.model).is_file() else str(options.model)
+    seed = {} if npg.seed == options.seed else {"npg_seed": npg.seed}
     return {
         "algorithm": "npg",
         "task": spelled_task(env.task.task),
@@ -142,6 +156,7 @@ def describe(npg: NPG) -> dict[str, Any]:
         "nworld": env.nworld * npg.team.size,
         "threads": torch.get_num_threads(),
         "seed": options.seed,
+        **seed,
         "npg": dataclasses.asdict(config) | {"samples": enough_samples(config, env.nworld * npg.team.size)},
     }
 
@@ -163,7 +178,9 @@ def fitted_config(config: NPGConfig, policy_shape: Mapping[str, Any], value_shap
 # continuing
 
 
-def check_resumable(run: Run, content: Mapping[str, Any], iterations: int, target_return: float | None) -> None:
+def check_resumable(
+    run: Run, content: Mapping[str, Any], iterations: int, target_return: float | None, *, command: bool = False
+) -> None:
     """Refuse to continue a run that is finished.
 
     Args:
@@ -171,6 +188,7 @@ def check_resumable(run: Run, content: Mapping[str, Any], iterations: int, targe
         content: The content of its checkpoint.
         iterations: Iterations in all.
         target_return: The return at which it will end.
+        command: Whether the message names a flag of the command line rather than an argument of ``train``.
 
     Raises:
         ValueError: The run has as many iterations, or has reached the return.
@@ -183,16 +201,21 @@ def check_resumable(run: Run, content: Mapping[str, Any], iterations: int, targe
         )
     done = content["iteration"]
     if iterations <= done:
-        raise ValueError(
-            f"the run in {run.folder} already has {done} iterations: give more, as in --iterations {2 * done}"
-        )
+        more = f"--iterations {2 * done}" if command else f"iterations={2 * done}"
+        raise ValueError(f"the run in {run.folder} already has {done} iterations: give more, as in {more}")
 
 
-def _check_equal(run: Run, config: Mapping[str, Any]) -> None:
+def _check_equal(run: Run, config: Mapping[str, Any], env: Env) -> None:
     """Refuse an algorithm with other settings than the run's."""
     now = json.loads(json.dumps(config))  # lists in place of tuples
-    for part in ("params", "physics", "npg", "nworld"):
-        for name, then, given in _entries(part, run.config.get(part), now[part]):
+    engine, engine_now = (engine_name(c["engine"], c["device"]) for c in (run.config, now))
+    task = run.config.get("kept", {}).get("name", env.task.name)  # an older run lacks it
+    names = [("task", task, env.task.name), ("engine", engine, engine_now)]
+    entries = [_entries(part, run.config.get(part), now[part]) for part in ("params", "physics", "npg", "nworld")]
+    options = _entries("options", run.config.get("options", {}), now["options"])
+    others = [entry for entry in options if entry[0] not in _FREE_OPTIONS]
+    for part in (names, *entries, others):
+        for name, then, given in part:
             if then != given:
                 raise ValueError(
                     f"the run in {run.folder} has {name} {then}, not {given}, and a run keeps its settings: make NPG "
@@ -207,6 +230,10 @@ def _entries(name: str, then: Any, now: Any) -> list[tuple[str, Any, Any]]:
     # an older run lacks the newest hyperparameters
     known = then if name == "npg" else {**then, **now}
     return [(entry, then.get(entry), now.get(entry)) for entry in known]
+
+
+_FREE_OPTIONS = ("nthread", "graphs", "model")
+"""Options that do not change a run's numbers, and the model, which is compared by its content."""
 
 
 def restore(run: Run, npg: NPG, content: Mapping[str, Any]) -> None:
@@ -256,6 +283,7 @@ def learn(
     keep_every: int = 0,
     save_every: int = 0,
     board: Any = None,
+    resumed: bool = False,
 ) -> None:
     """Iterate, and write a run's files.
 
@@ -271,19 +299,21 @@ def learn(
         keep_every: Iterations between two numbered policies; 0 for none.
         save_every: Iterations between two complete states; 0 for a number that follows from their time.
         board: TensorBoard's writer.
+        resumed: Whether the run holds the algorithm's present state.
 
     Raises:
         NotSavedError: The folder could no longer be written.
         Interrupted: One of several processes received a signal.
     """
     alone = npg.team.size == 1
-    keeper = None if run is None else Keeper(run, npg, keep_every=keep_every, save_every=save_every)
+    keeper = None if run is None else Keeper(
+        run, npg, keep_every=keep_every, save_every=save_every, resumed=resumed
+    )  # fmt: skip
     loop = None
     try:
         with postponed(not alone) as noted:
-            loop = _Loop(keeper, npg, noted, [board, callback], target_return)
-            if npg.iteration == 0:
-                loop.save()
+            loop = _Loop(keeper, npg, noted, [board, callback], target_return, resumed=resumed)
+            loop.save()
             while npg.iteration < iterations and not loop.ended:
                 loop.step()
             loop.save()
@@ -310,17 +340,18 @@ class _Loop:
         noted: Signals that this process received and postponed.
         callbacks: Called with each iteration; some may be None.
         target_return: The return at which training ends.
+        resumed: Whether the run holds the algorithm's present state.
     """
 
     def __init__(
         self, keeper: "Keeper | None", npg: NPG, noted: list[int], callbacks: list[Callback | None],
-        target_return: float | None,
+        target_return: float | None, *, resumed: bool,
     ) -> None:  # fmt: skip
         self.keeper, self.npg, self.noted, self.target_return = keeper, npg, noted, target_return
         self.callbacks = [function for function in callbacks if function is not None]
         self.alone = npg.team.size == 1
         self.due = self.ended = self.iterating = False
-        self.saved = npg.iteration if npg.iteration else -1
+        self.saved = npg.iteration if resumed else -1
         self.error: Exception | None = None
 
     def step(self) -> None:
@@ -328,12 +359,14 @@ class _Loop:
         complete = self.due
         self.iterating = True
         iteration = next(self.npg)
-        self.iterating = False
-        start = time.perf_counter()
-        renewed = complete or (self.keeper is not None and self.keeper.policy_due())
-        # the worlds of several processes are brought together only to be saved
-        state = self.npg.state_dict() if complete or (renewed and self.alone) else None
-        self._write(lambda keeper: keeper.keep(iteration, state, renewed=renewed, start=start))
+        # a signal counts either before the iteration or after its row, so that the table and the state agree
+        with postponed(self.alone):
+            start = time.perf_counter()
+            renewed = complete or (self.keeper is not None and self.keeper.policy_due())
+            # the worlds of several processes are brought together only to be saved
+            state = self.npg.state_dict() if complete or (renewed and self.alone) else None
+            self._write(lambda keeper: keeper.keep(iteration, state, renewed=renewed, start=start))
+            self.iterating = False
         if complete:
             self._write_state()
         self._decide(iteration)
@@ -397,30 +430,32 @@ class _Loop:
 class Keeper:
     """Writes a run's files after each iteration, and, where its folder cannot be written, the whole run elsewhere.
 
-    It keeps the boundary: the state after the last complete iteration, or after one at most two seconds before where
-    iterations are shorter than that. Whatever happens later, that state can be saved.
+    It keeps the boundary: the state after the last complete iteration, or, where iterations are short, after an earlier
+    one. The boundary moves whenever training has taken 200 times as long as the last such save, so that its saves take
+    at most a 200th of the time. Whatever happens later, that state can be saved.
 
     Args:
         run: The run.
         npg: The algorithm.
         keep_every: Iterations between two numbered policies; 0 for none.
         save_every: Iterations between two complete states; 0 for a number that follows from their time.
+        resumed: Whether the run holds the algorithm's present state.
     """
 
     iteration: int
     """Number of the boundary's iteration."""
 
-    def __init__(self, run: Run, npg: NPG, *, keep_every: int = 0, save_every: int = 0) -> None:
+    def __init__(self, run: Run, npg: NPG, *, keep_every: int = 0, save_every: int = 0, resumed: bool = False) -> None:
         self.run, self.npg, self.keep_every, self.save_every = run, npg, keep_every, save_every
         self.iteration = npg.iteration
         self._content = self._latest = policy_content(npg.iteration, npg.policy, npg.value)
         self._state: dict[str, Any] | None = None
-        self._saved = npg.iteration if npg.iteration else -1
+        self._saved = npg.iteration if resumed else -1
         self._complete: tuple[PolicyContent, dict[str, Any]] | None = None
         self._best = run.best_score()
         self._best_content: PolicyContent | None = None
         self._files = run.files()
-        self._rows: list[dict[str, Any]] = []
+        self._rows: collections.deque[dict[str, Any]] = collections.deque(maxlen=KEPT_ROWS)
         self._seconds = self._policy_seconds = 0.0
         self._when = self._policy_when = time.perf_counter()
 
@@ -565,8 +600,7 @@ class Keeper:
                 path = made / name
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(content)
-            for row in self._rows:
-                run.write(row)
+            self._write_table(run)
             if self._best_content is not None and self._best is not None:
                 run.save_best(self._best_content, self._score_name, self._best[1])
             run.save_policy(self._content)
@@ -580,6 +614,26 @@ class Keeper:
             if made is not None:
                 shutil.rmtree(made, ignore_errors=True)
             return None
+
+    def _write_table(self, run: Run) -> None:
+        """Complete the table in another folder, which holds the rows before this training."""
+        try:
+            table = self.run.metrics.read_bytes()
+        except OSError:
+            table = b""
+        if run.metrics.exists() and len(table) < run.metrics.stat().st_size:
+            table = b""  # it was cut off
+        last: float = -1
+        try:
+            if table:
+                run.metrics.write_bytes(table)
+            run.cut(self.npg.iteration)
+            last = max((row["iteration"] or 0 for row in (run.rows() if run.metrics.exists() else [])), default=-1)
+        except (ValueError, KeyError):  # other content than a table
+            run.metrics.write_bytes(self._files.get(run.metrics.name, b""))
+        for row in self._rows:
+            if row["iteration"] > last:
+                run.write(row)
 
 
 def _free(folder: Path) -> Path:

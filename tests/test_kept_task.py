@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,9 @@ from training_runs import QUIET, TINY, metrics, refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
+from lyceum_warp.cli.arguments import run_options
+from lyceum_warp.env import Env
+from lyceum_warp.kept_task import run_env
 from lyceum_warp.runs import Run
 
 SOURCE = """
@@ -141,6 +145,33 @@ def test_an_edited_model_is_named_and_the_runs_own_copy_used(folder: Path, capsy
     assert returns(capsys, str(out), "--task", str(folder / "mine" / "slide.py")) != before
 
 
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_run_that_begins_with_another_uses_its_copy_of_the_model(
+    moved: bool, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, robot, warm = trained(folder), folder / "mine" / "robot", folder / "warm"
+    masses = Env(str(folder / "mine" / "slide.py")).model.body_mass
+    if moved:
+        robot.rename(folder / "mine" / "other")
+        line = "the model of the task 'slide' is no longer where it was"
+    else:
+        part = robot / "parts" / "block.xml"
+        part.write_text(PART.replace('type="mesh"', 'type="mesh" mass="9"'))
+        line = "the model of the task 'slide' has changed since the run began"
+    capsys.readouterr()
+    arguments = ["train", "--from", str(out), "--out", str(warm), *QUIET, "--iterations"]
+    assert cli.main([*arguments, "1"]) == 0
+    refused(capsys, f"{line}: the run's own copy is used, {out / 'task' / 'robot' / 'scene.xml'}")
+    env = run_env(Run.open(warm), *run_options(Run.open(warm).config))
+    assert np.array_equal(env.model.body_mass, masses)
+    assert cli.main(["train", "--resume", str(warm), "--iterations", "2", *QUIET]) == 0
+    if not moved:  # a task that is named is used as it is now
+        arguments[4] = str(folder / "new")
+        assert cli.main([*arguments, "1", str(folder / "mine" / "slide.py")]) == 0
+        env = run_env(Run.open(folder / "new"), *run_options(Run.open(folder / "new").config))
+        assert env.model.body_mass[-1] == 9.0
+
+
 def test_a_run_of_python_keeps_a_model_that_was_made_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec = lw.gymnasium_model("hopper.xml").spec()
     spec.option.gravity = [0.0, 0.0, -30.0]
@@ -150,6 +181,26 @@ def test_a_run_of_python_keeps_a_model_that_was_made_there(tmp_path: Path, capsy
     assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2", "--task", "hopper"]) == 0
     assert before not in capsys.readouterr().out
     assert cli.main(["train", "--resume", str(tmp_path / "run"), "--iterations", "2", *QUIET]) == 0
+
+
+def test_python_names_a_task_and_a_model_that_have_changed(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The algorithm is made of them, so they are used as they are."""
+    file, table, out = folder / "mine" / "slide.py", folder / "mine" / "goal.npy", folder / "run"
+
+    def train(iterations: int, **words: Any) -> None:
+        env = lw.make(str(file), nworld=2, goal=table, horizon=10)
+        lw.train(lw.NPG(env, config=SMALL), out, iterations=iterations, **words)
+
+    train(1)
+    assert Run.open(out).config["params"] == {"goal": str(table)}
+    train(2, resume=True)
+    assert not caplog.messages
+    part = folder / "mine" / "robot" / "parts" / "block.xml"
+    part.write_text(PART.replace('type="slide"', 'type="slide" damping="9"'))
+    file.write_text(SOURCE.replace("-wp.abs(", "7.0 - wp.abs("))
+    train(3, resume=True)
+    changed = "has changed since the run began: it is used as it is now"
+    assert caplog.messages == [f"{file} {changed}", f"the model of the task 'slide' {changed}"]
 
 
 def test_a_task_of_a_program_is_evaluated_with_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

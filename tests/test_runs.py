@@ -39,12 +39,12 @@ def test_read_returns_the_saved_state(run: Run) -> None:
 
 def test_create_refuses_a_folder_with_content(run: Run, tmp_path: Path) -> None:
     before = {path: path.read_bytes() for path in run.folder.iterdir()}
-    with pytest.raises(ValueError, match=r"holds a run: continue it with --resume .*, or give another --out"):
+    with pytest.raises(ValueError, match=r"holds a run: continue it with resume=True, or give another folder"):
         Run.create(run.folder, {})
     assert before == {path: path.read_bytes() for path in run.folder.iterdir()}
     (tmp_path / "file").write_text("mine")
     for place in (tmp_path, tmp_path / "file"):
-        with pytest.raises(ValueError, match="is not an empty folder: give another --out"):
+        with pytest.raises(ValueError, match="is not an empty folder: give another folder"):
             Run.create(place, {})
 
 
@@ -103,6 +103,13 @@ def test_rows_come_back_with_every_digit(run: Run) -> None:
     read = run.rows()
     assert [row["value"] for row in read] == [row["value"] for row in rows]
     assert [row["mean"] for row in read] == [None, 1e-30, None]
+
+
+def test_cut_counts_iterations_and_not_rows(run: Run) -> None:
+    for i in (4, 5, 6):
+        run.write({"value": 0.5, "iteration": i})
+    run.cut(5)
+    assert [row["iteration"] for row in run.rows()] == [4, 5]
 
 
 def test_cut_drops_rows_without_a_checkpoint(run: Run) -> None:

@@ -14,10 +14,10 @@ from conftest import SharedEnv
 from training_runs import QUIET, metrics, refused
 
 import lyceum_warp as lw
-from lyceum_warp import cli
+from lyceum_warp import cli, training
 from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.runs import Run
-from lyceum_warp.training import POLICY_SHARE, SHARE, Keeper, NotSavedError
+from lyceum_warp.training import POLICY_SHARE, SHARE, Keeper, NotSavedError, describe
 
 CONFIG = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=2, mean_episodes=2)
 
@@ -74,8 +74,47 @@ def test_python_resumes_a_run_to_the_same_numbers(six: Path, tmp_path: Path) -> 
     with pytest.raises(ValueError, match="has gamma 0.995, not 0.9, and a run keeps its settings"):
         config = lw.NPGConfig(**{**vars(CONFIG), "gamma": 0.9})
         lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), folder, iterations=9, resume=True)
-    with pytest.raises(ValueError, match="already has 6 iterations"):
+    with pytest.raises(ValueError, match="already has 6 iterations: give more, as in iterations=12"):
         lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
+
+
+def test_python_resumes_the_same_task_on_the_same_engine(six: Path, env: lw.Env, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(six, tmp_path / "other"))
+    Run.open(other).amend(engine="warp")
+    for folder, given, message in [
+        (six, lw.make("point_mass", nworld=2, horizon=9), "has horizon None, not 9, and a run keeps"),
+        (six, lw.make("cartpole", nworld=2), "has task point_mass, not cartpole"),
+        (other, env, "has engine warp, not mujoco"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            lw.train(algorithm(given), folder, iterations=9, resume=True)
+
+
+def test_a_seed_of_the_algorithm_alone_is_kept(env: lw.Env, tmp_path: Path) -> None:
+    assert "npg_seed" not in describe(algorithm(env))
+    run = lw.train(algorithm(env, seed=3), tmp_path / "run", iterations=1)
+    assert (run.config["seed"], run.config["npg_seed"]) == (0, 3)
+    assert cli.main(["train", "--resume", str(run.folder), "--iterations", "2", *QUIET]) == 0
+
+
+def test_an_algorithm_that_has_iterated_begins_a_whole_run(six: Path, tmp_path: Path) -> None:
+    npg, folder = algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run"
+    for _ in range(3):
+        next(npg)
+    assert lw.train(npg, tmp_path / "three", iterations=3).read()["iteration"] == 3
+    assert lw.load(tmp_path / "three").nact == 2
+    begun = []
+
+    def callback(iteration: lw.Iteration) -> bool:
+        begun.append(Run.open(folder).read()["iteration"])
+        return iteration.iteration == 5
+
+    lw.train(npg, folder, iterations=9, callback=callback, save_every=100)
+    assert begun == [3, 3]
+    previous = folder / "previous.pt"  # as after kill -9 in iteration 6
+    previous.replace(folder / "checkpoint.pt")
+    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
+    assert metrics(folder) == metrics(six)[3:]
 
 
 def test_bad_arguments_leave_no_folder(env: lw.Env, tmp_path: Path) -> None:
@@ -249,7 +288,7 @@ def test_a_command_begins_with_the_policy_of_a_run(
     arguments = ["train", "--from", str(six), "--which", "4", "--param", "success_distance=0.5", "--iterations", "1"]
     assert cli.main([*arguments, "--out", str(out), "--keep-every", "1", *QUIET]) == 0
     config = Run.open(out).config
-    assert config["from"] == {"run": str(six / "policies"), "which": "4", "iteration": 4}
+    assert config["from"] == {"run": str(six), "which": "4", "iteration": 4}
     assert (config["task"], config["params"], config["nworld"]) == ("point_mass", {"success_distance": 0.5}, 2)
     assert config["npg"] == Run.open(six).config["npg"]
     state = Run.open(out).read()["state"]
@@ -332,6 +371,31 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(folder))
     return folder
+
+
+def test_a_rescued_run_has_the_rows_that_can_be_read(
+    env: lw.Env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "KEPT_ROWS", 2)
+    npg, run = algorithm(env), Run.create(tmp_path / "run", {})
+    keeper = Keeper(run, npg)
+    for _ in range(4):
+        keeper.keep(next(npg), None)
+
+    def rescued(name: str) -> list[float | None]:
+        folder = keeper._copied(tmp_path / name, whole=False)
+        assert folder is not None
+        return [row["iteration"] for row in Run.open(folder).rows()]
+
+    whole = run.metrics.read_text()
+    assert rescued("whole") == [1, 2, 3, 4]
+    run.metrics.write_text(whole[:-9])  # a full disk cuts the last row off
+    assert rescued("cut") == [1, 2, 3, 4]
+    for number, content in enumerate((b"mine\n1\n", b"\xff\n", b"iteration\n1,2\n")):
+        run.metrics.write_bytes(content)
+        assert rescued(f"other-{number}") == [3, 4]
+    shutil.rmtree(run.folder)
+    assert rescued("gone") == [3, 4]
 
 
 def test_a_folder_that_was_deleted_is_written_beside_it(six: Path, tmp_path: Path) -> None:

@@ -78,6 +78,8 @@ class NPG:
     """The value function that is learned with it."""
     rollout: Rollout
     """The samples of the last iteration."""
+    seed: int
+    """Seed of new networks and of the noise."""
     count: int
     """Samples in an iteration, those of all processes."""
     segments: bool
@@ -102,7 +104,7 @@ class NPG:
         check_kind("value of NPG", value, ValueFunction | None, "as lw.load_value(run) returns it")
         if value is not None:
             _check_value(value, env)
-        self.env = env
+        self.env, self.seed = env, seed
         self.team = team = team or Team()
         self.config = config = config or NPGConfig()
         n, nworld = env.nworld, env.nworld * team.size

@@ -220,7 +220,7 @@ def states_video(env: Env, states: torch.Tensor, path: Path, *, quiet: bool = Fa
 class Videos:
     """Writes a video of the mean policy every few iterations, and shows it in TensorBoard.
 
-    A machine that cannot draw is reported once, and gets no further video.
+    A machine that cannot draw a video, or cannot convert it for TensorBoard, is reported once, and gets no further one.
 
     Args:
         npg: The algorithm.
@@ -239,11 +239,15 @@ class Videos:
             return
         path = self.folder / f"{iteration.iteration:06d}.mp4"
         result = policy_video(self.npg.env, self.npg.policy, path, self.seed, quiet=True)
-        if result != str(path):
-            note(f"no further videos ({result.removeprefix('none: ')})")
+        reason = "" if result == str(path) else result.removeprefix("none: ")
+        if not reason and self.board is not None:
+            try:
+                self.board.video(path, iteration.samples)
+            except (ValueError, ImportError) as error:  # training goes on
+                reason = str(error)
+        if reason:
+            note(f"no further videos ({reason})")
             self.every = 0
-        elif self.board is not None:
-            self.board.video(path, iteration.samples)
 
 
 # plans

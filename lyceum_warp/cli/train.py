@@ -20,6 +20,7 @@ from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
 from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.cli.arguments import (
+    NO_FLAGS,
     EnvFlags,
     Physics,
     Repeated,
@@ -71,8 +72,8 @@ class Train:
     """Train a policy on a task with the natural policy gradient.
 
     The run's folder then holds config.json, versions.json, metrics.csv (one row for each iteration), policy.pt,
-    best.pt, checkpoint.pt, curve.png and video.mp4. Ctrl-C loses at most the current iteration, or two seconds of
-    short ones.
+    best.pt, checkpoint.pt, curve.png and video.mp4. Ctrl-C loses at most the current iteration; where iterations are
+    short, those since the policy was last saved, which is whenever training has taken 200 times as long as such a save.
 
     $ lyceum-warp train hopper --iterations 100 --seed 1
     $ lyceum-warp train half_cheetah --param ctrl_cost_weight=0.05 --param reset_noise_scale=0 --hidden 32 32
@@ -143,12 +144,15 @@ def train(options: Train) -> int:
     with join(options.env.device) as team:
         with team.together():
             # every mistake in the options is found before the folder is made
-            origin = _origin(options)
-            config, out = _config(options, team, origin), _folder(options)
+            origin, source = _origin(options), None
+            if options.from_run is not None and options.task is None:
+                source = Run.open(options.from_run)
+                options = dataclasses.replace(options, task=run_task(source, note=_silent))
+            config, out = _config(options, team, origin, source), _folder(options)
             run = None
             if team.leads:
                 Run.check_free(out)
-            npg = _algorithm(config, team, origin=origin)
+            npg = _algorithm(config, team, run=source, origin=origin)
             if team.leads:
                 kept = KeptTask.of(npg.env)
                 run = Run.create(out, config | kept.config, device=options.env.device)
@@ -164,7 +168,17 @@ def _origin(options: Train) -> tuple[PolicyContent, Path] | None:
     return read_checkpoint(path, parts=("iteration", "policy", "value")), path
 
 
-def _config(options: Train, team: Team, origin: tuple[PolicyContent, Path] | None = None) -> dict[str, Any]:
+def _config(
+    options: Train, team: Team, origin: tuple[PolicyContent, Path] | None = None, run: Run | None = None
+) -> dict[str, Any]:
+    """The configuration of a new run.
+
+    Args:
+        options: The options.
+        team: The processes.
+        origin: The content and the file of the policy that the run begins with.
+        run: The run whose task is used.
+    """
     if options.task is None:
         raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
     _check_iterations(options.iterations)
@@ -176,13 +190,15 @@ def _config(options: Train, team: Team, origin: tuple[PolicyContent, Path] | Non
         target_return=options.target_return, keep_every=options.keep_every, save_every=options.save_every
     )
     source = {}
-    if origin is not None:
+    if origin is not None and options.from_run is not None:
         npg = _fitted(npg, *origin)
-        place = {"run": str(origin[1].parent.resolve()), "which": options.which, "iteration": origin[0]["iteration"]}
+        place = {"run": str(options.from_run.resolve()), "which": options.which, "iteration": origin[0]["iteration"]}
         source = {"from": place}
     if nworld is None:
         nworld = 4096 * team.size if options.env.device.startswith("cuda") else 64
     others = {name: value for name, value in given(options.env).items() if name not in ("engine", "device")}
+    if run is not None:  # a run of Python may have options without flags
+        others |= {name: value for name, value in run.config.get("options", {}).items() if name in NO_FLAGS}
     return {
         "algorithm": "npg",
         "task": portable(options.task),
@@ -197,8 +213,14 @@ def _config(options: Train, team: Team, origin: tuple[PolicyContent, Path] | Non
         "iterations": options.iterations,
         "npg": dataclasses.asdict(npg) | {"samples": enough_samples(npg, nworld)},
         **settings,
+        **_shown(options),
         **source,
     }
+
+
+def _shown(options: Train) -> dict[str, Any]:
+    """What a run shows on its way, as config.json holds it."""
+    return {"tensorboard": options.tensorboard, "video_every": options.video_every}
 
 
 def _fitted(npg: NPGConfig, content: PolicyContent, path: Path) -> NPGConfig:
@@ -241,6 +263,7 @@ def saved_options(folder: Path) -> Train:
             param=tuple(f"{name}={spelled(value)}" for name, value in params.items()),
             target_return=config.get("target_return"), keep_every=config.get("keep_every", 0),
             save_every=config.get("save_every", 0),
+            tensorboard=config.get("tensorboard", False), video_every=config.get("video_every", 0),
             env=EnvFlags.of(known), physics=Physics.of(known.physics), npg=npg,
         )  # fmt: skip
     except (KeyError, TypeError, AttributeError, ValueError) as error:
@@ -264,8 +287,8 @@ def origin_options(given: Train) -> Train:
     same = given.task is None or task_name(find_task(given.task)) == run.task_name
     params = run_params(run, run_options(run.config)[1]) if same else {}
     return dataclasses.replace(
-        saved, task=run_task(run, note=note) if given.task is None else given.task, resume=None, target_return=None,
-        from_run=given.from_run, param=tuple(f"{name}={spelled(value)}" for name, value in params.items()),
+        saved, task=given.task, resume=None, target_return=None, from_run=given.from_run,
+        param=tuple(f"{name}={spelled(value)}" for name, value in params.items()),
     )  # fmt: skip
 
 
@@ -286,7 +309,7 @@ def resume(options: Train, folder: Path) -> int:
             run, npg = _reopened(options, folder, team)
         if team.leads:
             _warn_of_versions(run)
-            reopen(run, npg, iterations=options.iterations, **settings)
+            reopen(run, npg, iterations=options.iterations, **settings, **_shown(options))
         return _learn(run if team.leads else None, npg, options)
 
 
@@ -303,7 +326,7 @@ def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, NPG]:
     if options.out not in (None, folder):
         raise ValueError(f"a resumed run stays in its folder {folder}: omit --out")
     content = run.read(note=note if team.leads else _silent)
-    check_resumable(run, content, options.iterations, options.target_return)
+    check_resumable(run, content, options.iterations, options.target_return, command=True)
     origin = (content, run.checkpoint) if "from" in run.config else None
     npg = _algorithm(run.config, team, run=run, origin=origin)
     restore(run, npg, content)
@@ -333,7 +356,8 @@ def _algorithm(
     Args:
         config: The configuration.
         team: The processes.
-        run: The run that is continued, whose folder may hold a copy of the task.
+        run: The run whose task it is, and whose folder may hold a copy of it: the run that is continued, or the one
+            that a new run begins with.
         origin: The content and the file with the networks; new networks without it.
     """
     if config["threads"] < 1:
@@ -353,7 +377,7 @@ def _algorithm(
     if origin is not None:
         policy, value = networks(*origin)
         check_sizes(policy, env, origin[1])
-    return NPG(env, policy, value, _hyperparameters(config), seed=config["seed"], team=team)
+    return NPG(env, policy, value, _hyperparameters(config), seed=config.get("npg_seed", config["seed"]), team=team)
 
 
 def _silent(line: str) -> None:
@@ -386,6 +410,7 @@ def _learn(run: Run | None, npg: NPG, options: Train) -> int:
             learn(
                 run, npg, iterations=options.iterations, callback=show, board=board,
                 target_return=options.target_return, keep_every=options.keep_every, save_every=options.save_every,
+                resumed=options.resume is not None,
             )  # fmt: skip
     except Interrupted as signalled:
         if run is not None and run.checkpoint.exists():

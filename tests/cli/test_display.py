@@ -125,6 +125,23 @@ def test_videos_are_written_every_few_iterations_and_shown_in_tensorboard(first:
     assert [image.step for image in images] == [24, 48]
 
 
+@pytest.mark.parametrize("error", [ValueError, ImportError])
+def test_a_video_that_cannot_be_converted_is_reported_once(
+    error: type[Exception], first: lw.Iteration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    class Board:
+        def video(self, path: Path, samples: int) -> None:
+            raise error("ffmpeg gave no picture")
+
+    npg = lw.NPG(lw.make("point_mass", nworld=2, horizon=6), config=lw.NPGConfig(samples=12))
+    monkeypatch.setattr(display, "policy_video", lambda env, policy, path, *args, **words: str(path))
+    videos = display.Videos(npg, tmp_path / "videos", 1, 0, Board())  # type: ignore[arg-type]
+    for i in (1, 2):
+        videos(dataclasses.replace(first, iteration=i))
+    assert capsys.readouterr().err == "lyceum-warp: no further videos (ffmpeg gave no picture)\n"
+
+
 def test_a_machine_that_cannot_draw_is_reported_once(
     first: lw.Iteration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

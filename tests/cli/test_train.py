@@ -23,7 +23,7 @@ from lyceum_warp import cli
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.cli.arguments import EnvFlags
-from lyceum_warp.cli.train import NPGOptions, Train, _config
+from lyceum_warp.cli.train import NPGOptions, Train, _config, saved_options
 from lyceum_warp.runs import Run
 
 
@@ -110,6 +110,23 @@ def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: py
     assert before == {path: path.read_bytes() for path in trained.iterdir()}
     assert cli.main(["train", "--resume", str(tmp_path / "none")]) == 2
     refused(capsys, "there is no run in")
+
+
+def test_a_resumed_run_shows_the_same(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    pytest.importorskip("tensorboard")
+    assert train(out, "--iterations", "1", "--tensorboard", "--video-every", "50") == 0
+    resume = ["train", "--resume", str(out), *QUIET, "--iterations"]
+    assert cli.main([*resume, "2"]) == 0
+    assert len(list(out.glob("events.out.tfevents.*"))) == 2
+    saved = saved_options(out)
+    assert (saved.tensorboard, saved.video_every) == (True, 50)
+    assert cli.main([*resume, "3", "--no-tensorboard", "--video-every", "0"]) == 0
+    assert len(list(out.glob("events.out.tfevents.*"))) == 2
+    config = Run.open(out).config
+    assert (config.pop("tensorboard"), config.pop("video_every")) == (False, 0)
+    (out / "config.json").write_text(json.dumps(config))  # of an earlier release
+    assert cli.main([*resume, "4"]) == 0
 
 
 def physics(env: lw.Env) -> tuple[int, int, int, bool]:
@@ -343,13 +360,13 @@ def test_a_terminated_run_continues(trained: Path, tmp_path: Path) -> None:
     assert_continues(out, rest, trained)
 
 
-@pytest.mark.parametrize("moment", ["step", "log_prob", "write", "save_state"])
+@pytest.mark.parametrize("moment", ["step", "log_prob", "state_dict", "write", "save_state"])
 def test_an_interrupted_run_continues(
     moment: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Within this process: while it samples, learns, or writes. The tests of plan interrupt a command from outside."""
     out = tmp_path / "run"
-    owner: Any = {"step": lw.Env, "log_prob": lw.GaussianPolicy}.get(moment, Run)
+    owner: Any = {"step": lw.Env, "log_prob": lw.GaussianPolicy, "state_dict": lw.NPG}.get(moment, Run)
     original, calls = getattr(owner, moment), []
 
     def interrupting(*args: Any, **words: Any) -> Any:
