@@ -96,7 +96,9 @@ CASES: dict[str, dict[str, Any]] = {
     "knot_for_each_step": POINT | dict(knots=9, spline="linear", noise=[[0.3, 0.2], [0.2, 0.25]]),
     "one_knot": POINT | dict(update="predictive_sampling", noise=0.4, knots=1, include_plan=True),
 }
-SAME_ON_WARP = {"without_plan", "cem", "cem_of_one", "zero", "cubic", "knot_for_each_step", "one_knot"}
+SAME_ON_WARP = {
+    "ignore", "frame_skip", "without_plan", "cem", "cem_of_one", "zero", "cubic", "knot_for_each_step", "one_knot",
+}  # fmt: skip
 """Cases whose kernels other cases run on the Warp engine."""
 
 
