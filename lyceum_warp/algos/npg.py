@@ -134,7 +134,7 @@ class NPG:
         self._value_is_new = value is None
         self.value = value or ValueFunction(
             env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation,
-            time_orders=config.time_orders, group=group, **options,
+            scale=1.0 / max(1.0 - config.gamma, 1e-3), time_orders=config.time_orders, group=group, **options,
         )  # fmt: skip
         self.value.discount = config.gamma
         self.policy.to(device)

@@ -56,7 +56,7 @@ class Eval:
     episodes: int = 32
     """Number of episodes."""
     seed: int = 1
-    """Seed of the initial states, which differ from those that a training with the same seed draws."""
+    """Seed of the initial states, which differ from those that training with the same seed draws."""
     nworld: int = 32
     """Largest number of worlds; never more than episodes."""
     video: bool = False
