@@ -16,11 +16,11 @@ class Interrupted(BaseException):
 
 @contextlib.contextmanager
 def signals() -> Iterator[None]:
-    """Within the context the first Ctrl-C, SIGTERM or SIGHUP raises Interrupted, and later ones are ignored."""
+    """Within the context the first Ctrl-C, SIGTERM or SIGHUP raises Interrupted; later ones only within ``obeyed``."""
 
     def interrupt(number: int, frame: Any) -> None:
         for other in previous:
-            signal.signal(other, signal.SIG_IGN)
+            signal.signal(other, _ignore)
         raise Interrupted(number)
 
     previous = _handled_by(interrupt)
@@ -54,6 +54,30 @@ def ending() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def obeyed() -> Iterator[None]:
+    """Within the context one more Ctrl-C, SIGTERM or SIGHUP raises Interrupted, after that of ``signals``.
+
+    It is for work at the end of a program that may take long, so that a second Ctrl-C gives it up.
+    """
+
+    def interrupt(number: int, frame: Any) -> None:
+        for other in numbers:
+            signal.signal(other, _ignore)
+        raise Interrupted(number)
+
+    numbers = [number for number in _numbers() if signal.getsignal(number) is _ignore]
+    with contextlib.suppress(ValueError):  # only the main thread may set handlers
+        for number in numbers:
+            signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ValueError):
+            for number in numbers:
+                signal.signal(number, _ignore)
+
+
+@contextlib.contextmanager
 def postponed(when: bool = True) -> Iterator[list[int]]:
     """List Ctrl-C, SIGTERM and SIGHUP instead of handling them, which is left to the caller.
 
@@ -71,13 +95,20 @@ def postponed(when: bool = True) -> Iterator[list[int]]:
     try:
         yield noted
     except Interrupted:
-        previous = dict.fromkeys(previous, signal.SIG_IGN)
+        previous = dict.fromkeys(previous, _ignore)
         raise
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
     if noted:
         signal.raise_signal(signal.Signals(noted[0]))
+
+
+def _ignore(number: int, frame: Any) -> None:
+    """Handles a signal after Interrupted was raised.
+
+    It is not SIG_IGN, by which a shell makes a program ignore a signal, also in ``obeyed``.
+    """
 
 
 def _numbers() -> list[int]:
@@ -91,6 +122,6 @@ def _handled_by(handler: Callable[[int, Any], None]) -> dict[int, Any]:
     with contextlib.suppress(ValueError):  # only the main thread may set handlers
         for number in _numbers():
             # a shell that starts a program in the background makes it ignore SIGINT on purpose, and nohup SIGHUP
-            if signal.getsignal(number) is not signal.SIG_IGN:
+            if signal.getsignal(number) not in (signal.SIG_IGN, _ignore):
                 previous[number] = signal.signal(number, handler)
     return previous

@@ -9,15 +9,16 @@ import os
 import shutil
 import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from lyceum_warp.binding.local_modules import local_modules
 from lyceum_warp.binding.models import find_model
-from lyceum_warp.binding.registry import find_task, task_name
+from lyceum_warp.binding.registry import find_task
 from lyceum_warp.env import Env
 from lyceum_warp.model_files import ModelFile, read_spec
 from lyceum_warp.options import EnvOptions
@@ -33,14 +34,8 @@ _APART = 2
 """A task's file lies at most this many folders below the common one of it and its model."""
 _LARGEST = 512 * 2**20
 """Models with larger files than this, in bytes, are not copied."""
-
-
-def spelled_task(task: type[Task]) -> str | None:
-    """A task as config.json names it: a name, a file with a class, or None for a class without a file."""
-    if task.__module__.startswith("lyceum_warp."):
-        return task_name(task)
-    file = _file(task)
-    return None if file is None else f"{file}:{task.__name__}"
+_MOST_MODULES, _LARGEST_MODULES = 100, 8 * 2**20
+"""Modules that a task imports from its folder are not copied if they are more, or larger in bytes."""
 
 
 def _file(task: type[Task]) -> Path | None:
@@ -70,12 +65,17 @@ class KeptTask:
         files: dict[str, Path | bytes | np.ndarray] = {}
         if file is not None:
             kept["source_hash"] = _digest(file.read_bytes())
-        sources: dict[Path, Path | bytes] = {file: file} if own and file is not None else {}
+        sources: dict[Path, Path | bytes] = {}
+        modules: list[Path] = []
+        if own and file is not None:
+            modules = _module_files(file)
+            sources = {path: path for path in (file, *modules)}
+            kept["modules"] = {_beside(path, file): _digest(path.read_bytes()) for path in modules}
         main = None
         if own or env.options.model is not None:
             main, model = _model_files(env)
             sources |= model
-        names = _names_in_copy(sources, file)
+        names = _names_in_copy(sources, file, modules)
         if own and file is not None:
             kept["file"], kept["program"] = names[file], task.__module__ == "__main__"
         if main is not None:
@@ -181,8 +181,8 @@ def run_task(run: Run, *, note: Note = log.warning) -> str:
     if task is None or kept.get("program"):
         where = "a notebook" if task is None else task.partition(":")[0]
         raise ValueError(
-            f"the task {kept['name']!r} of the run in {run.folder} was defined in {where}, which trained it: give "
-            "--task with a file that only defines it, as --task my_task.py"
+            f"the task {kept['name']!r} of the run in {run.folder} was defined in {where}, which trained it: give a "
+            "file that only defines it (eval --task my_task.py, train my_task.py --from), or go on there (resume=True)"
         )
     path, colon, attribute = task.partition(":")
     if not path.endswith(".py"):
@@ -193,13 +193,24 @@ def run_task(run: Run, *, note: Note = log.warning) -> str:
     copy = run.task_folder / kept["file"] if "file" in kept else None
     if copy is None or not copy.is_file():
         return task
-    if not Path(path).is_file():
-        note(f"{path} does not exist any more: the run's own copy is used, {copy}")
-    elif _digest(Path(path).read_bytes()) != kept["source_hash"]:
-        note(f"{path} has changed since the run began: the run's own copy is used, {copy}; --task {path} uses the new")
-    else:
+    changes = _source_changes(Path(path), kept)
+    if not changes:
         return task
+    new = f"; give {path} as the task to use the new version" if Path(path).is_file() else ""
+    note(f"{changes[0]}: the run's own copy is used, {copy}{new}")
     return f"{copy}{colon}{attribute}"
+
+
+def _source_changes(file: Path, kept: Mapping[str, Any]) -> list[str]:
+    """What has happened to a task's file, and to the modules beside it, since the run began."""
+    known = {file: kept.get("source_hash")} | {file.parent / name: h for name, h in kept.get("modules", {}).items()}
+    changes = []
+    for path, hashed in known.items():
+        if not path.is_file():
+            changes.append(f"{path} does not exist any more")
+        elif hashed not in (None, _digest(path.read_bytes())):
+            changes.append(f"{path} has changed since the run began")
+    return changes
 
 
 def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
@@ -212,8 +223,8 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
     """
     kept, file = run.config.get("kept", {}), _file(env.task.task)
     hashed = None if kept.get("program") else kept.get("source_hash")  # a program that trains changes on its own
-    if file is not None and hashed not in (None, _digest(file.read_bytes())):
-        note(f"{file} has changed since the run began: it is used as it is now")
+    for change in _source_changes(file, {**kept, "source_hash": hashed}) if file is not None else ():
+        note(f"{change}: it is used as it is now" if "changed" in change else change)
     if _model_changed(run, kept, env):
         note(f"the model of the task {env.task.name!r} has changed since the run began: it is used as it is now")
 
@@ -262,8 +273,22 @@ def _model_hash(env: Env) -> str:
     return found.hexdigest()[:16]
 
 
-def _names_in_copy(paths: Iterable[Path], file: Path | None) -> dict[Path, str]:
-    """The paths in the folder ``task`` of a task's file and of its model's files.
+def _module_files(file: Path) -> list[Path]:
+    """The modules beside a task's file that it imports; none where they are too many or too large to copy."""
+    found = [path for path in local_modules(file).values() if path.is_file()]
+    if len(found) > _MOST_MODULES or sum(path.stat().st_size for path in found) > _LARGEST_MODULES:
+        log.info("%s imports %d modules from its folder, too many or too large to copy into the run", file, len(found))
+        return []
+    return found
+
+
+def _beside(path: Path, file: Path) -> str:
+    """The path of a module relative to the folder of a task's file."""
+    return path.relative_to(file.parent).as_posix()
+
+
+def _names_in_copy(paths: Iterable[Path], file: Path | None, modules: Sequence[Path] = ()) -> dict[Path, str]:
+    """The paths in the folder ``task`` of a task's file, of the modules beside it, and of its model's files.
 
     The files keep their places relative to each other, so that the copy of the task finds the copy of its model. Where
     the task's file lies elsewhere than its model, each has a place of its own.
@@ -273,8 +298,9 @@ def _names_in_copy(paths: Iterable[Path], file: Path | None) -> dict[Path, str]:
         return {}
     root = Path(os.path.commonpath([path.parent for path in paths]))
     if file in paths and len(file.parent.relative_to(root).parts) > _APART:
-        rest = [path for path in paths if path != file]
-        return {file: file.name} | {path: f"{_MODEL}/{name}" for path, name in _names_in_copy(rest, None).items()}
+        own = {path: _beside(path, file) for path in (file, *modules)}
+        rest = _names_in_copy([path for path in paths if path not in own], None)
+        return own | {path: f"{_MODEL}/{name}" for path, name in rest.items()}
     return {path: path.relative_to(root).as_posix() for path in paths}
 
 

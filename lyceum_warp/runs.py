@@ -1,28 +1,30 @@
-"""Runs: the folder of a training run, with its configuration, versions, metrics, policies and checkpoint."""
+"""Runs: the folder of a training run, its files, and the policies in it."""
 
 import contextlib
-import csv
-import io
 import json
 import logging
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
-from torch import nn
 
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
-from lyceum_warp.env import Env
-from lyceum_warp.files import newer_format, replaced
+from lyceum_warp.checkpoints import (
+    FORMAT,
+    PolicyContent,
+    check_format,
+    policy_content,
+    policy_of,
+    read_checkpoint,
+    serialized,
+    value_of,
+)
+from lyceum_warp.files import replaced
+from lyceum_warp.metrics_table import append_row, cut_rows, read_metrics
 from lyceum_warp.versions import versions
-
-Module = TypeVar("Module", bound=nn.Module)
-
-FORMAT = 1
-"""Format of the folder. It is raised when an older release could no longer read the folder."""
 
 _CONFIG, _VERSIONS, _METRICS, _CHECKPOINT = "config.json", "versions.json", "metrics.csv", "checkpoint.pt"
 _PREVIOUS, _LAST, _BEST, _NUMBERED = "previous.pt", "policy.pt", "best.pt", "policies"
@@ -42,7 +44,7 @@ class Run:
     ``policies/``       those of every n-th iteration, if asked for
     ``checkpoint.pt``   the complete state from which a run continues exactly, of the last iteration or an earlier one
     ``previous.pt``     the checkpoint before it
-    ``task/``           the task's file and its model, where they are not the package's
+    ``task/``           the task's file with modules beside it, and its model, where they are not the package's
     =================== ======================================================================================
 
     Args:
@@ -147,7 +149,7 @@ class Run:
             number = config["format"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} is not the configuration of a run of lyceum_warp ({error!r})") from error
-        _check_format(path, number)
+        check_format(path, number)
         return cls(folder, config)
 
     def amend(self, **changes: Any) -> None:
@@ -178,30 +180,8 @@ class Run:
     # the table
 
     def write(self, row: Mapping[str, Any]) -> None:
-        """Append a row to the table. A column that is new, as after an update of the task, is empty in earlier rows.
-
-        Args:
-            row: Values by the names of their columns. None becomes an empty cell; floats keep all their digits.
-        """
-        columns = self._columns()
-        if new := [name for name in row if name not in columns]:
-            cells = []
-            if columns:
-                with self.metrics.open(newline="") as file:
-                    cells = [line + [""] * len(new) for line in list(csv.reader(file))[1:]]
-            columns += new
-            with replaced(self.metrics) as temporary, temporary.open("w", newline="") as file:
-                csv.writer(file).writerows([columns, *cells])
-        with self.metrics.open("a", newline="") as file:
-            values = (row.get(name) for name in columns)
-            csv.writer(file).writerow(["" if value is None else value for value in values])
-
-    def _columns(self) -> list[str]:
-        """The names in the table's header; none where there is no table yet."""
-        if not self.metrics.exists():
-            return []
-        with self.metrics.open(newline="") as file:
-            return next(csv.reader(file), [])
+        """Append a row to the table; see ``append_row``."""
+        append_row(self.metrics, row)
 
     def rows(self) -> list[dict[str, float | None]]:
         """Read the rows of the table. An empty cell is None.
@@ -222,16 +202,7 @@ class Run:
         Args:
             iteration: Number of the last iteration to keep. The first row may have another number than 1.
         """
-        if not self.metrics.exists():
-            return
-        lines = self.metrics.read_text().splitlines(keepends=True)
-        column = next((i for i, name in enumerate(_cells(lines[0])) if name == "iteration"), None) if lines else None
-        kept = [
-            line for i, line in enumerate(lines)
-            if line.endswith("\n") and (i == 0 or _number_of_row(line, column, i) <= iteration)
-        ]  # fmt: skip
-        if kept != lines:
-            _write(self.metrics, "".join(kept))
+        cut_rows(self.metrics, iteration)
 
     def files(self) -> dict[str, bytes]:
         """The content of versions, table, best policy and task, by their paths below the folder."""
@@ -276,20 +247,20 @@ class Run:
     def _numbered(self, iteration: int) -> Path:
         return self.folder / _NUMBERED / f"{iteration:06d}.pt"
 
-    def save_policy(self, content: "PolicyContent", *, number: bool = False) -> None:
+    def save_policy(self, content: PolicyContent, *, number: bool = False) -> None:
         """Replace the last policy.
 
         Args:
             content: The policy and the value function.
             number: Whether to keep it under the number of its iteration, too.
         """
-        data = _serialized(content)
+        data = serialized(content)
         if number:
             (self.folder / _NUMBERED).mkdir(exist_ok=True)
             _write_bytes(self._numbered(content["iteration"]), data)
         _write_bytes(self.folder / _LAST, data)
 
-    def save_best(self, content: "PolicyContent", name: str, score: float) -> None:
+    def save_best(self, content: PolicyContent, name: str, score: float) -> None:
         """Replace the best policy.
 
         Args:
@@ -297,7 +268,7 @@ class Run:
             name: The column of the table by which it is the best.
             score: The number there.
         """
-        _write_bytes(self.folder / _BEST, _serialized({**content, "score": {"name": name, "value": score}}))
+        _write_bytes(self.folder / _BEST, serialized({**content, "score": {"name": name, "value": score}}))
 
     def best_score(self) -> tuple[int, float] | None:
         """The iteration and the score of the best policy; None where there is none."""
@@ -326,14 +297,14 @@ class Run:
         """
         self.save_state(policy_content(iteration, policy, value), state)
 
-    def save_state(self, content: "PolicyContent", state: Mapping[str, Any]) -> None:
+    def save_state(self, content: PolicyContent, state: Mapping[str, Any]) -> None:
         """The same with a policy and a value function that were copied before.
 
         Args:
             content: The policy and the value function.
             state: State of the algorithm.
         """
-        data = _serialized({**content, "state": dict(state)})
+        data = serialized({**content, "state": dict(state)})
         with replaced(self.checkpoint, durable=True) as temporary:
             temporary.write_bytes(data)
             if self.checkpoint.exists():
@@ -361,30 +332,10 @@ class Run:
                 note(f"{cause}: {self.previous}, of iteration {content['iteration']}, is used instead")
                 return content
             if isinstance(error, ValueError) and (self.folder / _LAST).is_file():
-                raise ValueError(f"{error}, or begin with the run's policy: --from {self.folder}") from error
+                raise ValueError(
+                    f"{error}, or begin with the run's policy: train --from {self.folder}, or NPG(env, lw.load(run))"
+                ) from error
             raise
-
-
-PolicyContent = dict[str, Any]
-"""A policy and a value function as they are saved: ``iteration``, ``policy``, and ``value`` if there is one."""
-
-
-def policy_content(iteration: int, policy: GaussianPolicy, value: ValueFunction | None = None) -> PolicyContent:
-    """A copy of a policy and of a value function on the CPU.
-
-    Args:
-        iteration: Number of complete iterations.
-        policy: The policy.
-        value: The value function.
-    """
-    content: PolicyContent = {"lyceum_warp": FORMAT, "iteration": iteration}
-    for name, module in (("policy", policy), ("value", value)):
-        if module is not None:
-            content[name] = {
-                "shape": module.shape,
-                "state": {key: tensor.detach().cpu().clone() for key, tensor in module.state_dict().items()},
-            }
-    return content
 
 
 def load(
@@ -410,7 +361,7 @@ def load(
             policy in it is of a class of its own and ``policy`` is not given, or does not fit.
     """
     content, path = _content(run, which, device)
-    return _policy(content, path, policy).to(device).eval().requires_grad_(False)
+    return policy_of(content, path, policy).to(device).eval().requires_grad_(False)
 
 
 def load_value(
@@ -429,10 +380,7 @@ def load_value(
             newer release.
     """
     content, path = _content(run, which, device)
-    return _filled(content, path, "value", lambda shape: ValueFunction(**shape)).to(device).eval().requires_grad_(False)
-
-
-_FIX = "restore the file from a copy, or train again with another --out"
+    return value_of(content, path).to(device).eval().requires_grad_(False)
 
 
 def _content(run: str | Path | Run, which: str | int, device: str | torch.device) -> tuple[PolicyContent, Path]:
@@ -447,143 +395,9 @@ def _content(run: str | Path | Run, which: str | int, device: str | torch.device
     return read_checkpoint(path, device, parts=("iteration", "policy")), path
 
 
-def networks(content: PolicyContent, path: Path) -> tuple[GaussianPolicy, ValueFunction]:
-    """The policy and the value function of a checkpoint, to be trained further.
-
-    Args:
-        content: The content of the checkpoint.
-        path: Its file, for messages.
-
-    Raises:
-        ValueError: The checkpoint holds something else.
-    """
-    return _policy(content, path, None), _filled(content, path, "value", lambda shape: ValueFunction(**shape))
-
-
-def _policy(content: PolicyContent, path: Path, given: GaussianPolicy | None) -> GaussianPolicy:
-    if given is None:
-        return _filled(content, path, "policy", GaussianPolicy.like)
-    return _filled(content, path, "policy", lambda shape: given, fix="give one like that of the run")
-
-
-def _filled(
-    content: PolicyContent, path: Path, name: str, made: Callable[[Mapping[str, Any]], Module], *, fix: str = _FIX
-) -> Module:
-    """A network with the weights of a checkpoint."""
-    try:
-        saved = content[name]
-        module = made(saved["shape"])
-        if different := _difference(module, saved["state"]):
-            raise ValueError(f"{path} holds a {name} of other parameters ({different}): {fix}")
-        module.load_state_dict(saved["state"])
-    except (KeyError, TypeError, RuntimeError) as error:
-        raise ValueError(f"{path} holds no {name} of lyceum_warp ({_first_sentence(error)}): {_FIX}") from error
-    return module
-
-
-def check_sizes(policy: Any, env: Env, path: Path) -> None:
-    """Refuse a policy that was trained on observations or actions of other sizes.
-
-    Args:
-        policy: The policy.
-        env: The environment that it is to act in.
-        path: Where it is from, for the message.
-
-    Raises:
-        ValueError: The sizes differ.
-    """
-    sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
-    if sizes != wanted:
-        raise ValueError(
-            f"the policy in {path} takes {sizes[0]} observations and gives {sizes[1]} actions, but the task "
-            f"{env.task.name!r} has {wanted[0]} and {wanted[1]}: use a task with the sizes that it was trained on"
-        )
-
-
-def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
-    """The first difference between a module's weights and saved ones; empty where there is none."""
-    own, saved = ({name: tuple(part.shape) for name, part in s.items()} for s in (module.state_dict(), state))
-    saved = {name: own[name] for name in getattr(module, "LATER", ())} | saved
-    for name in {**own, **saved}:
-        if own.get(name) != saved.get(name):
-            one, other = (f"{shape}" if shape is not None else "absent" for shape in (saved.get(name), own.get(name)))
-            return f"{name!r} is {one} in the file, and {other} in the network that takes it"
-    return ""
-
-
-def read_checkpoint(
-    path: Path, device: str | torch.device = "cpu", *, parts: tuple[str, ...] = ("iteration", "policy", "state")
-) -> dict[str, Any]:
-    """Read the content of a checkpoint, or of a saved policy. No code in the file is executed.
-
-    Args:
-        path: The file.
-        device: Device for its tensors.
-        parts: What it must hold.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        ValueError: The checkpoint is broken, was not written by lyceum_warp, or was written by a newer release.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no checkpoint {path}: train the run first")
-    try:
-        content = torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:  # of many types, from torch
-        raise ValueError(
-            f"the checkpoint {path} is cut off, or was not written by lyceum_warp ({_first_sentence(error)}): {_FIX}"
-        ) from error
-    if not isinstance(content, dict) or "lyceum_warp" not in content:
-        raise ValueError(f"the checkpoint {path} was not written by lyceum_warp: {_FIX}")
-    _check_format(path, content["lyceum_warp"])
-    if missing := set(parts) - content.keys():
-        raise ValueError(f"the checkpoint {path} lacks {', '.join(sorted(missing))}: {_FIX}")
-    return content
-
-
-def read_metrics(path: Path) -> list[dict[str, float | None]]:
-    """Read the rows of a table of metrics. An empty cell is None.
-
-    Raises:
-        ValueError: A cell is not a number, or the rows differ in length.
-    """
-    with path.open(newline="") as file:
-        reader = csv.DictReader(file, strict=True)
-        try:
-            return [{key: float(cell) if cell else None for key, cell in row.items()} for row in reader]
-        except (ValueError, TypeError, csv.Error) as error:
-            raise ValueError(f"{path} is not a table of metrics: line {reader.line_num}: {error}") from error
-
-
-def _check_format(path: Path, number: Any) -> None:
-    if not isinstance(number, int) or number < 1:
-        raise ValueError(f"{path} was not written by lyceum_warp: its format is {number!r}")
-    if number > FORMAT:
-        raise newer_format(path, number, FORMAT)
-
-
 def _write(path: Path, text: str) -> None:
     with replaced(path) as temporary:
         temporary.write_text(text)
-
-
-def _cells(line: str) -> list[str]:
-    return next(csv.reader([line]), [])
-
-
-def _number_of_row(line: str, column: int | None, otherwise: int) -> float:
-    """The iteration of a row; another number where it has no such column."""
-    try:
-        return otherwise if column is None else float(_cells(line)[column])
-    except (ValueError, IndexError, csv.Error):  # read_metrics names the line
-        return otherwise
-
-
-def _serialized(content: Any) -> memoryview:
-    """The bytes of a file. Written by Python they raise OSError on a full disk, where torch has errors of its own."""
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    return buffer.getbuffer()
 
 
 def _write_bytes(path: Path, data: memoryview) -> None:
@@ -607,9 +421,3 @@ def _number(which: Any) -> int | None:
     if isinstance(which, int) and not isinstance(which, bool):
         return which
     return int(which) if isinstance(which, str) and which.isdigit() else None
-
-
-def _first_sentence(error: BaseException) -> str:
-    """The first sentence of an error's message; torch's messages fill a page."""
-    text = str(error).strip() or type(error).__name__
-    return text.splitlines()[0].split(". ")[0][:200]

@@ -28,7 +28,8 @@ _TAGS = {
     "iteration": "time/iteration", "samples": "time/samples", "samples_per_second": "time/samples_per_second",
     "length_mean": "episode/length", "terminal_reward": "episode/terminal_reward", "eval_mean": "episode/eval",
     "success": "episode/success", "faults": "episode/faults", "outliers": "episode/outliers", "std_mean": "policy/std",
-    "reward_mean": "return/reward", "explained_variance": "value/explained_variance",
+    "skipped_updates": "policy/skipped_updates", "reward_mean": "return/reward",
+    "explained_variance": "value/explained_variance",
 }  # fmt: skip
 """Names of curves that do not follow from the columns."""
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from lyceum_warp.interrupts import Interrupted, postponed, signals
+from lyceum_warp.interrupts import Interrupted, obeyed, postponed, signals
 
 
 @pytest.fixture(autouse=True)
@@ -60,3 +60,26 @@ def test_postponed_false_leaves_signals_alone() -> None:
         with pytest.raises(Interrupted), postponed(False) as noted:
             signal.raise_signal(signal.SIGTERM)
         assert noted == []
+
+
+def test_a_second_signal_raises_within_obeyed_and_a_third_is_ignored() -> None:
+    with signals():
+        with pytest.raises(Interrupted):
+            signal.raise_signal(signal.SIGINT)
+        with pytest.raises(Interrupted) as raised, obeyed():
+            signal.raise_signal(signal.SIGTERM)
+        assert raised.value.number == signal.SIGTERM
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_obeyed_keeps_what_a_shell_ignores_and_other_handlers() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with signals():
+        with pytest.raises(Interrupted):
+            signal.raise_signal(signal.SIGTERM)
+        with obeyed():
+            signal.raise_signal(signal.SIGINT)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with pytest.raises(KeyboardInterrupt), obeyed():
+        signal.raise_signal(signal.SIGINT)

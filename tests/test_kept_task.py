@@ -12,7 +12,7 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.cli.arguments import run_options
 from lyceum_warp.env import Env
-from lyceum_warp.kept_task import run_env
+from lyceum_warp.kept_task import KeptTask, run_env
 from lyceum_warp.runs import Run
 
 SOURCE = """
@@ -125,11 +125,47 @@ def test_an_edited_task_is_named_and_the_runs_own_copy_used(folder: Path, capsys
     capsys.readouterr()
     assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
     refused(
-        capsys, f"{file} has changed since the run began: the run's own copy is used", f"--task {file} uses the new"
+        capsys,
+        f"{file} has changed since the run began: the run's own copy is used",
+        f"give {file} as the task to use the new version",
     )
     assert returns(capsys, str(out)) == before
     assert returns(capsys, str(out), "--task", str(file)) != before
     assert capsys.readouterr().err == ""
+
+
+def test_modules_that_a_task_imports_are_kept_with_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mine = folder / "mine"
+    source = SOURCE.replace("import warp as wp\n", "import warp as wp\nfrom slide_terms.goal import miss\n", 1)
+    source = source.replace("-wp.abs(s1.qpos[0] - p.goal[0])", "-miss(s1.qpos[0], p.goal[0])")
+    terms = "import warp as wp\n\n@wp.func\ndef miss(x: float, goal: float) -> float:\n    return wp.abs(x - goal)\n"
+    (mine / "slide_terms").mkdir()
+    (mine / "slide.py").write_text(source)
+    (mine / "slide_terms" / "goal.py").write_text(terms)
+    out = trained(folder)
+    before = returns(capsys, str(out))
+    assert capsys.readouterr().err == ""
+    (mine / "slide_terms" / "goal.py").write_text(terms.replace("wp.abs", "7.0 - wp.abs"))
+    assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
+    refused(capsys, f"{mine / 'slide_terms' / 'goal.py'} has changed since the run began: the run's own copy is used")
+    assert returns(capsys, str(out)) == before
+    assert returns(capsys, str(out), "--task", str(mine / "slide.py")) != before
+    mine.rename(folder / "moved")
+    try:
+        assert returns(capsys, str(out)) == before
+        assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
+        assert not list(out.rglob("__pycache__"))
+    finally:
+        shutil.rmtree(folder / "moved")
+
+
+def test_too_many_modules_are_not_copied(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "mine" / "slide_goal.py").write_text("GOAL = 0.1\n")
+    (folder / "mine" / "slide.py").write_text(f"import slide_goal\n{SOURCE}")
+    env = lw.make(str(folder / "mine" / "slide.py"), nworld=1)
+    assert "slide_goal.py" in KeptTask.of(env).files
+    monkeypatch.setattr("lyceum_warp.kept_task._LARGEST_MODULES", 5)
+    assert "slide.py" in KeptTask.of(env).files and "slide_goal.py" not in KeptTask.of(env).files
 
 
 def test_an_edited_model_is_named_and_the_runs_own_copy_used(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -208,5 +244,10 @@ def test_a_task_of_a_program_is_evaluated_with_a_file(tmp_path: Path, capsys: py
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=SMALL), tmp_path / "run", iterations=1)
     Run.open(tmp_path / "run").amend(task=None)  # as for a class of a notebook
     assert cli.main(["eval", str(tmp_path / "run")]) == 2
-    refused(capsys, "the task 'point_mass'", "was defined in a notebook", "give --task with a file")
+    refused(
+        capsys,
+        "the task 'point_mass'",
+        "was defined in a notebook",
+        "give a file that only defines it (eval --task my_task.py",
+    )
     assert cli.main(["eval", str(tmp_path / "run"), "--task", "point_mass", "--episodes", "2"]) == 0

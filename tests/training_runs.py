@@ -1,11 +1,14 @@
-"""Commands in this process: short training runs, their files, and the ends of commands."""
+"""Short training runs by the command and in Python, their files, and the ends of commands."""
 
 import csv
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
+import lyceum_warp as lw
 from lyceum_warp import cli
 
 TINY = ["--samples", "512", "--nworld", "2", "--hidden", "8", "--value-hidden", "8", "--mean-every", "2",
@@ -43,3 +46,22 @@ def interrupted(argv: list[str]) -> int:
         pytest.fail("the command did not handle SIGINT")
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+CONFIG = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=2, mean_episodes=2)
+
+
+def algorithm(env: lw.Env, **options: Any) -> lw.NPG:
+    """NPG with the settings of ``TINY``."""
+    return lw.NPG(env, config=CONFIG, **options)
+
+
+def six_iterations(folder: Path) -> Path:
+    """A run of six iterations in a new folder."""
+    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, keep_every=2)
+    return folder
+
+
+def mean_action(policy: lw.GaussianPolicy) -> torch.Tensor:
+    """What a policy does for one observation."""
+    return policy(torch.linspace(-1.0, 1.0, policy.nobs))

@@ -12,12 +12,7 @@ over time, s_t is that of the noise before smoothing: the spread of the elites i
 a standard deviation of 1.
 """
 
-from typing import Any
-
 from lyceum_warp.algos.mppi import MPPI
-from lyceum_warp.algos.mppi_arguments import words_of_update
-from lyceum_warp.algos.mppi_config import MPPIConfig
-from lyceum_warp.task import Task
 
 
 class CEM(MPPI):
@@ -37,15 +32,7 @@ class CEM(MPPI):
     ``spline``    spline_type     spline_order
     ============= =============== ========================
 
-    Args:
-        task: Name of a task, a file with one, or its class.
-        config: Settings in place of the task's.
-        words: The other arguments of ``lw.MPPI``.
-
-    Raises:
-        ValueError: An argument is unknown, ambiguous or not valid.
-        FileNotFoundError: A model or task file is missing.
+    Its arguments are those of ``lw.MPPI``, except ``update``.
     """
 
-    def __init__(self, task: str | type[Task], config: MPPIConfig | None = None, **words: Any) -> None:
-        super().__init__(task, config, **words_of_update("cem", words))
+    _update = "cem"

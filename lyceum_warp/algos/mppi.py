@@ -27,7 +27,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.algos.mppi_arguments import plain, planner_arguments
+from lyceum_warp.algos.mppi_arguments import plain, planner_arguments, words_of_update
 from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.planner_state import checked_state, state_from_parts
@@ -113,6 +113,8 @@ class MPPI:
     weights: torch.Tensor
     """The samples' weights, (samples,)."""
 
+    _update: str | None = None  # of a subclass: the only update that it has
+
     def __init__(
         self,
         task: str | type[Task],
@@ -127,6 +129,7 @@ class MPPI:
             raise ValueError(f"value must be a function of observations, or None, not {described(value)}")
         self.seed = whole_number("seed", seed, low=0)
         task = find_task(task)
+        words = words_of_update(self._update, words)
         self.config, options, own_params = planner_arguments(task, config, words, params, value)
         self.horizon, self.samples, self.iterations = self.config.horizon, self.config.samples, self.config.iterations
         self.temperature, self.discount = self.config.temperature, self.config.discount

@@ -94,12 +94,18 @@ def planner_arguments(
     return config, options.changed(place), dict(planning.params if value is None else {}) | rest
 
 
-def words_of_update(update: str, words: Mapping[str, Any]) -> dict[str, Any]:
+def words_of_update(update: str | None, words: Mapping[str, Any]) -> dict[str, Any]:
     """The arguments of a call of CEM or predictive sampling as those of a call of MPPI.
+
+    Args:
+        update: The update that the planner has; None for MPPI, which has any.
+        words: The flat keyword arguments.
 
     Raises:
         ValueError: They ask for another update.
     """
+    if update is None:
+        return dict(words)
     if words.get("update", update) != update:
         raise ValueError(f"update={words['update']!r} is another planner than {update!r}: call lw.MPPI with it")
     return {**words, "update": update}

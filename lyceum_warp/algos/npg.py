@@ -45,6 +45,12 @@ log = logging.getLogger(__name__)
 _SHORTER = 4
 """How often a step, and a change of the statistics, is shortened at most."""
 
+_LARGEST = 1e30
+"""Rewards beyond it count as it, so that float32 holds the sum of an episode's rewards."""
+
+_PATIENCE = 10
+"""Iterations in a row with an update that is not finite, after which learning ends."""
+
 _DRIFT = 0.2
 """The largest part of the wanted KL divergence that new statistics of observations may cause."""
 
@@ -69,7 +75,8 @@ class NPG:
     Raises:
         ValueError: The environment does not reset automatically, or an argument is of the wrong type, or
             the policy cannot be learned (``lyceum_warp.algos.policy_check``).
-        FloatingPointError: Raised by an iteration whose gradient is not finite; the policy is left unchanged.
+        FloatingPointError: In 10 iterations in a row, the step of the policy or the fit of the value function was not
+            finite. Each such update is left out, and counted in ``Iteration.skipped_updates``.
     """
 
     policy: GaussianPolicy
@@ -166,7 +173,7 @@ class NPG:
         # a seed of its own: the same numbers should not make both the weights and the noise
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
 
-        self.iteration = self.samples = 0
+        self.iteration = self.samples = self._skipping = 0
         self.rollout.restart()
         if self.segments:
             self.rollout.stagger(self.generator, team)
@@ -205,24 +212,20 @@ class NPG:
         finite, fraction, kl = self.move(step, obs, old_mean)
         timer.mark()
 
+        # 6. The value function, on the returns of these samples. Its statistics change just before, so that the fit
+        # corrects what they do to its predictions.
+        self.value.observe(value_obs, team)
+        fitted = self.fit(value_obs, rollout.step.flatten(), target.flatten(), self.generator)
+
         # One copy brings the numbers of all processes to the host.
         update = UpdateNumbers(
             finite=finite, kl=kl, step_norm=step.norm(), step_fraction=fraction, gradient_norm=gradient.norm(),
             std_mean=self.policy.log_std.detach().exp().mean(), reward=rollout.reward.double().mean(),
-            faults=rollout.faults.sum(), outliers=outliers,
+            faults=rollout.faults.sum(), outliers=outliers, fitted=fitted,
         )  # fmt: skip
         packed = ProcessNumbers(update, prediction, finished(rollout), finished_metrics(rollout)).pack()
         processes = [ProcessNumbers.unpack(numbers) for numbers in team.gather(packed[None]).tolist()]
-        if not processes[0].update.finite:
-            raise FloatingPointError(
-                f"the policy gradient of iteration {self.iteration + 1} is not finite; the policy is unchanged. "
-                f"{rollout.explain_not_finite()}"
-            )
-
-        # 6. The value function, on the returns of these samples. Its statistics change just before, so that the fit
-        # corrects what they do to its predictions.
-        self.value.observe(value_obs, team)
-        self.fit(value_obs, rollout.step.flatten(), target.flatten(), self.generator)
+        self._check_updates(processes[0].update)
         timer.mark()
 
         # 7. Every few iterations, the mean policy in whole episodes.
@@ -250,6 +253,19 @@ class NPG:
             samples_per_second=self.count / time_sample,
         )
 
+    def _check_updates(self, update: UpdateNumbers) -> None:
+        """End learning once too many iterations in a row had an update that is not finite."""
+        parts = {"the step of the policy": update.finite, "the fit of the value function": update.fitted}
+        skipped = [part for part, finite in parts.items() if not finite]
+        self._skipping = self._skipping + 1 if skipped else 0
+        if self._skipping >= _PATIENCE:
+            last, self._skipping = self.iteration + 1, 0
+            raise FloatingPointError(
+                f"{' and '.join(skipped)} in iteration {last} {'are' if len(skipped) > 1 else 'is'} not finite, as in "
+                f"the {_PATIENCE - 1} iterations before it, whose updates were left out. "
+                f"{self.rollout.explain_not_finite()}"
+            )
+
     def sample(self) -> None:
         """Fill the rollout buffer with steps of the current policy under new noise."""
         with one_thread():
@@ -263,16 +279,18 @@ class NPG:
         At a time limit and at the end of the rollout, the value function's prediction stands for the rest of the
         episode. A state in which the episode terminated is worth 0 (mjrl; Lyceum bootstraps there, too). The returns
         set the value function's scale, and advantages beyond ten times that scale are set to this bound, so that one
-        extreme reward neither hides all others nor spoils the value function.
+        extreme reward neither hides all others nor spoils the value function. A prediction that is not finite counts as
+        the mean of the last returns.
 
         Returns:
-            Advantages, (steps, nworld); returns, (steps, nworld); how well the value function predicted them; and the
-            number of advantages that were bounded.
+            Advantages divided by about the value function's scale, (steps, nworld); returns, (steps, nworld); how well
+            the value function predicted them; and the number of advantages that were bounded.
         """
         rollout, config, team = self.rollout, self.config, self.team
-        value = self.value(rollout.obs_groups[self.value.group], rollout.step)
-        next_value = self.value(rollout.final_obs_groups[self.value.group], rollout.step + 1.0)
-        arrays = [rollout.reward, value, next_value, rollout.terminated, rollout.done]
+        value = self.predict(rollout.obs_groups[self.value.group], rollout.step)
+        next_value = self.predict(rollout.final_obs_groups[self.value.group], rollout.step + 1.0)
+        reward = rollout.reward.clamp(-_LARGEST, _LARGEST)
+        arrays = [reward, value, next_value, rollout.terminated, rollout.done]
         inputs = [wp.from_torch(array) for array in arrays]
         outputs = [wp.from_torch(self._advantage), wp.from_torch(self._return)]
         args = [*inputs, config.gamma, config.lam, *outputs]
@@ -280,14 +298,27 @@ class NPG:
         advantage, target = self._advantage, self._return
         prediction = prediction_sums(target, value)
         self.value.rescale(target, first=self._value_is_new and self.iteration == 0, team=team)
-        bound = BOUND * self.value.scale.float()
+        # the step does not depend on the unit; a power of two rounds nothing
+        unit = torch.exp2(torch.floor(torch.log2(self.value.scale)))
+        advantage, scale = advantage / unit.float(), (self.value.scale / unit).float()
+        bound = BOUND * scale
         outliers = (advantage.abs() > bound).sum()
         advantage = torch.minimum(torch.maximum(advantage, -bound), bound)
         if config.whiten:
             advantage = advantage - team.sum(advantage.sum()) / self.count
             variance = team.sum(advantage.square().sum()) / (self.count - 1)
-            advantage = advantage / (variance.sqrt() + 1e-6 * self.value.scale.float())
+            advantage = advantage / (variance.sqrt() + 1e-6 * scale)
         return advantage, target, prediction, outliers
+
+    def predict(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+        """The value function's finite predictions; in place of others, the mean of the last returns.
+
+        Args:
+            obs: Observations, (..., nobs).
+            step: Steps since the reset, (...,).
+        """
+        value = self.value(obs, step)
+        return torch.where(value.isfinite(), value, self.value.shift.float())
 
     @torch.no_grad()
     def observe(self, obs: torch.Tensor) -> torch.Tensor:
@@ -352,8 +383,8 @@ class NPG:
             old_mean: The mean actions of the policy that sampled, (samples, nact).
 
         Returns:
-            Whether the step is finite; the share of it that was made; and the KL divergence from the old policy to the
-            new one, averaged over the samples of all processes.
+            Whether the step and the divergence are finite; the share of it that was made; and the KL divergence from
+            the old policy to the new one, averaged over the samples of all processes.
         """
         wanted = 0.5 * self.config.delta
         limit = self.config.kl_limit * wanted + 1e-6  # and rounding
@@ -384,7 +415,7 @@ class NPG:
         fraction = torch.where(kl <= limit, fraction, 0.0)
         kl = divergence(fraction)
         self.team.copy_leader(self.policy.parameters())
-        return finite, fraction, kl
+        return finite & kl.isfinite(), fraction, kl
 
     def state_dict(self) -> dict[str, Any]:
         """The state on which the next iteration depends, with the worlds of all processes.
@@ -436,6 +467,9 @@ def _check_value(value: ValueFunction, env: Env) -> None:
             f"the value function takes {size} observations, but the group {value.group!r} of the task {name!r} has "
             f"{wanted}"
         )
+    for part, numbers in value.state_dict().items():
+        if not numbers.isfinite().all():
+            raise ValueError(f"the value function's {part!r} is not finite: leave it out for a new value function")
 
 
 def _value_group(env: Env, config: NPGConfig) -> str:

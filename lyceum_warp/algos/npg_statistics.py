@@ -74,6 +74,8 @@ class Iteration:
     """Faults of worlds in this iteration."""
     outliers: int
     """Samples whose advantage exceeded ten standard deviations of the returns, and was set to that bound."""
+    skipped_updates: int
+    """Updates of this iteration that were not finite and were left out: the policy's step, the value function's fit."""
     time_sample: float
     """Seconds of sampling."""
     time_gradient: float
@@ -121,6 +123,8 @@ class UpdateNumbers(NamedTuple):
     """Faults of the process's worlds."""
     outliers: Scalar
     """Samples of the process whose advantage was set to its bound."""
+    fitted: Scalar
+    """Whether the value function's fit is finite; all processes have the same."""
 
 
 class ValueSums(NamedTuple):
@@ -258,6 +262,7 @@ def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence
         **value_statistics([process.values for process in processes], samples),
         "faults": round(sum(process.update.faults for process in processes)),
         "outliers": round(sum(process.update.outliers for process in processes)),
+        "skipped_updates": (not update.finite) + (not update.fitted),
         "metrics": metric_means(processes, metrics),
     }
 

@@ -1,5 +1,6 @@
 """The buffer of NPG's samples."""
 
+import math
 from collections.abc import Collection
 
 import torch
@@ -12,6 +13,9 @@ from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.capture import Graphs, Phase
 from lyceum_warp.kernels import collect
+
+_LARGE = 1e18
+"""Observations beyond it have squares that float32 cannot hold."""
 
 
 @document_attributes
@@ -155,22 +159,36 @@ class Rollout:
         self.running_return.masked_fill_(first > 0, torch.nan)
 
     def explain_not_finite(self) -> str:
-        """A sentence that names the rewards or observations that are not finite; waits for the device."""
-        for name, values in (("reward", self.reward), ("observation", self.obs), ("observation", self.final_obs)):
-            bad = ~values.isfinite()
+        """A sentence that names what is not finite, or too large for float32, and how to fix it; waits for the device.
+
+        Rewards and observations that are not finite are faults; only a caller can write such numbers.
+        """
+        spaces = self.env.obs_spaces
+        kinds: list[tuple[str, torch.Tensor, float, str]] = [("reward", self.reward, torch.inf, "")]
+        for groups in (self.obs_groups, self.final_obs_groups):
+            kinds += [("observation", obs, _LARGE, group) for group, obs in groups.items()]
+        for name, values, limit, group in kinds:
+            bad = ~(values.abs() < limit)
             if not bad.any():
                 continue
             samples = bad.view(*bad.shape[:2], -1).any(-1)
             t, world, *place = bad.nonzero()[0].tolist()
-            number, step = values[t, world, *place].item(), int(self.step[t, world])
-            spans = self.env.obs_space.parts.items()
+            number = values[t, world, *place].item()
+            spans = spaces[group].parts.items() if group else ()
             part = [f" in {part!r}" for part, span in spans for i in place if span.start <= i < span.stop]
+            finite = math.isfinite(number)
             return (
-                f"The {name} of the task {self.env.task.name!r} is {number}{''.join(part)}, {step} steps after a reset "
-                f"of world {self.env.first_world + world}, and not finite in {int(samples.sum())} of "
-                f"{samples.numel()} samples"
+                f"The {name} of the task {self.env.task.name!r} is {number:g}{''.join(part)} in step {t + 1} of world "
+                f"{self.env.first_world + world}, and {f'beyond {limit:g}' if finite else 'not finite'} in "
+                f"{int(samples.sum())} of {samples.numel()} samples"
+                f"{': scale it in observe, or normalise observations (normalize)' if finite else ''}"
             )
-        return "Rewards and observations are finite: make the step (delta) smaller"
+        if not self.action.isfinite().all():
+            return "Rewards and observations are finite, actions are not: make the step (delta) smaller"
+        return (
+            "Rewards and observations are finite: make the step (delta) or the rate of the value function's fit "
+            "(value_rate) smaller"
+        )
 
     def _store_inputs(self) -> None:
         dim = (self.env.nworld, max(self.env.obs_space.size, self.env.action_space.size))

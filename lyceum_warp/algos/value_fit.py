@@ -39,24 +39,31 @@ class ValueFit:
         for parameter, part in zip(self.parameters, self._split(self.gradient), strict=True):
             parameter.grad = part.view_as(parameter)
         self.captured: CapturedStep | None = None
+        self._good = torch.nn.utils.parameters_to_vector(self.parameters).detach()
 
     def _split(self, flat: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return flat.split([p.numel() for p in self.parameters])
 
-    def __call__(self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor, generator: torch.Generator) -> None:
-        """Fit to returns.
+    def __call__(
+        self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor, generator: torch.Generator
+    ) -> torch.Tensor:
+        """Fit to returns. If that leaves a parameter or a moment that is not finite, restore all from before.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
             step: Steps since the reset, (samples,).
             target: Returns, (samples,). One further than ``BOUND`` scales from the value's shift is set to that bound.
             generator: Draws the order of all processes' samples.
+
+        Returns:
+            Whether the fit is finite, as a tensor.
         """
         with torch.no_grad():
             features = self.value.features(obs, step)
             target = ((target - self.value.shift) / self.value.scale).clamp(-BOUND, BOUND)
             target = target.float().unsqueeze(-1)
         with one_thread():
+            self._keep_if_finite()
             for _ in range(self.epochs):
                 order = torch.randperm(self.samples, generator=generator, device=features.device)
                 if self.cuda and self.team.captures:
@@ -66,7 +73,32 @@ class ValueFit:
                 for part in order.split(self.batch):
                     places, weight = self._own(part)
                     self.learn(features[places], target[places], weight)
-        self.team.copy_leader(self.parameters)
+            self.team.copy_leader(self.parameters)
+            finite = self._keep_if_finite()
+            self._restore()
+        return finite
+
+    def _numbers(self) -> list[torch.Tensor]:
+        """Parameters and Adam's moments, which exist from the first step on."""
+        moments = [moment for p in self.parameters for moment in self.optimizer.state.get(p, {}).values()]
+        return [*self.parameters, *moments]
+
+    @torch.no_grad()
+    def _keep_if_finite(self) -> torch.Tensor:
+        """Copy all numbers, unless one is not finite; nothing waits for the device."""
+        present = torch.cat([numbers.reshape(-1) for numbers in self._numbers()])
+        # the first moments are zeros
+        good = torch.nn.functional.pad(self._good, (0, len(present) - len(self._good)))
+        finite = self.team.sum((~present.isfinite()).any().float()) == 0
+        self._good = torch.where(finite, present, good)
+        return finite
+
+    @torch.no_grad()
+    def _restore(self) -> None:
+        """Copy back the last numbers that were finite."""
+        numbers = self._numbers()
+        for tensor, part in zip(numbers, self._good.split([tensor.numel() for tensor in numbers]), strict=True):
+            tensor.copy_(part.view_as(tensor))
 
     def _own(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | float]:
         """The process's samples of a mini-batch, and their weights in the mean over the whole mini-batch."""

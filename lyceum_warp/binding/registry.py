@@ -12,12 +12,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from lyceum_warp.binding.local_modules import Stamps, importable, local_modules, stamps
 from lyceum_warp.task import Task
 
 _tasks: dict[str, type[Task]] = {}
 
-_loaded: dict[str, tuple[int, int]] = {}
-"""When the files of tasks were written and how long they were when they were last run, by their modules' names."""
+_loaded: dict[str, Stamps] = {}
+"""The files of tasks, and of the modules beside them, as they were when they were last run, by their modules' names."""
 
 
 def register(task: type[Task]) -> type[Task]:
@@ -63,6 +64,14 @@ def _file(task: type[Task]) -> str | None:
     return file and str(Path(file).resolve())
 
 
+def spelled_task(task: type[Task]) -> str | None:
+    """A task as ``find_task`` finds it in another process: a name, a file with a class, or None without a file."""
+    if task.__module__.startswith("lyceum_warp."):
+        return task_name(task)
+    file = _file(task)
+    return f"{file}:{task.__name__}" if file and file.endswith(".py") and Path(file).is_file() else None
+
+
 def task_name(task: type[Task]) -> str:
     """The name under which a task is registered."""
     return snake_case(task.__name__)
@@ -81,7 +90,8 @@ def task_names() -> list[str]:
 def find_task(task: str | Path | type[Task]) -> type[Task]:
     """The class of a task, by name, by file (``path/to/file.py`` or ``path/to/file.py:Class``), or itself.
 
-    A file that has changed since is run again; existing environments keep the task that they were made of.
+    A file may import modules that lie beside it. If one of these files has changed since, the file is run again;
+    existing environments keep the task that they were made of.
 
     Raises:
         ValueError: There is no such task, or its file can't be run.
@@ -124,7 +134,7 @@ def _run(path: Path, name: str) -> None:
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
         where = f"the task file {path}" if line is None else f"the task file {path}, line {line}"
         if isinstance(error, ImportError):
-            raise ImportError(f"{where}: {error}: install what it imports, or remove the import") from error
+            raise ImportError(f"{where}: {error}: install what it imports, or put it beside the file") from error
         raise ValueError(f"{where}: {_explained(error)}") from error
 
 
@@ -146,11 +156,12 @@ def _task_of_file(path: Path, attribute: str) -> type[Task]:
     if not path.is_file():
         raise FileNotFoundError(f"there is no task file {str(path)!r}")
     name = f"{_FILE}{path.stem}_{zlib.crc32(str(path.resolve()).encode()):08x}"
-    stat = path.stat()
-    version = stat.st_mtime_ns, stat.st_size
-    if name not in sys.modules or _loaded.get(name) != version:
-        _run(path, name)
-        _loaded[name] = version
+    if name not in sys.modules or name not in _loaded or _loaded[name] != stamps(_loaded[name]):
+        modules = local_modules(path)
+        read = stamps([path.resolve(), *modules.values()])
+        with importable(path, modules):
+            _run(path, name)
+        _loaded[name] = read
     module = sys.modules[name]
     found = {
         key: value

@@ -19,8 +19,10 @@ from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
 from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.binding.registry import find_task, task_name, task_names
+from lyceum_warp.checkpoints import PolicyContent, check_sizes, policy_of, read_checkpoint, value_of
 from lyceum_warp.cli.arguments import (
     NO_FLAGS,
+    CameraWords,
     EnvFlags,
     Physics,
     Repeated,
@@ -33,23 +35,28 @@ from lyceum_warp.cli.arguments import (
 )
 from lyceum_warp.cli.display import (
     Display,
-    LongWork,
-    Videos,
     curve_table,
     make_console,
     note,
     plotted,
     policy_video,
+    tried,
 )
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted
 from lyceum_warp.kept_task import KeptTask, run_env, run_params, run_task
 from lyceum_warp.machine import cpu_cores
-from lyceum_warp.runs import PolicyContent, Run, check_sizes, networks, read_checkpoint
+from lyceum_warp.runs import Run
 from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
 from lyceum_warp.training import check_resumable, checked_settings, fitted_config, learn, reopen, restore
+from lyceum_warp.validate import whole_number
 from lyceum_warp.versions import versions
+from lyceum_warp.viewer.follow import RunViewer
+from lyceum_warp.viz.cameras import find_camera, parsed_camera
+from lyceum_warp.viz.long_work import LongWork
+from lyceum_warp.viz.policy_videos import Videos
+from lyceum_warp.viz.video import check_video
 
 _FINAL_EPISODES = 32
 
@@ -130,6 +137,13 @@ class Train:
     video_every: int = 0
     """Iterations between two further videos of the mean policy, videos/000100.mp4 and so on in the run's folder, which
     TensorBoard shows, too; 0 for none."""
+    camera: CameraWords = ()
+    """Camera of the videos: a name or an index of the model's, "free" for MuJoCo's default free camera, or a part of a
+    free camera's pose, as azimuth=90, elevation=-20, distance=3, lookat=0,0,1 or track=BODY; may be given several
+    times."""
+    view: bool = False
+    """Whether to show the newest policy while the run trains, in a viewer with worlds of its own: lyceum-warp view
+    FOLDER --follow, which another shell may run as well."""
     plot: bool = True
     """Whether to draw the learning curve at the end."""
     require_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
@@ -153,6 +167,7 @@ def train(options: Train) -> int:
             if team.leads:
                 Run.check_free(out)
             npg = _algorithm(config, team, run=source, origin=origin)
+            _check_camera(options, npg)
             if team.leads:
                 kept = KeptTask.of(npg.env)
                 run = Run.create(out, config | kept.config, device=options.env.device)
@@ -184,6 +199,7 @@ def _config(
     _check_iterations(options.iterations)
     if options.tensorboard:
         check_tensorboard()
+    _check_videos(options)
     find_task(options.task)
     npg, nworld = options.npg.checked(), options.nworld
     settings = checked_settings(
@@ -232,7 +248,7 @@ def _fitted(npg: NPGConfig, content: PolicyContent, path: Path) -> NPGConfig:
     fitted = fitted_config(npg, content["policy"]["shape"], content["value"]["shape"])
     for field in dataclasses.fields(npg):
         given, saved = getattr(npg, field.name), getattr(fitted, field.name)
-        if given not in (saved, field.default):
+        if given != saved:  # the flags' defaults are those of the run
             flag = f"--{field.name.replace('_', '-')}"
             raise ValueError(f"the networks in {path} have {field.name} {saved}, not {given}: leave out {flag}")
     return fitted
@@ -306,7 +322,9 @@ def resume(options: Train, folder: Path) -> int:
             )
             if options.tensorboard:
                 check_tensorboard()
+            _check_videos(options)
             run, npg = _reopened(options, folder, team)
+            _check_camera(options, npg)
         if team.leads:
             _warn_of_versions(run)
             reopen(run, npg, iterations=options.iterations, **settings, **_shown(options))
@@ -337,7 +355,7 @@ def _settings(options: Train) -> dict[str, Any]:
     """The settings that a resumed run must keep."""
     free = ("iterations", "out", "resume", "video", "plot", "require_return", "npg", "param", "env", "physics",
             "from_run", "which", "target_return", "keep_every", "save_every", "tensorboard",
-            "video_every")  # fmt: skip
+            "video_every", "camera")  # fmt: skip
     settings = {f.name: getattr(options, f.name) for f in dataclasses.fields(options) if f.name not in free}
     settings["task"] = portable(options.task or "")
     settings["param"] = parameters(options.param, options)
@@ -375,9 +393,32 @@ def _algorithm(
         env = run_env(run, options, params, note=note if team.leads else _silent)
     policy = value = None
     if origin is not None:
-        policy, value = networks(*origin)
+        policy, value = policy_of(*origin), value_of(*origin)
         check_sizes(policy, env, origin[1])
     return NPG(env, policy, value, _hyperparameters(config), seed=config.get("npg_seed", config["seed"]), team=team)
+
+
+def _check_videos(options: Train) -> None:
+    """Check that the videos on the way can be made.
+
+    Raises:
+        ValueError: Their number of iterations is out of range.
+        NoVideoError: A package for videos is not installed.
+    """
+    if whole_number("--video-every", options.video_every, low=0):
+        check_video()
+
+
+def _check_camera(options: Train, npg: NPG) -> None:
+    """Refuse a camera that the model does not have, or that no video uses.
+
+    Raises:
+        ValueError: It is not valid.
+    """
+    camera = parsed_camera(options.camera)
+    if camera is not None and not (options.video or options.video_every):
+        raise ValueError("--camera has no effect with --no-video: leave out one of them")
+    find_camera(npg.env.model, camera)
 
 
 def _silent(line: str) -> None:
@@ -398,15 +439,19 @@ def _learn(run: Run | None, npg: NPG, options: Train) -> int:
         console.print(_headline(run, npg, options), soft_wrap=True)
         display = Display(console, npg.iteration, options.iterations)
         seed = evaluation_seed(options.seed + 1)
-        videos = Videos(npg, run.folder / "videos", options.video_every, seed, board)
+        videos = Videos(
+            npg, run.folder / "videos", options.video_every, seed, board, camera=parsed_camera(options.camera),
+            note=note, progress=display.work,
+        )  # fmt: skip
 
     def show(iteration: Iteration) -> None:
         if display is not None and videos is not None:
             display(iteration)
             videos(iteration)
 
+    viewer = RunViewer(run.folder) if options.view and run is not None else contextlib.nullcontext()
     try:
-        with display or contextlib.nullcontext():
+        with viewer, display or contextlib.nullcontext():
             learn(
                 run, npg, iterations=options.iterations, callback=show, board=board,
                 target_return=options.target_return, keep_every=options.keep_every, save_every=options.save_every,
@@ -459,11 +504,14 @@ def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:
         paths.append(("curve", plotted(run)))
     if options.video:
         seed = evaluation_seed(options.seed + 1)
-        video = policy_video(npg.env, npg.policy, run.folder / "video.mp4", seed)
+        video = policy_video(
+            npg.env, npg.policy, run.folder / "video.mp4", seed, camera=parsed_camera(options.camera)
+        )  # fmt: skip
         paths.append(("video", video))
         if options.tensorboard and Path(video).is_file():
-            with TensorBoard(run.folder, run.config) as board:
-                board.video(video, npg.samples)
+            shown = tried(lambda: _show_video(run, video, npg.samples))
+            if shown.startswith("none: "):
+                note(f"TensorBoard does not show the video ({shown.removeprefix('none: ')})")
     for name, path in paths:
         console.print(f"{name + ':':<12}{path}", soft_wrap=True, markup=False)
     final = episodes.returns.mean().item()
@@ -475,6 +523,12 @@ def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:
         )
         return 1
     return 0
+
+
+def _show_video(run: Run, video: str, samples: int) -> None:
+    """Add a video to a run's TensorBoard."""
+    with TensorBoard(run.folder, run.config) as board:
+        board.video(video, samples)
 
 
 def _returns(episodes: Episodes) -> str:

@@ -139,6 +139,16 @@ def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device 
     return _on_cpu_cores() if engine == "auto" and engine_name(engine, device) == "warp" else {}
 
 
+def options_for_plant(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
+    """The options to change for a world that keeps its rate beside a planner.
+
+    On a GPU its steps would wait for the planner's work there. It therefore steps on a CPU core, through the C engine.
+    """
+    name = device.alias if isinstance(device, wp.Device) else device
+    on_gpu = engine in ("auto", "warp") and find_device(name).is_cuda
+    return _on_cpu_cores() if on_gpu else {}
+
+
 def place_samples(
     engine: str | EngineFactory,
     device: str | None,

@@ -3,7 +3,9 @@
 import copy
 import dataclasses
 import math
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -211,18 +213,6 @@ def test_segments_continue_where_the_last_ones_ended(env: lw.Env) -> None:
     assert lengths[-1] == 12.0
 
 
-def test_a_gradient_that_is_not_finite_leaves_the_policy_unchanged(env: lw.Env) -> None:
-    env.rand_reset(0)
-    npg = lw.NPG(env, config=SMALL)
-    with torch.no_grad():
-        npg.value.network[0].weight[0, 0] = math.nan
-    before = [p.clone() for p in (*npg.policy.parameters(), *npg.value.parameters())]
-    with pytest.raises(FloatingPointError, match="gradient of iteration 1 is not finite; .* finite: make the step"):
-        next(npg)
-    after = (*npg.policy.parameters(), *npg.value.parameters())
-    assert all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(before, after, strict=True))
-
-
 def test_point_mass_learns_to_reach_the_target() -> None:
     """A short run with the original's own settings for this task; its full run is in the README's figures."""
     env = lw.make("point_mass", nworld=16)
@@ -253,6 +243,9 @@ def test_wrong_arguments_are_refused(env: lw.Env) -> None:
         lw.NPG(env, value=torch.nn.Linear(6, 1))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="takes the group 'critic' of observations, which the task 'point_mass' lacks"):
         lw.NPG(env, value=lw.ValueFunction(6, group="critic"))
+    broken = lw.ValueFunction(6, scale=math.nan)
+    with pytest.raises(ValueError, match="the value function's 'scale' is not finite: leave it out for a new value"):
+        lw.NPG(env, value=broken)
     with pytest.raises(ValueError, match="autoreset=True"):
         lw.NPG(lw.make("point_mass", autoreset=False))
 
@@ -302,13 +295,130 @@ def test_a_reward_or_observation_that_is_not_finite_is_a_fault(where: int, fault
     assert all(math.isfinite(it.kl) and math.isfinite(it.value_error) for it in iterations)
 
 
-def test_an_observation_that_is_not_finite_is_named() -> None:
-    """Only a caller can write one: a task's own is a fault."""
+WILD = """
+import warp as wp
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    qvel: Row[float]
+
+@wp.struct
+class Params:
+    dt: float
+    chance: float = 0.0
+    size: float = 1.0
+    reward_size: float = 1.0
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):
+    obs[0] = s.qpos[1]
+    obs[1] = s.qvel[2]
+    if lw.uniform(rng, 0.0, 1.0) < p.chance:
+        obs[1] = p.size
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    if s1.qpos[1] < 1.22:
+        return p.reward_size * wp.sign(s1.qvel[2])
+    return 1.0
+
+class Wild(lw.Task):
+    model, horizon = "hopper.xml", 80
+    obs = {"height": 1, "rate": 1}
+"""
+
+
+def wild(task_file: TaskFile, params: dict[str, float], **changes: object) -> lw.NPG:
+    """NPG on a task whose observations or rewards are finite, but too large for float32."""
+    env = lw.make(str(task_file("wild.py", WILD)), nworld=4, **params)
+    plain = {"mean_every": 0, "normalize": False, "activation": "relu", "value_activation": "relu"}
+    return lw.NPG(env, config=dataclasses.replace(SMALL, **plain | changes))
+
+
+def mean_actions(policy: lw.GaussianPolicy) -> torch.Tensor:
+    return policy(torch.linspace(-1.0, 1.0, 10).view(5, 2)).detach()
+
+
+def numbers(npg: lw.NPG) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in (*npg.policy.parameters(), *npg.value.parameters())])
+
+
+def test_rewards_whose_sums_exceed_float32_are_bounded(task_file: TaskFile) -> None:
+    for size in (1e20, 3e38):
+        npg = wild(task_file, {"reward_size": size})
+        iterations = [next(npg) for _ in range(5)]
+        assert not any(it.skipped_updates for it in iterations)
+        assert all(math.isfinite(it.value_error) and it.kl > 1e-6 for it in iterations)
+
+
+def test_updates_that_are_not_finite_are_left_out_and_counted(task_file: TaskFile) -> None:
+    npg = wild(task_file, {"chance": 0.002, "size": 1e30})
+    skipped = []
+    for _ in range(12):
+        before = mean_actions(npg.policy)
+        it = next(npg)
+        spikes = int((npg.rollout.obs > 1e20).sum())
+        assert it.skipped_updates == (2 if spikes else 0)
+        assert torch.equal(mean_actions(npg.policy), before) == bool(spikes)
+        skipped.append(it.skipped_updates)
+    assert 0 in skipped and 2 in skipped
+    assert numbers(npg).isfinite().all()
+
+
+def test_many_updates_in_a_row_that_are_not_finite_end_a_run(task_file: TaskFile, tmp_path: Path) -> None:
+    npg = wild(task_file, {"chance": 0.9, "size": 1e30})
+    before = mean_actions(npg.policy)
+    with pytest.raises(FloatingPointError) as raised:
+        lw.train(npg, tmp_path / "run", iterations=20)
+    message = str(raised.value)
+    assert message.startswith(
+        "the step of the policy and the fit of the value function in iteration 10 are not finite, as in the 9 "
+        "iterations before it, whose updates were left out. The observation of the task 'wild' is 1e+30 in 'rate' in "
+    )
+    assert message.endswith("of 320 samples: scale it in observe, or normalise observations (normalize)")
+    assert raised.value.__notes__[0].startswith(f"the run in {tmp_path / 'run'} is saved up to iteration ")
+    assert torch.equal(mean_actions(lw.load(tmp_path / "run")), before)
+    assert math.isfinite(next(wild(task_file, {"chance": 0.9, "size": 1e30}, normalize=True)).kl)
+
+
+def test_a_value_function_that_became_not_finite_is_restored(task_file: TaskFile) -> None:
+    npg = wild(task_file, {})
+    next(npg)
+    good = numbers(npg)[-1].item()
+    with torch.no_grad():
+        npg.value.network[0].weight[0, 0] = math.nan
+    it = next(npg)
+    assert (it.skipped_updates, it.faults) == (1, 0) and it.kl > 0.01
+    assert numbers(npg).isfinite().all() and numbers(npg)[-1].item() == pytest.approx(good, rel=1e-3)
+    assert next(npg).skipped_updates == 0
+
+
+def test_a_checkpoint_whose_value_function_is_not_finite_continues_with_a_new_one(task_file: TaskFile) -> None:
+    """As earlier releases may have written it."""
+    npg = wild(task_file, {})
+    next(npg)
+    state = npg.state_dict()
+    state["value"]["network.2.bias"].fill_(math.nan)
+    state["optimizer"]["state"][0]["exp_avg"].fill_(math.nan)
+    resumed = wild(task_file, {})
+    resumed.load_state_dict(state)
+    assert [next(resumed).skipped_updates for _ in range(3)] == [1, 0, 0]
+    assert numbers(resumed).isfinite().all() and math.isfinite(next(resumed).explained_variance)
+
+
+def test_what_is_not_finite_is_named() -> None:
+    """Only a caller can write such an observation: a task's own is a fault."""
     env = lw.make("hopper", nworld=4)
     rollout = lw.Rollout(env, 3)
-    assert rollout.explain_not_finite() == "Rewards and observations are finite: make the step (delta) smaller"
+    smaller = r"Rewards and observations are finite: make the step \(delta\) or .* \(value_rate\) smaller"
+    assert re.fullmatch(smaller, rollout.explain_not_finite())
+    rollout.action[0, 0, 0] = math.inf
+    assert "actions are not: make the step (delta) smaller" in rollout.explain_not_finite()
     rollout.obs[1, 2, 6] = math.nan
-    found = "The observation of the task 'hopper' is nan in 'velocity', 0 steps after a reset of world 2"
+    found = "The observation of the task 'hopper' is nan in 'velocity' in step 2 of world 2"
     assert rollout.explain_not_finite() == f"{found}, and not finite in 1 of 12 samples"
 
 

@@ -132,24 +132,24 @@ def test_a_row_of_metrics_has_a_column_for_each_metric() -> None:
 
 def process(first: float, faults: float) -> ProcessNumbers:
     """Numbers that count upwards from the first."""
-    numbers = iter(torch.arange(first, first + 22))
+    numbers = iter(torch.arange(first, first + 23))
     parts = [kind(*(next(numbers) for _ in kind._fields)) for kind in (UpdateNumbers, ValueSums, EpisodeSums)]
     return ProcessNumbers(*parts)._replace(update=parts[0]._replace(faults=torch.tensor(faults)))  # type: ignore[arg-type,call-arg]
 
 
 def test_packed_numbers_are_unpacked_under_their_names() -> None:
     packed = process(1.0, 4).pack()
-    assert (packed.dtype, packed.shape) == (torch.float64, (22,))
+    assert (packed.dtype, packed.shape) == (torch.float64, (23,))
     unpacked = ProcessNumbers.unpack(packed.tolist())
     assert unpacked == process(1.0, 4)
-    assert (unpacked.update.kl, unpacked.update.faults, unpacked.values.return_mean) == (2.0, 4.0, 10.0)
-    assert (unpacked.episodes.episodes, unpacked.episodes.success) == (14.0, 22.0)
+    assert (unpacked.update.kl, unpacked.update.faults, unpacked.values.return_mean) == (2.0, 4.0, 11.0)
+    assert (unpacked.episodes.episodes, unpacked.episodes.success) == (15.0, 23.0)
 
 
 def test_summary_sums_faults_and_outliers_and_sets_attributes_of_an_iteration() -> None:
     both = summary([ProcessNumbers.unpack(process(*numbers).pack().tolist()) for numbers in ((1, 4), (3, 5))], 10)
     assert (both["faults"], both["outliers"]) == (9, 20)
-    assert (both["kl"], both["step_norm"], both["return_max"]) == (2.0, 3.0, 20.0)
+    assert (both["kl"], both["step_norm"], both["return_max"]) == (2.0, 3.0, 21.0)
     others = {"iteration", "samples", "samples_per_second"}
     names = {field.name for field in dataclasses.fields(lw.Iteration)} - others
     assert both.keys() == {name for name in names if not name.startswith(("time_", "mean_"))}

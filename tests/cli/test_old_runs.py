@@ -8,6 +8,8 @@ import torch
 
 import lyceum_warp as lw
 from lyceum_warp.cli import main
+from lyceum_warp.runs import Run
+from lyceum_warp.training import restore
 
 OLD = Path(__file__).parent.parent / "data" / "old_run"
 
@@ -35,3 +37,21 @@ def test_an_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.
     assert [row["iteration"] for row in lw.runs.Run.open(old_run).rows()] == [1, 2, 3]
     out = capsys.readouterr().out
     assert "4 worlds, mujoco engine on cpu" in out
+
+
+@pytest.mark.parametrize("gamma", [0.9, 0.995])
+def test_the_value_function_of_an_old_run_keeps_its_scale(gamma: float, old_run: Path) -> None:
+    """Its file lacks the scale, which was 1 / (1 - gamma)."""
+    content = torch.load(old_run / "checkpoint.pt", weights_only=True)
+    content["value"]["shape"] |= {"scale": 1.0 / (1.0 - gamma), "discount": gamma}
+    torch.save(content, old_run / "checkpoint.pt")
+    run = Run.open(old_run)
+    saved = run.config["npg"] | {"gamma": gamma, "hidden": (8,), "value_hidden": (8,)}
+    run.amend(npg=saved)
+    npg = lw.NPG(lw.make("hopper", nworld=4, integrator="euler"), config=lw.NPGConfig(**saved))
+    restore(run, npg, run.read())
+    obs, step = torch.linspace(-1.0, 1.0, 22).view(2, 11), torch.zeros(2)
+    torch.testing.assert_close(npg.value(obs, step), lw.load_value(old_run)(obs, step))
+    # before the release that scales to the returns, a prediction was the network's output times this factor
+    plain = npg.value.network(obs).squeeze(-1) / (1.0 - gamma)
+    torch.testing.assert_close(npg.value(obs, step), plain)

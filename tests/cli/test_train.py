@@ -22,9 +22,11 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.binding.registry import find_task
+from lyceum_warp.cli import display
 from lyceum_warp.cli.arguments import EnvFlags
 from lyceum_warp.cli.train import NPGOptions, Train, _config, saved_options
-from lyceum_warp.runs import Run
+from lyceum_warp.runs import Run, load
+from lyceum_warp.viz import drawing
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +76,36 @@ def test_a_task_file_is_trained_and_evaluated(
     assert cli.main(["eval", str(tmp_path / out), "--episodes", "2", "--video"]) == 0
     video = tmp_path / out / "eval.mp4"
     assert f"video: {video if video.exists() else 'none: '}" in capsys.readouterr().out
+
+
+def test_a_video_that_fails_is_one_line_of_a_successful_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*args: object, **words: object) -> None:
+        raise OSError(28, "No space left on\ndevice")
+
+    monkeypatch.setattr(display, "write_video", fail)
+    monkeypatch.setattr(drawing, "libraries", lambda: ["nonsense"])
+    out = tmp_path / "run"
+    options = [*TINY, "--horizon", "6", "--no-plot", "--iterations", "1", "--video-every", "1"]
+    assert cli.main(["train", "point_mass", "--out", str(out), *options]) == 0
+    shown = capsys.readouterr()
+    assert "video:      none: [Errno 28] No space left on device" in shown.out.splitlines()
+    assert "lyceum-warp: no further videos (this machine cannot draw off-screen (nonsense: " in shown.err
+    assert load(out) is not None
+
+
+def test_an_unknown_camera_is_refused_before_the_folder_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for flags, message in (
+        (["--camera", "side"], "there is no camera 'side': the model has "),
+        (["--camera", "0", "--no-video"], "--camera has no effect with --no-video"),
+        (["--video-every", "-1"], "--video-every must be a whole number from 0"),
+    ):
+        assert cli.main(["train", "point_mass", "--out", str(tmp_path / "run"), *TINY, *flags]) == 2
+        refused(capsys, message)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one(

@@ -13,7 +13,14 @@ import lyceum_warp as lw
 from lyceum_warp.engines import memory, placement
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
-from lyceum_warp.engines.placement import engine_name, find_device, open_engine, options_for_few_worlds, place_samples
+from lyceum_warp.engines.placement import (
+    engine_name,
+    find_device,
+    open_engine,
+    options_for_few_worlds,
+    options_for_plant,
+    place_samples,
+)
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 
 ON_CPU = {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None}
@@ -109,6 +116,14 @@ def test_few_worlds_move_from_a_gpu_to_cpu_cores_with_auto_only() -> None:
     assert options_for_few_worlds("auto", "cuda:0") == ON_CPU
     for engine, device in (("auto", "cpu"), ("auto", None), ("warp", "cuda:0"), ("mujoco", "cpu"), (ToyEngine, "cuda")):
         assert options_for_few_worlds(engine, device) == {}
+
+
+def test_a_plant_moves_from_a_gpu_to_a_cpu_core(gpu: Any) -> None:
+    """Also where the engine was chosen: beside a planner its steps would wait for the GPU."""
+    for engine, device in (("auto", "cuda:0"), ("warp", "cuda:0")):
+        assert options_for_plant(engine, device) == ON_CPU
+    for engine, device in (("auto", None), ("warp", "cpu"), ("mujoco", "cpu"), (ToyEngine, "cuda:0")):
+        assert options_for_plant(engine, device) == {}
 
 
 def test_place_samples_chooses_by_the_number_of_samples(gpu: Any) -> None:

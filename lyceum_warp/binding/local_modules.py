@@ -1,0 +1,136 @@
+"""Modules that lie beside a task's file and are imported by it, as Python finds those beside a program."""
+
+import ast
+import contextlib
+import importlib
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import TypeAlias
+
+Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
+"""When files were written, and how long they were; None for one that does not exist."""
+
+_taken: dict[str, Stamps] = {}
+"""The modules in ``sys.modules`` that a task's file imported from its folder, by name."""
+
+
+def local_modules(file: Path) -> dict[str, Path]:
+    """The modules beside a file that it imports, and those that they import, by name, without running any of them.
+
+    Args:
+        file: A Python file.
+
+    Returns:
+        The modules' files; of a package without ``__init__.py``, its folder.
+    """
+    folder = file.resolve().parent
+    found: dict[str, Path] = {}
+    pending = [("", file.resolve())]
+    while pending:
+        name, path = pending.pop()
+        try:
+            tree = ast.parse(path.read_bytes())
+        except (OSError, SyntaxError, ValueError):
+            continue
+        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        for wanted in _imported_names(tree, package):
+            if _module_file(folder, wanted) is None:
+                wanted = wanted.rpartition(".")[0]  # a name within a module
+            for part in _prefixes(wanted):
+                if part not in found and (module := _module_file(folder, part)) not in (None, file.resolve()):
+                    found[part] = module
+                    if module.is_file():
+                        pending.append((part, module))
+    return found
+
+
+def _imported_names(tree: ast.AST, package: str) -> Iterator[str]:
+    """Names of modules, and of what is imported from them, in a module of this package."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            owner = node.module or ""
+            if node.level:
+                parents = package.split(".") if package else []
+                if node.level > len(parents):
+                    continue
+                owner = ".".join([*parents[: len(parents) - node.level + 1], *filter(None, [node.module])])
+            yield owner
+            yield from (f"{owner}.{alias.name}" for alias in node.names)
+
+
+def _prefixes(name: str) -> list[str]:
+    parts = name.split(".") if name else []
+    return [".".join(parts[: i + 1]) for i in range(len(parts))]
+
+
+def _module_file(folder: Path, name: str) -> Path | None:
+    """The file of a module below a folder, or the folder of a package without ``__init__.py``."""
+    if not name:
+        return None
+    base = folder.joinpath(*name.split("."))
+    for file in (base / "__init__.py", base.with_name(base.name + ".py")):
+        if file.is_file():
+            return file
+    return base if base.is_dir() and any(base.glob("*.py")) else None
+
+
+def stamps(files: Iterable[Path]) -> Stamps:
+    """The present state of files, by which a change is found."""
+    found: Stamps = {}
+    for file in files:
+        with contextlib.suppress(OSError):
+            stat = file.stat()
+            found[file] = stat.st_mtime_ns, stat.st_size
+        found.setdefault(file, None)
+    return found
+
+
+@contextlib.contextmanager
+def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
+    """A block in which a task's file can import the modules beside it.
+
+    Modules of the same names that another task's file imported from another folder, or that have changed since, are
+    replaced. Where the block fails, all modules are those from before.
+
+    Args:
+        file: The task's file.
+        modules: What ``local_modules`` returned for it.
+    """
+    before = {name: sys.modules.get(name) for name in modules}
+    if any(name in _taken and _taken[name] != stamps([path]) for name, path in modules.items()):
+        for name in modules:  # all of them, because they may hold names of each other
+            if name in _taken:
+                sys.modules.pop(name, None)
+    folder, bytecode = str(file.resolve().parent), sys.dont_write_bytecode
+    sys.path.insert(0, folder)
+    importlib.invalidate_caches()
+    sys.dont_write_bytecode = True  # its time stamps count whole seconds, and the folder may be that of a run
+    try:
+        yield
+    except BaseException:
+        for name, module in before.items():
+            _put(name, module)
+        raise
+    finally:
+        sys.path.remove(folder)
+        sys.dont_write_bytecode = bytecode
+    for name, path in modules.items():
+        if (module := sys.modules.get(name)) is not None and module is not before[name] and _is_at(module, path):
+            _taken[name] = stamps([path])
+
+
+def _put(name: str, module: ModuleType | None) -> None:
+    if module is not None:
+        sys.modules[name] = module
+    else:
+        sys.modules.pop(name, None)
+
+
+def _is_at(module: ModuleType, path: Path) -> bool:
+    """Whether a module was imported from a file, or from a folder."""
+    places = [getattr(module, "__file__", None)] if path.is_file() else [*getattr(module, "__path__", [])]
+    return any(place is not None and Path(place).resolve() == path.resolve() for place in places)

@@ -1,0 +1,82 @@
+"""Modules beside a task's file: which of them it imports, and how it finds them."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import tiny_task
+
+from lyceum_warp.binding.local_modules import local_modules
+from lyceum_warp.binding.registry import find_task
+
+
+def write(folder: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+
+def test_modules_are_found_through_each_other_without_running_them(tmp_path: Path) -> None:
+    write(tmp_path, {
+        "task.py": "import json, numpy.linalg\nfrom aaa_first import one\ndef later():\n    import aaa_pkg.deep.leaf\n",
+        "aaa_first.py": "import aaa_second as other, task\n1 / 0\n",
+        "aaa_second.py": "from aaa_pkg import tool, name\n",
+        "aaa_pkg/__init__.py": "from . import side\nfrom .side import x\n",
+        "aaa_pkg/side.py": "from ..above import nothing\n",
+        "aaa_pkg/tool.py": "",
+        "aaa_pkg/other.py": "",
+        "aaa_pkg/deep/leaf.py": "from ..side import x\nthis is not Python\n",
+        "aaa_unused.py": "",
+    })  # fmt: skip
+    found = {name: path.relative_to(tmp_path).as_posix() for name, path in local_modules(tmp_path / "task.py").items()}
+    assert found == {
+        "aaa_first": "aaa_first.py", "aaa_second": "aaa_second.py", "aaa_pkg": "aaa_pkg/__init__.py",
+        "aaa_pkg.tool": "aaa_pkg/tool.py", "aaa_pkg.side": "aaa_pkg/side.py", "aaa_pkg.deep": "aaa_pkg/deep",
+        "aaa_pkg.deep.leaf": "aaa_pkg/deep/leaf.py",
+    }  # fmt: skip
+
+
+SHARED = (
+    tiny_task.TINY
+    + """
+from aaa_size import SKIP
+
+Tiny.frame_skip = SKIP
+"""
+)
+
+
+def shared(folder: Path, skip: int) -> Path:
+    write(folder, {"aaa_size.py": "from aaa_inner.number import SKIP\n", "aaa_inner/number.py": f"SKIP = {skip}\n"})
+    return tiny_task.write(folder, SHARED)
+
+
+def test_a_task_imports_modules_beside_it(tmp_path: Path) -> None:
+    path = list(sys.path)
+    assert find_task(shared(tmp_path, 3)).frame_skip == 3
+    assert sys.path == path and not list(tmp_path.rglob("__pycache__"))
+
+
+def test_modules_of_one_name_in_two_folders_are_distinct(tmp_path: Path) -> None:
+    files = []
+    for name, skip in (("a", 4), ("b", 5)):
+        (tmp_path / name).mkdir()
+        files.append(shared(tmp_path / name, skip))
+    assert [find_task(file).frame_skip for file in (*files, *files)] == [4, 5, 4, 5]
+
+
+def test_a_module_that_changed_is_read_again(tmp_path: Path) -> None:
+    file = shared(tmp_path, 6)
+    first = find_task(file)
+    assert find_task(file) is first
+    shared(tmp_path, 17)
+    assert (find_task(file).frame_skip, first.frame_skip) == (17, 6)
+
+
+def test_a_module_that_fails_leaves_those_from_before(tmp_path: Path) -> None:
+    file = shared(tmp_path, 8)
+    first, module = find_task(file), sys.modules["aaa_size"]
+    (tmp_path / "aaa_size.py").write_text("from aaa_inner.number import SKIP\n1 / 0\n")
+    with pytest.raises(ValueError, match=r"task file .*tiny\.py, line \d+: ZeroDivisionError: division by zero"):
+        find_task(file)
+    assert sys.modules["aaa_size"] is module and vars(sys.modules[first.__module__])["Tiny"] is first
