@@ -1,9 +1,13 @@
-"""NPG at one million samples on Gymnasium's tasks: one setting for all, or the settings of each task's own.
+"""NPG at one million samples on Gymnasium's tasks: one setting for all, or a setting of each task's own.
 
 python bench/learning_table.py --processes 16 --out bench/results/learning_table.jsonl
-python bench/learning_table.py hopper swimmer --seeds 0 1 --own
+python bench/learning_table.py --search --seeds 100 101 --processes 16 --out bench/results/learning_search.jsonl
+python bench/learning_table.py --own bench/results/learning_search.jsonl --processes 16 \\
+    --out bench/results/learning_table.jsonl
 
 A run has one core. Its results are the mean policy's return over 16 episodes at the end and at its best evaluation.
+The search tries ``TRIED``; a task's own setting is the one whose mean policy is best at the end, on average over the
+seeds of the search, which the table does not use.
 Beside them stand the best means of Tianshou's NPG at one million samples, published for older versions of the
 environments: https://tianshou.org/en/stable/01_tutorials/06_benchmark.html
 """
@@ -38,8 +42,31 @@ TASKS = (
 )  # fmt: skip
 """Gymnasium's tasks, those that take longest first."""
 
-OWN: dict[str, dict[str, Any]] = {}
-"""Settings of each task's own; "nworld" is the number of worlds, the others are NPG's."""
+DEFAULT = "default"
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    DEFAULT: {},
+    "gamma 0.99": {"gamma": 0.99, "lam": 0.95},
+    "gamma 0.999": {"gamma": 0.999},
+    "5,000 samples": {"samples": 5000},
+    "5,000 samples, gamma 0.99": {"samples": 5000, "gamma": 0.99, "lam": 0.95, "value_epochs": 5},
+    "2,000 samples, gamma 0.99": {"samples": 2000, "gamma": 0.99, "lam": 0.95, "value_epochs": 5},
+    "less noise": {"log_std": -1.0},
+    "gamma 0.97, less noise": {"gamma": 0.97, "log_std": -1.0},
+    "beginnings": {"samples": 5000, "rollout": "episodes", "min_log_std": -1.5, "delta": 0.05},
+}
+"""What differs from the default. "beginnings" samples the first 79 steps of an episode in each of 64 worlds."""
+
+_LONG = (DEFAULT, "gamma 0.99", "less noise", "2,000 samples, gamma 0.99")
+_GAITS = (DEFAULT, "gamma 0.99", "5,000 samples", "5,000 samples, gamma 0.99")
+
+TRIED: dict[str, tuple[str, ...]] = {
+    "humanoid": _LONG, "humanoid_standup": _LONG, "ant": (*_LONG, "5,000 samples, gamma 0.99"),
+    "pusher": (DEFAULT, "gamma 0.97, less noise"), "reacher": (DEFAULT, "gamma 0.97, less noise"),
+    "walker2d": _GAITS, "half_cheetah": _GAITS, "hopper": _GAITS, "swimmer": (DEFAULT, "5,000 samples", "gamma 0.999"),
+    "inverted_double_pendulum": (DEFAULT, "beginnings"), "inverted_pendulum": (DEFAULT, "beginnings"),
+}  # fmt: skip
+"""Settings that the search tries."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,8 +77,10 @@ class Options:
     """Tasks."""
     config: lw.NPGConfig = dataclasses.field(default_factory=lw.NPGConfig)
     """Hyperparameters."""
-    own: bool = False
-    """Whether to use the settings of each task's own."""
+    search: bool = False
+    """Whether to try the settings of ``TRIED``."""
+    own: Path | None = None
+    """The file of a search: each task gets the setting that was best there."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds."""
     samples: int = 1_000_000
@@ -64,27 +93,42 @@ class Options:
     """File for the runs, one line of JSON each. Runs that it holds already are not repeated."""
 
 
-def case(options: Options, task: str) -> learning.Options:
+def case(options: Options, task: str, setting: str) -> learning.Options:
     """The settings of a task's runs."""
-    own = dict(OWN.get(task, {})) if options.own else {}
-    nworld = own.pop("nworld", options.nworld)
-    config = dataclasses.replace(options.config, **own)
-    each = -(-(config.samples or 10_000) // nworld) * nworld
+    config = dataclasses.replace(options.config, **SETTINGS[setting])
+    each = -(-(config.samples or 10_000) // options.nworld) * options.nworld
     iterations = -(-options.samples // each)
     # evaluations step, too: about twenty of them, the last one at the end
     every = max(1, iterations // 20)
     iterations = -(-iterations // every) * every
     config = dataclasses.replace(config, mean_every=every)
-    return learning.Options(task, config=config, iterations=iterations, nworld=nworld, processes=2)
+    return learning.Options(task, config=config, iterations=iterations, nworld=options.nworld, processes=2)
 
 
-def run(options: Options, task: str, seed: int) -> dict[str, Any]:
+def chosen(search: Path | None, tasks: tuple[str, ...]) -> dict[str, str]:
+    """The setting of each task: the best one of a search, or the default."""
+    if search is None:
+        return dict.fromkeys(tasks, DEFAULT)
+    found: dict[str, dict[str, list[float]]] = {}
+    for r in read(search):
+        found.setdefault(r["task"], {}).setdefault(r["setting"], []).append(r["final"])
+    if missing := [task for task in tasks if task not in found]:
+        raise SystemExit(f"{search} has no run of {', '.join(missing)}: search again with these tasks")
+    return {task: max(found[task], key=lambda s: statistics.fmean(found[task][s])) for task in tasks}
+
+
+def read(path: Path | None) -> list[dict[str, Any]]:
+    """The runs of a file."""
+    return [json.loads(line) for line in path.read_text().splitlines()] if path is not None and path.exists() else []
+
+
+def run(options: Options, task: str, setting: str, seed: int) -> dict[str, Any]:
     """One run: its curve and how it ended."""
-    settings, start = case(options, task), time.perf_counter()
+    settings, start = case(options, task, setting), time.perf_counter()
     rows = learning.run(settings, seed)
     evaluated = [row for row in rows if row["mean_return"] is not None]
     return {
-        "task": task, "seed": seed, "own": options.own, "nworld": settings.nworld,
+        "task": task, "setting": setting, "seed": seed, "nworld": settings.nworld,
         "config": dataclasses.asdict(settings.config),
         "final": evaluated[-1]["mean_return"], "best": max(row["mean_return"] for row in evaluated),
         "noisy": statistics.fmean(row["return_mean"] for row in rows[-max(1, len(rows) // 20) :]),
@@ -97,14 +141,16 @@ def run(options: Options, task: str, seed: int) -> dict[str, Any]:
 
 
 def main(options: Options) -> None:
-    done: list[dict[str, Any]] = []
-    if options.out is not None and options.out.exists():
-        done = [json.loads(line) for line in options.out.read_text().splitlines()]
-    have = {(r["task"], r["seed"], r["own"]) for r in done}
-    wanted = [(t, s) for t in options.tasks for s in options.seeds if (t, s, options.own) not in have]
+    if options.search:
+        cases = [(task, setting) for task in options.tasks for setting in TRIED.get(task, tuple(SETTINGS))]
+    else:
+        cases = list(chosen(options.own, options.tasks).items())
+    done = read(options.out)
+    have = {(r["task"], r["setting"], r["seed"]) for r in done}
+    wanted = [(*case, seed) for case in cases for seed in options.seeds if (*case, seed) not in have]
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(options.processes, mp_context=context) as pool:
-        runs = [pool.submit(run, options, task, seed) for task, seed in wanted]
+        runs = [pool.submit(run, options, *case) for case in wanted]
         for future in concurrent.futures.as_completed(runs):
             result = future.result()
             done.append(result)
@@ -113,20 +159,25 @@ def main(options: Options) -> None:
                 with options.out.open("a") as file:
                     file.write(json.dumps(result) + "\n")
             ended = f"{result['final']:.1f}, {result['seconds']:.0f} s"
-            print(f"{result['task']} seed {result['seed']}: {ended}", flush=True)
-    Console(width=130).print(table([r for r in done if r["task"] in options.tasks and r["own"] == options.own]))
+            print(f"{result['task']}, {result['setting']}, seed {result['seed']}: {ended}", flush=True)
+    rows = {
+        case: [r for r in done if (r["task"], r["setting"]) == case and r["seed"] in options.seeds] for case in cases
+    }
+    Console(width=150).print(table(rows))
 
 
-def table(runs: list[dict[str, Any]]) -> Table:
-    """The results by task."""
-    grid = Table("task", "seeds", "mean policy at the end", "best evaluation", "with noise", "published", "seconds")
-    for task in TASKS + tuple(sorted({r["task"] for r in runs} - set(TASKS))):
-        own = [r for r in runs if r["task"] == task]
-        if not own:
+def table(cases: dict[tuple[str, str], list[dict[str, Any]]]) -> Table:
+    """The results by task and setting."""
+    grid = Table(
+        "task", "setting", "seeds", "mean policy at the end", "best evaluation", "with noise", "published", "seconds"
+    )
+    for (task, setting), runs in cases.items():
+        if not runs:
             continue
         published = "{:g} ± {:g}".format(*PUBLISHED[task]) if task in PUBLISHED else ""
-        cells = [spread([r[name] for r in own]) for name in ("final", "best", "noisy")]
-        grid.add_row(task, str(len(own)), *cells, published, f"{statistics.fmean(r['seconds'] for r in own):.0f}")
+        cells = [spread([r[name] for r in runs]) for name in ("final", "best", "noisy")]
+        seconds = f"{statistics.fmean(r['seconds'] for r in runs):.0f}"
+        grid.add_row(task, setting, str(len(runs)), *cells, published, seconds)
     return grid
 
 
