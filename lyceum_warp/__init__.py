@@ -82,6 +82,8 @@ from lyceum_warp.task import (
     tendon,
 )
 from lyceum_warp.training import train
+from lyceum_warp.viewer.follow import RunViewer
+from lyceum_warp.viewer.show import view
 
 __version__ = "0.1.0"
 
@@ -108,6 +110,7 @@ __all__ = [
     "PredictiveSampling",
     "Rollout",
     "Row",
+    "RunViewer",
     "Sigmoid",
     "Task",
     "Trajectory",
@@ -170,4 +173,5 @@ __all__ = [
     "train",
     "uniform",
     "vec10",
+    "view",
 ]

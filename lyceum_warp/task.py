@@ -345,6 +345,9 @@ class Task:
     gymnasium: ClassVar[str | None] = None
     """Id of the Gymnasium environment whose model, observation, reward, termination, reset and parameters the task
     has, as "Hopper-v5"; None where there is no such environment. Subclasses do not inherit it."""
+    trace: ClassVar[str | None] = None
+    """Name of the site or body whose path the viewer draws for a planner's samples. None: the centre of mass of a robot
+    whose base moves freely, or the end of an arm."""
     planning: ClassVar[Planning] = Planning()
     """The task's settings for MPPI: those of the planner, and options and parameters of its worlds, as
     ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import pytest
 from conftest import TaskFile
+from memory_window import MemoryWindow
 from training_runs import TINY
 
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.runs import Run
+from lyceum_warp.viewer import show as views
 from lyceum_warp.viz.video import NoVideoError, check_video
 
 ROOT = Path(__file__).parent.parent
@@ -100,6 +102,16 @@ class Walkthrough:
                 assert cli.main([command, *options, *more]) == 0, words
             case _:
                 pytest.fail(f"{words} is a command that this test does not know")
+
+
+@pytest.fixture(autouse=True)
+def short_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows in memory, which close after two frames."""
+
+    def opened(*words: object, **options: object) -> MemoryWindow:
+        return MemoryWindow(lambda frame, number: [] if number < 1 else None)
+
+    monkeypatch.setattr(views, "opened", opened)
 
 
 @pytest.fixture

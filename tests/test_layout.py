@@ -13,7 +13,8 @@ ROOT = Path(lw.__file__).parent
 TESTS = Path(__file__).parent
 
 LEVELS = {
-    "docstrings": -1, "arrays": 0, "done": 0, "files": 0, "forks": 0, "interrupts": 0, "machine": 0, "model_files": 0,
+    "docstrings": -1, "arrays": 0, "done": 0, "files": 0, "forks": 0, "interrupts": 0, "machine": 0,
+    "metrics_table": 1, "model_files": 0,
     "mujoco_log": 0, "validate": 0, "versions": 0, "warp_log": 0,
     "actuators": 1, "fields": 1, "kernels": 1, "model_fields": 1, "options": 1, "task": 1,
     "graphs": 2, "spaces": 2,
@@ -22,10 +23,12 @@ LEVELS = {
     "env": 5,
     "openloop": 6,
     "algos": 7, "control": 7, "testing": 7,
-    "runs": 8, "tensorboard": 8,
-    "kept_task": 9, "viz": 9,
-    "training": 10,
-    "cli": 11,
+    "checkpoints": 8, "tensorboard": 8,
+    "runs": 9,
+    "keeper": 10, "kept_task": 10, "viz": 10,
+    "training": 11,
+    "viewer": 12,
+    "cli": 13,
 }  # fmt: skip
 """The floor of every room: a room imports from lower floors, or from itself."""
 

@@ -82,6 +82,7 @@ ALLOWED = (
     r"catch_warnings\(record=True\)",  # Python's
     r'"record": list\(self\.rows\)',  # MuJoCo's: Batch.rollout(record=...)
     r'self\.control, record=\["qpos", "qvel"\]',
+    r"\bRecorder\b",  # of a video, viz/video.py
     r'"record": "graphs"',  # the hint for a word of earlier releases, and its tests
     r'\("record", "did you mean graphs\?"\)',
     r'\(\{"record": False\}, "no parameter \'record\': did you mean graphs"\)',

@@ -1,4 +1,4 @@
-"""The command line: tasks, new, check, train, eval, export, plan, warmup."""
+"""The command line: tasks, new, check, train, eval, export, plan, view, warmup."""
 
 import importlib.metadata
 import os
@@ -15,6 +15,7 @@ from lyceum_warp.cli.list_tasks import Tasks, list_tasks
 from lyceum_warp.cli.new_task import New, new_task
 from lyceum_warp.cli.plan import Plan, plan
 from lyceum_warp.cli.train import Train, origin_options, resume, saved_options, train
+from lyceum_warp.cli.view import View, view_command
 from lyceum_warp.cli.warmup import Warmup, warm_up
 from lyceum_warp.interrupts import Interrupted, signals
 from lyceum_warp.viz.video import NoVideoError
@@ -26,6 +27,7 @@ _Command = Annotated[Tasks, tyro.conf.subcommand("tasks")] \
     | Annotated[Eval, tyro.conf.subcommand("eval")] \
     | Annotated[Export, tyro.conf.subcommand("export")] \
     | Annotated[Plan, tyro.conf.subcommand("plan")] \
+    | Annotated[View, tyro.conf.subcommand("view")] \
     | Annotated[Warmup, tyro.conf.subcommand("warmup")]  # fmt: skip
 
 _DESCRIPTION = """Batched MuJoCo worlds for robot learning.
@@ -37,6 +39,7 @@ $ lyceum-warp train hopper --iterations 100
 $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
 $ lyceum-warp export runs/hopper-20260101-120000 --to policy.onnx
 $ lyceum-warp plan reach --real-time
+$ lyceum-warp view reach --mppi
 $ lyceum-warp warmup hopper --device cuda:0
 """
 
@@ -67,6 +70,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return export(command)
             if isinstance(command, Plan):
                 return plan(command)
+            if isinstance(command, View):
+                return view_command(command)
             if isinstance(command, Warmup):
                 return warm_up(command)
             if command.from_run is not None:

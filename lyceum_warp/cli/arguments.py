@@ -15,6 +15,9 @@ from lyceum_warp.options import OPTIONS, EnvOptions, PhysicsOptions
 Repeated = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")]
 """A flag that may be given several times, each time with one NAME=VALUE."""
 
+CameraWords = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME|PART=VALUE")]
+"""The flag --camera; ``viz.cameras.parsed_camera`` reads it."""
+
 Class = TypeVar("Class")
 
 

@@ -2,7 +2,7 @@
 
 import math
 import sys
-import time
+from collections.abc import Callable
 from pathlib import Path
 
 import rich.box
@@ -11,9 +11,6 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from lyceum_warp.algos.evaluation import evaluation_worlds
-from lyceum_warp.algos.networks import moved
-from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.control.control_report import ControlReport
@@ -21,7 +18,10 @@ from lyceum_warp.control.episode_collector import ControlProgress
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs import Run
-from lyceum_warp.tensorboard import TensorBoard
+from lyceum_warp.viz.cameras import CameraChoice
+from lyceum_warp.viz.long_work import LongWork
+from lyceum_warp.viz.policy_videos import one_line, policy_states
+from lyceum_warp.viz.video import write_video
 
 _TABLE_ROWS = 15
 
@@ -47,6 +47,7 @@ class Display:
 
     def __init__(self, console: Console, done: int, total: int) -> None:
         self.console, self.total, self.mean = console, total, math.nan
+        self.other: LongWork | None = None
         self.progress = Progress(
             BarColumn(bar_width=8), MofNCompleteColumn(), TextColumn("{task.fields[text]}"),
             TimeElapsedColumn(), TimeRemainingColumn(compact=True), TextColumn("left"),
@@ -70,7 +71,8 @@ class Display:
         result = f"reward {it.reward_mean:.3g} a step" if math.isnan(it.return_mean) else f"return {it.return_mean:.4g}"
         mean = "" if math.isnan(shown) else f"(mean policy {shown:.4g})"
         success = "" if math.isnan(it.success) else f"success {it.success:.0%}"
-        bad = [counted(it.faults, "fault"), counted(it.outliers, "outlier")]
+        numbers = {"fault": it.faults, "outlier": it.outliers, "skipped update": it.skipped_updates}
+        bad = [counted(number, what) for what, number in numbers.items()]
         rate = f"{it.samples_per_second / 1000:.3g}k"
         if self.console.is_terminal:
             most = [result, mean, success, *bad, f"{rate}/s"]
@@ -81,6 +83,17 @@ class Display:
             text = _first_that_fits([[result, mean, success, *bad, f"{rate} samples/s"]], 1)
             self.console.print(f"iteration {it.iteration:4d}/{self.total}  {text}", soft_wrap=True)
             sys.stdout.flush()
+
+    def work(self, text: str, unit: str, done: int, total: int) -> None:
+        """Show the progress of other work between two iterations."""
+        if self.console.is_terminal:
+            self.progress.update(self.bar, text=f"{text}: {done}/{total} {unit}")
+            return
+        if self.other is None or (self.other.text, self.other.unit) != (text, unit):
+            self.other = LongWork(text, unit, self.console)
+        self.other(done, total)
+        if done >= total:
+            self.other = None
 
 
 _BAR_WIDTH = 36
@@ -96,44 +109,6 @@ def _first_that_fits(lines: list[list[str]], width: int) -> str:
 def counted(number: int, what: str) -> str:
     """A number of things in words; empty for 0."""
     return f"{number:,d} {what}{'s' if number > 1 else ''}" if number else ""
-
-
-class LongWork:
-    """Progress of work that may take long: a passing bar on a terminal, now and then a line elsewhere.
-
-    Work that takes less than three seconds shows nothing where there is no terminal.
-
-    Args:
-        text: What is done.
-        unit: What is counted, as "frames".
-        console: Where it is shown.
-        quiet: Whether to show nothing.
-    """
-
-    def __init__(self, text: str, unit: str, console: Console | None = None, *, quiet: bool = False) -> None:
-        self.text, self.unit, self.console, self.quiet = text, unit, console or make_console(), quiet
-        self.progress = Progress(
-            TextColumn("{task.description}"), BarColumn(bar_width=12), MofNCompleteColumn(), TextColumn(unit),
-            TimeElapsedColumn(), console=self.console, transient=True, disable=quiet or not self.console.is_terminal,
-        )  # fmt: skip
-        self.bar = self.progress.add_task(text, total=None)
-        self.start, self.next = time.monotonic(), 3.0
-
-    def __enter__(self) -> "LongWork":
-        self.progress.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.progress.stop()
-
-    def __call__(self, done: int, total: int) -> None:
-        """Show that a part of the work is done."""
-        self.progress.update(self.bar, completed=done, total=total)
-        seconds = time.monotonic() - self.start
-        if not (self.quiet or self.console.is_terminal) and seconds >= self.next and done < total:
-            self.console.print(f"{self.text}: {done} of {total} {self.unit}, {seconds:.0f} s", soft_wrap=True)
-            sys.stdout.flush()
-            self.next = seconds + 10.0
 
 
 def curve_table(rows: list[dict[str, float | None]]) -> Table:
@@ -175,17 +150,29 @@ def _spread(rows: list[dict[str, float | None]]) -> list[dict[str, float | None]
     return [rows[round(i * (len(rows) - 1) / (_TABLE_ROWS - 1))] for i in range(_TABLE_ROWS)]
 
 
+def tried(make: Callable[[], object]) -> str:
+    """The path that a function returns, or "none" and the reason why there is none.
+
+    For what is made of results that are saved: its failure must not look like theirs.
+    """
+    try:
+        return str(make())
+    except Exception as error:
+        return f"none: {one_line(error)}"
+
+
 def plotted(run: Run) -> str:
     """Draw a run's learning curve; returns the picture's path, or the reason why there is none."""
-    try:
+
+    def draw() -> Path:
         from lyceum_warp.viz.learning_curve import learning_curve
 
-        return str(learning_curve(run))
-    except ImportError as error:
-        return f"none: {error}"
+        return learning_curve(run)
+
+    return tried(draw)
 
 
-def policy_video(env: Env, policy: GaussianPolicy, path: Path, seed: int, *, quiet: bool = False) -> str:
+def policy_video(env: Env, policy: GaussianPolicy, path: Path, seed: int, *, camera: CameraChoice = None) -> str:
     """Write a video of an episode under a policy; returns its path, or the reason why there is none.
 
     Args:
@@ -193,61 +180,25 @@ def policy_video(env: Env, policy: GaussianPolicy, path: Path, seed: int, *, qui
         policy: The policy.
         path: The mp4 file.
         seed: Seed of the initial state.
-        quiet: Whether to show no progress, as while another progress is shown.
+        camera: The camera; see ``write_video``.
     """
-    from lyceum_warp.viz import video
 
-    one = evaluation_worlds(env, 1, autoreset=False)
-    try:
-        with LongWork("running an episode for the video", "steps", quiet=quiet) as work:
-            states = video.episode(one, moved(policy, one), seed=seed, progress=work)
-        return states_video(one, states, path, quiet=quiet)
-    except ValueError as error:
-        return f"none: {error}"
+    def make() -> str:
+        with LongWork("running an episode for the video", "steps", make_console()) as work:
+            one, states = policy_states(env, policy, seed, progress=work)
+        return states_video(one, states, path, camera=camera)
+
+    return tried(make)
 
 
-def states_video(env: Env, states: torch.Tensor, path: Path, *, quiet: bool = False) -> str:
+def states_video(env: Env, states: torch.Tensor, path: Path, *, camera: CameraChoice = None) -> str:
     """Write a video of given states; returns its path, or the reason why there is none."""
-    from lyceum_warp.viz import video
 
-    try:
-        with LongWork("drawing the video", "frames", quiet=quiet) as work:
-            return str(video.write_video(env, states, path, progress=work))
-    except (video.NoVideoError, ValueError) as error:
-        return f"none: {error}"
+    def make() -> Path:
+        with LongWork("drawing the video", "frames", make_console()) as work:
+            return write_video(env, states, path, camera=camera, progress=work)
 
-
-class Videos:
-    """Writes a video of the mean policy every few iterations, and shows it in TensorBoard.
-
-    A machine that cannot draw a video, or cannot convert it for TensorBoard, is reported once, and gets no further one.
-
-    Args:
-        npg: The algorithm.
-        folder: Folder of the videos, which have the numbers of their iterations.
-        every: Iterations between two videos; 0 for none.
-        seed: Seed of the initial state, the same for all videos.
-        board: TensorBoard's writer, if there is one.
-    """
-
-    def __init__(self, npg: NPG, folder: Path, every: int, seed: int, board: TensorBoard | None) -> None:
-        self.npg, self.folder, self.every, self.seed, self.board = npg, folder, every, seed, board
-
-    def __call__(self, iteration: Iteration) -> None:
-        """Write a video after an iteration, if it is time for one."""
-        if not self.every or iteration.iteration % self.every:
-            return
-        path = self.folder / f"{iteration.iteration:06d}.mp4"
-        result = policy_video(self.npg.env, self.npg.policy, path, self.seed, quiet=True)
-        reason = "" if result == str(path) else result.removeprefix("none: ")
-        if not reason and self.board is not None:
-            try:
-                self.board.video(path, iteration.samples)
-            except (ValueError, ImportError) as error:  # training goes on
-                reason = str(error)
-        if reason:
-            note(f"no further videos ({reason})")
-            self.every = 0
+    return tried(make)
 
 
 # plans
@@ -316,9 +267,10 @@ def report_table(report: ControlReport, *, success: bool = True) -> Table:
 
 def plotted_control(trajectories: list[Trajectory], path: Path) -> str:
     """Draw trajectories; returns the picture's path, or the reason why there is none."""
-    try:
+
+    def draw() -> Path:
         from lyceum_warp.viz.control_plot import control_plot
 
-        return str(control_plot(trajectories, path))
-    except ImportError as error:
-        return f"none: {error}"
+        return control_plot(trajectories, path)
+
+    return tried(draw)

@@ -2,20 +2,27 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import rich.box
 import tyro
 from rich.table import Table
 
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
+from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.cli.arguments import NO_FLAGS, Repeated, given, optional_flags, parameters, run_options
-from lyceum_warp.cli.display import LongWork, make_console, note, policy_video
+from lyceum_warp.checkpoints import check_sizes
+from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, Repeated, given, optional_flags, parameters, run_options
+from lyceum_warp.cli.display import make_console, note, policy_video
+from lyceum_warp.control.policy_episodes import policy_episodes
+from lyceum_warp.control.trajectory import source
 from lyceum_warp.engines.placement import options_for_few_worlds
+from lyceum_warp.env import Env
 from lyceum_warp.kept_task import run_env
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.runs import Run, check_sizes, load
+from lyceum_warp.runs import Run, load
+from lyceum_warp.viz.cameras import find_camera, parsed_camera
+from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.video import check_video
 
 
@@ -42,6 +49,8 @@ class Eval:
     so.
 
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
+    $ lyceum-warp eval runs/hopper-20260101-120000 --video --camera track=torso --camera azimuth=45
+    $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 8 --episodes-to runs/hopper-episodes
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
@@ -61,6 +70,12 @@ class Eval:
     """Largest number of worlds; never more than episodes."""
     video: bool = False
     """Whether to write a video of one episode, eval.mp4 in the run's folder."""
+    camera: CameraWords = ()
+    """Camera of the video: a name or an index of the model's, "free" for MuJoCo's default free camera, or a part of a
+    free camera's pose, as azimuth=90, elevation=-20, distance=3, lookat=0,0,1 or track=BODY; may be given several
+    times."""
+    episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Folder, new or empty, for a file of each episode, as lyceum-warp plan writes them: episode-000.npz and so on."""
     env: tyro.conf.OmitArgPrefixes[OtherEnv] = dataclasses.field(default_factory=OtherEnv)
 
 
@@ -68,8 +83,13 @@ def evaluate_run(options: Eval) -> int:
     """Run the command; returns the exit code."""
     if options.episodes < 1 or options.nworld < 1:
         raise ValueError(f"eval needs at least 1 episode and 1 world, not {options.episodes} and {options.nworld}")
+    camera = parsed_camera(options.camera)
     if options.video:
         check_video()
+    elif camera is not None:
+        raise ValueError("--camera has no effect without --video: give both, or leave out --camera")
+    if options.episodes_to is not None:
+        Run.check_free(options.episodes_to, resumable=False, command=False)
     run = Run.open(options.run)
     config = run.config
     nworld = min(options.nworld, options.episodes)
@@ -82,11 +102,13 @@ def evaluate_run(options: Eval) -> int:
         known = known.changed(options_for_few_worlds(known.engine, known.device))
     path = run.policy_file(options.which)
     env = run_env(run, known, params, note=note, task=options.task)
+    find_camera(env.model, camera)
+    origin = _source(env, run)
     if env.horizon == 0:
         env = evaluation_worlds(env, nworld)
     policy = load(run, which=options.which, device=env.obs.device)
     check_sizes(policy, env, path)
-    with LongWork("evaluating the policy", "steps") as work:
+    with LongWork("evaluating the policy", "steps", make_console()) as work:
         episodes = evaluate(env, policy, options.episodes, seed=options.seed, progress=work).first(options.episodes)
     table = Table(box=rich.box.SIMPLE)
     for heading in ("", "mean", "std", "min", "max"):
@@ -102,7 +124,33 @@ def evaluate_run(options: Eval) -> int:
     console.print(table)
     if env.task.functions["success"] is not None:
         console.print(f"success: {episodes.success.mean().item():.0%}")
+    if options.episodes_to is not None:
+        paths = _save_episodes(env, policy, options, origin)
+        console.print(f"episodes: {paths}", soft_wrap=True, markup=False)
     if options.video:
-        video = policy_video(env, policy, run.folder / "eval.mp4", evaluation_seed(options.seed))
+        video = policy_video(env, policy, run.folder / "eval.mp4", evaluation_seed(options.seed), camera=camera)
         console.print(f"video: {video}", soft_wrap=True, markup=False)
     return 0
+
+
+def _save_episodes(env: Env, policy: GaussianPolicy, options: Eval, source: dict[str, Any]) -> str:
+    """Run the same episodes again, and write a file of each; returns what names them all."""
+    assert options.episodes_to is not None
+    whose = {"run": str(options.run.resolve()), "which": options.which}
+    with LongWork("running the episodes that are saved", "steps", make_console()) as work:
+        episodes = policy_episodes(
+            env.replicate(autoreset=False), policy, options.episodes, seed=evaluation_seed(options.seed),
+            controller=whose, progress=work,
+        )  # fmt: skip
+        for number, episode in enumerate(episodes):
+            path = options.episodes_to / f"episode-{number:03d}.npz"
+            dataclasses.replace(episode, source=source).save(path)
+    return str(options.episodes_to / "episode-*.npz")
+
+
+def _source(env: Env, run: Run) -> dict[str, Any]:
+    """How to make the environment of a run again; with the run's copy of a model where it was used."""
+    made, copy = source(env), run.config.get("kept", {}).get("model")
+    if copy is not None and env.options.model is not None and "model" not in made["options"]:
+        made["options"]["model"] = str((run.task_folder / copy).resolve())
+    return made

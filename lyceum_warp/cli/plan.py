@@ -14,7 +14,16 @@ from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.mppi_config import MPPIConfig
 from lyceum_warp.binding.registry import find_task, snake_case, task_name
-from lyceum_warp.cli.arguments import Physics, Placement, Repeated, given, optional_flags, parameters, portable
+from lyceum_warp.cli.arguments import (
+    CameraWords,
+    Physics,
+    Placement,
+    Repeated,
+    given,
+    optional_flags,
+    parameters,
+    portable,
+)
 from lyceum_warp.cli.display import PlanDisplay, make_console, plotted_control, report_table, states_video
 from lyceum_warp.control.checked_controller import CheckedController
 from lyceum_warp.control.control_report import control_report
@@ -25,6 +34,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted
 from lyceum_warp.runs import Run, load_value
 from lyceum_warp.validate import whole_number
+from lyceum_warp.viz.cameras import find_camera, parsed_camera
 
 
 @optional_flags(MPPIConfig, default="(default: the task's)")
@@ -107,6 +117,10 @@ class Plan:
     """Another model, only for the planner."""
     video: bool = True
     """Whether to make a video of the first episode."""
+    camera: CameraWords = ()
+    """Camera of the video: a name or an index of the model's, "free" for MuJoCo's default free camera, or a part of a
+    free camera's pose, as azimuth=90, elevation=-20, distance=3, lookat=0,0,1 or track=BODY; may be given several
+    times."""
     plot: bool = True
     """Whether to draw rewards, planning times and ages."""
     planner: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
@@ -135,10 +149,14 @@ def plan(options: Plan) -> int:
     )
     Run.check_free(out, resumable=False)
     # every wrong option is found before the folder is made
+    camera = parsed_camera(options.camera)
+    if camera is not None and not options.video:
+        raise ValueError("--camera has no effect with --no-video: leave out one of them")
     torch.set_num_threads(1)
     params, planner_params = _parameters(options)
     plant, planner = _worlds(options, params, planner_params)
     CheckedController(planner, plant).check_horizon(planner.horizon, every)
+    find_camera(plant.model, camera)
     config = {
         "algorithm": planner.config.update, "task": portable(options.task), "params": params,
         "planner": planner.settings, "planner_params": planner_params,
@@ -278,14 +296,14 @@ def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
 
 def _report(run: Run, plant: Env, done: list[Trajectory], options: Plan) -> int:
     """Print the report, draw the plot and the video, and list the files."""
-    console = make_console()
+    console, camera = make_console(), parsed_camera(options.camera)
     report = control_report(done, rate=_rate(options, done[0]))
     console.print(report_table(report, success=plant.task.functions["success"] is not None))
     paths = [("episodes", str(run.folder / "episode-*.npz")), ("report", str(run.folder / "report.json"))]
     if options.plot:
         paths.append(("plot", plotted_control(done, run.folder / "plan.png")))
     if options.video:
-        paths.append(("video", states_video(plant, done[0].states, run.folder / "video.mp4")))
+        paths.append(("video", states_video(plant, done[0].states, run.folder / "video.mp4", camera=camera)))
     for name, path in paths:
         console.print(f"{name + ':':<12}{path}", soft_wrap=True, markup=False)
     return 0

@@ -8,6 +8,7 @@ import queue
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 from typing import Protocol
 
@@ -46,6 +47,7 @@ def control_async(
     reset: bool = True,
     on_step: OnStep | None = None,
     on_abort: OnAbort | None = None,
+    clock: "Clock | None" = None,
 ) -> Trajectory:
     """Control one world, the plant, that keeps its rate by the wall clock and does not wait for plans.
 
@@ -83,6 +85,7 @@ def control_async(
         on_step: Called with a ``ControlProgress`` after each step, in the calling thread. Its time delays the plant.
         on_abort: Called with the trajectory of the complete steps, if there are any, when an exception ends the run
             (Ctrl-C included). ``done_reason`` of that trajectory is 0. The exception is raised afterwards.
+        clock: Another clock, for instance one that works while the plant waits for its next step.
 
     Returns:
         The episode.
@@ -100,13 +103,13 @@ def control_async(
     checked = CheckedController(controller, env)
     begin_episode(env, checked, seed, reset=reset)
     _capture_graphs(env)
-    clock = Clock()
+    clock = Clock() if clock is None else clock
     episode = EpisodeCollector(env, checked, mode="async", period=period, seed=seed, now=clock.now)
     planner = _PlannerThread(checked, clock, seed, first_step(env, reset=reset), reset=reset)
     with _frequent_thread_switches():
         try:
             planner.publish(0, episode.states[0], episode.obs[0])
-            planner.wait()
+            planner.wait(clock)
             episode.restart_clock()
             wall = run_plant(env, checked, planner, clock, episode, limit, on_step)
             planner.stop()
@@ -134,6 +137,10 @@ class Clock:
             time.sleep(left - _SPIN)
         while self.now() < moment:
             pass
+
+    def wait_for(self, event: threading.Event) -> None:
+        """Wait until an event is set: the first plan of a run."""
+        event.wait()
 
 
 class PlanSource(Protocol):
@@ -226,9 +233,9 @@ class _PlannerThread:
         """Make the next plan from this state, unless a newer one is published first. The tensors must not change."""
         self._states.put((step, state, obs))
 
-    def wait(self) -> None:
+    def wait(self, clock: Clock) -> None:
         """Wait for the first plan."""
-        self._begun.wait()
+        clock.wait_for(self._begun)
         self.check()
 
     def check(self) -> None:
@@ -251,7 +258,10 @@ class _PlannerThread:
         self._states.put(None)
         self._thread.join(patience)
         if self._thread.is_alive():
-            atexit.register(_interrupt, self._thread)
+            if not _unfinished:
+                atexit.unregister(_interrupt_unfinished)
+                atexit.register(_interrupt_unfinished)
+            _unfinished.add(self._thread)
 
     def add_plans(self, episode: EpisodeCollector) -> None:
         """Add the finished plans to an episode."""
@@ -294,6 +304,14 @@ class _PlannerThread:
         actions = controller(state, obs, shift, step)
         self._plans.append(TimedPlan(len(self._plans), step, begun, self._clock.now() - begun, actions))
         self._qualities.append(controller.quality())  # after the plan, for which the plant may be waiting
+
+
+_unfinished: "weakref.WeakSet[threading.Thread]" = weakref.WeakSet()
+
+
+def _interrupt_unfinished() -> None:
+    for thread in list(_unfinished):
+        _interrupt(thread)
 
 
 def _interrupt(thread: threading.Thread) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from lyceum_warp.binding.registry import spelled_task
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.done import Done
 from lyceum_warp.env import Env
@@ -33,6 +34,8 @@ _SCALARS: dict[str, Callable[[Any], Any]] = {
     "engine": str, "params": dict, "versions": dict, "seed": lambda seed: seed if seed is None else int(seed),
     "controller": dict, "state_parts": dict, "obs_parts": dict, "action_names": list,
 }  # fmt: skip
+_LATER: dict[str, Callable[[Any], Any]] = {"source": dict}
+"""Scalars that files of earlier releases lack."""
 
 
 @document_attributes
@@ -107,6 +110,10 @@ class Trajectory:
     """Columns of the named parts of an observation."""
     action_names: Sequence[str]
     """Names of the actions' columns."""
+    source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """How to make the plant again, for ``episode_env``: ``task``, a name or a file with a class, None for a task of a
+    notebook or of the program that ran; ``params``, names of the parameters that were given; ``options``. Empty in
+    files of earlier releases."""
 
     @property
     def steps(self) -> int:
@@ -138,20 +145,31 @@ class Trajectory:
         """Age of each action in steps: steps since the state from which it was planned, (steps,) int64."""
         return torch.arange(self.steps) - self.plan_steps[self.plan_of]
 
+    def part(self, name: str) -> torch.Tensor:
+        """A part of all states, (steps + 1, size), a view: ``part("qpos")`` are the positions.
+
+        Raises:
+            ValueError: The states have no such part.
+        """
+        if name not in self.state_parts:
+            raise ValueError(f"the states have no part {name!r}: they have {', '.join(self.state_parts)}")
+        start, stop = self.state_parts[name]
+        return self.states[:, start:stop]
+
     def save(self, path: str | Path) -> Path:
         """Write the trajectory to a file. A reader finds the old file or the whole new one.
 
         The file is a compressed ``.npz``, which numpy reads without pickle. Each array has the name, the shape, the
         type and the unit of its attribute. ``info`` is JSON text, a string array without axes, with ``format`` (1),
         ``task``, ``engine``, ``params``, ``versions``, ``mode``, ``timestep``, ``period``, ``wall_seconds``,
-        ``done_reason``, ``seed``, ``controller``, ``state_parts``, ``obs_parts`` and ``action_names``. For example,
-        with ``start, stop = info["state_parts"]["qpos"]``, the positions are ``states[:, start:stop]``.
+        ``done_reason``, ``seed``, ``controller``, ``state_parts``, ``obs_parts``, ``action_names`` and ``source``. For
+        example, with ``start, stop = info["state_parts"]["qpos"]``, the positions are ``states[:, start:stop]``.
 
         Returns:
             The file's path.
         """
         path = Path(path)
-        info = {"format": FORMAT, **{name: getattr(self, name) for name in _SCALARS}}
+        info = {"format": FORMAT, **{name: getattr(self, name) for name in _SCALARS | _LATER}}
         arrays: dict[str, Any] = {name: getattr(self, name).numpy() for name in _ARRAYS}
         arrays["info"] = np.array(json.dumps(info))
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -161,7 +179,10 @@ class Trajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> "Trajectory":
-        """Read a file that ``save`` wrote. No code in the file is executed.
+        """Read a file that ``save`` wrote.
+
+        Reading executes no code. The file may name a task file, which ``episode_env`` runs as code only if it belongs
+        to this user and no other user can write it.
 
         Raises:
             FileNotFoundError: The file does not exist.
@@ -174,7 +195,9 @@ class Trajectory:
                 if info["format"] <= FORMAT:
                     content: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
                     _check(content)
-                    return cls(**content, **{name: kind(info[name]) for name, kind in _SCALARS.items()})
+                    scalars = {name: kind(info[name]) for name, kind in _SCALARS.items()}
+                    scalars |= {name: kind(info[name]) for name, kind in _LATER.items() if name in info}
+                    return cls(**content, **scalars)
         except OSError:
             raise
         except Exception as error:  # of many types, from numpy and zipfile
@@ -203,5 +226,22 @@ def provenance(env: Env) -> dict[str, Any]:
         "task": env.task.name, "engine": env.engine.name, "params": params, "versions": versions(env.device.alias),
         "state_parts": {name: [part.start, part.stop] for name, part in env.state_space.parts.items()},
         "obs_parts": {name: [part.start, part.stop] for name, part in env.obs_space.parts.items()},
-        "action_names": list(env.action_space.parts),
+        "action_names": list(env.action_space.parts), "source": source(env),
+    }  # fmt: skip
+
+
+_PLACEMENT = ("engine", "device", "nthread", "nworld", "seed", "first_world", "autoreset", "graphs", "nvtx", "fields")
+"""Options that change neither the physics nor the states."""
+
+
+def source(env: Env) -> dict[str, Any]:
+    """How to make an environment again; see ``Trajectory.source``."""
+    task = env.task.task
+    options = {name: value for name, value in env.options.given().items() if name not in _PLACEMENT}
+    model = options.pop("model", None)
+    if isinstance(model, str | Path):
+        options["model"] = str(Path(model).resolve()) if Path(model).is_file() else str(model)
+    return {
+        "task": None if task.__module__ == "__main__" else spelled_task(task), "params": sorted(env.given_params),
+        "options": json.loads(json.dumps(options, default=str)),
     }  # fmt: skip

@@ -1,88 +1,173 @@
-"""A program that draws states into a video: ``python render.py job.npz model.mjb out.mp4``.
+"""A program that draws poses into a video: ``python render.py folder``.
 
-The job holds a row for each frame of ``qpos``, ``mocap_pos``, ``mocap_quat``, and of each model field that differs
-between states, as ``model_geom_size``.
+``drawing.py`` runs it in a process of its own and writes pickled objects to its standard input: first a dictionary with
+``size``, ``fps``, ``camera`` and ``background``, then one dictionary for each picture (``Shot``), then None. The folder
+holds the model, ``model.mjb``; the program writes ``video.mp4`` beside it. It prints "ready" once it can draw, and a
+line for each picture. If its input ends without None, the process that runs it has died: it deletes the folder.
 
 MuJoCo chooses its graphics library once, when it is imported, and a driver that fails may end the process. Therefore
-``video.py`` runs this file in a process for each library that it tries. The file imports nothing of the package. Exit
+``drawing.py`` runs this file in a process for each library that it tries. The file imports nothing of the package. Exit
 code 3 means that this machine cannot draw with this library; the last line on stderr holds the reason.
 """
 
+import itertools
+import os
+import pickle
+import shutil
 import sys
-from typing import Any
+from pathlib import Path
+from typing import Any, TypedDict
 
 import numpy as np
 
 CANNOT_DRAW = 3
-
-MODEL_FIELD = "model_"
-"""What the job's names of model fields begin with."""
+ABANDONED = 4
 
 
-def camera(mujoco: Any, model: Any) -> Any:
-    """Choose the first tracking camera, else the first one fixed to the world, else one that follows the first body."""
-    modes = [int(mode) for mode in model.cam_mode]
-    # as numbers, because MuJoCo's enums do not equal NumPy's integers
-    tracking = (int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
-    for i, mode in enumerate(modes):
-        if mode in tracking:
-            return i
-    for i, body in enumerate(model.cam_bodyid):
-        if body == 0:
-            return i
-    view = mujoco.MjvCamera()
-    mujoco.mjv_defaultFreeCamera(model, view)
-    if model.nbody > 1:
-        view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, 1
-    return view
+class Shot(TypedDict):
+    """What one frame, or several in succession, show."""
+
+    pose: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """qpos, mocap_pos and mocap_quat."""
+    model_fields: dict[str, np.ndarray]
+    """Values of model fields by their names. Fields that are not there have the model's values."""
+    camera: tuple[float, ...] | None
+    """The camera from this frame on; None for the last one."""
+    ghosts: list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[float, ...]]]
+    """Further poses of the same model, each with its colour."""
+    lines: list[tuple[np.ndarray, tuple[float, ...], float]]
+    """Points of lines, (points, 3), each with its colour and its width in pixels."""
+    frames: int
+    """Frames of the video that show it."""
+
+
+class Painter:
+    """Draws poses of a model.
+
+    Args:
+        mujoco: The module, which chooses a graphics library when it is imported.
+        model: The model. Its fields are changed.
+        size: Width and height in pixels.
+        camera: The camera's values.
+    """
+
+    def __init__(self, mujoco: Any, model: Any, size: tuple[int, int], camera: tuple[float, ...]) -> None:
+        self.mujoco, self.model = mujoco, model
+        width, height = size
+        model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
+        model.vis.global_.offheight = max(model.vis.global_.offheight, height)
+        # a finer shadow map shows no more, and takes half of the time of a frame that is drawn without a GPU
+        model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, 2 * max(size))
+        self.renderer = mujoco.Renderer(model, height, width)
+        self.data, self.ghost = mujoco.MjData(model), mujoco.MjData(model)
+        self.view, self.option, self.perturb = mujoco.MjvCamera(), mujoco.MjvOption(), mujoco.MjvPerturb()
+        set_camera(self.view, camera)
+        self._nominal: dict[str, np.ndarray] = {}
+        self._fields: dict[str, np.ndarray] = {}
+
+    def draw(self, shot: Shot) -> np.ndarray:
+        """Draw one frame, (height, width, 3) uint8."""
+        self._set_fields(shot["model_fields"])
+        if shot["camera"] is not None:
+            set_camera(self.view, shot["camera"])
+        self._place(self.data, shot["pose"])
+        self.renderer.update_scene(self.data, self.view, self.option)
+        scene = self.renderer.scene
+        for pose, colour in shot["ghosts"]:
+            self._place(self.ghost, pose)
+            first = scene.ngeom
+            moving = int(self.mujoco.mjtCatBit.mjCAT_DYNAMIC)
+            self.mujoco.mjv_addGeoms(self.model, self.ghost, self.option, self.perturb, moving, scene)
+            for geom in scene.geoms[first : scene.ngeom]:
+                geom.rgba[:], geom.matid, geom.transparent = colour, -1, 1
+        for points, colour, width in shot["lines"]:
+            self._add_line(scene, points, colour, width)
+        image: np.ndarray = self.renderer.render()
+        return image
+
+    def _place(self, data: Any, pose: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+        data.qpos[:] = pose[0]
+        if self.model.nmocap:
+            data.mocap_pos[:], data.mocap_quat[:] = pose[1], pose[2]
+        self.mujoco.mj_forward(self.model, data)
+
+    def _set_fields(self, given: dict[str, np.ndarray]) -> None:
+        for name in given:
+            if name not in self._nominal:
+                self._nominal[name] = self._fields[name] = np.array(getattr(_owner(self.model, name), name))
+        wanted = self._nominal | given
+        if any(not np.array_equal(np.ravel(value), np.ravel(self._fields[name])) for name, value in wanted.items()):
+            change_model(self.mujoco, self.model, wanted)
+            self._fields = wanted
+
+    def _add_line(self, scene: Any, points: np.ndarray, colour: tuple[float, ...], width: float) -> None:
+        kind = int(self.mujoco.mjtGeom.mjGEOM_LINE)
+        for start, end in itertools.pairwise(points):
+            if scene.ngeom == scene.maxgeom:
+                return
+            geom = scene.geoms[scene.ngeom]
+            rgba = np.array(colour, dtype=np.float32)
+            self.mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), rgba)
+            self.mujoco.mjv_connector(geom, kind, width, start, end)
+            scene.ngeom += 1
+
+
+def set_camera(view: Any, values: tuple[float, ...]) -> None:
+    """Give a camera the values that ``cameras.camera_values`` returned."""
+    view.type, view.fixedcamid, view.trackbodyid = (int(value) for value in values[:3])
+    view.lookat[:] = values[3:6]
+    view.distance, view.azimuth, view.elevation = values[6:9]
+    view.orthographic = int(values[9])
 
 
 def change_model(mujoco: Any, model: Any, rows: dict[str, Any]) -> None:
     """Set fields of a model by their names, and compute what follows from them, such as the poses of cameras."""
     for name, row in rows.items():
-        owner = model if hasattr(model, name) else model.opt
+        owner = _owner(model, name)
         value = getattr(owner, name)
         if isinstance(value, np.ndarray):
-            value[...] = row.reshape(value.shape)
+            value[...] = np.reshape(row, value.shape)
         else:
-            setattr(owner, name, row.item())
+            setattr(owner, name, np.asarray(row).item())
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def main(job_path: str, model_path: str, out: str) -> int:
-    """Draw one frame for each row of the job."""
+def _owner(model: Any, name: str) -> Any:
+    return model if hasattr(model, name) else model.opt
+
+
+def main(folder: str) -> int:
+    """Draw one frame for each pose of the input."""
+    source = sys.stdin.buffer
     try:
         import mujoco
 
-        model = mujoco.MjModel.from_binary_path(model_path)
-        job = np.load(job_path)
-        width, height = (int(size) for size in job["size"])
-        model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
-        model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-        renderer = mujoco.Renderer(model, height, width)
+        job = pickle.load(source)
+        if job["background"] and hasattr(os, "nice"):
+            os.nice(10)
+        model = mujoco.MjModel.from_binary_path(str(Path(folder, "model.mjb")))
+        painter = Painter(mujoco, model, job["size"], job["camera"])
+        painter.renderer.update_scene(painter.data, painter.view)
+        painter.renderer.render()  # some drivers fail only here
     except Exception as error:  # of different types, depending on the library
         print(str(error).strip() or type(error).__name__, file=sys.stderr)
         return CANNOT_DRAW
     import imageio.v2 as imageio
 
-    data, view = mujoco.MjData(model), camera(mujoco, model)
-    fields = {key.removeprefix(MODEL_FIELD): job[key] for key in job.files if key.startswith(MODEL_FIELD)}
     options: Any = dict(fps=float(job["fps"]), codec="libx264", pixelformat="yuv420p", quality=8, macro_block_size=2)
-    writer: Any = imageio.get_writer(out, format="FFMPEG", **options)
-    with writer:
-        frames = len(job["qpos"])
-        for i in range(frames):
-            if any(i == 0 or (rows[i] != rows[i - 1]).any() for rows in fields.values()):
-                change_model(mujoco, model, {name: rows[i] for name, rows in fields.items()})
-            data.qpos[:] = job["qpos"][i]
-            if model.nmocap:
-                data.mocap_pos[:] = job["mocap_pos"][i].reshape(-1, 3)
-                data.mocap_quat[:] = job["mocap_quat"][i].reshape(-1, 4)
-            mujoco.mj_forward(model, data)
-            renderer.update_scene(data, view)
-            writer.append_data(renderer.render())
-            print(f"frame {i + 1} of {frames}", flush=True)  # video.py reads it
-    renderer.close()
+    try:
+        writer: Any = imageio.get_writer(str(Path(folder, "video.mp4")), format="FFMPEG", **options)
+        with writer:
+            print("ready", flush=True)
+            while (shot := pickle.load(source)) is not None:
+                image = painter.draw(shot)
+                for _ in range(shot["frames"]):
+                    writer.append_data(image)
+                print("frame", flush=True)
+    except (EOFError, pickle.UnpicklingError):
+        shutil.rmtree(folder, ignore_errors=True)
+        return ABANDONED
+    painter.renderer.close()
     return 0
 
 

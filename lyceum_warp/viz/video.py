@@ -1,33 +1,41 @@
-"""Videos of policies, drawn off-screen."""
+"""Videos, drawn off-screen by a process of their own."""
 
-import importlib.util
+import contextlib
 import math
-import os
-import re
-import subprocess
-import sys
-import tempfile
-from collections.abc import Callable
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from lyceum_warp.env import Env
-from lyceum_warp.viz import EXTRA
-from lyceum_warp.viz.render import CANNOT_DRAW, MODEL_FIELD
+from lyceum_warp.validate import positive_number, whole_number
+from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
+from lyceum_warp.viz.drawing import Drawing, NoVideoError, check_video
+from lyceum_warp.viz.long_work import LongWork
+from lyceum_warp.viz.render import Shot
+
+__all__ = ["GhostPose", "Line", "NoVideoError", "Progress", "Recorder", "check_video", "episode", "write_video"]
 
 Progress: TypeAlias = Callable[[int, int], object]
 """Called with how much is done, and how much there is in all."""
 
+GhostPose: TypeAlias = tuple[ArrayLike, ArrayLike | None, ArrayLike | None, ArrayLike]
+"""qpos, mocap_pos, mocap_quat and colour of a ghost."""
+
+Line: TypeAlias = tuple[ArrayLike, ArrayLike]
+"""Points of a line, (n, 3), and its colour."""
+
+_LINE_WIDTH = 2.0  # pixels
 _MAX_RATE = 60  # frames per second; screens rarely show more
 _POSES = ("qpos", "mocap_pos", "mocap_quat")
-
-
-class NoVideoError(RuntimeError):
-    """The machine cannot draw, or lacks a package for videos. The message names it and the fix."""
+_KILLED = 5.0  # seconds that the thread gets to end after its process was killed
 
 
 @torch.no_grad()
@@ -72,106 +80,343 @@ def write_video(
     states: torch.Tensor,
     out: str | Path,
     *,
+    camera: CameraChoice = None,
     size: tuple[int, int] = (640, 480),
     speed: float = 1.0,
-    progress: Progress | None = None,
+    progress: Progress | bool = True,
 ) -> Path:
     """Draw states into an mp4 file, each with the model fields that belong to it.
 
-    The camera is the model's first tracking camera, else its first camera that is fixed to the world, else a camera
-    that follows the first body. The video has at most 60 frames per second: with a shorter time step, states are left
-    out.
+    The video has at most 60 frames per second: with a shorter time step, states are left out. It is drawn by a process
+    of its own, without a display.
 
     Args:
         env: Environment that the states come from.
         states: States of one world, one row per step, (steps, state_space.size).
-        out: The file. It is overwritten.
+        out: The file. It is replaced once the video is complete.
+        camera: A camera of the model by its name or index, a ``FreeCamera`` or ``mujoco.MjvCamera``, or "free" for
+            MuJoCo's default free camera. By default the model's first tracking camera, else its first camera that is
+            fixed to the world, else a camera that follows the first body.
         size: Width and height in pixels, even numbers.
         speed: Simulated seconds per second of the video.
-        progress: Called after each frame with the number of frames so far and in all.
+        progress: Called after each frame with the number of frames so far and in all. True shows a bar on a terminal,
+            and elsewhere now and then a line on stderr; False shows nothing.
 
     Returns:
         The file's path.
 
     Raises:
-        ValueError: The states do not have the environment's shape, or the size is odd.
+        ValueError: The states do not have the environment's shape, the model has no such camera, the size is odd, or
+            the file's name does not end in ``.mp4``.
         NoVideoError: The machine cannot draw, or lacks a package for videos.
     """
-    out = Path(out)
     if states.ndim != 2 or states.shape[1] != env.state_space.size or not len(states):
         raise ValueError(f"states must have the shape (steps, {env.state_space.size}), not {tuple(states.shape)}")
-    if any(pixels < 2 or pixels % 2 for pixels in size):
-        raise ValueError(f"size must be two even numbers, the width and the height in pixels, not {size}")
-    check_video()
-    rate = speed / env.timestep
+    rate = positive_number("speed", speed, "simulated seconds per second") / env.timestep
     stride = max(1, math.ceil(rate / _MAX_RATE - 1e-9))
     parts = env.state_space.parts
-    keys = {name: name for name in _POSES if name in parts}
-    keys |= {MODEL_FIELD + field.name: field.name for field in env.task.dynamics}
-    rows: Any = {key: states[::stride, parts[name]].numpy() for key, name in keys.items()}
-    with tempfile.TemporaryDirectory() as folder:
-        job, model, video = Path(folder, "job.npz"), Path(folder, "model.mjb"), Path(folder, "video.mp4")
-        np.savez(job, fps=rate / stride, size=size, **rows)
-        mujoco.mj_saveModel(env.model, str(model), None)
-        _draw([str(job), str(model), str(video)], progress)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_bytes(video.read_bytes())
-    return out
+    rows = states[::stride].cpu()
+    poses = [rows[:, parts[name]].numpy() if name in parts else _nothing(len(rows)) for name in _POSES]
+    fields = {field.name: rows[:, parts[field.name]].numpy() for field in env.task.dynamics}
+    with (
+        Drawing(env.model, out, camera=camera, size=size, fps=rate / stride) as drawing,
+        _shown_progress(progress) as report,
+    ):
+        for i in range(len(rows)):
+            shown = {name: values[i] for name, values in fields.items()}
+            drawing.draw(_shot((poses[0][i], poses[1][i].reshape(-1, 3), poses[2][i].reshape(-1, 4)), shown))
+            if report is not None:
+                report(i + 1, len(rows))
+        return drawing.finish()
 
 
-def check_video() -> None:
-    """Check that the packages for videos are installed.
+def _shown_progress(progress: Progress | bool) -> contextlib.AbstractContextManager[Progress | None]:
+    if progress is True:
+        return LongWork("drawing the video", "frames")
+    return contextlib.nullcontext(progress or None)
+
+
+def _nothing(rows: int) -> np.ndarray:
+    return np.zeros((rows, 0))
+
+
+class Recorder:
+    """A video of poses that come one by one, as from a viewer.
+
+    A process of its own draws them, at a low priority, and ``add`` never waits for it. Where it is slower than the
+    poses come, as without a GPU, they wait in memory, and ``close`` waits until the last one is drawn. With
+    ``most_waiting`` no more than these wait: further poses are dropped, and the last one that waits is shown in their
+    place, so that the video keeps its duration. The file is there once the video is complete, never before: after
+    ``cancel``, after an error within a ``with`` block, or where the program is killed, an older file of this name stays
+    as it is.
+
+    >>> with Recorder(env.model, "video.mp4", camera="side", fps=1 / env.timestep) as mp4:
+    ...     for _ in range(100):
+    ...         env.step()
+    ...         mp4.add(env.field("qpos")[0])
+
+    Args:
+        model: The model of the poses.
+        out: The file, whose name ends in ``.mp4``.
+        camera: The camera, as in ``write_video``.
+        size: Width and height in pixels, even numbers.
+        fps: Frames per second of the video.
+        most_waiting: The most poses that wait for the process; by default all that come.
 
     Raises:
-        NoVideoError: One of them is not installed.
+        ValueError: The model has no such camera, or an argument is out of range.
+        NoVideoError: A package for videos is not installed.
     """
-    if missing := [name for name in ("imageio", "imageio_ffmpeg") if importlib.util.find_spec(name) is None]:
-        raise NoVideoError(f"videos need {' and '.join(missing)}: {EXTRA}")
 
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        out: str | Path,
+        *,
+        camera: CameraChoice = None,
+        size: tuple[int, int] = (640, 480),
+        fps: float = 30.0,
+        most_waiting: int | None = None,
+    ) -> None:
+        self.model, self.out = model, Path(out)
+        bodies = np.argsort(model.body_mocapid)[model.nbody - model.nmocap :]  # in the order of their mocap poses
+        self._mocap = model.body_pos[bodies].copy(), model.body_quat[bodies].copy()
+        self._sizes = model.nq, model.nmocap
+        self._drawing = Drawing(model, out, camera=camera, size=size, fps=fps, background=True)
+        self._most = math.inf if most_waiting is None else whole_number("most_waiting", most_waiting, low=1)
+        self._poses: deque[Shot] = deque()
+        self._changed = threading.Condition()  # also guards the poses and the numbers
+        self._added = self._drawn = self._dropped = 0
+        self._ended = self._cancelled = False
+        self._error: NoVideoError | OSError | None = None
+        self._thread = threading.Thread(target=self._draw, name="lyceum-warp video", daemon=True)
+        self._thread.start()
 
-def _libraries() -> list[str]:
-    """Values of MUJOCO_GL to try, in order; "" is MuJoCo's default."""
-    given = os.environ.get("MUJOCO_GL", "")
-    others = ["egl", "osmesa"] if sys.platform.startswith("linux") else [""]
-    return list(dict.fromkeys([given, *others] if given else others))
+    def __enter__(self) -> "Recorder":
+        return self
 
+    def __exit__(self, kind: object, *exception: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.cancel()
 
-def _draw(arguments: list[str], progress: Progress | None = None) -> None:
-    """Run ``render.py`` with each graphics library until one works."""
-    failures = []
-    for library in _libraries():
-        environment = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
-        if library:
-            environment["MUJOCO_GL"] = library
-        # -P keeps the folder of render.py off the path, where its other modules could shadow packages
-        command = [sys.executable, "-P", str(Path(__file__).with_name("render.py")), *arguments]
-        code, errors = _run(command, environment, progress)
-        if code == 0:
-            return
-        lines = errors.strip().splitlines()
-        reason = lines[-1].strip()[:160] if lines else f"it ended with code {code}"
-        failures.append(f"{library or 'OpenGL'}: {reason}")
-        if code > 0 and code != CANNOT_DRAW:  # another graphics library would fail, too
-            raise NoVideoError(f"the video could not be written ({reason})")
-    raise NoVideoError(
-        f"this machine cannot draw off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
-        "libegl1 and libgl1-mesa-dri) or OSMesa (libosmesa6), or set MUJOCO_GL to a library that works"
-    )
+    @property
+    def added(self) -> int:
+        """Number of frames so far."""
+        return self._added
 
+    @property
+    def drawn(self) -> int:
+        """Number of frames that are drawn."""
+        return self._drawn
 
-def _run(command: list[str], environment: dict[str, str], progress: Progress | None) -> tuple[int, str]:
-    """Run ``render.py``, which prints a line for each frame; returns its exit code and its errors."""
-    with (
-        tempfile.TemporaryFile("w+", errors="replace") as errors,
-        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
-    ):
+    @property
+    def dropped(self) -> int:
+        """Number of frames without their poses: those that came while too many waited, and those that ``end`` drops."""
+        return self._dropped
+
+    @property
+    def finished(self) -> bool:
+        """Whether the drawing has ended: the file is there, or ``close`` raises the error."""
+        return not self._thread.is_alive()
+
+    def add(
+        self,
+        qpos: ArrayLike,
+        mocap_pos: ArrayLike | None = None,
+        mocap_quat: ArrayLike | None = None,
+        *,
+        model_fields: Mapping[str, ArrayLike] | None = None,
+        camera: CameraChoice = None,
+        ghosts: Iterable[GhostPose] = (),
+        lines: Iterable[Line] = (),
+        frames: int = 1,
+    ) -> None:
+        """Add a pose, which is copied.
+
+        Args:
+            qpos: Positions, (nq,).
+            mocap_pos: Positions of the mocap bodies, (nmocap, 3) metres; by default the model's.
+            mocap_quat: Their orientations, (nmocap, 4), w, x, y, z; by default the model's.
+            model_fields: Model fields by MuJoCo's names where this pose's values differ from the model's.
+            camera: Another camera from this pose on.
+            ghosts: Further poses, which are drawn over it: (qpos, mocap_pos, mocap_quat, colour), where mocap_pos and
+                mocap_quat may be None, and the colour is red, green, blue and opacity, from 0 to 1.
+            lines: Lines through points: (points, colour), points (n, 3) in metres.
+            frames: Number of frames that show it.
+
+        Raises:
+            ValueError: A shape is wrong, the model has no such camera or field, or the video is closed.
+            NoVideoError: The drawing has failed.
+        """
+        self._check()
+        if self._ended:
+            raise ValueError(f"the video {self.out} is closed")
+        shot = _shot(
+            self._pose(qpos, mocap_pos, mocap_quat),
+            {name: self._field(name, value) for name, value in (model_fields or {}).items()},
+            None if camera is None else camera_values(find_camera(self.model, camera)),
+            [(self._pose(*ghost[:3]), _colour(ghost[3])) for ghost in ghosts],
+            [(_array("points of a line", points, (-1, 3)), _colour(colour), _LINE_WIDTH) for points, colour in lines],
+            whole_number("frames", frames, low=1),
+        )
+        with self._changed:
+            self._added += frames
+            if len(self._poses) < self._most:
+                self._poses.append(shot)
+            else:
+                self._poses[-1]["frames"] += frames
+                self._dropped += frames
+            self._changed.notify_all()
+
+    def end(self, *, drop: bool = False) -> None:
+        """Take no further poses, and finish the video in the background.
+
+        Args:
+            drop: Drop the poses that wait: the video ends with those that are drawn.
+        """
+        with self._changed:
+            self._ended = True
+            if drop:
+                self._dropped += sum(shot["frames"] for shot in self._poses)
+                self._poses.clear()
+            self._changed.notify_all()
+
+    def wait(self, seconds: float = math.inf, *, progress: Progress | bool = True) -> bool:
+        """Wait until the drawing has ended, for a time; returns whether it has.
+
+        Args:
+            seconds: How long.
+            progress: As in ``close``.
+        """
+        if not self.finished and seconds > 0:
+            with _shown_progress(progress) as report:
+                self._wait(report, time.monotonic() + seconds)
+        return self.finished
+
+    def close(self, *, progress: Progress | bool = True) -> Path:
+        """Take no further poses, and wait until all are drawn and the file is complete.
+
+        An exception while it waits, such as Ctrl-C, cancels the video.
+
+        Args:
+            progress: Called now and then with the number of frames that are drawn and of those that were added. True
+                and False are as in ``write_video``.
+
+        Returns:
+            The file's path.
+
+        Raises:
+            NoVideoError: The drawing has failed, or there is no pose.
+            ValueError: The video was cancelled.
+            OSError: The file cannot be written.
+        """
+        self.end()
+        if not self._cancelled:
+            try:
+                self.wait(progress=progress)
+            except BaseException:
+                self.cancel()
+                raise
+        if self._cancelled:
+            raise ValueError(f"the video {self.out} was cancelled")
+        self._check()
+        return self.out
+
+    def cancel(self) -> None:
+        """Give up the video at once, and write no file. Nothing happens where it is complete."""
+        if self._thread.is_alive():
+            self._cancelled = True
+            self.end(drop=True)
+            self._drawing.abandon()
+            self._thread.join(_KILLED)
+
+    def _wait(self, report: Progress | None, until: float) -> None:
+        """Wait until the drawing has ended, or until a time of ``time.monotonic``."""
+        shown = 0
+        while (not self.finished or self._drawn > shown) and (left := until - time.monotonic()) > 0:
+            with self._changed:
+                self._changed.wait(min(left, 0.1))
+            if self._drawn > shown:
+                shown = self._drawn
+                if report is not None:
+                    report(shown, self._added)
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def _draw(self) -> None:
+        """Draw poses as they come, in a thread."""
         try:
-            for line in process.stdout or ():
-                if progress is not None and (frame := re.fullmatch(r"frame (\d+) of (\d+)\n", line)):
-                    progress(int(frame[1]), int(frame[2]))
-        except BaseException:  # Ctrl-C
-            process.kill()
-            raise
-        code = process.wait()
-        errors.seek(0)
-        return code, errors.read()
+            with self._drawing as drawing:
+                while (shot := self._next()) is not None:
+                    drawing.draw(shot)
+                    with self._changed:
+                        self._drawn += shot["frames"]
+                        self._changed.notify_all()
+                if not self._cancelled:
+                    drawing.finish()
+        except (NoVideoError, OSError) as error:
+            self._error = None if self._cancelled else error
+        except Exception as error:  # the thread has no caller that would see it
+            self._error = NoVideoError(f"the video could not be written ({' '.join(str(error).split())})")
+
+    def _next(self) -> Shot | None:
+        """The next pose, or None after the last one."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._poses or self._ended)
+            return self._poses.popleft() if self._poses else None
+
+    def _pose(
+        self, qpos: ArrayLike, mocap_pos: ArrayLike | None, mocap_quat: ArrayLike | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        nq, nmocap = self._sizes
+        return (
+            _array("qpos", qpos, (nq,)),
+            _array("mocap_pos", self._mocap[0] if mocap_pos is None else mocap_pos, (nmocap, 3)),
+            _array("mocap_quat", self._mocap[1] if mocap_quat is None else mocap_quat, (nmocap, 4)),
+        )
+
+    def _field(self, name: str, value: ArrayLike) -> np.ndarray:
+        owner = self.model if hasattr(self.model, name) else self.model.opt
+        wanted = getattr(owner, name, None)
+        if not isinstance(wanted, np.ndarray | float | int):
+            raise ValueError(f"the model has no field {name!r}")
+        return _array(name, value, (np.size(wanted),), flat=True)
+
+
+def _array(name: str, value: Any, shape: tuple[int, ...], *, flat: bool = False) -> np.ndarray:
+    """A copy of an array, float64, of a given shape.
+
+    Raises:
+        ValueError: It has another shape.
+    """
+    try:
+        array = np.array(value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers, not {value!r}") from None
+    array = array.ravel() if flat else array
+    if array.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, array.shape, strict=True)):
+        wanted = "(n, 3)" if -1 in shape else str(shape)
+        raise ValueError(f"{name} must have the shape {wanted}, not {array.shape}")
+    return array
+
+
+def _colour(value: ArrayLike) -> tuple[float, ...]:
+    return tuple(_array("a colour", value, (4,)).tolist())
+
+
+def _shot(
+    pose: tuple[np.ndarray, np.ndarray, np.ndarray],
+    model_fields: dict[str, np.ndarray],
+    camera: tuple[float, ...] | None = None,
+    ghosts: Sequence[Any] = (),
+    lines: Sequence[Any] = (),
+    frames: int = 1,
+) -> Shot:
+    return {
+        "pose": pose, "model_fields": model_fields, "camera": camera, "ghosts": list(ghosts), "lines": list(lines),
+        "frames": frames,
+    }  # fmt: skip

@@ -4,15 +4,12 @@ import dataclasses
 import io
 import math
 import re
-from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 import lyceum_warp as lw
 from lyceum_warp.cli import display
-from lyceum_warp.tensorboard import TensorBoard
-from lyceum_warp.viz import video
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +38,7 @@ def test_a_line_shows_what_there_is(first: lw.Iteration) -> None:
     assert "(mean policy 3117) success 25% 29.4k" in line(first, **common, success=0.25)
     assert "success" not in line(first, **common, success=math.nan)
     assert "(mean policy 3117) 1 fault 1,200 outliers 29.4k" in line(first, **common, faults=1, outliers=1200)
+    assert "(mean policy 3117) 2 skipped updates 29.4k" in line(first, **common, skipped_updates=2)
 
 
 @pytest.mark.parametrize("changes", [{}, {"success": 0.25}, {"success": 1.0, "faults": 12_345, "outliers": 12_345}])
@@ -87,68 +85,17 @@ def test_the_table_counts_faults_and_outliers_of_all_iterations(first: lw.Iterat
     assert "fault" not in table([first.row(), {"iteration": 2.0}])  # a row of an earlier release
 
 
-def test_long_work_prints_a_line_now_and_then() -> None:
-    console = Console(file=io.StringIO(), width=120)
-    with display.LongWork("drawing the video", "frames", console) as work:
-        work(1, 500)
-        assert console.file.getvalue() == ""
-        start = work.start
-        for seconds in (4.0, 4.5, 15.0):
-            work.start = start - seconds
-            work(int(20 * seconds), 500)
-    assert console.file.getvalue().splitlines() == [
-        "drawing the video: 80 of 500 frames, 4 s", "drawing the video: 300 of 500 frames, 15 s",
-    ]  # fmt: skip
-
-
-def test_long_work_is_a_passing_bar_on_a_terminal() -> None:
+def test_other_work_is_shown_between_iterations() -> None:
+    console = Console(file=io.StringIO(), width=120, highlight=False)
+    with display.Display(console, 0, 10) as shown:
+        shown.work("drawing the video", "frames", 1, 80)
+        assert shown.other is not None
+        shown.other.start -= 4.0
+        for done in (20, 30, 80):
+            shown.work("drawing the video", "frames", done, 80)
+        assert shown.other is None
+    assert console.file.getvalue() == "drawing the video: 20 of 80 frames, 4 s\n"
     console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system=None)
-    with display.LongWork("evaluating", "episodes", console) as work:
-        work(3, 32)
-    assert "3/32" in console.file.getvalue() and "episodes" in console.file.getvalue()
-
-
-def test_videos_are_written_every_few_iterations_and_shown_in_tensorboard(first: lw.Iteration, tmp_path: Path) -> None:
-    pytest.importorskip("tensorboard")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    npg = lw.NPG(lw.make("point_mass", nworld=2, horizon=6), config=lw.NPGConfig(samples=12))
-    board = TensorBoard(tmp_path / "board", {})
-    videos = display.Videos(npg, tmp_path / "videos", 2, 0, board)
-    for i in (1, 2, 3, 4):
-        videos(dataclasses.replace(first, iteration=i, samples=12 * i))
-        if not videos.every:
-            pytest.skip("this machine cannot draw")
-    board.close()
-    assert sorted(path.name for path in (tmp_path / "videos").iterdir()) == ["000002.mp4", "000004.mp4"]
-    images = EventAccumulator(str(tmp_path / "board"), {"images": 0}).Reload().Images("video")
-    assert [image.step for image in images] == [24, 48]
-
-
-@pytest.mark.parametrize("error", [ValueError, ImportError])
-def test_a_video_that_cannot_be_converted_is_reported_once(
-    error: type[Exception], first: lw.Iteration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    class Board:
-        def video(self, path: Path, samples: int) -> None:
-            raise error("ffmpeg gave no picture")
-
-    npg = lw.NPG(lw.make("point_mass", nworld=2, horizon=6), config=lw.NPGConfig(samples=12))
-    monkeypatch.setattr(display, "policy_video", lambda env, policy, path, *args, **words: str(path))
-    videos = display.Videos(npg, tmp_path / "videos", 1, 0, Board())  # type: ignore[arg-type]
-    for i in (1, 2):
-        videos(dataclasses.replace(first, iteration=i))
-    assert capsys.readouterr().err == "lyceum-warp: no further videos (ffmpeg gave no picture)\n"
-
-
-def test_a_machine_that_cannot_draw_is_reported_once(
-    first: lw.Iteration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(video, "_libraries", lambda: ["nonsense"])
-    npg = lw.NPG(lw.make("point_mass", nworld=2, horizon=6), config=lw.NPGConfig(samples=12))
-    videos = display.Videos(npg, tmp_path / "videos", 1, 0, None)
-    for i in (1, 2):
-        videos(dataclasses.replace(first, iteration=i))
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and error.startswith("lyceum-warp: no further videos (this machine cannot")
+    with display.Display(console, 0, 10) as shown:
+        shown.work("drawing the video", "frames", 20, 80)
+    assert "drawing the video: 20/80 frames" in console.file.getvalue()

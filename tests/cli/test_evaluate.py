@@ -3,15 +3,21 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
+import mujoco
 import pytest
+import torch
 import warp as wp
 from training_runs import metrics, refused, train
 
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos.evaluation import MEAN_SEED
+from lyceum_warp.cli import display
+from lyceum_warp.control.saved_episodes import episode_env, load_episodes
 from lyceum_warp.runs import load
+from lyceum_warp.viz.cameras import find_camera
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +70,60 @@ def test_the_loaded_policy_is_the_trained_one(trained: Path) -> None:
     assert repr(episodes.returns.mean().item()) == metrics(trained)[-1]["mean_return"]
 
 
+def test_the_evaluated_episodes_are_saved(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, options = tmp_path / "episodes", ["--episodes", "3", "--nworld", "2", "--seed", "7"]
+    assert cli.main(["eval", str(trained), *options, "--episodes-to", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert f"episodes: {out / 'episode-*.npz'}" in shown
+    lines = {line.split()[0]: line.split() for line in shown.splitlines() if line.split()}
+    episodes = list(load_episodes(out).values())
+    assert [file.name for file in sorted(out.iterdir())] == [f"episode-00{i}.npz" for i in range(3)]
+    returns = torch.tensor([episode.episode_return for episode in episodes])
+    assert returns.mean().item() == pytest.approx(float(lines["return"][1]), rel=1e-4)
+    assert all(episode.steps == 256 and episode.controller["run"] == str(trained) for episode in episodes)
+    env = episode_env(episodes[2])
+    env.set_state(episodes[2].states[9:10])
+    env.step(load(trained)(env.obs))
+    torch.testing.assert_close(env.get_state()[0], episodes[2].states[10], rtol=0, atol=1e-6)
+    assert cli.main(["eval", str(trained), *options, "--episodes-to", str(out)]) == 2
+    refused(capsys, f"{out} exists and is not an empty folder: give another folder")
+
+
+def test_a_video_is_made_with_the_camera_that_is_named(
+    trained: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    cameras = []
+
+    def write_video(env: lw.Env, states: torch.Tensor, path: Path, **options: Any) -> Path:
+        cameras.append(find_camera(env.model, options["camera"]))
+        return path
+
+    monkeypatch.setattr(display, "write_video", write_video)
+    for words in (["0"], ["free"], ["azimuth=30", "track=agent"]):
+        flags = [flag for word in words for flag in ("--camera", word)]
+        assert cli.main(["eval", str(trained), "--episodes", "1", "--horizon", "9", "--video", *flags]) == 0
+    fixed, free, tracking = cameras
+    assert fixed.fixedcamid == 0 and free.type == mujoco.mjtCamera.mjCAMERA_FREE
+    assert (tracking.azimuth, tracking.type) == (30, mujoco.mjtCamera.mjCAMERA_TRACKING)
+    capsys.readouterr()
+    for flags, message in (
+        (["--video", "--camera", "side"], "there is no camera 'side': the model has "),
+        (["--video", "--camera", "side", "--camera", "top"], "a camera is a name, an index, or a pose of lookat="),
+        (["--camera", "0"], "--camera has no effect without --video"),
+    ):
+        assert cli.main(["eval", str(trained), "--episodes", "1", *flags]) == 2
+        refused(capsys, message)
+    assert len(cameras) == 3
+
+
 @pytest.mark.gpu
 def test_gpu_a_run_trains_and_is_evaluated_on_the_cpu(tmp_path: Path) -> None:
     assert wp.is_cuda_available()
     assert train(tmp_path / "run", "--device", "cuda", "--iterations", "2") == 0
     assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2", "--device", "cpu"]) == 0
+    out = tmp_path / "episodes"
+    flags = ["--episodes", "3", "--nworld", "2", "--episodes-to", str(out)]
+    assert cli.main(["eval", str(tmp_path / "run"), "--device", "cuda", *flags]) == 0
+    episodes = load_episodes(out)
+    assert len(episodes) == 3 and episode_env(episodes).device.is_cpu

@@ -67,12 +67,25 @@ def test_a_run_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_a_video_is_made_of_the_first_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert plan(tmp_path / "run", "--no-plot") == 0
+    assert plan(tmp_path / "run", "--no-plot", "--steps", "12", "--camera", "azimuth=20", "--camera", "track=1") == 0
     lines = capsys.readouterr().out.splitlines()
     video = next(line for line in lines if line.startswith("video:")).split(maxsplit=1)[1]
     if video.startswith("none: this machine cannot draw"):
         pytest.skip(video)
     assert Path(video).read_bytes()[4:8] == b"ftyp"
+
+
+def test_an_unknown_camera_is_refused_before_the_folder_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for flags, message in (
+        (["--camera", "side"], "there is no camera 'side': the model has "),
+        (["--camera", "track=elbow"], "the camera cannot track the body 'elbow'"),
+        (["--no-video", "--camera", "0"], "--camera has no effect with --no-video"),
+    ):
+        assert plan(tmp_path / "run", *flags) == 2
+        refused(capsys, message)
+    assert not (tmp_path / "run").exists()
 
 
 def test_real_time_keeps_the_rate_of_the_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

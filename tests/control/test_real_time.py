@@ -202,6 +202,18 @@ except KeyboardInterrupt:
     assert done.returncode == 0 and done.stdout == "ended 1\n", done.stderr
 
 
+def test_another_clock_works_while_the_plant_waits(env: lw.Env) -> None:
+    waited: list[float] = []
+
+    class Working(Clock):
+        def wait_until(self, moment: float) -> None:
+            waited.append(moment)
+            super().wait_until(moment)
+
+    episode = control_async(env, towards, period=0.01, steps=5, seed=0, clock=Working())
+    assert np.diff(waited) == pytest.approx(0.01) and len(waited) == episode.steps + 1
+
+
 def test_the_real_clock_never_waits_too_short() -> None:
     clock = Clock()
     for wait in (-1.0, 0.0, 0.0002, 0.004):

@@ -2,16 +2,9 @@
 
 import mujoco
 import numpy as np
-import pytest
 from varied_task import ball
 
-import lyceum_warp as lw
-from lyceum_warp.viz.render import camera, change_model
-
-
-@pytest.mark.parametrize("task, expected", [("half_cheetah", 0), ("hopper", 0), ("reach", 0), ("point_mass", 0)])
-def test_the_models_own_camera_is_chosen(task: str, expected: int) -> None:
-    assert camera(mujoco, lw.make(task).model) == expected
+from lyceum_warp.viz.render import change_model
 
 
 def test_a_changed_model_has_the_poses_of_one_that_was_compiled_so() -> None:

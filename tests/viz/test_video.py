@@ -1,24 +1,50 @@
 """Videos."""
 
-import json
 import os
+import signal
 import subprocess
 import sys
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import torch
+import video_frames
 from conftest import SharedEnv
-from varied_task import Varied
+from varied_task import Varied, ball
 
 import lyceum_warp as lw
-from lyceum_warp.viz import video
+from lyceum_warp.viz import drawing, video
+from lyceum_warp.viz.cameras import FreeCamera
+
+SMALL = (96, 64)
 
 
 @pytest.fixture(scope="module")
 def env() -> lw.Env:
     return lw.make("point_mass", autoreset=False, horizon=20)
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    """A red ball on a rail, seen from the front."""
+    return ball().compile()
+
+
+def drawable(make: Callable[[], Path]) -> Path:
+    """The result of a function that draws; skips the test on a machine that cannot draw."""
+    pytest.importorskip("imageio_ffmpeg")
+    try:
+        return make()
+    except video.NoVideoError as error:
+        if "cannot draw off-screen" not in str(error):
+            raise
+        pytest.skip(str(error))
 
 
 def still(obs: torch.Tensor) -> torch.Tensor:
@@ -39,94 +65,77 @@ def test_episode_refuses_automatic_resets(shared_env: SharedEnv) -> None:
 
 
 def test_write_video_writes_a_frame_for_each_state(env: lw.Env, tmp_path: Path) -> None:
-    pytest.importorskip("imageio")
     steps: list[tuple[int, int]] = []
     frames: list[tuple[int, int]] = []
     states = video.episode(env, still, seed=4, progress=lambda *counts: steps.append(counts))
     assert steps == [(10, 20), (20, 20)]
-    progress = lambda *counts: frames.append(counts)  # noqa: E731
-    try:
-        path = video.write_video(env, states, tmp_path / "video.mp4", size=(160, 120), progress=progress)
-    except video.NoVideoError as error:
-        pytest.skip(str(error))
+    out, shown = tmp_path / "new" / "video.mp4", lambda *counts: frames.append(counts)
+    path = drawable(lambda: video.write_video(env, states, out, size=(160, 120), progress=shown))
     assert frames == [(i, len(states)) for i in range(1, len(states) + 1)]
-    # in a small process: imageio forks, and after all other tests there may be too little memory to fork this one
-    program = """
-import json, sys
-import imageio.v2 as imageio
-with imageio.get_reader(sys.argv[1]) as reader:
-    frames = list(reader.iter_data())
-    print(json.dumps([reader.get_meta_data()["fps"], len(frames), frames[0].shape, int(frames[0].max())]))
-"""
-    done = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True)
-    fps, count, shape, brightest = json.loads(done.stdout)
-    assert fps == pytest.approx(1 / env.timestep)
-    assert count == len(states)
-    assert shape == [120, 160, 3]
-    assert brightest > 100  # the scene has light
+    assert [file.name for file in path.parent.iterdir()] == ["video.mp4"]
+    result = video_frames.read(path)
+    assert result["fps"] == pytest.approx(1 / env.timestep)
+    assert result["frames"] == len(states) and result["shape"] == [120, 160, 3]
+    assert min(result["brightest"]) > 100  # the scene has light
 
 
-def test_a_video_has_the_model_fields_of_its_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("imageio")
+def test_a_video_has_the_model_fields_of_its_states(tmp_path: Path) -> None:
     env = lw.make(Varied, autoreset=False)
     first, second = (video.episode(env, lambda obs: torch.zeros(1, 1), seed=seed) for seed in (1, 2))
     states, parts = torch.cat([first, second]), env.state_space.parts
     sizes = states[:, parts["geom_size"]][:, 0]
     assert sizes.unique().numel() == 2
-    jobs = []
-
-    def drawn(arguments: list[str], progress: object) -> None:
-        with np.load(arguments[0]) as job:
-            jobs.append(dict(job))
-        Path(arguments[2]).write_bytes(b"")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(video, "_draw", drawn)
-        video.write_video(env, states, tmp_path / "none.mp4", speed=1e-3)
-    for name in ("body_mass", "body_pos", "geom_size"):
-        np.testing.assert_array_equal(jobs[0][f"model_{name}"], states[:, parts[name]].numpy())
-    try:
-        path = video.write_video(env, states, tmp_path / "video.mp4", size=(160, 120), speed=0.01)
-    except video.NoVideoError as error:
-        pytest.skip(str(error))
-    program = """
-import json, sys
-import imageio.v2 as imageio
-with imageio.get_reader(sys.argv[1]) as reader:
-    print(json.dumps([int((f[..., 0] > f[..., 1].astype(int) + 60).sum()) for f in reader.iter_data()]))
-"""
-    done = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True)
-    areas = np.array(json.loads(done.stdout), dtype=float)  # of the red ball, which is seen from a fixed place
+    out = tmp_path / "video.mp4"
+    path = drawable(lambda: video.write_video(env, states, out, size=(160, 120), speed=0.01))
+    areas = np.array(video_frames.read(path)["red"], dtype=float)  # of the red ball, which is seen from a fixed place
     assert len(areas) == len(states) and areas.min() > 0
     ratio = areas[len(first) :].mean() / areas[: len(first)].mean()
     assert ratio == pytest.approx((sizes[-1] / sizes[0]).item() ** 2, rel=0.25)
+
+
+def test_a_video_is_seen_from_the_given_camera(env: lw.Env, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="there is no camera 'side': the model has "):
+        video.write_video(env, env.get_state(), tmp_path / "video.mp4", camera="side")
+    assert not list(tmp_path.iterdir())
+    pictures = []
+    for name, camera in (("near", FreeCamera(distance=0.3)), ("far", FreeCamera(distance=3.0))):
+        write = lambda name=name, camera=camera: video.write_video(  # noqa: E731
+            env, env.get_state(), tmp_path / f"{name}.mp4", camera=camera, size=SMALL
+        )
+        pictures.append(drawable(write).read_bytes())
+    assert pictures[0] != pictures[1]
 
 
 def test_a_machine_that_cannot_draw_is_reported_with_a_fix(
     env: lw.Env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("imageio_ffmpeg")
-    monkeypatch.setattr(video, "_libraries", lambda: ["nonsense"])
-    with pytest.raises(
-        video.NoVideoError, match=r"cannot draw off-screen \(nonsense: .*\): install Mesa's EGL"
-    ) as caught:
+    monkeypatch.setattr(drawing, "libraries", lambda: ["nonsense"])
+    message = r"cannot draw off-screen \(nonsense: .*\): install Mesa's EGL"
+    with pytest.raises(video.NoVideoError, match=message) as caught:
         video.write_video(env, env.get_state(), tmp_path / "video.mp4")
     assert "\n" not in str(caught.value)
-    assert not (tmp_path / "video.mp4").exists()
+    mp4 = video.Recorder(env.model, tmp_path / "video.mp4")
+    mp4.add(env.field("qpos")[0])
+    with pytest.raises(video.NoVideoError, match=message):
+        mp4.close()
+    with pytest.raises(video.NoVideoError, match=message):
+        mp4.add(env.field("qpos")[0])
+    assert mp4.finished and not list(tmp_path.iterdir())
 
 
 def test_the_library_in_mujoco_gl_is_tried_first(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setitem(os.environ, "MUJOCO_GL", "osmesa")
-    assert video._libraries() == ["osmesa", "egl"]
+    assert drawing.libraries() == ["osmesa", "egl"]
     monkeypatch.delitem(os.environ, "MUJOCO_GL")
-    assert video._libraries() == ["egl", "osmesa"]
+    assert drawing.libraries() == ["egl", "osmesa"]
 
 
 def test_a_missing_imageio_is_reported_with_the_extra(
     env: lw.Env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(drawing.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(video.NoVideoError, match=r"videos need imageio and imageio_ffmpeg: pip install 'lyceum-warp\["):
         video.write_video(env, env.get_state(), tmp_path / "video.mp4")
 
@@ -137,6 +146,217 @@ def test_states_of_another_shape_are_refused(env: lw.Env, tmp_path: Path) -> Non
         video.write_video(env, torch.zeros(3, size - 1), tmp_path / "video.mp4")
 
 
-def test_an_odd_size_is_refused(env: lw.Env, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"size must be two even numbers, .*, not \(31, 20\)"):
-        video.write_video(env, env.get_state(), tmp_path / "video.mp4", size=(31, 20))
+@pytest.mark.parametrize("options, message", [
+    ({"size": (31, 20)}, r"size must be two even numbers, .*, not \(31, 20\)"),
+    ({"speed": 0.0}, r"speed must be a positive number of simulated seconds per second, not 0.0"),
+    ({"out": "video.avi"}, r"give a file's name that ends in .mp4, not '.*video.avi'"),
+])  # fmt: skip
+def test_a_wrong_argument_is_refused(env: lw.Env, tmp_path: Path, options: dict[str, Any], message: str) -> None:
+    out = tmp_path / options.pop("out", "video.mp4")
+    with pytest.raises(ValueError, match=message):
+        video.write_video(env, env.get_state(), out, **options)
+    assert not list(tmp_path.iterdir())
+
+
+# poses one by one
+
+
+def test_poses_are_drawn_one_by_one(model: mujoco.MjModel, tmp_path: Path) -> None:
+    out, shown = tmp_path / "video.mp4", []
+
+    def write() -> Path:
+        mp4 = video.Recorder(model, out, size=SMALL, fps=25)
+        for i in range(8):
+            mp4.add([0.1 * i])
+        assert mp4.added == 8 and not mp4.finished  # no pose has waited for the process
+        mp4.end()
+        return mp4.close(progress=lambda *counts: shown.append(counts))
+
+    result = video_frames.read(drawable(write))
+    assert shown[-1] == (8, 8)
+    assert (result["frames"], result["fps"], result["shape"]) == (8, 25, [64, 96, 3])
+    assert np.all(np.diff(result["columns"]) > 0.5)  # the ball moves to the right
+
+
+def test_a_pose_has_its_own_model_camera_ghosts_and_lines(model: mujoco.MjModel, tmp_path: Path) -> None:
+    small = {"geom_size": np.array([[0.1, 0, 0], [0.1, 0, 0]])}
+    red = (1, 0, 0, 1)
+
+    def write() -> Path:
+        with video.Recorder(model, tmp_path / "video.mp4", size=SMALL) as mp4:
+            mp4.add([0.0])
+            mp4.add([0.0], model_fields=small)
+            mp4.add([0.0])  # the model's own size
+            mp4.add([0.0], ghosts=[([1.5], None, None, red)])
+            mp4.add([0.0], lines=[([[-1.5, 0, -1], [1.5, 0, -1]], red)])
+            mp4.add([0.0], camera=FreeCamera(lookat=(0, 0, 0), distance=8, azimuth=90, elevation=0))
+            mp4.add([0.0])  # the last camera
+        return tmp_path / "video.mp4"
+
+    plain, shrunk, again, ghost, line, far, last = video_frames.read(drawable(write))["red"]
+    assert shrunk < 0.3 * plain and again == pytest.approx(plain, rel=0.05)
+    assert ghost > 1.5 * plain and line > plain + 20
+    assert far < 0.5 * plain and last == pytest.approx(far, rel=0.1)
+
+
+def slow_drawing(monkeypatch: pytest.MonkeyPatch, seconds: float) -> threading.Event:
+    """Make every pose take some seconds; returns an event that is set once the first one is drawn."""
+    drawn, draw = threading.Event(), drawing.Drawing.draw
+
+    def slow(self: drawing.Drawing, shot: Any) -> None:
+        draw(self, shot)
+        drawn.set()
+        time.sleep(seconds)
+
+    monkeypatch.setattr(drawing.Drawing, "draw", slow)
+    return drawn
+
+
+def test_poses_that_come_too_fast_are_dropped_and_the_video_keeps_its_length(
+    model: mujoco.MjModel, tmp_path: Path
+) -> None:
+    def write() -> Path:
+        with video.Recorder(model, tmp_path / "video.mp4", size=SMALL, most_waiting=2) as mp4:
+            for i in range(10):
+                mp4.add([0.1 * i])
+            assert mp4.added == 10 and mp4.dropped in (7, 8)  # the process may have taken one
+        assert mp4.drawn == 10
+        return mp4.out
+
+    result = video_frames.read(drawable(write))
+    assert result["frames"] == 10
+    columns = result["columns"]
+    assert columns[1] > columns[0] + 0.5 and columns[-1] == pytest.approx(columns[-2], abs=0.3)
+
+
+def test_a_pose_can_last_several_frames(model: mujoco.MjModel, tmp_path: Path) -> None:
+    def write() -> Path:
+        with video.Recorder(model, tmp_path / "video.mp4", size=SMALL) as mp4:
+            mp4.add([0.0], frames=4)
+            mp4.add([1.0])
+            with pytest.raises(ValueError, match="frames must be"):
+                mp4.add([0.0], frames=0)
+        return mp4.out
+
+    columns = video_frames.read(drawable(write))["columns"]
+    assert len(columns) == 5 and np.ptp(columns[:4]) < 0.3 and columns[4] > columns[3] + 5
+
+
+def test_a_video_can_end_with_what_is_drawn(
+    model: mujoco.MjModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = slow_drawing(monkeypatch, 0.5)
+
+    def write() -> Path:
+        mp4 = video.Recorder(model, tmp_path / "video.mp4", size=SMALL)
+        for _ in range(100):
+            mp4.add([0.0])
+        while not mp4.finished and not drawn.wait(0.05):
+            pass
+        assert not mp4.wait(0.0)
+        mp4.end(drop=True)
+        assert mp4.wait(20.0)
+        path = mp4.close()
+        assert mp4.drawn + mp4.dropped == 100 and mp4.dropped > 80
+        return path
+
+    assert video_frames.read(drawable(write))["frames"] < 20
+
+
+def test_cancel_kills_a_process_that_hangs(
+    model: mujoco.MjModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    started: list[subprocess.Popen[bytes]] = []
+    popen = subprocess.Popen
+
+    def hanging(command: list[str], **options: Any) -> subprocess.Popen[bytes]:
+        started.append(popen([sys.executable, "-c", "import time; time.sleep(300)"], **options))
+        return started[-1]
+
+    monkeypatch.setattr(drawing.subprocess, "Popen", hanging)
+    mp4 = video.Recorder(model, tmp_path / "video.mp4", size=SMALL)
+    mp4.add([0.0])
+    while not started:
+        time.sleep(0.01)
+    begin = time.monotonic()
+    mp4.cancel()
+    assert time.monotonic() - begin < 4 and mp4.finished
+    assert len(started) == 1 and started[0].poll() is not None and not list(tmp_path.iterdir())
+
+
+def test_an_error_or_cancel_leaves_the_old_file(model: mujoco.MjModel, tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    out = tmp_path / "video.mp4"
+    out.write_text("old")
+
+    def interrupt(*counts: int) -> None:
+        raise KeyboardInterrupt
+
+    mp4 = video.Recorder(model, out, size=SMALL)
+    mp4.add([0.0])
+    mp4.cancel()
+    with pytest.raises(ValueError, match="video.mp4 is closed"):
+        mp4.add([0.0])
+    with pytest.raises(ValueError, match="video.mp4 was cancelled"):
+        mp4.close()
+    with pytest.raises(ZeroDivisionError), video.Recorder(model, out, size=SMALL) as mp4:
+        mp4.add([0.0])
+        raise ZeroDivisionError
+    mp4 = video.Recorder(model, out, size=SMALL)
+    for _ in range(100):
+        mp4.add([0.0])
+    with pytest.raises((KeyboardInterrupt, video.NoVideoError)):
+        mp4.close(progress=interrupt)
+    with pytest.raises(video.NoVideoError, match="has no pose|cannot draw"):
+        video.Recorder(model, out, size=SMALL).close()
+    assert out.read_text() == "old" and [file.name for file in tmp_path.iterdir()] == ["video.mp4"]
+
+
+def test_a_killed_program_leaves_no_file(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    program = f"""
+import sys, time
+import mujoco
+from lyceum_warp.viz.video import Recorder
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><geom size='1'/></body></worldbody></mujoco>")
+mp4 = Recorder(model, {str(tmp_path / "video.mp4")!r}, size={SMALL})
+mp4.add([])
+while not mp4.drawn and not mp4.finished:
+    time.sleep(0.01)
+print("drawn", flush=True)
+time.sleep(60)
+"""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    environment = os.environ | {"TMPDIR": str(folder)}
+    with subprocess.Popen(
+        [sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None and process.stdout.readline() == "drawn\n"
+        process.send_signal(signal.SIGKILL)
+    end = time.monotonic() + 30
+    while list(folder.iterdir()) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not list(folder.iterdir()) and not (tmp_path / "video.mp4").exists()
+
+
+WRONG_POSES = [
+    (dict(qpos=[0.0, 1.0]), r"qpos must have the shape \(1,\), not \(2,\)"),
+    (dict(qpos=[0.0], mocap_pos=[[0, 0, 0]]), r"mocap_pos must have the shape \(0, 3\), not \(1, 3\)"),
+    (dict(qpos=[0.0], model_fields={"geom_sise": [1.0]}), "the model has no field 'geom_sise'"),
+    (dict(qpos=[0.0], model_fields={"geom_size": [1.0]}), r"geom_size must have the shape \(6,\), not \(1,\)"),
+    (dict(qpos=[0.0], camera="top"), r"no camera 'top': the model has 'fixed' \(0\)"),
+    (dict(qpos=[0.0], lines=[([0, 0, 0], (1, 0, 0, 1))]), r"points of a line must have the shape \(n, 3\), not \(3,\)"),
+    (dict(qpos=[0.0], ghosts=[([0.0], None, None, "red")]), "a colour must be numbers, not 'red'"),
+]  # fmt: skip
+
+
+def test_a_wrong_pose_is_refused_where_it_is_added(model: mujoco.MjModel, tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    mp4 = video.Recorder(model, tmp_path / "video.mp4", size=SMALL)
+    for pose, message in WRONG_POSES:
+        with pytest.raises(ValueError, match=message):
+            mp4.add(**pose)  # type: ignore[arg-type]
+    mp4.cancel()
+    assert mp4.added == 0

@@ -1,0 +1,256 @@
+"""lyceum-warp view."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+
+from lyceum_warp.algos.mppi import MPPI
+from lyceum_warp.algos.mppi_arguments import task_config
+from lyceum_warp.binding.registry import find_task, task_name
+from lyceum_warp.checkpoints import check_sizes
+from lyceum_warp.cli.arguments import NO_FLAGS, Repeated, given, optional_flags, parameters, run_options
+from lyceum_warp.cli.display import note
+from lyceum_warp.cli.plan import Settings
+from lyceum_warp.control.saved_episodes import episode_env, load_episodes
+from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.engines.placement import options_for_few_worlds
+from lyceum_warp.env import Env
+from lyceum_warp.interrupts import Interrupted, signals
+from lyceum_warp.kept_task import run_env
+from lyceum_warp.options import EnvOptions
+from lyceum_warp.runs import Run, load
+from lyceum_warp.validate import whole_number
+from lyceum_warp.viewer.follow import Follower, Parent, wait_for_run
+from lyceum_warp.viewer.session import Watcher, check_world
+from lyceum_warp.viewer.show import chosen_graphics, view
+
+_RUN_WORLDS = 16
+_WAIT = 10.0  # seconds that --follow waits for a run
+_LONG = 1e9
+
+
+@optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)")
+class Place:
+    """Where the worlds run; with --mppi, the planner's."""
+
+    engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
+    """mujoco (the C engine, on CPU cores), warp, or auto."""
+    device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
+    """cpu, or a CUDA device such as cuda:0. Without this flag a run whose engine is auto is shown on the CPU."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class View:
+    """Show a task, a policy, a planner or episodes, in a browser or in a window.
+
+    Give a task to look at its worlds, to push its bodies with the mouse, and, with --mppi, to see a planner control it
+    in real time; a run to see its policy, with --follow the newest one while the run trains; or files of episodes, as
+    lyceum-warp plan writes them, or the folder of such a run, to play them back.
+
+    The viewer is a page for browsers. It prints the address, which holds a secret, and over ssh the command that
+    forwards the port. With --gfx native it is a window, on a machine with a display.
+
+    $ lyceum-warp view hopper
+    $ lyceum-warp view runs/hopper-20260101-120000 --which best
+    $ lyceum-warp view runs/hopper-20260101-120000 --follow --nworld 64
+    $ lyceum-warp view reach --mppi --samples 64
+    $ lyceum-warp view runs/plan-reach-20260101-120000/episode-*.npz
+    """
+
+    what: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TASK|RUN|FILE...")]
+    """A task's name or a file with one, a run's folder, or files of episodes."""
+    mppi: bool = False
+    """Control the shown world by planning: MPPI, or with --update another planner."""
+    follow: bool = False
+    """Take the newest policy of a run while it trains."""
+    which: str = "last"
+    """Which policy of a run: last, best, or the number of an iteration that was kept."""
+    task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
+    """The task of a run or of episodes where it is not found: a name or a file."""
+    nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Number of worlds: by default 16 for a run, 1 otherwise."""
+    world: int = 0
+    """Number of the world that is shown first."""
+    seed: int = 0
+    """Seed of the initial states."""
+    paused: bool = False
+    """Whether to start paused."""
+    trace: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """The site or body whose path is drawn for the planner's samples; by default the task's choice."""
+    gfx: Annotated[str, tyro.conf.arg(metavar="web|native")] = "web"
+    """web for a page in a browser, native for a window of this machine's own screen."""
+    host: str = "127.0.0.1"
+    """Address on which the page is served. Other machines reach it only under another one than the default."""
+    port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Port of the page; by default the first free one from 8080 on."""
+    browser: bool = False
+    """Whether to open the page in this machine's browser."""
+    param: Repeated = ()
+    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf, a table as NAME=file.npy; may be given several
+    times."""
+    fps: float = 30.0
+    """The most frames per second."""
+    place: tyro.conf.OmitArgPrefixes[Place] = dataclasses.field(default_factory=Place)
+    planner: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
+
+
+def view_command(options: View, parent: Parent | None = None) -> int:
+    """Run the command; returns the exit code.
+
+    Args:
+        options: The command's arguments.
+        parent: The program that started this one, and ends it.
+    """
+    chosen_graphics(options.gfx)
+    _check(options)
+    torch.set_num_threads(1)
+    kind = _kind(options.what)
+    for flag, fits in (("follow", ("run",)), ("mppi", ("task", "run"))):
+        if getattr(options, flag) and kind not in fits:
+            raise ValueError(f"--{flag} needs a {' or a '.join(fits)}, and {options.what[0]} is not one: leave it out")
+    shown: dict[str, Any] = {
+        name: getattr(options, name) for name in ("world", "paused", "trace", "gfx", "host", "port", "browser", "fps")
+    }
+    watchers: list[Watcher] = [] if parent is None else [_Ends(parent)]
+    if kind == "episodes":
+        episodes = load_episodes(options.what)
+        env = _episodes_env(options, episodes)
+        unique = len({file.name for file in episodes}) == len(episodes)
+        named = {file.name if unique else str(file): episode for file, episode in episodes.items()}
+        view(env, episodes=named, watchers=watchers, **shown)
+        return 0
+    controllers: dict[str, Any] = {}
+    if kind == "run":
+        run = _run(options, parent)
+        env = _run_worlds(options, run)
+        if options.follow:
+            follower = Follower(run, device=env.obs.device)
+            check_sizes(follower.policy, env, run.policy_file())
+            controllers["policy"] = follower
+            watchers.append(follower.update)
+        else:
+            policy = load(run, which=options.which, device=env.obs.device)
+            check_sizes(policy, env, run.policy_file(options.which))
+            controllers["policy"] = policy
+    else:
+        env = _task_worlds(options)
+    if options.mppi:
+        controllers["mppi"] = _planner(options, env)
+    view(env, controllers, seed=options.seed, watchers=watchers, **shown)
+    return 0
+
+
+def _check(options: View) -> None:
+    """Refuse numbers that cannot be meant, and flags without an effect, before worlds are made."""
+    whole_number("seed", options.seed, low=0)
+    if options.nworld is not None:
+        whole_number("nworld", options.nworld, low=1)
+    if not options.what:
+        raise ValueError("view needs a task, a run, or files of episodes")
+    settings = given(options.planner)
+    if settings and not options.mppi:
+        raise ValueError(f"--{next(iter(settings)).replace('_', '-')} is a setting of the planner: add --mppi")
+
+
+def _kind(what: tuple[str, ...]) -> str:
+    """What the words name: "task", "run" or "episodes"."""
+    first = Path(what[0])
+    if first.suffix == ".npz":
+        return "episodes"
+    if first.is_dir():
+        if not (first / "config.json").is_file() and any(first.glob("*.npz")):
+            return "episodes"
+        run = Run.open(first)
+        kind = "run" if run.config.get("algorithm") == "npg" else "episodes"
+    else:
+        kind = "task"
+    if len(what) > 1 and kind != "episodes":
+        raise ValueError(f"one {kind} can be shown at a time, not {len(what)}: {', '.join(what)}")
+    return kind
+
+
+# episodes
+
+
+def _episodes_env(options: View, episodes: dict[Path, Trajectory]) -> Env:
+    """A world of the task of some episodes."""
+    if options.nworld is not None and options.nworld > 1:
+        raise ValueError(f"--nworld {options.nworld} has no effect for episodes: leave it out")
+    check_world(options.world, 1)
+    return episode_env(episodes, task=options.task, **parameters(options.param, options))
+
+
+# worlds
+
+
+def _task_worlds(options: View) -> Env:
+    params = parameters(options.param, options)
+    nworld = options.nworld or 1
+    check_world(options.world, nworld)
+    if options.mppi and nworld == 1:  # the plant itself
+        return Env(options.what[0], autoreset=False, nthread=1, **params)
+    return Env(options.what[0], nworld=nworld, **given(options.place), **params)
+
+
+def _planner(options: View, env: Env) -> MPPI:
+    """The planner, where the flags place it."""
+    config = options.planner.on_top_of(task_config(env.task.task, None))
+    words = given(options.place) | ({} if env.options.model is None else {"model": env.options.model})
+    return MPPI(env.task.task, config, seed=options.seed, params=env.given_params, **words)
+
+
+def _run(options: View, parent: Parent | None) -> Run:
+    folder = Path(options.what[0])
+    if not options.follow:
+        return Run.open(folder)
+    if options.which != "last":
+        raise ValueError(f"--follow shows the newest policy, not {options.which!r}: leave out one of them")
+    if parent is None:
+        return wait_for_run(folder, seconds=_WAIT)
+    return wait_for_run(folder, seconds=_LONG, going_on=lambda: not parent.ended.is_set())
+
+
+def _run_worlds(options: View, run: Run) -> Env:
+    """Worlds of a run's task, in the run's own physics; on the CPU unless a device is given."""
+    known, params = run_options(run.config)
+    nworld = options.nworld or _RUN_WORLDS
+    check_world(options.world, nworld)
+    if options.task is not None and task_name(find_task(options.task)) != run.task_name:
+        known, params = EnvOptions(engine=known.engine, device=known.device), {}
+    params |= parameters(options.param, options)
+    known = known.changed({"nworld": nworld} | given(options.place))
+    if options.place.device is None:
+        known = known.changed(options_for_few_worlds(known.engine, known.device))
+    return run_env(run, known, params, note=note, task=options.task)
+
+
+# a viewer that another program started
+
+
+class _Ends:
+    """Ends the viewer with the program that started it."""
+
+    def __init__(self, parent: Parent) -> None:
+        self._parent = parent
+
+    def __call__(self) -> list[str]:
+        if self._parent.ended.is_set():
+            raise Interrupted(0)
+        return []
+
+
+def attached() -> None:
+    """The program of ``lw.RunViewer``: reads its job from the standard input, and ends with the program behind it."""
+    parent = Parent()
+    job = parent.job
+    try:
+        with signals():
+            view_command(View(what=(job["folder"],), follow=True, **job["options"]), parent)
+    except (ValueError, OSError, RuntimeError, ImportError) as error:
+        if not parent.ended.is_set():
+            note(f"the viewer of {job['folder']} ended: {' '.join(str(error).split())}")
+    except Interrupted:
+        pass

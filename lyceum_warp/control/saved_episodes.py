@@ -1,0 +1,184 @@
+"""Files of episodes, read for playback, and an environment that shows them."""
+
+import os
+import stat
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.env import Env
+from lyceum_warp.task import Task
+
+
+def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajectory]:
+    """Read files of episodes that can be shown together: of one task, with states of one form.
+
+    Args:
+        paths: Files that ``Trajectory.save``, ``lyceum-warp plan`` or ``lyceum-warp eval --episodes-to`` wrote. A
+            folder stands for its ``.npz`` files in the order of their names.
+
+    Returns:
+        The episodes by their files, in the given order.
+
+    Raises:
+        FileNotFoundError: A file does not exist, or a folder holds no episode.
+        ValueError: A file is broken, was written by a newer release, or is of another task or of another model than
+            the first one.
+    """
+    episodes: dict[Path, Trajectory] = {}
+    for path in _files([paths] if isinstance(paths, str | Path) else paths):
+        episodes[path] = Trajectory.load(path)
+        first = next(iter(episodes))
+        _check_same(first, episodes[first], path, episodes[path])
+    if not episodes:
+        raise ValueError("there is no episode to load: give at least one file")
+    return episodes
+
+
+def episode_env(
+    episodes: Mapping[Path, Trajectory] | Trajectory, *, task: str | Path | type[Task] | None = None, **changes: Any
+) -> Env:
+    """Make an environment of saved episodes' task, in which their states can be set: one world, no automatic resets.
+
+    It has the parameters, the model and the physics of the first episode. ``env.set_state`` takes the states of all.
+
+    The file of an episode may come from another person, and names the file of its task, which is run as code. Without
+    ``task`` this is done only where the task's file and its folder belong to this user or to the administrator, and no
+    other user can write them.
+
+    Args:
+        episodes: The episodes, as ``load_episodes`` returns them.
+        task: The task, where the file cannot name it (a notebook's, one whose file has moved, or one whose file others
+            can write). It must have the name of the episodes' task.
+        changes: Other options and parameters, as for ``lw.make``.
+
+    Raises:
+        FileNotFoundError: The file of the task or of its model is missing.
+        ValueError: The task cannot be found or has another name, others can write its file, or the states do not fit
+            it.
+    """
+    if isinstance(episodes, Trajectory):
+        episodes = {Path("the episode"): episodes}
+    path, first = next(iter(episodes.items()))
+    chosen = _task(path, first, task)
+    words = {"autoreset": False, "nthread": 1, **first.source.get("options", {})}
+    words |= {name: first.params[name] for name in first.source.get("params", ())}
+    env = Env(chosen, **words | changes)
+    if env.task.name != first.task:
+        raise ValueError(f"{path} is an episode of the task {first.task!r}, not of {env.task.name!r}")
+    check_episode(env, first, path)
+    return env
+
+
+def check_episode(env: Env, episode: Trajectory, name: str | Path = "the episode") -> None:
+    """Check that an environment can be in the states of an episode.
+
+    Args:
+        env: The environment.
+        episode: The episode.
+        name: What messages call it.
+
+    Raises:
+        ValueError: The episode is of another task, or its states have another form.
+    """
+    if episode.task != env.task.name:
+        raise ValueError(f"{name} is an episode of the task {episode.task!r}, not of {env.task.name!r}")
+    now = {part: [place.start, place.stop] for part, place in env.state_space.parts.items()}
+    if difference := _difference(episode.state_parts, now):
+        raise ValueError(
+            f"{name} does not fit the task {episode.task!r} as it is now, whose states have {difference}: the task or "
+            "its model has changed, or options such as dynamics are missing"
+        )
+
+
+def _files(paths: Iterable[str | Path]) -> list[Path]:
+    found: list[Path] = []
+    for path in map(Path, paths):
+        if path.is_dir():
+            inside = sorted(path.glob("*.npz"))
+            if not inside:
+                raise FileNotFoundError(f"there is no episode in the folder {path}: its files would end in .npz")
+            found += inside
+        elif not path.exists():
+            raise FileNotFoundError(f"there is no file {path}")
+        else:
+            found.append(path)
+    return found
+
+
+def _check_same(first: Path, one: Trajectory, path: Path, other: Trajectory) -> None:
+    if other.task != one.task:
+        raise ValueError(
+            f"{path} is an episode of the task {other.task!r}, and {first} of {one.task!r}: load them apart"
+        )
+    if difference := _difference(one.state_parts, other.state_parts):
+        raise ValueError(f"{path} is of another model than {first}: its states have {difference}")
+
+
+def _difference(wanted: Mapping[str, Sequence[int]], found: Mapping[str, Sequence[int]]) -> str:
+    """The first difference between two forms of states, as "qpos of 7 numbers, not 9"; empty without one."""
+    for name in [*wanted, *(name for name in found if name not in wanted)]:
+        one, other = (_size(parts, name) for parts in (wanted, found))
+        if one != other:
+            return f"no {name}" if other is None else f"{name} of {other} numbers, not {one or 0}"
+    if list(wanted) != list(found) or any(list(wanted[name]) != list(found[name]) for name in wanted):
+        return "their parts in another order"
+    return ""
+
+
+def _size(parts: Mapping[str, Sequence[int]], name: str) -> int | None:
+    return parts[name][1] - parts[name][0] if name in parts else None
+
+
+def _task(path: Path, episode: Trajectory, given: str | Path | type[Task] | None) -> type[Task]:
+    if given is not None:
+        return find_task(given)
+    spelled = episode.source.get("task", episode.task if "task" not in episode.source else None)
+    advice = f"give the task that {path} was made with, as a file that defines it"
+    if spelled is not None and not isinstance(spelled, str):
+        raise ValueError(f"{path} is broken: it names the task {spelled!r}; {advice}")
+    if spelled is None:
+        raise ValueError(f"the task {episode.task!r} was defined in a notebook or a program: {advice}")
+    file = spelled.partition(":")[0]
+    if file.endswith(".py") and not Path(file).is_file():
+        raise FileNotFoundError(f"the file of the task {episode.task!r}, {file}, does not exist any more: {advice}")
+    if file.endswith(".py") and (reason := _foreign(Path(file).resolve())):
+        raise ValueError(
+            f"{path} names the task file {file}, which would be run as code, and {reason}: if you trust it, give it as "
+            f"the task, with --task {spelled} or task={spelled!r}"
+        )
+    try:
+        return find_task(spelled)
+    except ValueError as error:
+        if file.endswith(".py"):
+            raise
+        raise ValueError(f"{error}; {advice}") from error
+
+
+def _foreign(file: Path) -> str:
+    """Why a file may hold another user's code, as "it can be written by others"; empty where it cannot."""
+    if not hasattr(os, "getuid"):
+        return "this system does not say who can write it"
+    for place, name in ((file, "it"), (file.parent, f"its folder {file.parent}")):
+        status = place.stat()
+        if status.st_uid not in (os.getuid(), 0):
+            return f"{name} belongs to another user"
+        if status.st_mode & stat.S_IWOTH or (status.st_mode & stat.S_IWGRP and not _is_private(status.st_gid)):
+            return f"{name} can be written by other users"
+    return ""
+
+
+def _is_private(group: int) -> bool:
+    """Whether a group has this user, or the administrator, as its only member: the user's own, as many systems have."""
+    import grp
+    import pwd
+
+    if group == 0:
+        return True
+    try:
+        user, entry = pwd.getpwuid(os.getuid()), grp.getgrgid(group)
+    except KeyError:
+        return False
+    return user.pw_gid == group and entry.gr_name == user.pw_name and set(entry.gr_mem) <= {user.pw_name}

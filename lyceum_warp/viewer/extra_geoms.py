@@ -1,0 +1,184 @@
+"""Ghosts and traces as geoms that are drawn beside the model."""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from lyceum_warp.viewer.protocol import Ghost, Pose
+
+TRACE_COLOUR = (0.6, 0.65, 0.75, 0.5)
+BEST_COLOUR = (0.1, 0.75, 0.3, 1.0)
+LINE_WIDTH = 3.0  # pixels
+MAX_LINES = 160
+"""Lines of all traces. A browser is sent all geoms 60 times a second, with about 600 bytes for each."""
+FEWEST_SEGMENTS = 4
+"""Segments of a trace where there are too few geoms for all its points."""
+
+
+@dataclasses.dataclass
+class Drawn:
+    """What the ghosts and traces of a frame became."""
+
+    geoms: list[mujoco.MjvGeom]
+    ghosts: int
+    """Ghosts that are drawn."""
+    traces: int
+    """Traces that are drawn."""
+
+
+class ExtraGeoms:
+    """Draws ghosts and traces with a limited number of geoms.
+
+    The best trace comes first, then the ghosts, then the other traces. Of too many ghosts, those farthest from the
+    world that is shown are left out; of too many traces, those that end farthest from the best one.
+
+    Args:
+        model: The model whose geoms a ghost has.
+        limit: Geoms that may be drawn.
+
+    """
+
+    def __init__(self, model: mujoco.MjModel, limit: int) -> None:
+        self.model, self.limit = model, limit
+        self._data = mujoco.MjData(model)
+        self._options = mujoco.MjvOption()
+        self._perturb = mujoco.MjvPerturb()
+        # a ghost that does not fit is noticed after its geoms were added
+        self._scene = mujoco.MjvScene(model, limit + 2 * (model.ngeom + model.nsite) + 10)
+        self._lines = [mujoco.MjvGeom() for _ in range(limit)]
+
+    def draw(
+        self,
+        pose: Pose,
+        ghosts: Sequence[Ghost] = (),
+        traces: np.ndarray | None = None,
+        best: int | None = None,
+        groups: np.ndarray | None = None,
+    ) -> Drawn:
+        """Make the geoms of a frame; they are valid until the next call.
+
+        Args:
+            pose: The pose of the world that is shown.
+            ghosts: Poses beside it.
+            traces: (samples, points, 3), metres.
+            best: Index of the best of them.
+            groups: (6,) which groups of geoms are visible; those of a new ``MjvOption`` otherwise.
+
+        """
+        if groups is not None:
+            self._options.geomgroup = groups
+        paths = [np.asarray(path, dtype=np.float64) for path in ([] if traces is None else traces)]
+        ends = np.array([path[-1] for path in paths]).reshape(-1, 3)
+        distances = (
+            np.linalg.norm(ends - (ends.mean(0) if best is None else ends[best]), axis=1) if paths else np.empty(0)
+        )
+        if best is not None:
+            distances[best] = -1.0
+        order = np.argsort(distances, kind="stable")
+        chosen = [(paths[i], BEST_COLOUR if i == best else TRACE_COLOUR) for i in order]
+
+        first = self._trace(chosen[:1], min(self.limit, MAX_LINES), 0) if best is not None else 0
+        bodies, drawn = self._ghosts(pose, ghosts, self.limit - first)
+        rest = chosen[1:] if first else chosen
+        before = first
+        left = min(self.limit - len(bodies), MAX_LINES) - first
+        segments = max(len(paths[0]) - 1, 1) if paths else 1
+        if rest and len(rest) * segments > left:
+            segments = min(max(left // len(rest), FEWEST_SEGMENTS), segments)
+            rest = rest[: max(left, 0) // segments]
+        for path, colour in rest:
+            before += self._trace([(path, colour)], segments, before)
+        return Drawn([*bodies, *self._lines[:before]], drawn, len(rest) + bool(first))
+
+    def _trace(self, paths: Sequence[tuple[np.ndarray, Sequence[float]]], segments: int, begin: int) -> int:
+        """Draw paths from the line ``begin`` on, with at most ``segments`` lines each; return how many they take."""
+        used = 0
+        for path, colour in paths:
+            number = min(len(path) - 1, segments)
+            points = path[np.linspace(0, len(path) - 1, number + 1).round().astype(int)]
+            for start, end in itertools.pairwise(points):
+                line = self._lines[begin + used]
+                mujoco.mjv_initGeom(
+                    line, mujoco.mjtGeom.mjGEOM_LINE, _ZERO, _ZERO, _UNIT, np.array(colour, dtype=np.float32)
+                )
+                line.emission = 1.0  # visible in the dark, too
+                mujoco.mjv_connector(line, mujoco.mjtGeom.mjGEOM_LINE, LINE_WIDTH, start, end)
+                used += 1
+        return used
+
+    def _ghosts(self, pose: Pose, ghosts: Sequence[Ghost], limit: int) -> tuple[list[mujoco.MjvGeom], int]:
+        """Draw the nearest ghosts that fit; return their geoms and their number."""
+        if not ghosts or limit <= 0:
+            return [], 0
+        here = self._place(pose)
+        placed = [self._place(ghost.pose) for ghost in ghosts]
+        distances = [np.linalg.norm(each.centre - here.centre) for each in placed]
+        scene, drawn = self._scene, 0
+        scene.ngeom = 0
+        ends: list[tuple[int, int]] = []
+        for i in np.argsort(distances, kind="stable"):
+            begin = scene.ngeom
+            placed[i].write(self._data)
+            mujoco.mjv_addGeoms(
+                self.model, self._data, self._options, self._perturb, mujoco.mjtCatBit.mjCAT_DYNAMIC, scene
+            )
+            if scene.ngeom > limit:
+                scene.ngeom = begin
+                break
+            ends.append((scene.ngeom, i))
+            drawn += 1
+        geoms: list[mujoco.MjvGeom] = []
+        begin = 0
+        for end, i in ends:
+            colour, same = ghosts[i].colour, placed[i].geoms_as_in(here)
+            for geom in scene.geoms[begin:end]:
+                if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and same[geom.objid]:
+                    continue  # two surfaces in one place flicker
+                geom.rgba = colour
+                geom.matid = -1  # the colour instead of the material's
+                geom.transparent = colour[3] < 1
+                geom.category = mujoco.mjtCatBit.mjCAT_DECOR  # not taken for the body itself
+                geoms.append(geom)
+            begin = end
+        return geoms, drawn
+
+    def _place(self, pose: Pose) -> "_Placed":
+        """Where the geoms lie at a pose."""
+        data = self._data
+        data.qpos[:] = pose.qpos
+        if self.model.nmocap:
+            data.mocap_pos[:], data.mocap_quat[:] = pose.mocap_pos, pose.mocap_quat
+        mujoco.mj_kinematics(self.model, data)
+        masses = self.model.body_mass
+        centre = masses @ data.xipos / max(masses.sum(), mujoco.mjMINVAL)
+        return _Placed(centre, tuple(getattr(data, name).copy() for name in _PLACES))
+
+
+_PLACES = ("xpos", "xquat", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat")
+"""What the kinematics compute and a drawing uses."""
+
+
+@dataclasses.dataclass
+class _Placed:
+    """A pose whose kinematics were computed."""
+
+    centre: np.ndarray
+    """(3,) centre of mass, metres."""
+    places: tuple[np.ndarray, ...]
+
+    def geoms_as_in(self, other: "_Placed") -> np.ndarray:
+        """Which geoms lie within a millimetre and half a degree of where they lie in another pose, (ngeom,)."""
+        places = dict(zip(_PLACES, self.places, strict=True))
+        others = dict(zip(_PLACES, other.places, strict=True))
+        near = np.abs(places["geom_xpos"] - others["geom_xpos"]).max(1, initial=0.0) < 1e-3
+        return near & (np.abs(places["geom_xmat"] - others["geom_xmat"]).max(1, initial=0.0) < 1e-2)
+
+    def write(self, data: mujoco.MjData) -> None:
+        for name, value in zip(_PLACES, self.places, strict=True):
+            getattr(data, name)[:] = value
+
+
+_ZERO, _UNIT = np.zeros(3), np.eye(3).ravel()

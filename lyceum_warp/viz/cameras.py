@@ -1,0 +1,173 @@
+"""The camera of a video: one of the model's, by name or index, or a free one, by its pose."""
+
+import dataclasses
+import difflib
+import math
+import textwrap
+from collections.abc import Iterable
+from typing import TypeAlias
+
+import mujoco
+import numpy as np
+
+from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.validate import positive_number
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FreeCamera:
+    """A camera that looks at a point, or follows a body. What is not given is as in MuJoCo's default free camera."""
+
+    lookat: tuple[float, float, float] | None = None
+    """Point to look at, metres. A camera that follows a body looks at the centre of mass of its subtree instead."""
+    distance: float | None = None
+    """Distance from that point, metres."""
+    azimuth: float | None = None
+    """Direction of the view around the vertical axis, degrees: 0 looks along x, 90 along y."""
+    elevation: float | None = None
+    """Direction of the view above the horizontal plane, degrees: -90 looks straight down."""
+    track: str | int | None = None
+    """Name or index of a body to follow."""
+
+
+CameraChoice: TypeAlias = str | int | FreeCamera | mujoco.MjvCamera | None
+"""A camera of the model by its name or index, a free camera ("free" and -1 stand for MuJoCo's default), or None for the
+default of a video: the model's first tracking camera, else its first one fixed to the world, else one that follows the
+first body."""
+
+FREE = "free"
+
+
+def find_camera(model: mujoco.MjModel, camera: CameraChoice = None) -> mujoco.MjvCamera:
+    """The camera that a choice stands for, as MuJoCo describes it.
+
+    Raises:
+        ValueError: The model has no such camera or body, or a number is not valid.
+    """
+    if isinstance(camera, mujoco.MjvCamera):
+        return camera
+    if camera is None:
+        return _default_camera(model)
+    if isinstance(camera, FreeCamera):
+        return _free_camera(model, camera)
+    names = camera_names(model)
+    if isinstance(camera, str) and camera and camera in names:
+        return _fixed_camera(names.index(camera))
+    if camera == FREE or (_is_index(camera) and camera == -1):
+        return _free_camera(model, FreeCamera())
+    index = int(camera) if isinstance(camera, str) and camera.isdecimal() else camera
+    if _is_index(index) and 0 <= int(index) < len(names):
+        return _fixed_camera(int(index))
+    raise ValueError(f"there is no camera {camera!r}: {_listed(names)}, or {FREE!r}, MuJoCo's default free camera")
+
+
+def parsed_camera(words: Iterable[str]) -> str | FreeCamera | None:
+    """The camera that words of a shell describe: a name or an index, or parts of a pose such as ``azimuth=90``.
+
+    Args:
+        words: One word, or several as NAME=VALUE: lookat=X,Y,Z, distance, azimuth, elevation, track. None of them
+            stands for the default.
+
+    Raises:
+        ValueError: The words are written in another way.
+    """
+    words = list(words)
+    if not words or (len(words) == 1 and "=" not in words[0]):
+        return words[0] if words else None
+    parts: dict[str, object] = {}
+    kinds = [field.name for field in dataclasses.fields(FreeCamera)]
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals or name not in kinds:
+            raise ValueError(
+                f"a camera is a name, an index, or a pose of {', '.join(f'{kind}=...' for kind in kinds)}, not {word!r}"
+            )
+        try:
+            numbers = [float(number) for number in value.split(",")] if name != "track" else []
+        except ValueError:
+            numbers = []
+        if name != "track" and len(numbers) != (3 if name == "lookat" else 1):
+            wanted = "X,Y,Z" if name == "lookat" else "a number"
+            raise ValueError(f"the camera's {name} must be {wanted}, not {value!r}")
+        parts[name] = value if name == "track" else tuple(numbers) if name == "lookat" else numbers[0]
+    return FreeCamera(**parts)  # type: ignore[arg-type]
+
+
+def camera_names(model: mujoco.MjModel) -> list[str]:
+    """Names of the model's cameras, in order; "" for one without a name."""
+    return [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_CAMERA, i) or "" for i in range(model.ncam)]
+
+
+def camera_values(camera: mujoco.MjvCamera) -> tuple[float, ...]:
+    """The values of a camera: type, index, tracked body, lookat (3), distance, azimuth, elevation, orthographic."""
+    return (
+        int(camera.type), camera.fixedcamid, camera.trackbodyid, *map(float, camera.lookat), camera.distance,
+        camera.azimuth, camera.elevation, int(camera.orthographic),
+    )  # fmt: skip
+
+
+def tracking_camera(model: mujoco.MjModel) -> int | None:
+    """Index of the model's first camera that follows a body, ``model.cam_bodyid``; None without one."""
+    # as numbers, because MuJoCo's enums do not equal NumPy's integers
+    tracking = (int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
+    return next((i for i, mode in enumerate(model.cam_mode) if int(mode) in tracking), None)
+
+
+def _default_camera(model: mujoco.MjModel) -> mujoco.MjvCamera:
+    if (tracking := tracking_camera(model)) is not None:
+        return _fixed_camera(tracking)
+    for i, body in enumerate(model.cam_bodyid):
+        if body == 0:
+            return _fixed_camera(i)
+    return _free_camera(model, FreeCamera(track=1 if model.nbody > 1 else None))
+
+
+def _fixed_camera(index: int) -> mujoco.MjvCamera:
+    view = mujoco.MjvCamera()
+    view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, index
+    return view
+
+
+def _free_camera(model: mujoco.MjModel, camera: FreeCamera) -> mujoco.MjvCamera:
+    view = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, view)
+    if camera.lookat is not None:
+        point = np.asarray(camera.lookat, dtype=float)
+        if point.shape != (3,) or not np.isfinite(point).all():
+            raise ValueError(f"the camera's lookat must be three finite numbers, not {camera.lookat}")
+        view.lookat[:] = point
+    if camera.distance is not None:
+        view.distance = positive_number("the camera's distance", camera.distance, "metres")
+    for name in ("azimuth", "elevation"):
+        if (angle := getattr(camera, name)) is not None:
+            if not isinstance(angle, int | float) or not math.isfinite(angle):
+                raise ValueError(f"the camera's {name} must be a number of degrees, not {angle!r}")
+            setattr(view, name, angle)
+    if camera.track is not None:
+        view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, _body(model, camera.track)
+    return view
+
+
+def _body(model: mujoco.MjModel, body: str | int) -> int:
+    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, i) or "" for i in range(model.nbody)]
+    if isinstance(body, str) and body in names:
+        return names.index(body)
+    index = int(body) if isinstance(body, str) and body.isdecimal() else body
+    if _is_index(index) and 0 <= int(index) < len(names):
+        return int(index)
+    close = difflib.get_close_matches(body, names, 3) if isinstance(body, str) else []
+    given = ", ".join(name for name in names if name)
+    hint = f"did you mean {' or '.join(close)}?" if close else f"its bodies are {textwrap.shorten(given, 200)}"
+    raise ValueError(f"the camera cannot track the body {body!r}, which the model does not have: {hint}")
+
+
+def _is_index(value: object) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
+def _listed(names: list[str]) -> str:
+    if not names:
+        return "the model has none"
+    cameras = ", ".join(f"{name!r} ({i})" if name else str(i) for i, name in enumerate(names))
+    return f"the model has {cameras}"

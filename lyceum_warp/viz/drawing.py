@@ -1,0 +1,225 @@
+"""The process that draws a video, seen from this one."""
+
+import contextlib
+import importlib.util
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from lyceum_warp.files import replaced
+from lyceum_warp.validate import positive_number
+from lyceum_warp.viz import EXTRA
+from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
+from lyceum_warp.viz.render import CANNOT_DRAW, Shot
+
+_PATIENCE = 10.0  # seconds that the process gets to end
+
+
+class NoVideoError(RuntimeError):
+    """The machine cannot draw, or lacks a package for videos. The message names it and the fix."""
+
+
+def check_video() -> None:
+    """Check that the packages for videos are installed.
+
+    Raises:
+        NoVideoError: One of them is not installed.
+    """
+    if missing := [name for name in ("imageio", "imageio_ffmpeg") if importlib.util.find_spec(name) is None]:
+        raise NoVideoError(f"videos need {' and '.join(missing)}: {EXTRA}")
+
+
+def libraries() -> list[str]:
+    """Values of MUJOCO_GL to try, in order; "" stands for MuJoCo's default."""
+    given = os.environ.get("MUJOCO_GL", "")
+    others = ["egl", "osmesa"] if sys.platform.startswith("linux") else [""]
+    return list(dict.fromkeys([given, *others] if given else others))
+
+
+class Drawing:
+    """A process that draws poses into a file, with the first graphics library that works; a context.
+
+    Args:
+        model: The model.
+        out: The file.
+        camera: The camera.
+        size: Width and height in pixels.
+        fps: Frames per second.
+        background: Whether the process gives way to others on a busy machine.
+
+    Raises:
+        ValueError: The model has no such camera, or an argument is out of range.
+        NoVideoError: A package for videos is not installed.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, out: str | Path, *, camera: CameraChoice, size: tuple[int, int], fps: float,
+        background: bool = False,
+    ) -> None:  # fmt: skip
+        self._model, self.out = model, Path(out)
+        if len(size) != 2 or any(not isinstance(n, int | np.integer) or n < 2 or n % 2 for n in size):
+            raise ValueError(f"size must be two even numbers, the width and the height in pixels, not {size}")
+        if self.out.suffix.lower() != ".mp4" or self.out.is_dir():
+            raise ValueError(f"a video is an mp4 file: give a file's name that ends in .mp4, not {str(out)!r}")
+        self._job = {
+            "size": tuple(map(int, size)), "fps": positive_number("fps", fps, "frames per second"),
+            "camera": camera_values(find_camera(model, camera)), "background": background,
+        }  # fmt: skip
+        check_video()
+        self._frames = 0
+        self._ends = contextlib.ExitStack()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._errors: Any = None
+        self._lock = threading.Lock()  # for abandon, which another thread calls
+        self._abandoned = False
+
+    def __enter__(self) -> "Drawing":
+        failures: list[str] = []
+        for library in libraries():
+            try:
+                self._start(library)
+                if self._process is not None and self._answer() == "ready":
+                    return self
+                code, reason = self._ended()
+            except BaseException:
+                self._stop()
+                raise
+            self._stop()
+            failures.append(f"{library or 'OpenGL'}: {reason}")
+            if code > 0 and code != CANNOT_DRAW:  # another graphics library would fail, too
+                raise NoVideoError(f"the video could not be written ({reason})")
+        raise NoVideoError(
+            f"this machine cannot draw off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
+            "libegl1 and libgl1-mesa-dri) or OSMesa (libosmesa6), or set MUJOCO_GL to a library that works"
+        )
+
+    def __exit__(self, *exception: object) -> None:
+        self._stop()
+
+    def abandon(self) -> None:
+        """Kill the process, and start no other one; may be called from another thread, which does not wait.
+
+        The thread that draws then gets a ``NoVideoError``.
+        """
+        with self._lock:
+            self._abandoned = True
+            if self._process is not None:
+                _kill(self._process)
+
+    def draw(self, shot: Shot) -> None:
+        """Draw a pose, and write its frames.
+
+        Raises:
+            NoVideoError: The process has ended.
+        """
+        if not self._send(shot) or self._answer() != "frame":
+            raise NoVideoError(f"the video could not be written ({self._ended()[1]})")
+        self._frames += 1
+
+    def finish(self) -> Path:
+        """Complete the video, and put it in its place.
+
+        Raises:
+            NoVideoError: There is no frame, or the video cannot be completed.
+            OSError: The file cannot be written.
+        """
+        if not self._frames:
+            raise NoVideoError(f"the video {self.out} has no pose: nothing is written")
+        self._send(None)
+        code, reason = self._ended()
+        if code:
+            raise NoVideoError(f"the video could not be written ({reason})")
+        if self._abandoned:
+            raise NoVideoError(f"the video {self.out} was cancelled")
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        with replaced(self.out) as temporary:
+            shutil.copyfile(Path(self._folder, "video.mp4"), temporary)
+        return self.out
+
+    def _start(self, library: str) -> None:
+        environment = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+        if library:
+            environment["MUJOCO_GL"] = library
+        folder = tempfile.TemporaryDirectory(prefix="lyceum-warp-", ignore_cleanup_errors=True)
+        self._folder = self._ends.enter_context(folder)
+        mujoco.mj_saveModel(self._model, str(Path(self._folder, "model.mjb")), None)
+        self._errors = tempfile.TemporaryFile("w+", errors="replace")  # noqa: SIM115
+        self._ends.enter_context(self._errors)
+        # -P keeps the folder of render.py off the path, where its other modules could shadow packages
+        command = [sys.executable, "-P", str(Path(__file__).with_name("render.py")), self._folder]
+        with self._lock:
+            if self._abandoned:
+                raise NoVideoError(f"the video {self.out} was cancelled")
+            self._process = subprocess.Popen(
+                command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
+                start_new_session=True,  # Ctrl-C in the shell is for this process alone, which ends the other one
+            )  # fmt: skip
+        self._send(self._job)
+
+    def _send(self, message: Any) -> bool:
+        """Send a message; returns False where the process has ended."""
+        assert self._process is not None and self._process.stdin is not None
+        try:
+            pickle.dump(message, self._process.stdin, protocol=pickle.HIGHEST_PROTOCOL)
+            self._process.stdin.flush()
+        except OSError:
+            return False
+        return True
+
+    def _answer(self) -> str:
+        """The next line of the process; empty where it has ended."""
+        assert self._process is not None and self._process.stdout is not None
+        for line in self._process.stdout:
+            if line in (b"ready\n", b"frame\n"):  # drivers may print lines of their own
+                return line.decode().strip()
+        return ""
+
+    def _ended(self) -> tuple[int, str]:
+        """The exit code of the process, and the last line of its errors."""
+        assert self._process is not None
+        code = self._process.wait()
+        self._errors.seek(0)
+        lines = self._errors.read().strip().splitlines()
+        return code, lines[-1].strip()[:160] if lines else f"it ended with code {code}"
+
+    def _stop(self) -> None:
+        """End the process, if it runs, and delete its files."""
+        with self._lock:
+            process, self._process = self._process, None
+        if process is None:
+            self._ends.close()
+        else:
+            assert process.stdin is not None and process.stdout is not None
+            with contextlib.suppress(OSError):
+                process.stdin.close()  # it then ends
+            try:
+                process.wait(_PATIENCE)
+            except BaseException as error:
+                _kill(process)
+                process.wait()
+                if not isinstance(error, subprocess.TimeoutExpired):
+                    raise
+            finally:
+                process.stdout.close()
+                self._ends.close()
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process and those that it started, such as ffmpeg."""
+    if process.poll() is not None:
+        return
+    with contextlib.suppress(ProcessLookupError):
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()

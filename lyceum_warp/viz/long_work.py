@@ -1,0 +1,43 @@
+"""Progress of work that may take long: a passing bar on a terminal, lines elsewhere."""
+
+import time
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+
+class LongWork:
+    """Progress of work that may take long: a passing bar on a terminal, now and then a line elsewhere.
+
+    Work that takes less than three seconds shows nothing where there is no terminal.
+
+    Args:
+        text: What is done.
+        unit: What is counted, as "frames".
+        console: Where it is shown; by default on stderr.
+    """
+
+    def __init__(self, text: str, unit: str, console: Console | None = None) -> None:
+        self.text, self.unit, self.console = text, unit, console or Console(highlight=False, stderr=True)
+        self.progress = Progress(
+            TextColumn("{task.description}"), BarColumn(bar_width=12), MofNCompleteColumn(), TextColumn(unit),
+            TimeElapsedColumn(), console=self.console, transient=True, disable=not self.console.is_terminal,
+        )  # fmt: skip
+        self.bar = self.progress.add_task(text, total=None)
+        self.start, self.next = time.monotonic(), 3.0
+
+    def __enter__(self) -> "LongWork":
+        self.progress.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.progress.stop()
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show that a part of the work is done."""
+        self.progress.update(self.bar, completed=done, total=total)
+        seconds = time.monotonic() - self.start
+        if not self.console.is_terminal and seconds >= self.next and done < total:
+            self.console.print(f"{self.text}: {done} of {total} {self.unit}, {seconds:.0f} s", soft_wrap=True)
+            self.console.file.flush()
+            self.next = seconds + 10.0

@@ -1,0 +1,88 @@
+"""Videos of a policy, at the end of its training and on the way."""
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeAlias
+
+import torch
+
+from lyceum_warp.algos.evaluation import evaluation_worlds
+from lyceum_warp.algos.networks import moved
+from lyceum_warp.algos.npg import NPG
+from lyceum_warp.algos.npg_statistics import Iteration
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.env import Env
+from lyceum_warp.tensorboard import TensorBoard
+from lyceum_warp.viz.cameras import CameraChoice
+from lyceum_warp.viz.video import Progress, episode, write_video
+
+log = logging.getLogger(__name__)
+
+NamedProgress: TypeAlias = Callable[[str, str, int, int], object]
+"""Called with what is done, the unit in which it is counted, how much is done, and how much there is in all."""
+
+
+def policy_states(
+    env: Env, policy: GaussianPolicy, seed: int, *, progress: Progress | None = None
+) -> tuple[Env, torch.Tensor]:
+    """Run an episode of a policy in a world of its own; returns its environment, and the states for ``write_video``.
+
+    Args:
+        env: An environment of the policy's task.
+        policy: The policy.
+        seed: Seed of the initial state.
+        progress: Called now and then with the number of steps so far and the horizon.
+    """
+    one = evaluation_worlds(env, 1, autoreset=False)
+    return one, episode(one, moved(policy, one), seed=seed, progress=progress)
+
+
+class Videos:
+    """Writes a video of the mean policy every few iterations, and shows it in TensorBoard.
+
+    An error, as on a machine that cannot draw a video or convert it for TensorBoard, is reported once; there are no
+    further videos then, and training goes on.
+
+    Args:
+        npg: The algorithm.
+        folder: Folder of the videos, which have the numbers of their iterations.
+        every: Iterations between two videos; 0 for none.
+        seed: Seed of the initial state, the same for all videos.
+        board: TensorBoard's writer, if there is one.
+        camera: The camera; see ``write_video``.
+        note: Called with the line that reports an error.
+        progress: Called now and then while a video is made.
+    """
+
+    def __init__(
+        self, npg: NPG, folder: Path, every: int, seed: int, board: TensorBoard | None, *, camera: CameraChoice = None,
+        note: Callable[[str], object] = log.warning, progress: NamedProgress | None = None,
+    ) -> None:  # fmt: skip
+        self.npg, self.folder, self.every, self.seed, self.board = npg, folder, every, seed, board
+        self.camera, self.note, self.progress = camera, note, progress
+
+    def __call__(self, iteration: Iteration) -> None:
+        """Write a video after an iteration, if it is time for one."""
+        if not self.every or iteration.iteration % self.every:
+            return
+        path = self.folder / f"{iteration.iteration:06d}.mp4"
+        try:
+            env, states = policy_states(
+                self.npg.env, self.npg.policy, self.seed, progress=self._progress("running an episode", "steps")
+            )
+            write_video(env, states, path, camera=self.camera, progress=self._progress("drawing the video", "frames"))
+            if self.board is not None:
+                self.board.video(path, iteration.samples)
+        except Exception as error:  # of any kind: the training is worth more than its video
+            self.note(f"no further videos ({one_line(error)})")
+            self.every = 0
+
+    def _progress(self, text: str, unit: str) -> Progress:
+        named = self.progress
+        return lambda done, total: None if named is None else named(text, unit, done, total)
+
+
+def one_line(error: BaseException) -> str:
+    """The message of an error in one line."""
+    return " ".join(str(error).split()) or type(error).__name__

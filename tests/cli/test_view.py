@@ -1,0 +1,187 @@
+"""lyceum-warp view, called as a shell would, with a window in memory."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from conftest import TaskFile
+from memory_window import MemoryWindow
+from tiny_task import TINY
+from toy_controllers import towards
+from training_runs import interrupted, refused, train
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.viewer import show as views
+from lyceum_warp.viewer.protocol import Frame, Scene
+from lyceum_warp.viewer.window import Window
+
+
+class Opened:
+    """Collects the scenes and the frames of the windows that the command opens."""
+
+    def __init__(self) -> None:
+        self.scenes: list[Scene] = []
+        self.frames: list[Frame] = []
+        self.options: dict[str, Any] = {}
+        self.number = 3
+
+    def __call__(self, scene: Scene, graphics: str, **options: Any) -> MemoryWindow:
+        self.scenes.append(scene)
+        self.options = {"gfx": graphics, **options}
+
+        def after(frame: Frame, number: int) -> list[Any] | None:
+            self.frames.append(frame)
+            return None if number + 1 >= self.number else []
+
+        return MemoryWindow(after)
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> Opened:
+    collected = Opened()
+    monkeypatch.setattr(views, "opened", collected)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    return collected
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    assert train(folder, "--iterations", "2") == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    env = lw.make("point_mass", autoreset=False, horizon=10, success_distance=0.1)
+    folder = tmp_path_factory.mktemp("episodes")
+    return [lw.control(env, towards, seed=seed).save(folder / f"episode-{seed:03d}.npz") for seed in (0, 1)]
+
+
+def test_a_task_is_shown(opened: Opened) -> None:
+    options = ["--nworld", "3", "--world", "2", "--port", "8123", "--param", "success_distance=0.2"]
+    assert cli.main(["view", "point_mass", *options]) == 0
+    (scene,) = opened.scenes
+    assert scene.title == "point_mass" and scene.nworld == 3 and scene.modes == ("passive",)
+    assert opened.options == {"gfx": "web", "host": "127.0.0.1", "port": 8123, "browser": False}
+    assert opened.frames[0].status.world == 2
+
+
+def test_the_viewer_is_a_page_also_where_there_is_a_display(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.delenv("SSH_CONNECTION", raising=False)
+    assert cli.main(["view", "point_mass"]) == 0
+    assert opened.options["gfx"] == "web"
+    assert cli.main(["view", "point_mass", "--gfx", "native"]) == 0
+    assert opened.options["gfx"] == "native"
+
+
+def test_a_task_of_your_own_is_shown_under_a_planner(opened: Opened, task_file: TaskFile) -> None:
+    file = task_file("viewed.py", TINY)
+    opened.number = 12
+    assert cli.main(["view", str(file), "--mppi", "--samples", "4", "--horizon", "5", "--paused"]) == 0
+    (scene,) = opened.scenes
+    assert scene.controllers == ("mppi",) and scene.modes == ("controller", "passive")
+    assert opened.frames[-1].status.paused
+
+
+def test_a_runs_policy_is_shown(opened: Opened, run: Path) -> None:
+    assert cli.main(["view", str(run), "--seed", "3"]) == 0
+    (scene,) = opened.scenes
+    assert scene.controllers == ("policy",) and scene.nworld == 16
+    assert cli.main(["view", str(run), "--which", "best", "--nworld", "2", "--mppi", "--samples", "4"]) == 0
+    assert opened.scenes[1].controllers == ("policy", "mppi") and opened.scenes[1].nworld == 2
+    assert cli.main(["view", str(run), "--follow", "--nworld", "1"]) == 0
+
+
+def test_episodes_are_played_back(opened: Opened, files: list[Path]) -> None:
+    for words in ([str(file) for file in files], [str(files[0].parent)]):
+        assert cli.main(["view", *words]) == 0
+        scene = opened.scenes[-1]
+        assert scene.modes == ("playback", "passive") and scene.episodes == ("episode-000.npz", "episode-001.npz")
+    first = lw.Trajectory.load(files[0])
+    part = first.state_parts["qpos"]
+    assert torch.equal(torch.from_numpy(opened.frames[0].pose.qpos), first.states[0, part[0] : part[1]])
+
+
+@pytest.mark.parametrize(
+    ("words", "messages"),
+    [
+        (["hoper"], ["there is no task 'hoper'"]),
+        (["point_mass", "--world", "1"], ["there is no world 1: there is 1 world, number 0"]),
+        (["point_mass", "--nworld", "4", "--world", "9"], ["there is no world 9: there are 4 worlds, 0 to 3"]),
+        (["point_mass", "--gfx", "native"], ["there is no display for a native window"]),
+        (["point_mass", "--gfx", "vr"], ["gfx must be 'web' or 'native', not 'vr'"]),
+        (["point_mass", "--follow"], ["--follow needs a run", "point_mass"]),
+        (["point_mass", "--samples", "4"], ["--samples is a setting of the planner: add --mppi"]),
+        (["point_mass", "hopper"], ["one task can be shown at a time, not 2"]),
+        (["missing.npz"], ["there is no file missing.npz"]),
+        (["point_mass", "--param", "nworld=3"], ["nworld is an option"]),
+        (["point_mass", "--mppi", "--trace", "nose"], ["no site and no body 'nose' to trace"]),
+    ],
+)
+def test_a_mistake_is_one_line(
+    opened: Opened, capsys: pytest.CaptureFixture[str], words: list[str], messages: list[str]
+) -> None:
+    assert cli.main(["view", *words]) == 2
+    refused(capsys, *messages)
+    assert not opened.scenes
+
+
+def test_an_episode_of_another_task_is_one_line(
+    opened: Opened, capsys: pytest.CaptureFixture[str], files: list[Path], tmp_path: Path
+) -> None:
+    env = lw.make("hopper", autoreset=False, horizon=3)
+    other = lw.control(env, lambda state, obs: torch.zeros(3), seed=0).save(tmp_path / "other.npz")
+    assert cli.main(["view", str(files[0]), str(other)]) == 2
+    refused(capsys, "other.npz is an episode of the task 'hopper'", "of 'point_mass'")
+    broken = tmp_path / "broken.npz"
+    broken.write_bytes(b"nothing")
+    assert cli.main(["view", str(broken)]) == 2
+    refused(capsys, "broken.npz is broken, or is not a trajectory")
+
+
+def test_ctrl_c_closes_the_window(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
+    import signal
+
+    closed = []
+
+    def after(frame: Frame, number: int) -> list[Any]:
+        signal.raise_signal(signal.SIGINT)
+        return []
+
+    class Interrupting(MemoryWindow):
+        def close(self) -> None:
+            closed.append(True)
+
+    monkeypatch.setattr(views, "opened", lambda *words, **options: Interrupting(after))
+    assert interrupted(["view", "point_mass"]) == 130
+    assert closed == [True]
+
+
+def test_a_port_in_use_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    import socket
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert cli.main(["view", "point_mass", "--gfx", "web", "--port", str(port)]) == 2
+    refused(capsys, f"port {port} is in use")
+
+
+def test_view_opens_a_page_and_prints_its_address(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Window] = []
+
+    def closing(session: views.Session, window: Window) -> None:
+        made.append(window)
+        window.close()
+
+    monkeypatch.setattr(views.Session, "run", closing)
+    lw.view(lw.make("point_mass"), gfx="web")
+    assert made[0].address in capsys.readouterr().out

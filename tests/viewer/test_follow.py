@@ -1,0 +1,113 @@
+"""Following a run while it trains."""
+
+import contextlib
+import importlib
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from training_runs import train
+
+import lyceum_warp as lw
+from lyceum_warp.checkpoints import policy_content
+from lyceum_warp.runs import Run
+from lyceum_warp.viewer.follow import Follower, wait_for_run
+
+# the package has a function of this name
+training = importlib.import_module("lyceum_warp.cli.train")
+
+
+def test_a_follower_takes_the_newest_policy(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    npg = lw.NPG(lw.make("point_mass", nworld=2), config=lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,)))
+    followers: list[Follower] = []
+    messages: list[str] = []
+
+    def callback(iteration: lw.Iteration) -> None:
+        if not followers:
+            followers.append(Follower(Run.open(folder)))
+        # short iterations are not saved at once
+        Run.open(folder).save_policy(policy_content(npg.iteration, npg.policy, npg.value))
+        messages.extend(followers[0].update())
+
+    lw.train(npg, folder, iterations=3, callback=callback)
+    assert followers[0].iteration == 3
+    assert [message.partition(",")[0] for message in messages][-1] == "policy of iteration 3"
+    obs = torch.randn(4, npg.policy.nobs)
+    with torch.no_grad():
+        assert torch.equal(followers[0](obs), npg.policy(obs))
+
+
+def test_a_file_that_cannot_be_read_is_a_message(tmp_path: Path) -> None:
+    assert train(tmp_path / "run", "--iterations", "1") == 0
+    follower = Follower(Run.open(tmp_path / "run"))
+    assert follower.update() == []
+    (tmp_path / "run" / "policy.pt").write_bytes(b"half a file")
+    (message,) = follower.update()
+    assert "was not read" in message and "\n" not in message
+    assert follower.update() == []
+
+
+def test_a_run_that_does_not_come_is_reported(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="there is no run in"):
+        wait_for_run(tmp_path / "run", seconds=0.1)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text('{"format": 1}')
+    with pytest.raises(FileNotFoundError, match="has no policy"):
+        wait_for_run(tmp_path / "run", seconds=0.1)
+
+
+def trained(folder: Path, callback: Callable[[lw.Iteration], object] | None = None) -> tuple[list[Any], list[Any]]:
+    """The numbers of a run: its rows without times, and its policy."""
+    env = lw.make("point_mass", nworld=2, engine="mujoco", seed=3)
+    npg = lw.NPG(env, config=lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,)), seed=3)
+    run = lw.train(npg, folder, iterations=4, callback=callback)
+    rows = [{k: v for k, v in row.items() if "time" not in k and k != "samples_per_second"} for row in run.rows()]
+    return [list(map(str, row.items())) for row in rows], list(lw.load(run).state_dict().values())
+
+
+def test_a_run_with_a_viewer_has_the_same_numbers_to_the_bit(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    alone = trained(tmp_path / "alone")
+    begun, printed = time.monotonic(), ""
+    with lw.RunViewer(tmp_path / "shown", gfx="web", nworld=2) as viewer:
+
+        def callback(iteration: lw.Iteration) -> None:
+            nonlocal printed
+            viewer(iteration)
+            while not re.search(r"http://127\.0\.0\.1:\d+/", printed):  # the first iteration waits for the viewer
+                assert viewer.is_open and time.monotonic() < begun + 60, printed
+                time.sleep(0.1)
+                printed += capfd.readouterr().out
+
+        shown = trained(tmp_path / "shown", callback)
+        assert viewer.is_open
+    assert not viewer.is_open
+    assert alone[0] == shown[0]
+    for one, other in zip(alone[1], shown[1], strict=True):
+        assert torch.equal(one, other)
+
+
+def test_train_shows_its_run_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folders: list[Path] = []
+    monkeypatch.setattr(training, "RunViewer", lambda folder: folders.append(folder) or contextlib.nullcontext())
+    assert train(tmp_path / "run", "--iterations", "1", "--view") == 0
+    assert folders == [tmp_path / "run"]
+
+
+def test_a_viewer_of_a_task_that_is_not_found_ends_with_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert train(tmp_path / "run", "--iterations", "1") == 0
+    run = Run.open(tmp_path / "run")
+    run.amend(task="missing_task")
+    with lw.RunViewer(tmp_path / "run", gfx="web") as viewer:
+        begun = time.monotonic()
+        while viewer.is_open and time.monotonic() < begun + 60:
+            time.sleep(0.1)
+    lines = capfd.readouterr().err.splitlines()
+    assert sum("the viewer of" in line and "missing_task" in line for line in lines) == 1
+    assert not any("Traceback" in line for line in lines)

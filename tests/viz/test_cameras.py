@@ -1,0 +1,97 @@
+"""Cameras of videos."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import lyceum_warp as lw
+from lyceum_warp.viz.cameras import FreeCamera, camera_values, find_camera, parsed_camera
+
+MODEL = """
+<mujoco>
+  <worldbody>
+    <camera name="corner" pos="0 -3 1"/>
+    <camera pos="0 -3 1"/>
+    <camera name="1" pos="0 -3 1"/>
+    <body name="torso" pos="0 0 1"><freejoint/><geom size=".1"/><body name="head"><geom size=".1"/></body></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(MODEL)
+
+
+@pytest.mark.parametrize("task", ["half_cheetah", "hopper", "reach", "point_mass"])
+def test_the_models_own_camera_is_the_default(task: str) -> None:
+    found = find_camera(lw.make(task).model)
+    assert (found.type, found.fixedcamid) == (mujoco.mjtCamera.mjCAMERA_FIXED, 0)
+
+
+def test_without_a_camera_the_default_follows_the_first_body() -> None:
+    text = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+    found = find_camera(mujoco.MjModel.from_xml_string(text))
+    assert (found.type, found.trackbodyid) == (mujoco.mjtCamera.mjCAMERA_TRACKING, 1)
+    empty = find_camera(mujoco.MjModel.from_xml_string("<mujoco/>"))
+    assert empty.type == mujoco.mjtCamera.mjCAMERA_FREE
+
+
+@pytest.mark.parametrize("camera, index", [("corner", 0), (1, 1), (np.int64(2), 2), ("0", 0), ("1", 2)])
+def test_a_camera_is_found_by_name_and_by_index(model: mujoco.MjModel, camera: object, index: int) -> None:
+    found = find_camera(model, camera)  # type: ignore[arg-type]
+    assert (found.type, found.fixedcamid) == (mujoco.mjtCamera.mjCAMERA_FIXED, index)
+
+
+@pytest.mark.parametrize("camera", ["side", "", 3, -2, True, 0.0, "7"])
+def test_an_unknown_camera_is_refused_with_the_models_cameras(model: mujoco.MjModel, camera: object) -> None:
+    with pytest.raises(ValueError, match=r"no camera .*: the model has 'corner' \(0\), 1, '1' \(2\), or 'free'"):
+        find_camera(model, camera)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="the model has none, or 'free'"):
+        find_camera(mujoco.MjModel.from_xml_string("<mujoco/>"), 0)
+
+
+def test_a_free_camera_has_the_given_pose_and_otherwise_mujocos(model: mujoco.MjModel) -> None:
+    default = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, default)
+    for choice in ("free", -1, FreeCamera()):
+        assert camera_values(find_camera(model, choice)) == camera_values(default)
+    found = find_camera(model, FreeCamera(lookat=(1, 2, 3), azimuth=45))
+    assert (*found.lookat, found.azimuth) == (1, 2, 3, 45)
+    assert (found.distance, found.elevation) == (default.distance, default.elevation)
+    for body in ("head", 2, "2"):
+        found = find_camera(model, FreeCamera(track=body, distance=4))
+        assert (found.type, found.trackbodyid, found.distance) == (mujoco.mjtCamera.mjCAMERA_TRACKING, 2, 4)
+    assert find_camera(model, default) is default
+
+
+@pytest.mark.parametrize("pose, message", [
+    (dict(track="tors"), "cannot track the body 'tors', .*: did you mean torso?"),
+    (dict(track=7), "cannot track the body 7, .*: its bodies are world, torso, head"),
+    (dict(distance=0), "distance must be a positive number of metres, not 0"),
+    (dict(azimuth=float("nan")), "azimuth must be a number of degrees, not nan"),
+    (dict(lookat=(1, 2)), r"lookat must be three finite numbers, not \(1, 2\)"),
+])  # fmt: skip
+def test_a_wrong_pose_is_refused(model: mujoco.MjModel, pose: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        find_camera(model, FreeCamera(**pose))  # type: ignore[arg-type]
+
+
+def test_words_of_a_shell_describe_a_camera() -> None:
+    assert parsed_camera([]) is None
+    assert parsed_camera(["side"]) == "side"
+    words = ["azimuth=90", "elevation=-20", "lookat=0,0.5,1", "distance=2", "track=torso"]
+    expected = FreeCamera(azimuth=90, elevation=-20, lookat=(0, 0.5, 1), distance=2, track="torso")
+    assert parsed_camera(words) == expected
+
+
+@pytest.mark.parametrize("words, message", [
+    (["side", "top"], "a camera is a name, an index, or a pose of lookat=..., .*, not 'side'"),
+    (["roll=3"], "not 'roll=3'"),
+    (["azimuth=left"], "azimuth must be a number, not 'left'"),
+    (["lookat=1,2"], "lookat must be X,Y,Z, not '1,2'"),
+])  # fmt: skip
+def test_other_words_are_refused(words: list[str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        parsed_camera(words)

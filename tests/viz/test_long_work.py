@@ -1,0 +1,28 @@
+"""Progress of work that may take long."""
+
+import io
+
+from rich.console import Console
+
+from lyceum_warp.viz.long_work import LongWork
+
+
+def test_long_work_prints_a_line_now_and_then() -> None:
+    console = Console(file=io.StringIO(), width=120)
+    with LongWork("drawing the video", "frames", console) as work:
+        work(1, 500)
+        assert console.file.getvalue() == ""
+        start = work.start
+        for seconds in (4.0, 4.5, 15.0):
+            work.start = start - seconds
+            work(int(20 * seconds), 500)
+    assert console.file.getvalue().splitlines() == [
+        "drawing the video: 80 of 500 frames, 4 s", "drawing the video: 300 of 500 frames, 15 s",
+    ]  # fmt: skip
+
+
+def test_long_work_is_a_passing_bar_on_a_terminal() -> None:
+    console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system=None)
+    with LongWork("evaluating", "episodes", console) as work:
+        work(3, 32)
+    assert "3/32" in console.file.getvalue() and "episodes" in console.file.getvalue()
