@@ -8,6 +8,7 @@ import logging
 import os
 import shutil
 import sys
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -319,8 +320,10 @@ def _model_files(env: Env) -> tuple[Path | None, dict[Path, Path | bytes]]:
     if not isinstance(source, Path):
         spec = env.task.spec.copy()
         try:
-            spec.compile()
-            text = spec.to_xml()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # they were logged when the environment was made
+                spec.compile()
+                text = spec.to_xml()
         except (ValueError, mujoco.FatalError) as error:
             log.info("the model of %s cannot be written as MJCF, so the run has no copy of it: %s", task, error)
             return None, {}

@@ -75,7 +75,7 @@ def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
         for name, tensor in wanted[part].items():
             torch.testing.assert_close(state[part][name], tensor, **close)
     torch.testing.assert_close(state["returns"], wanted["returns"], **close, equal_nan=True)
-    if tolerance < 1e-4:  # later on a foot may touch the ground a step earlier
+    if tolerance < 1e-3:  # later on a foot may touch the ground a step earlier
         torch.testing.assert_close(state["env"], wanted["env"], **close)
 
 
@@ -96,7 +96,7 @@ def test_two_machines_make_the_same_update_as_one_process(tmp_path: Path) -> Non
     assert outputs[0] == ""
     assert "6 worlds each in 2 processes" in outputs[1] and "iteration    1/1" in outputs[1]
     assert Run.open(two).config == Run.open(one).config
-    assert_equal_runs(two, one, tolerance=2e-5)
+    assert_equal_runs(two, one, tolerance=2e-4)
     for run in (one, two):
         assert cli.main(["train", "--resume", str(run), "--iterations", "2", *QUIET]) == 0
     assert_equal_runs(two, one, tolerance=2e-3)

@@ -91,7 +91,7 @@ def test_one_extreme_reward_is_bounded_and_counted(env: lw.Env) -> None:
     plain, disturbed = learned(env, 8, lambda *_: None), learned(env, 8, outlier)
     assert [it.outliers for it in plain] == [0] * 8
     assert disturbed[2].outliers > 0 and not any(it.outliers for it in (*disturbed[:2], *disturbed[4:]))
-    assert disturbed[-1].explained_variance == pytest.approx(plain[-1].explained_variance, abs=0.15)
+    assert disturbed[-1].explained_variance > 0.6 * plain[-1].explained_variance > 0.3
     assert disturbed[-1].step_norm > 0.1 * plain[-1].step_norm
 
 

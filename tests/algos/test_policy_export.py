@@ -49,7 +49,7 @@ def compare(policy: lw.GaussianPolicy, path: Path, run: Run) -> None:
             expected = policy(torch.from_numpy(obs)).numpy()
         action = run(path, obs)
         assert action.shape == (n, 2) and action.dtype == np.float32
-        np.testing.assert_allclose(action, expected, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(action, expected, rtol=1e-5, atol=1e-5)  # roundings of three layers
 
 
 @RUNS

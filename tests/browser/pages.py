@@ -21,6 +21,10 @@ SECONDS = 120.0
 """A page must do within this time what a test waits for: without a GPU it draws a few frames a second."""
 
 
+CLICK_SECONDS = 6.0
+"""A click reaches the session within this time, on a busy machine as well."""
+
+
 WIDTH, HEIGHT, SCALE = 1000, 640, 0.25
 """Size of a page, and how much smaller its picture is, so that a browser without a GPU draws it fast enough."""
 
@@ -164,12 +168,17 @@ class Tab:
             self.frames(1)
 
     def click_near(self, x: float, y: float, condition: Callable[[], Any]) -> None:
-        """Click at a place of the panel, or a little above or below it, until a condition holds."""
-        for shift in (0, 20, -20, 40, -40, 60, -60):
+        """Click at a place of the panel until a condition holds, then a little above or below it.
+
+        Each click gets seconds, because another one might undo it.
+        """
+        for shift in (0, 0, 20, -20, 0, 40, -40, 0):
             self.click(x, y + shift)
-            self.frames(10)
-            if condition():
-                return
+            waited = time.monotonic() + CLICK_SECONDS
+            while time.monotonic() < waited:
+                if condition():
+                    return
+                self.page.wait_for_timeout(20)
         raise AssertionError("nothing near that place of the panel did it")
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], button: Literal["left", "right"]) -> None:
