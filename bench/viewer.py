@@ -28,6 +28,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
+import measurements
 import torch
 import tyro
 from rich.console import Console
@@ -234,7 +235,8 @@ def main(options: Options) -> None:
         console.print(table)
         found[name] = {"without": runs[False], "with": runs[True]}
     if options.out is not None:
-        options.out.write_text(json.dumps(found, indent=2) + "\n")
+        content = {"versions": measurements.context(options.device), **found}
+        options.out.write_text(json.dumps(content, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -133,7 +133,7 @@ class ExtraGeoms:
         geoms: list[mujoco.MjvGeom] = []
         begin = 0
         for end, i in ends:
-            colour, same = ghosts[i].colour, placed[i].geoms_as_in(here)
+            colour, same = ghosts[i].colour, placed[i].geoms_as_in(here, self.model.geom_type)
             for geom in scene.geoms[begin:end]:
                 if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and same[geom.objid]:
                     continue  # two surfaces in one place flicker
@@ -159,6 +159,8 @@ class ExtraGeoms:
 
 _PLACES = ("xpos", "xquat", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat")
 """What the kinematics compute and a drawing uses."""
+_ROUND = (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER)
+"""Geoms that look the same at any angle about their third axis."""
 
 
 @dataclasses.dataclass
@@ -169,12 +171,18 @@ class _Placed:
     """(3,) centre of mass, metres."""
     places: tuple[np.ndarray, ...]
 
-    def geoms_as_in(self, other: "_Placed") -> np.ndarray:
-        """Which geoms lie within a millimetre and half a degree of where they lie in another pose, (ngeom,)."""
+    def geoms_as_in(self, other: "_Placed", types: np.ndarray) -> np.ndarray:
+        """Which geoms look as in another pose, within a millimetre and half a degree, (ngeom,).
+
+        Capsules and cylinders may turn about their axes, and spheres about all.
+        """
         places = dict(zip(_PLACES, self.places, strict=True))
         others = dict(zip(_PLACES, other.places, strict=True))
         near = np.abs(places["geom_xpos"] - others["geom_xpos"]).max(1, initial=0.0) < 1e-3
-        return near & (np.abs(places["geom_xmat"] - others["geom_xmat"]).max(1, initial=0.0) < 1e-2)
+        turned = np.abs(places["geom_xmat"] - others["geom_xmat"]).reshape(-1, 3, 3)
+        turned[np.isin(types, _ROUND), :, :2] = 0.0  # columns are axes
+        turned[types == mujoco.mjtGeom.mjGEOM_SPHERE] = 0.0
+        return near & (turned.max((1, 2), initial=0.0) < 1e-2)
 
     def write(self, data: mujoco.MjData) -> None:
         for name, value in zip(_PLACES, self.places, strict=True):

@@ -58,7 +58,8 @@ class Past:
     @property
     def behind(self) -> int:
         """Steps that can be taken back."""
-        return self.now - self.oldest
+        # the present takes the place of the oldest state as soon as one of them is taken back
+        return min(self.now - self.oldest, max(self.length - 1, 0))
 
     @property
     def ahead(self) -> int:

@@ -46,6 +46,21 @@ def test_a_ghost_leaves_out_geoms_that_lie_where_the_world_has_them() -> None:
     np.testing.assert_allclose([geom.pos[0] for geom in drawn.geoms], [0.5])
 
 
+@pytest.mark.parametrize(
+    ("kind", "angle", "drawn"),
+    [("capsule", 1.0, 0), ("cylinder", 1.0, 0), ("sphere", 1.0, 0), ("box", 1.0, 1), ("box", 0.0, 0)],
+)
+def test_a_ghost_leaves_out_a_geom_that_only_turned_about_its_axis(kind: str, angle: float, drawn: int) -> None:
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><worldbody>
+              <body><joint axis="0 0 1"/><geom type="{kind}" size=".1 .1 .1"/></body>
+            </worldbody></mujoco>"""
+    )
+    none = np.empty((0, 3)), np.empty((0, 4))
+    turned = Ghost(Pose(np.array([angle]), *none), (0.2, 0.4, 0.6, 0.3))
+    assert len(ExtraGeoms(model, 100).draw(Pose(np.zeros(1), *none), [turned]).geoms) == drawn
+
+
 def test_ghosts_of_a_model_with_several_bodies_are_drawn_in_their_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     """The kinematics are computed once for each of them, and for the world itself."""
     model = mujoco.MjModel.from_xml_string(
