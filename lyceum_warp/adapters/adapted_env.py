@@ -85,17 +85,19 @@ class HostArrays:
         env: The environment.
         copy: Whether results are copies. Without, those of an environment on the CPU are its live buffers, which
             change with the next step.
+        one_world: Whether actions are those of the only world, without its axis.
     """
 
-    def __init__(self, env: Env, *, copy: bool = True) -> None:
+    def __init__(self, env: Env, *, copy: bool = True, one_world: bool = False) -> None:
         self._env, self._copy = env, copy
         # an environment on the CPU shares its buffer; for another one the copy to the device starts from pinned memory
         pinned = torch.empty(env.action.shape, pin_memory=True) if env.action.is_cuda else None
         self._pinned = pinned
-        self._action = (env.action if pinned is None else pinned).numpy()
+        actions = (env.action if pinned is None else pinned).numpy()
+        self._action = actions[0] if one_world else actions
 
     def set_action(self, action: Any) -> None:
-        """Copy actions into the environment, (nworld, nact), floats of any size.
+        """Copy actions into the environment, (nworld, nact) or (nact,), float32 or float64.
 
         Raises:
             ValueError: They are not a NumPy array, or one of another shape or type.

@@ -53,7 +53,7 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         self._observations = Observations(self.env, dict_obs=dict_obs)
         self.observation_space = observation_space(self.env, dict_obs=self._observations.dict_obs)
         self.action_space = action_space(self.env)
-        self._host = HostArrays(self.env)
+        self._host = HostArrays(self.env, one_world=True)
         self._infos = Infos(self.env)
         self._seed = SeedOnce(seeded=isinstance(task, Env) or "seed" in words)
         self._reset_once = False
@@ -90,7 +90,7 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         """
         if not self._reset_once:
             raise gymnasium.error.ResetNeeded("there was no reset before this step: call reset() first")
-        self._host.set_action(action[None] if isinstance(action, np.ndarray) else action)
+        self._host.set_action(action)
         self.env.step()
         obs, (reward, terminated, truncated), info = self._shown()
         return obs, reward, terminated, truncated, info
