@@ -36,7 +36,7 @@ def test_a_step_has_the_numbers_of_the_environment_behind_it(full: StableBaselin
     rng = np.random.default_rng(0)
     returns, lengths, ends, timeouts = np.zeros(N), np.zeros(N, dtype=int), 0, 0
     for _ in range(45):
-        action = rng.uniform(-0.5, 1, (N, 3)).astype(np.float32)
+        action = rng.uniform(-1, 1, (N, 3)).astype(np.float32)
         obs, reward, done, infos = full.step(action)
         twin.step(torch.from_numpy(action))
         np.testing.assert_array_equal(obs, twin.obs.numpy())
@@ -55,7 +55,7 @@ def test_a_step_has_the_numbers_of_the_environment_behind_it(full: StableBaselin
                 assert info["episode_metrics"]["cost"] == twin.episode_metrics["cost"][world].item()
                 timeouts += info["TimeLimit.truncated"]
         returns[done], lengths[done], ends = 0, 0, ends + done.sum()
-    assert ends > timeouts > 0
+    assert ends and timeouts
 
 
 def test_only_ended_worlds_cost_a_dictionary(hopper: StableBaselines3VecEnv) -> None:
@@ -100,7 +100,7 @@ def test_vector_wrappers_work(hopper: StableBaselines3VecEnv) -> None:
     env.reset()
     rng = np.random.default_rng(0)
     for _ in range(40):
-        *_, done, infos = env.step(rng.uniform(-1, 1, (N, 3)).astype(np.float32))
+        *_, infos = env.step(rng.uniform(-1, 1, (N, 3)).astype(np.float32))
         for info in infos:
             assert ("terminal_observation" in info) == ("episode" in info)
     assert env.episode_count
