@@ -395,7 +395,7 @@ def test_options_that_do_not_fit_are_refused(options: dict[str, Any], message: s
 
 
 @pytest.mark.parametrize("seed", [-1, [1, 2, 3, 4], 0.5])
-def test_a_seed_that_is_no_number_is_refused(seed: Any, hopper: GymnasiumVectorEnv) -> None:
+def test_a_seed_that_is_not_a_whole_number_is_refused(seed: Any, hopper: GymnasiumVectorEnv) -> None:
     with pytest.raises(ValueError, match="seed must be a whole number"):
         hopper.reset(seed=seed)
 
