@@ -186,7 +186,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the process that draws pictures."""
-        self._pictures.close()
+        if hasattr(self, "_pictures"):  # Gymnasium closes an environment that could not be made, too
+            self._pictures.close()
 
     def _given(self, *buffers: torch.Tensor) -> list[Any]:
         """Buffers as the caller gets them."""
