@@ -3,11 +3,14 @@
 from typing import Any, ClassVar
 
 import numpy as np
+import torch
 
-from lyceum_warp.adapters.adapted_env import HostArrays, Infos, Observations, SeedOnce, environment_of
+from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of
 from lyceum_warp.adapters.gymnasium_library import gymnasium
 from lyceum_warp.adapters.gymnasium_spaces import action_space, observation_space
+from lyceum_warp.adapters.host_arrays import HostArrays
 from lyceum_warp.adapters.rendering import RENDER_MODES, check_render_mode, frame_rate
+from lyceum_warp.adapters.step_results import Observations, StepResults
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 from lyceum_warp.viz.cameras import CameraChoice
@@ -54,8 +57,8 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         self.observation_space = observation_space(self.env, dict_obs=self._observations.dict_obs)
         self.action_space = action_space(self.env)
         self._host = HostArrays(self.env, one_world=True)
-        self._infos = Infos(self.env)
-        self._seed = SeedOnce(seeded=isinstance(task, Env) or "seed" in words)
+        self._results = StepResults(self.env, self._observations, self._rows)
+        self._seeds = ResetSeeds(seeded=isinstance(task, Env) or "seed" in words)
         self._reset_once = False
         self._pictures = WorldPictures(self.env, camera=camera, size=render_size)
 
@@ -71,12 +74,12 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         """
         if options:
             raise ValueError(f"reset has no option {next(iter(options))!r}: leave options out")
-        drawn_seed = self._seed(seed, lambda: self.np_random_seed)
+        own_seed = self._seeds(seed, lambda: self.np_random_seed)
         super().reset(seed=seed)
-        self.env.rand_reset(drawn_seed)
+        self.env.rand_reset(own_seed)
         self._reset_once = True
-        obs, _, info = self._shown()
-        return obs, info
+        obs, *_, info = self._results()
+        return obs, _numbers(info)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advance the world by one step.
@@ -92,8 +95,8 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
             raise gymnasium.error.ResetNeeded("there was no reset before this step: call reset() first")
         self._host.set_action(action)
         self.env.step()
-        obs, (reward, terminated, truncated), info = self._shown()
-        return obs, reward, terminated, truncated, info
+        obs, reward, terminated, truncated, info = self._results()
+        return obs, float(reward), bool(terminated), bool(truncated), _numbers(info)
 
     def render(self) -> Any:
         """A picture of the world, (height, width, 3) uint8; None without a ``render_mode``.
@@ -107,14 +110,11 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         """End the process that draws pictures."""
         self._pictures.close()
 
-    def _shown(self) -> tuple[Any, list[Any], dict[str, Any]]:
-        """The observation, the results of the last step, and what else there is to say."""
-        count, results = self._observations.count, [self.env.reward, self.env.terminated, self.env.truncated]
-        values = self._host.of(*self._observations.current, *results, *self._infos.tensors)
-        obs = self._observations.formed([value[0] for value in values[:count]])
-        infos = self._infos.named(values[count + len(results) :])
-        return obs, [value.item() for value in values[count : count + len(results)]], _of_one_world(infos)
+    def _rows(self, *buffers: torch.Tensor) -> list[Any]:
+        """The row of the only world in each buffer."""
+        return [array[0] for array in self._host.of(*buffers)]
 
 
-def _of_one_world(infos: dict[str, Any]) -> dict[str, Any]:
-    return {name: _of_one_world(value) if isinstance(value, dict) else value[0].item() for name, value in infos.items()}
+def _numbers(info: dict[str, Any]) -> dict[str, Any]:
+    """Infos of one world as Python's own numbers."""
+    return {name: _numbers(value) if isinstance(value, dict) else value.item() for name, value in info.items()}

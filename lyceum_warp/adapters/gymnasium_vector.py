@@ -5,10 +5,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyceum_warp.adapters.adapted_env import HostArrays, Infos, Observations, SeedOnce, environment_of, per_world
+from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, per_world
 from lyceum_warp.adapters.gymnasium_library import gymnasium
 from lyceum_warp.adapters.gymnasium_spaces import action_space, observation_space
+from lyceum_warp.adapters.host_arrays import HostArrays
 from lyceum_warp.adapters.rendering import RENDER_MODES, check_render_mode, frame_rate
+from lyceum_warp.adapters.step_results import Observations, StepResults
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 from lyceum_warp.validate import check_tensor, described
@@ -95,8 +97,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
         self._host = None if torch else HostArrays(self.env, copy=copy)
         self._copy = copy
-        self._infos = Infos(self.env)
-        self._seed = SeedOnce(seeded=isinstance(task, Env) or "seed" in words)
+        self._results = StepResults(self.env, self._observations, self._given)
+        self._seeds = ResetSeeds(seeded=isinstance(task, Env) or "seed" in words)
         self._ended = self.env.done.clone()
         self._reset_once = False
         self._pictures = WorldPictures(self.env, camera=camera, size=render_size)
@@ -120,14 +122,13 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             ValueError: The seed is not a whole number, or an option is unknown or has another shape or type.
         """
         mask = self._mask(options)
-        drawn_seed = self._seed(seed, lambda: self.np_random_seed)
+        own_seed = self._seeds(seed, lambda: self.np_random_seed)
         super().reset(seed=seed)
-        self.env.rand_reset(drawn_seed, mask)
+        self.env.rand_reset(own_seed, mask)
         self._ended.copy_(self.env.done)
         self._reset_once = True
-        count = self._observations.count
-        values = self._given(*self._observations.current, *self._infos.tensors)
-        return self._observations.formed(values[:count]), self._infos.named(values[count:])
+        obs, *_, infos = self._results()
+        return obs, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Advance every world by one step.
@@ -153,13 +154,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             env.rand_reset(mask=self._ended)
             self._ended.copy_(env.done)
-        count = self._observations.count
-        results = [env.reward, env.terminated, env.truncated]
-        values = self._given(*self._observations.current, *results, *self._infos.tensors)
-        infos = self._infos.named(values[count + len(results) :])
+        obs, rewards, terminations, truncations, infos = self._results()
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
-            self._add_final(infos, values[count + 1], values[count + 2])
-        return self._observations.formed(values[:count]), *values[count : count + len(results)], infos
+            self._add_final(infos, terminations | truncations)
+        return obs, rewards, terminations, truncations, infos
 
     def render(self) -> tuple[Any, ...] | None:
         """A picture of each world, (height, width, 3) uint8; None without a ``render_mode``.
@@ -195,10 +193,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             return list(self._host.of(*buffers))
         return [buffer.clone() for buffer in buffers] if self._copy else list(buffers)
 
-    def _add_final(self, infos: dict[str, Any], terminated: Any, truncated: Any) -> None:
+    def _add_final(self, infos: dict[str, Any], ended: Any) -> None:
         """Add the last observations and infos of episodes that ended in this step."""
         final_info = dict(infos)
-        ended = terminated | truncated
         if self._host is None:
             final_obs = self._observations.formed(self._given(*self._observations.final))
         elif ended.any():

@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyceum_warp.adapters.adapted_env import HostArrays, Infos, Observations, SeedOnce, environment_of, per_world
+from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, per_world
 from lyceum_warp.adapters.gymnasium_spaces import action_space, observation_space
+from lyceum_warp.adapters.host_arrays import HostArrays
 from lyceum_warp.adapters.libraries import check_library
 from lyceum_warp.adapters.rendering import check_render_mode, frame_rate
+from lyceum_warp.adapters.step_results import Infos, Observations
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 from lyceum_warp.viz.cameras import CameraChoice
@@ -65,7 +67,7 @@ class StableBaselines3VecEnv(VecEnv):
         self._host, self._infos = HostArrays(env), Infos(env)
         super().__init__(env.nworld, observation_space(env, dict_obs=dict_obs), action_space(env))
         self.metadata: dict[str, Any] = {**self.metadata, "render_fps": frame_rate(env)}
-        self._seed_once = SeedOnce(seeded=isinstance(task, Env) or "seed" in words)
+        self._own_seeds = ResetSeeds(seeded=isinstance(task, Env) or "seed" in words)
         self._returns, self._lengths = np.zeros(env.nworld), np.zeros(env.nworld, dtype=int)
         self._no_infos: list[dict[str, Any]] = [{} for _ in range(env.nworld)]
         self._start = time.time()
@@ -80,7 +82,7 @@ class StableBaselines3VecEnv(VecEnv):
         """
         if options := next(filter(None, self._options), None):
             raise ValueError(f"reset has no option {next(iter(options))!r}: leave set_options out")
-        seed = self._seed_once(self._seeds[0], lambda: int(np.random.randint(2**31 - 1)))
+        seed = self._own_seeds(self._seeds[0], lambda: int(np.random.randint(2**31 - 1)))
         self.env.rand_reset(seed)
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0.0, 0
