@@ -43,6 +43,8 @@ class Options:
     """Samples an iteration, of all worlds together."""
     turns: int = 5
     """Iterations of each; medians over them are printed."""
+    threads: int = 1
+    """Threads of torch, whose networks are small here. The environments use all cores."""
     seed: int = 0
     """Seed of the worlds and of PPO."""
     out: Path | None = None
@@ -131,6 +133,7 @@ def measure(options: Options, nworld: int) -> list[Row]:
 
 
 def main(options: Options) -> None:
+    torch.set_num_threads(options.threads)
     rows = [row for nworld in options.nworld for row in measure(options, nworld)]
     table = Table("task", "worlds", "environments", "samples/s", "slowest to fastest", "rollouts alone, samples/s")
     for row in rows:
@@ -139,7 +142,7 @@ def main(options: Options) -> None:
         table.add_row(row.task, str(row.nworld), row.environments, *numbers, rollouts)
     Console().print(table)
     if options.out is not None:
-        settings = {"samples": options.samples, "turns": options.turns, "torch_threads": torch.get_num_threads()}
+        settings = {"samples": options.samples, "turns": options.turns, "torch_threads": options.threads}
         measurements.write(options.out, rows, **settings)
 
 

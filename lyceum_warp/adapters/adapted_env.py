@@ -1,6 +1,6 @@
 """What the adapters have in common: the environment behind them, its seeds, and its values for each world."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -12,7 +12,8 @@ from lyceum_warp.validate import whole_number
 _SEEDS = 2**31
 """Seeds of an environment lie below this number."""
 
-_OTHER_WORDS = {"nworld": "num_envs", "autoreset": "the adapter's way to reset"}
+_OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode, where there is one,"}
+"""Options of an environment that an adapter sets, and what decides instead."""
 
 
 def environment_of(
@@ -62,7 +63,7 @@ class ResetSeeds:
     def __init__(self, *, seeded: bool) -> None:
         self._seeded = seeded
 
-    def __call__(self, given: Any, drawn: Any) -> int | None:
+    def __call__(self, given: Any, drawn: Callable[[], Any]) -> int | None:
         """The seed of this reset; None where the random streams go on.
 
         Args:

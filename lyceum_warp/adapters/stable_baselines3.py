@@ -134,9 +134,11 @@ class StableBaselines3VecEnv(VecEnv):
         A tensor with a row for each world gives the rows, anything else the same value for each. A parameter of the
         task gives its value.
         """
-        params = self.env.task.parameters.values
-        if attr_name in params:
-            return self._chosen(params[attr_name], indices)
+        parameters = self.env.task.parameters
+        if attr_name in parameters.values:
+            value = parameters.values[attr_name]
+            rows = list(value) if attr_name in parameters.per_world else [value] * self.num_envs
+            return [rows[i] for i in self._get_indices(indices)]
         return self._chosen(getattr(self.env if hasattr(self.env, attr_name) else self, attr_name), indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:

@@ -121,6 +121,8 @@ def test_attributes_and_methods_are_those_of_the_worlds() -> None:
     assert env.get_attr("ctrl_cost_weight", indices=[0, 2]) == [0.5, 0.5]
     env.set_attr("ctrl_cost_weight", 0.25)
     assert env.env.given_params["ctrl_cost_weight"] == 0.25
+    env.set_attr("ctrl_cost_weight", [0.0, 1.0, 2.0, 3.0])
+    assert env.get_attr("ctrl_cost_weight", indices=[1, 3]) == [1.0, 3.0]
     env.reset()
     env.step(np.zeros((N, 3), dtype=np.float32))
     assert [step.item() for step in env.get_attr("episode_step", indices=[1, 3])] == [1, 1]
