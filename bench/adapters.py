@@ -1,12 +1,13 @@
 """Stable-Baselines3's PPO through its adapter, beside the same PPO on Gymnasium's environments.
 
     python bench/adapters.py --nworld 16 64
+    python bench/adapters.py --nworld 256 --samples 8192 --batch-size 1024 --epochs 5
 
 The learners take turns of one iteration each: a rollout and its update. Gymnasium's environments run in
 Stable-Baselines3's own vector environments: DummyVecEnv steps them one after another, SubprocVecEnv in a process each.
-All of them have the same hyperparameters, Stable-Baselines3's defaults with as many samples an iteration as for one
-environment. The update does not depend on the environment; it is timed apart, as the difference to the rollout. The
-first iteration of each is left out, because it compiles kernels and starts processes.
+All of them have the same hyperparameters. With Stable-Baselines3's defaults most of the time goes to the update, which
+is the same for all of them; therefore the rollouts, with their policy, are timed alone, too. The first iteration of
+each is left out, because it compiles kernels and starts processes.
 """
 
 import dataclasses
@@ -41,6 +42,10 @@ class Options:
     """The largest number of worlds for which SubprocVecEnv, with a process for each, is measured, too."""
     samples: int = 2048
     """Samples an iteration, of all worlds together."""
+    batch_size: int = 64
+    """Samples of a minibatch; the default is Stable-Baselines3's."""
+    epochs: int = 10
+    """Epochs of an update; the default is Stable-Baselines3's."""
     turns: int = 5
     """Iterations of each; medians over them are printed."""
     threads: int = 1
@@ -92,7 +97,10 @@ class Learner:
     def __init__(self, env: VecEnv, options: Options) -> None:
         self.env, self.options, self.clock = env, options, RolloutClock()
         steps = options.samples // env.num_envs
-        self.model = PPO("MlpPolicy", env, n_steps=steps, seed=options.seed, device="cpu")
+        self.model = PPO(
+            "MlpPolicy", env, n_steps=steps, batch_size=options.batch_size, n_epochs=options.epochs, seed=options.seed,
+            device="cpu",
+        )  # fmt: skip
         self.samples = steps * env.num_envs
         self.seconds: list[float] = []
         self.rollout_seconds: list[float] = []
@@ -142,7 +150,8 @@ def main(options: Options) -> None:
         table.add_row(row.task, str(row.nworld), row.environments, *numbers, rollouts)
     Console().print(table)
     if options.out is not None:
-        settings = {"samples": options.samples, "turns": options.turns, "torch_threads": options.threads}
+        names = ("samples", "batch_size", "epochs", "turns", "threads")
+        settings = {name: getattr(options, name) for name in names}
         measurements.write(options.out, rows, **settings)
 
 
