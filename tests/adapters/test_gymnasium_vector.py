@@ -249,6 +249,18 @@ def test_statistics_of_episodes_are_those_of_the_steps(hopper: GymnasiumVectorEn
     assert episodes > 3 and envs.episode_count == episodes
 
 
+def test_a_wrapper_passes_the_mask_of_a_partial_reset_on(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    envs = wrappers.vector.RecordEpisodeStatistics(vector(autoreset_mode=AutoresetMode.DISABLED))
+    envs.reset(seed=5)
+    lengths = []
+    for action in actions():
+        *_, terminated, truncated, infos = envs.step(action)
+        if (ended := terminated | truncated).any():
+            lengths += infos["episode"]["l"][ended].tolist()
+            envs.reset(options={"reset_mask": ended})
+    assert len(lengths) > 3 and max(lengths) == 20
+
+
 OBSERVATION_WRAPPERS = {
     "NormalizeObservation": wrappers.vector.NormalizeObservation,
     "FlattenObservation": wrappers.vector.FlattenObservation,

@@ -1,5 +1,6 @@
 """Many worlds as Stable-Baselines3's vector environment: its numbers, its learners, its wrappers, its errors."""
 
+import warnings
 from typing import Any
 
 import gymnasium
@@ -8,12 +9,14 @@ import pytest
 import torch
 from full_task import Full
 from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import lyceum_warp as lw
 from lyceum_warp.adapters.stable_baselines3 import StableBaselines3VecEnv
+from lyceum_warp.gym import GymnasiumEnv
 from lyceum_warp.viz.video import NoVideoError
 
 N = 4
@@ -92,6 +95,12 @@ def test_an_off_policy_learner_stores_the_last_observation_and_no_time_limit(ful
     assert len(ended)
     for step, world in ended:  # the next observation is not the first one of the next episode
         assert (buffer.next_observations[step, world] != buffer.observations[step + 1, world]).any()
+
+
+def test_stable_baselines3s_checker_accepts_a_single_world() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(GymnasiumEnv("hopper"), skip_render_check=True)
 
 
 def test_vector_wrappers_work(hopper: StableBaselines3VecEnv) -> None:
