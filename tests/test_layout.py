@@ -27,8 +27,8 @@ LEVELS = {
     "runs": 9,
     "keeper": 10, "kept_task": 10, "viz": 10,
     "training": 11,
-    "viewer": 12,
-    "cli": 13,
+    "adapters": 12, "viewer": 12,
+    "cli": 13, "gym": 13,
 }  # fmt: skip
 """The floor of every room: a room imports from lower floors, or from itself."""
 

@@ -1,4 +1,4 @@
-"""The process that draws a video, seen from this one."""
+"""The process that draws a video or pictures, seen from this one."""
 
 import contextlib
 import importlib.util
@@ -11,7 +11,7 @@ import sys
 import tempfile
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import mujoco
 import numpy as np
@@ -20,7 +20,7 @@ from lyceum_warp.files import replaced
 from lyceum_warp.validate import positive_number
 from lyceum_warp.viz import EXTRA
 from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
-from lyceum_warp.viz.render import CANNOT_DRAW, Shot
+from lyceum_warp.viz.render import CANNOT_DRAW, VIDEO, Shot
 
 _PATIENCE = 10.0  # seconds that the process gets to end
 
@@ -46,44 +46,40 @@ def libraries() -> list[str]:
     return list(dict.fromkeys([given, *others] if given else others))
 
 
-class Drawing:
-    """A process that draws poses into a file, with the first graphics library that works; a context.
+class DrawingProcess:
+    """A process that draws poses, with the first graphics library that works; a context.
 
     Args:
         model: The model.
-        out: The file.
         camera: The camera.
         size: Width and height in pixels.
-        fps: Frames per second.
+        fps: Frames per second of a video; None for pictures.
         background: Whether the process gives way to others on a busy machine.
 
     Raises:
-        ValueError: The model has no such camera, or an argument is out of range.
-        NoVideoError: A package for videos is not installed.
+        ValueError: The model has no such camera, or the size is out of range.
     """
 
+    product = "the drawing"
+    """What it makes, for error messages."""
+
     def __init__(
-        self, model: mujoco.MjModel, out: str | Path, *, camera: CameraChoice, size: tuple[int, int], fps: float,
+        self, model: mujoco.MjModel, *, camera: CameraChoice, size: tuple[int, int], fps: float | None,
         background: bool = False,
     ) -> None:  # fmt: skip
-        self._model, self.out = model, Path(out)
+        self._model = model
         if len(size) != 2 or any(not isinstance(n, int | np.integer) or n < 2 or n % 2 for n in size):
             raise ValueError(f"size must be two even numbers, the width and the height in pixels, not {size}")
-        if self.out.suffix.lower() != ".mp4" or self.out.is_dir():
-            raise ValueError(f"a video is an mp4 file: give a file's name that ends in .mp4, not {str(out)!r}")
-        self._job = {
-            "size": tuple(map(int, size)), "fps": positive_number("fps", fps, "frames per second"),
-            "camera": camera_values(find_camera(model, camera)), "background": background,
-        }  # fmt: skip
-        check_video()
-        self._frames = 0
+        self.size = int(size[0]), int(size[1])
+        camera_numbers = camera_values(find_camera(model, camera))
+        self._job = {"size": self.size, "fps": fps, "camera": camera_numbers, "background": background}
         self._ends = contextlib.ExitStack()
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: Any = None
         self._lock = threading.Lock()  # for abandon, which another thread calls
         self._abandoned = False
 
-    def __enter__(self) -> "Drawing":
+    def __enter__(self) -> Self:
         failures: list[str] = []
         for library in libraries():
             try:
@@ -97,7 +93,7 @@ class Drawing:
             self._stop()
             failures.append(f"{library or 'OpenGL'}: {reason}")
             if code > 0 and code != CANNOT_DRAW:  # another graphics library would fail, too
-                raise NoVideoError(f"the video could not be written ({reason})")
+                raise NoVideoError(f"{self.product} could not be written ({reason})")
         raise NoVideoError(
             f"this machine cannot draw off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
             "libegl1 and libgl1-mesa-dri) or OSMesa (libosmesa6), or set MUJOCO_GL to a library that works"
@@ -116,36 +112,6 @@ class Drawing:
             if self._process is not None:
                 _kill(self._process)
 
-    def draw(self, shot: Shot) -> None:
-        """Draw a pose, and write its frames.
-
-        Raises:
-            NoVideoError: The process has ended.
-        """
-        if not self._send(shot) or self._answer() != "frame":
-            raise NoVideoError(f"the video could not be written ({self._ended()[1]})")
-        self._frames += 1
-
-    def finish(self) -> Path:
-        """Complete the video, and put it in its place.
-
-        Raises:
-            NoVideoError: There is no frame, or the video cannot be completed.
-            OSError: The file cannot be written.
-        """
-        if not self._frames:
-            raise NoVideoError(f"the video {self.out} has no pose: nothing is written")
-        self._send(None)
-        code, reason = self._ended()
-        if code:
-            raise NoVideoError(f"the video could not be written ({reason})")
-        if self._abandoned:
-            raise NoVideoError(f"the video {self.out} was cancelled")
-        self.out.parent.mkdir(parents=True, exist_ok=True)
-        with replaced(self.out) as temporary:
-            shutil.copyfile(Path(self._folder, "video.mp4"), temporary)
-        return self.out
-
     def _start(self, library: str) -> None:
         environment = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
         if library:
@@ -159,7 +125,7 @@ class Drawing:
         command = [sys.executable, "-P", str(Path(__file__).with_name("render.py")), self._folder]
         with self._lock:
             if self._abandoned:
-                raise NoVideoError(f"the video {self.out} was cancelled")
+                raise NoVideoError(f"{self.product} was cancelled")
             self._process = subprocess.Popen(
                 command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
                 start_new_session=True,  # Ctrl-C in the shell is for this process alone, which ends the other one
@@ -212,6 +178,67 @@ class Drawing:
             finally:
                 process.stdout.close()
                 self._ends.close()
+
+
+class Drawing(DrawingProcess):
+    """A process that draws poses into a file, with the first graphics library that works; a context.
+
+    Args:
+        model: The model.
+        out: The file.
+        camera: The camera.
+        size: Width and height in pixels.
+        fps: Frames per second.
+        background: Whether the process gives way to others on a busy machine.
+
+    Raises:
+        ValueError: The model has no such camera, or an argument is out of range.
+        NoVideoError: A package for videos is not installed.
+    """
+
+    product = "the video"
+
+    def __init__(
+        self, model: mujoco.MjModel, out: str | Path, *, camera: CameraChoice, size: tuple[int, int], fps: float,
+        background: bool = False,
+    ) -> None:  # fmt: skip
+        self.out = Path(out)
+        fps = positive_number("fps", fps, "frames per second")
+        super().__init__(model, camera=camera, size=size, fps=fps, background=background)
+        if self.out.suffix.lower() != ".mp4" or self.out.is_dir():
+            raise ValueError(f"a video is an mp4 file: give a file's name that ends in .mp4, not {str(out)!r}")
+        check_video()
+        self._frames = 0
+
+    def draw(self, shot: Shot) -> None:
+        """Draw a pose, and write its frames.
+
+        Raises:
+            NoVideoError: The process has ended.
+        """
+        if not self._send(shot) or self._answer() != "frame":
+            raise NoVideoError(f"the video could not be written ({self._ended()[1]})")
+        self._frames += 1
+
+    def finish(self) -> Path:
+        """Complete the video, and put it in its place.
+
+        Raises:
+            NoVideoError: There is no frame, or the video cannot be completed.
+            OSError: The file cannot be written.
+        """
+        if not self._frames:
+            raise NoVideoError(f"the video {self.out} has no pose: nothing is written")
+        self._send(None)
+        code, reason = self._ended()
+        if code:
+            raise NoVideoError(f"the video could not be written ({reason})")
+        if self._abandoned:
+            raise NoVideoError(f"the video {self.out} was cancelled")
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        with replaced(self.out) as temporary:
+            shutil.copyfile(Path(self._folder, VIDEO), temporary)
+        return self.out
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:

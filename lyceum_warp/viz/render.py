@@ -1,9 +1,10 @@
-"""A program that draws poses into a video: ``python render.py folder``.
+"""A program that draws poses into a video, or as single pictures: ``python render.py folder``.
 
 ``drawing.py`` runs it in a process of its own and writes pickled objects to its standard input: first a dictionary with
 ``size``, ``fps``, ``camera`` and ``background``, then one dictionary for each picture (``Shot``), then None. The folder
-holds the model, ``model.mjb``; the program writes ``video.mp4`` beside it. It prints "ready" once it can draw, and a
-line for each picture. If its input ends without None, the process that runs it has died: it deletes the folder.
+holds the model, ``model.mjb``; the program writes ``video.mp4`` beside it, or, where ``fps`` is None, each picture over
+the last one into ``picture.raw``. It prints "ready" once it can draw, and a line for each picture. If its input ends
+without None, the process that runs it has died: it deletes the folder.
 
 MuJoCo chooses its graphics library once, when it is imported, and a driver that fails may end the process. Therefore
 ``drawing.py`` runs this file in a process for each library that it tries. The file imports nothing of the package. Exit
@@ -22,6 +23,9 @@ import numpy as np
 
 CANNOT_DRAW = 3
 ABANDONED = 4
+
+VIDEO, PICTURE = "video.mp4", "picture.raw"
+"""The files that the program writes; a picture is (height, width, 3) uint8."""
 
 
 class Shot(TypedDict):
@@ -152,12 +156,8 @@ def main(folder: str) -> int:
     except Exception as error:  # of different types, depending on the library
         print(str(error).strip() or type(error).__name__, file=sys.stderr)
         return CANNOT_DRAW
-    import imageio.v2 as imageio
-
-    options: Any = dict(fps=float(job["fps"]), codec="libx264", pixelformat="yuv420p", quality=8, macro_block_size=2)
     try:
-        writer: Any = imageio.get_writer(str(Path(folder, "video.mp4")), format="FFMPEG", **options)
-        with writer:
+        with _LastPicture(Path(folder, PICTURE)) if job["fps"] is None else _video(Path(folder, VIDEO), job) as writer:
             print("ready", flush=True)
             while (shot := pickle.load(source)) is not None:
                 image = painter.draw(shot)
@@ -169,6 +169,30 @@ def main(folder: str) -> int:
         return ABANDONED
     painter.renderer.close()
     return 0
+
+
+def _video(path: Path, job: dict[str, Any]) -> Any:
+    import imageio.v2 as imageio
+
+    options: Any = dict(fps=float(job["fps"]), codec="libx264", pixelformat="yuv420p", quality=8, macro_block_size=2)
+    return imageio.get_writer(str(path), format="FFMPEG", **options)
+
+
+class _LastPicture:
+    """A file with the picture that was drawn last, with the methods of a video."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> "_LastPicture":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        pass
+
+    def append_data(self, image: np.ndarray) -> None:
+        """Replace the picture."""
+        self.path.write_bytes(image.tobytes())
 
 
 if __name__ == "__main__":

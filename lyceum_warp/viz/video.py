@@ -5,7 +5,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -114,20 +114,31 @@ def write_video(
         raise ValueError(f"states must have the shape (steps, {env.state_space.size}), not {tuple(states.shape)}")
     rate = positive_number("speed", speed, "simulated seconds per second") / env.timestep
     stride = max(1, math.ceil(rate / _MAX_RATE - 1e-9))
-    parts = env.state_space.parts
     rows = states[::stride].cpu()
-    poses = [rows[:, parts[name]].numpy() if name in parts else _nothing(len(rows)) for name in _POSES]
-    fields = {field.name: rows[:, parts[field.name]].numpy() for field in env.task.dynamics}
     with (
         Drawing(env.model, out, camera=camera, size=size, fps=rate / stride) as drawing,
         _shown_progress(progress) as report,
     ):
-        for i in range(len(rows)):
-            shown = {name: values[i] for name, values in fields.items()}
-            drawing.draw(_shot((poses[0][i], poses[1][i].reshape(-1, 3), poses[2][i].reshape(-1, 4)), shown))
+        for i, shot in enumerate(shots(env, rows)):
+            drawing.draw(shot)
             if report is not None:
                 report(i + 1, len(rows))
         return drawing.finish()
+
+
+def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
+    """What pictures of states show, each state with the model fields that belong to it.
+
+    Args:
+        env: Environment that the states come from.
+        states: The states, (number of states, state_space.size), on the CPU.
+    """
+    parts = env.state_space.parts
+    poses = [states[:, parts[name]].numpy() if name in parts else _nothing(len(states)) for name in _POSES]
+    fields = {field.name: states[:, parts[field.name]].numpy() for field in env.task.dynamics}
+    for i in range(len(states)):
+        shown = {name: values[i] for name, values in fields.items()}
+        yield _shot((poses[0][i], poses[1][i].reshape(-1, 3), poses[2][i].reshape(-1, 4)), shown)
 
 
 def _shown_progress(progress: Progress | bool) -> contextlib.AbstractContextManager[Progress | None]:

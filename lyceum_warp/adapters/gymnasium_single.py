@@ -1,0 +1,120 @@
+"""One world as an environment of Gymnasium."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of
+from lyceum_warp.adapters.gymnasium_library import gymnasium
+from lyceum_warp.adapters.gymnasium_spaces import action_space, observation_space
+from lyceum_warp.adapters.host_arrays import HostArrays
+from lyceum_warp.adapters.rendering import RENDER_MODES, check_render_mode, frame_rate
+from lyceum_warp.adapters.step_results import Observations, StepResults
+from lyceum_warp.env import Env
+from lyceum_warp.task import Task
+from lyceum_warp.viz.cameras import CameraChoice
+from lyceum_warp.viz.pictures import WorldPictures
+
+
+class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
+    """One task in one world, as ``gymnasium.Env``: for evaluation, debugging and tools that take no vector environment.
+
+    ``info`` holds ``eval``, ``done_reason``, and where the task has them ``success``, ``metrics`` and
+    ``episode_metrics``. Many worlds are much faster in ``GymnasiumVectorEnv``.
+
+    Args:
+        task: A task as ``lw.make`` takes it, or an environment of one world, made with ``autoreset=False``.
+        dict_obs: Whether an observation is a dict of the task's groups. By default it is where there are several;
+            False gives the group ``policy`` alone.
+        render_mode: "rgb_array" for pictures, or None.
+        camera: The camera of pictures, as in ``lyceum_warp.viz.video.write_video``.
+        render_size: Their width and height in pixels, even numbers.
+        **words: Options and parameters for ``lw.make``.
+
+    Raises:
+        ValueError: An argument is unknown or does not fit.
+        FileNotFoundError: A package that brings the task's model is not installed.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES, "render_fps": 50}  # type: ignore[misc]
+
+    def __init__(
+        self,
+        task: str | type[Task] | Env,
+        *,
+        dict_obs: bool | None = None,
+        render_mode: str | None = None,
+        camera: CameraChoice = None,
+        render_size: tuple[int, int] = (480, 480),
+        **words: Any,
+    ) -> None:
+        check_render_mode(render_mode)
+        self.env = environment_of(task, 1, words, autoreset=False)
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": frame_rate(self.env)}  # type: ignore[misc]
+        self._observations = Observations(self.env, dict_obs=dict_obs)
+        self.observation_space = observation_space(self.env, dict_obs=self._observations.dict_obs)
+        self.action_space = action_space(self.env)
+        self._host = HostArrays(self.env, one_world=True)
+        self._results = StepResults(self.env, self._observations, self._rows)
+        self._seeds = ResetSeeds(seeded=isinstance(task, Env) or "seed" in words)
+        self._reset_once = False
+        self._pictures = WorldPictures(self.env, camera=camera, size=render_size)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin a new, random episode.
+
+        Args:
+            seed: Restarts the random stream; without one it goes on.
+            options: None or empty.
+
+        Raises:
+            ValueError: The seed is not a whole number, or there is an option.
+        """
+        if options:
+            raise ValueError(f"reset has no option {next(iter(options))!r}: leave options out")
+        own_seed = self._seeds(seed, lambda: self.np_random_seed)
+        super().reset(seed=seed)
+        self.env.rand_reset(own_seed)
+        self._reset_once = True
+        obs, *_, info = self._results()
+        return obs, _numbers(info)
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Advance the world by one step.
+
+        Args:
+            action: (nact,), float32.
+
+        Raises:
+            ResetNeeded: There was no reset yet.
+            ValueError: The action has another shape or type.
+        """
+        if not self._reset_once:
+            raise gymnasium.error.ResetNeeded("there was no reset before this step: call reset() first")
+        self._host.set_action(action)
+        self.env.step()
+        obs, reward, terminated, truncated, info = self._results()
+        return obs, float(reward), bool(terminated), bool(truncated), _numbers(info)
+
+    def render(self) -> Any:
+        """A picture of the world, (height, width, 3) uint8; None without a ``render_mode``.
+
+        Raises:
+            NoVideoError: The machine cannot draw.
+        """
+        return None if self.render_mode is None else self._pictures()[0]
+
+    def close(self) -> None:
+        """End the process that draws pictures."""
+        self._pictures.close()
+
+    def _rows(self, *buffers: torch.Tensor) -> list[Any]:
+        """The row of the only world in each buffer."""
+        return [array[0] for array in self._host.of(*buffers)]
+
+
+def _numbers(info: dict[str, Any]) -> dict[str, Any]:
+    """Infos of one world as Python's own numbers."""
+    return {name: _numbers(value) if isinstance(value, dict) else value.item() for name, value in info.items()}

@@ -1,0 +1,194 @@
+"""Many worlds as a vector environment of Stable-Baselines3. It needs the extra ``stable-baselines3``."""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, per_world
+from lyceum_warp.adapters.gymnasium_spaces import action_space, observation_space
+from lyceum_warp.adapters.host_arrays import HostArrays
+from lyceum_warp.adapters.libraries import check_library
+from lyceum_warp.adapters.rendering import check_render_mode, frame_rate
+from lyceum_warp.adapters.step_results import Infos, Observations
+from lyceum_warp.env import Env
+from lyceum_warp.task import Task
+from lyceum_warp.viz.cameras import CameraChoice
+from lyceum_warp.viz.pictures import WorldPictures
+
+check_library("stable-baselines3", low="2.9", below="3", install="lyceum-warp[stable-baselines3]")
+
+from stable_baselines3.common.monitor import Monitor  # noqa: E402 (after the check)
+from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
+
+
+class StableBaselines3VecEnv(VecEnv):
+    """One task in many worlds, as ``stable_baselines3.common.vec_env.VecEnv``.
+
+    A world whose episode ends has an info dict with ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (as
+    Stable-Baselines3's Monitor gives it: return ``r``, length ``l``, seconds since the start ``t``), ``eval``,
+    ``done_reason``, where the task has a goal ``is_success``, and where it has metrics ``episode_metrics``. Those of
+    the other worlds are empty, and are the same objects in every step.
+
+    Only the group ``policy`` of several groups of observations is given, because Stable-Baselines3 would show the
+    others to the policy, too.
+
+    Args:
+        task: A task as ``lw.make`` takes it, or an environment.
+        num_envs: Number of worlds.
+        dict_obs: Whether an observation is a dict of all groups instead.
+        render_mode: "rgb_array" for pictures, or None.
+        camera: The camera of pictures, as in ``lyceum_warp.viz.video.write_video``.
+        render_size: Their width and height in pixels, even numbers.
+        **words: Options and parameters for ``lw.make``.
+
+    Raises:
+        ValueError: An argument is unknown or does not fit.
+        FileNotFoundError: A package that brings the task's model is not installed.
+    """
+
+    def __init__(
+        self,
+        task: str | type[Task] | Env,
+        num_envs: int | None = None,
+        *,
+        dict_obs: bool = False,
+        render_mode: str | None = None,
+        camera: CameraChoice = None,
+        render_size: tuple[int, int] = (480, 480),
+        **words: Any,
+    ) -> None:
+        check_render_mode(render_mode)
+        self.render_mode = render_mode  # which the base class asks for
+        self.env = env = environment_of(task, num_envs, words, autoreset=True)
+        self._observations = Observations(env, dict_obs=dict_obs)
+        self._host, self._infos = HostArrays(env), Infos(env)
+        super().__init__(env.nworld, observation_space(env, dict_obs=dict_obs), action_space(env))
+        self.metadata: dict[str, Any] = {**self.metadata, "render_fps": frame_rate(env)}
+        self._own_seeds = ResetSeeds(seeded=isinstance(task, Env) or "seed" in words)
+        self._returns, self._lengths = np.zeros(env.nworld), np.zeros(env.nworld, dtype=int)
+        self._no_infos: list[dict[str, Any]] = [{} for _ in range(env.nworld)]
+        self._start = time.time()
+        self._reset_once = False
+        self._pictures = WorldPictures(env, camera=camera, size=render_size)
+
+    def reset(self) -> Any:
+        """Begin new, random episodes in all worlds, and return their first observations.
+
+        Raises:
+            ValueError: ``set_options`` gave an option; there is none.
+        """
+        if options := next(filter(None, self._options), None):
+            raise ValueError(f"reset has no option {next(iter(options))!r}: leave set_options out")
+        seed = self._own_seeds(self._seeds[0], lambda: int(np.random.randint(2**31 - 1)))
+        self.env.rand_reset(seed)
+        self._reset_seeds()
+        self._returns[:], self._lengths[:] = 0.0, 0
+        self._reset_once = True
+        return self._observations.formed(list(self._host.of(*self._observations.current)))
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Take the actions of the next step, (num_envs, nact), float32.
+
+        Raises:
+            RuntimeError: There was no reset yet.
+            ValueError: The actions have another shape or type.
+        """
+        if not self._reset_once:
+            raise RuntimeError("there was no reset before this step: call reset() first")
+        self._host.set_action(actions)
+
+    def step_wait(self) -> Any:
+        """Advance every world by one step.
+
+        Returns:
+            Observations, rewards, dones and info dicts.
+        """
+        env, count = self.env, self._observations.count
+        env.step()
+        *values, reward, done = self._host.of(*self._observations.current, env.reward, env.done)
+        self._returns += reward
+        self._lengths += 1
+        infos = self._no_infos.copy()
+        if done.any():
+            self._add_ends(infos, done.nonzero()[0])
+        return self._observations.formed(values[:count]), reward, done, infos
+
+    def close(self) -> None:
+        """End the process that draws pictures."""
+        self._pictures.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """A picture of each world, (height, width, 3) uint8; None for each without a ``render_mode``.
+
+        Raises:
+            NoVideoError: The machine cannot draw.
+        """
+        return [None] * self.num_envs if self.render_mode is None else self._pictures()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute of the environment behind this one, or of this one, for each world.
+
+        A tensor with a row for each world gives the rows, anything else the same value for each. A parameter of the
+        task gives its value.
+        """
+        parameters = self.env.task.parameters
+        if attr_name in parameters.values:
+            value = parameters.values[attr_name]
+            rows = list(value) if attr_name in parameters.per_world else [value] * self.num_envs
+            return [rows[i] for i in self._get_indices(indices)]
+        return self._chosen(getattr(self.env if hasattr(self.env, attr_name) else self, attr_name), indices)
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set a parameter of the task in all worlds, or an attribute of this environment.
+
+        Raises:
+            ValueError: ``indices`` leaves worlds out.
+        """
+        if len(set(self._get_indices(indices))) != self.num_envs:
+            raise ValueError(f"{attr_name!r} belongs to all worlds together: leave indices out")
+        if attr_name in self.env.task.parameters.values:
+            self.env.set_params(**{attr_name: value})
+        else:
+            setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Call a method of the environment behind this one once; its result for each world, as in ``get_attr``."""
+        return self._chosen(getattr(self.env, method_name)(*method_args, **method_kwargs), indices)
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
+        """Whether a wrapper's work is done here, for each world: that of Monitor is."""
+        return self._chosen(wrapper_class is Monitor, indices)
+
+    def _chosen(self, value: Any, indices: Any) -> list[Any]:
+        rows = per_world(value, self.num_envs)
+        return [rows[i] for i in self._get_indices(indices)]
+
+    def _add_ends(self, infos: list[dict[str, Any]], worlds: np.ndarray) -> None:
+        """Put the infos of ended episodes in their places, and begin to sum up the next ones."""
+        env, count = self.env, self._observations.count
+        index = torch.from_numpy(worlds).to(env.obs.device)
+        buffers = [*self._observations.final, env.terminated, *self._infos.tensors]
+        values = self._host.of(*(buffer[index] for buffer in buffers))
+        rows, terminated = self._observations.rows(values[:count]), values[count]
+        said = self._infos.named(values[count + 1 :])
+        said.pop("metrics", None)
+        seconds = round(time.time() - self._start, 6)
+        for i, world in enumerate(worlds.tolist()):
+            infos[world] = {
+                "terminal_observation": rows[i],
+                "TimeLimit.truncated": not terminated[i],
+                "episode": {"r": self._returns[world].item(), "l": self._lengths[world].item(), "t": seconds},
+                **_of_world(said, i),
+            }
+        self._returns[worlds], self._lengths[worlds] = 0.0, 0
+
+
+def _of_world(infos: dict[str, Any], i: int) -> dict[str, Any]:
+    """The infos of one world, under Stable-Baselines3's names."""
+    return {
+        "is_success" if name == "success" else name: _of_world(value, i) if isinstance(value, dict) else value[i].item()
+        for name, value in infos.items()
+    }

@@ -1,0 +1,108 @@
+"""What a step led to, in the forms that libraries expect."""
+
+from collections.abc import Callable
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import torch
+
+from lyceum_warp.arrays import torch_view
+from lyceum_warp.env import Env
+
+
+class Observations:
+    """The observations that an adapter gives: those of the group ``policy``, or of every group by its name.
+
+    Args:
+        env: The environment.
+        dict_obs: Whether to give every group; None where there are several.
+    """
+
+    def __init__(self, env: Env, *, dict_obs: bool | None) -> None:
+        self._env = env
+        self.dict_obs = len(env.obs_groups) > 1 if dict_obs is None else dict_obs
+        self._groups = list(env.obs_groups) if self.dict_obs else ["policy"]
+
+    @property
+    def current(self) -> list[torch.Tensor]:
+        """The observations of each group, (nworld, size); without automatic resets the last ones of ended episodes."""
+        env = self._env
+        if env.autoreset:
+            return [env.obs_groups[group] for group in self._groups]
+        # a world with a fault has restarted even then, and its observation is that of its next episode
+        done = env.done[:, None]
+        return [torch.where(done, env.final_obs_groups[group], env.obs_groups[group]) for group in self._groups]
+
+    @property
+    def final(self) -> list[torch.Tensor]:
+        """The same of the states that the last step led to, before any reset."""
+        return [self._env.final_obs_groups[group] for group in self._groups]
+
+    @property
+    def count(self) -> int:
+        """Number of groups."""
+        return len(self._groups)
+
+    def formed(self, values: list[Any]) -> Any:
+        """Values of the groups as the library takes them: one array, or a dict of arrays."""
+        return dict(zip(self._groups, values, strict=True)) if self.dict_obs else values[0]
+
+    def rows(self, values: list[np.ndarray]) -> list[Any]:
+        """Arrays of the groups, (worlds, size of the group), as one observation for each world."""
+        return [self.formed(list(row)) for row in zip(*values, strict=True)]
+
+
+class Infos:
+    """What an environment says about a step beside its results, by name.
+
+    ``eval`` is the evaluation metric of the state that the step led to, ``done_reason`` has the bits of ``lw.Done``,
+    ``success`` is there where the task has a goal; ``metrics`` and ``episode_metrics`` (their sums over the episode of
+    the step) where it has metrics.
+
+    Args:
+        env: The environment.
+    """
+
+    def __init__(self, env: Env) -> None:
+        self._plain = {"eval": env.eval, "done_reason": env.done_reason}
+        if env.task.functions["success"] is not None:
+            self._plain["success"] = env.success
+        self._metrics = {}
+        if env.metrics:
+            self._metrics = {"metrics": torch_view(env.worlds.metrics), "episode_metrics": env.episode_metric_sums}
+        self._names = tuple(env.metrics)
+
+    @property
+    def tensors(self) -> list[torch.Tensor]:
+        """The buffers that hold it all."""
+        return [*self._plain.values(), *self._metrics.values()]
+
+    def named(self, values: list[Any]) -> dict[str, Any]:
+        """Values of the buffers in their order, tensors or arrays, by name."""
+        infos = dict(zip(self._plain, values, strict=False))
+        for name, table in zip(self._metrics, values[len(self._plain) :], strict=True):
+            infos[name] = dict(zip(self._names, table.T, strict=True))
+        return infos
+
+
+class StepResults:
+    """The results of a step as Gymnasium returns them.
+
+    Args:
+        env: The environment.
+        observations: Its observations.
+        given: Turns buffers into what the caller gets, all of them in one call.
+    """
+
+    def __init__(self, env: Env, observations: Observations, given: Callable[..., list[Any]]) -> None:
+        self._buffers = env.reward, env.terminated, env.truncated
+        self._observations, self._infos, self._given = observations, Infos(env), given
+
+    def __call__(self) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Observations, rewards, terminations, truncations and infos."""
+        shown = self._observations.current
+        values = iter(self._given(*shown, *self._buffers, *self._infos.tensors))
+        obs = self._observations.formed(list(islice(values, len(shown))))
+        reward, terminated, truncated = islice(values, len(self._buffers))
+        return obs, reward, terminated, truncated, self._infos.named(list(values))

@@ -1,0 +1,45 @@
+"""Gymnasium's ids of all tasks: ``gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=64)``.
+
+Importing this module registers every task of the package, and every task that was registered by then, in the namespace
+``lyceum``, under the name of its class: ``lyceum/HalfCheetah-v0``. No task's file is read before an environment is
+made. ``register`` adds a task of your own.
+"""
+
+from pathlib import Path
+
+from lyceum_warp.adapters.gymnasium_library import gymnasium
+from lyceum_warp.adapters.gymnasium_single import GymnasiumEnv
+from lyceum_warp.adapters.gymnasium_vector import GymnasiumVectorEnv
+from lyceum_warp.binding.registry import find_task, task_name, task_names
+from lyceum_warp.task import Task
+
+__all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "register"]
+
+
+def register(task: str | Path | type[Task]) -> str:
+    """Give a task an id of Gymnasium, and return it, as "lyceum/MyHopper-v0".
+
+    A task with the same id is replaced.
+
+    Args:
+        task: Name of a task, a file with one, or its class.
+
+    Raises:
+        ValueError: There is no such task.
+        FileNotFoundError: There is no such file.
+    """
+    known = isinstance(task, str) and task in task_names()
+    name = str(task) if known else task_name(find_task(task))
+    id = f"lyceum/{''.join(map(str.capitalize, name.split('_')))}-v0"
+    gymnasium.registry.pop(id, None)  # Gymnasium warns of an id that is registered twice
+    gymnasium.register(
+        id,
+        entry_point="lyceum_warp.gym:GymnasiumEnv",
+        vector_entry_point="lyceum_warp.gym:GymnasiumVectorEnv",
+        kwargs={"task": name if known else find_task(task)},
+    )
+    return id
+
+
+for _task in task_names():
+    register(_task)

@@ -1,0 +1,134 @@
+"""One world as Gymnasium's environment, which Gymnasium's own checker accepts."""
+
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from full_task import Full
+from gymnasium import wrappers
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+
+import lyceum_warp as lw
+from lyceum_warp.gym import GymnasiumEnv
+from lyceum_warp.viz.video import NoVideoError
+
+
+@pytest.fixture(scope="module")
+def hopper() -> Iterator[gymnasium.Env]:
+    env = gymnasium.make("lyceum_warp.gym:lyceum/Hopper-v0")
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def draws() -> bool:
+    """Whether this machine can draw."""
+    try:
+        env = GymnasiumEnv("hopper", render_mode="rgb_array", render_size=(64, 48))
+        assert env.render().shape == (48, 64, 3)
+        env.close()
+    except NoVideoError:
+        return False
+    return True
+
+
+THEIRS = ("is -infinity. This is probably too low", "is infinity. This is probably too high")
+"""What the checker says of every observation without bounds, those of Gymnasium's own robots included."""
+
+
+def test_gymnasiums_checker_has_no_complaint(hopper: gymnasium.Env, draws: bool) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(hopper.unwrapped, skip_render_check=not draws)
+    said = [str(warning.message) for warning in caught]
+    assert not [text for text in said if not any(known in text for known in THEIRS)]
+
+
+def test_the_checker_accepts_groups_of_observations() -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(GymnasiumEnv(Full), skip_render_check=True)
+    said = [str(warning.message) for warning in caught]
+    assert not [text for text in said if not any(known in text for known in THEIRS)]
+
+
+def test_a_step_has_the_numbers_of_the_environment_behind_it() -> None:
+    env, twin = GymnasiumEnv(Full), lw.make(Full, autoreset=False)
+    obs, info = env.reset(seed=7)
+    twin.rand_reset(7)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        assert env.observation_space.contains(obs)
+        np.testing.assert_array_equal(obs["critic"], twin.obs_groups["critic"][0].numpy())
+        action = rng.uniform(-1, 1, 3).astype(np.float32)
+        obs, reward, terminated, truncated, info = env.step(action)
+        twin.step(torch.from_numpy(action)[None])
+        assert (reward, terminated, truncated) == (twin.reward.item(), twin.terminated.item(), twin.truncated.item())
+        assert info["eval"] == twin.eval.item() and info["done_reason"] == twin.done_reason.item()
+        assert info["metrics"] == {name: value.item() for name, value in twin.metrics.items()}
+        assert info["episode_metrics"]["cost"] == twin.episode_metrics["cost"].item()
+        if terminated or truncated:
+            break
+    else:
+        pytest.fail("no episode ended within the horizon")
+
+
+def test_wrappers_of_gymnasium_work(hopper: gymnasium.Env) -> None:
+    env: Any = wrappers.TimeLimit(wrappers.NormalizeObservation(hopper), max_episode_steps=5)
+    env = wrappers.RecordEpisodeStatistics(wrappers.ClipAction(wrappers.NormalizeReward(env)))
+    env.reset(seed=0)
+    for step in range(5):
+        *_, terminated, truncated, info = env.step(np.zeros(3, dtype=np.float32))
+        assert not terminated and truncated == (step == 4)
+    assert info["episode"]["l"] == 5
+
+
+def test_gymnasiums_own_vector_environments_take_it() -> None:
+    envs = gymnasium.make_vec("lyceum_warp.gym:lyceum/PointMass-v0", num_envs=2, vectorization_mode="sync")
+    obs, _ = envs.reset()
+    assert (obs[0] != obs[1]).any()
+    envs.step(envs.action_space.sample())
+
+
+def test_a_maximal_number_of_steps_is_gymnasiums(hopper: gymnasium.Env) -> None:
+    env = gymnasium.make("lyceum_warp.gym:lyceum/Hopper-v0", max_episode_steps=2)
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(3, dtype=np.float32))[3] for _ in range(2)]
+    assert ends == [False, True]
+    envs = gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=2, max_episode_steps=2)
+    envs.reset(seed=0)
+    ends = [envs.step(np.zeros((2, 3), dtype=np.float32))[3].all() for _ in range(2)]
+    assert ends == [False, True]
+
+
+@pytest.mark.parametrize(
+    "action, message",
+    [
+        (np.zeros(2, dtype=np.float32), r"float32 array of shape \(3,\), not a float32 array of shape \(2,\)"),
+        (np.zeros((1, 3), dtype=np.float32), r"not a float32 array of shape \(1, 3\)"),
+        (np.zeros(3, dtype=int), r"float32 array of shape \(3,\), not a int64 array of shape \(3,\)"),
+        (torch.zeros(3), r"not a float32 tensor of shape \(3,\)"),
+    ],
+)
+def test_an_action_that_does_not_fit_is_refused(action: Any, message: str, hopper: gymnasium.Env) -> None:
+    hopper.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        hopper.unwrapped.step(action)
+
+
+def test_a_step_before_a_reset_is_refused() -> None:
+    env = GymnasiumEnv("hopper")
+    with pytest.raises(ResetNeeded, match="there was no reset before this step: call reset"):
+        env.step(np.zeros(3, dtype=np.float32))
+    with pytest.raises(ValueError, match="reset has no option 'reset_mask': leave options out"):
+        env.reset(options={"reset_mask": [True]})
+
+
+def test_an_environment_of_several_worlds_is_refused() -> None:
+    with pytest.raises(ValueError, match="the environment has 2 worlds, not num_envs=1"):
+        GymnasiumEnv(lw.make("hopper", nworld=2, autoreset=False))

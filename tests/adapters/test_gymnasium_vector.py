@@ -1,0 +1,452 @@
+"""Many worlds as Gymnasium's vector environment: its numbers, its modes, its wrappers, its errors."""
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from full_task import Full
+from gymnasium import wrappers
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode
+
+import lyceum_warp as lw
+from lyceum_warp.gym import GymnasiumVectorEnv
+from lyceum_warp.viz.video import NoVideoError
+
+STEPS = 30
+N = 4
+
+
+@pytest.fixture(scope="module")
+def made() -> Callable[..., lw.Env]:
+    """Environments of ``Full``, whose episodes have at most 20 steps; one with automatic resets and one without."""
+    envs: dict[bool, lw.Env] = {}
+
+    def get(*, autoreset: bool = True) -> lw.Env:
+        if autoreset not in envs:
+            envs[autoreset] = lw.make(Full, nworld=N, autoreset=autoreset)
+        return envs[autoreset]
+
+    return get
+
+
+@pytest.fixture
+def vector(made: Callable[..., lw.Env]) -> Callable[..., GymnasiumVectorEnv]:
+    def get(**options: Any) -> GymnasiumVectorEnv:
+        mode = options.get("autoreset_mode", AutoresetMode.SAME_STEP)
+        return GymnasiumVectorEnv(made(autoreset=mode is AutoresetMode.SAME_STEP), **options)
+
+    return get
+
+
+@pytest.fixture(scope="module")
+def hopper() -> Iterator[GymnasiumVectorEnv]:
+    env = gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=N)
+    assert isinstance(env, GymnasiumVectorEnv)
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def hopper_in_next_step() -> GymnasiumVectorEnv:
+    return GymnasiumVectorEnv("hopper", N, autoreset_mode="NextStep")
+
+
+def actions() -> Iterator[np.ndarray]:
+    rng = np.random.default_rng(0)
+    for _ in range(STEPS):
+        yield rng.uniform(-1, 1, (N, 3)).astype(np.float32)
+
+
+def as_array(value: Any) -> np.ndarray:
+    return value.numpy().copy() if isinstance(value, torch.Tensor) else value
+
+
+def by_hand(env: lw.Env) -> list[dict[str, np.ndarray]]:
+    """The buffers of an environment after each step of the same actions."""
+    env.rand_reset(5)
+    steps = []
+    for action in actions():
+        env.step(torch.from_numpy(action))
+        values = {
+            name: getattr(env, name) for name in ("obs", "final_obs", "reward", "terminated", "truncated", "done")
+        }
+        values |= {"critic": env.obs_groups["critic"], "final_critic": env.final_obs_groups["critic"], "eval": env.eval}
+        values |= {"success": env.success, "done_reason": env.done_reason, "speed": env.metrics["speed"]}
+        values |= {"cost_sum": env.episode_metrics["cost"]}
+        steps.append({name: as_array(value) for name, value in values.items()})
+    assert sum(step["done"].sum() for step in steps) > 3
+    return steps
+
+
+@pytest.mark.parametrize("tensors", [False, True], ids=["numpy", "torch"])
+def test_a_step_has_the_numbers_of_the_environment_behind_it(
+    tensors: bool, vector: Callable[..., GymnasiumVectorEnv]
+) -> None:
+    envs = vector(torch=tensors)
+    expected = by_hand(envs.env)
+    obs, infos = envs.reset(seed=5)
+    assert obs.keys() == {"policy", "critic"} and infos["eval"].shape == (N,)
+    for step, action in zip(expected, actions(), strict=True):
+        given: Any = torch.from_numpy(action) if tensors else action
+        obs, reward, terminated, truncated, infos = envs.step(given)
+        assert isinstance(reward, torch.Tensor if tensors else np.ndarray)
+        shown = {
+            "obs": obs["policy"], "critic": obs["critic"], "reward": reward, "terminated": terminated,
+            "truncated": truncated, "eval": infos["eval"], "done_reason": infos["done_reason"],
+            "success": infos["success"], "speed": infos["metrics"]["speed"],
+            "cost_sum": infos["episode_metrics"]["cost"],
+        }  # fmt: skip
+        for name, value in shown.items():
+            np.testing.assert_array_equal(as_array(value), step[name], err_msg=name)
+        if not tensors:
+            assert ("final_obs" in infos) == step["done"].any()
+        if "final_obs" in infos:
+            check_final(infos, step, tensors)
+
+
+def check_final(infos: dict[str, Any], step: dict[str, np.ndarray], tensors: bool) -> None:
+    ended = step["done"]
+    for mask in ("_final_obs", "_final_info"):
+        np.testing.assert_array_equal(as_array(infos[mask]), ended)
+    np.testing.assert_array_equal(as_array(infos["final_info"]["eval"])[ended], step["eval"][ended])
+    if tensors:
+        np.testing.assert_array_equal(as_array(infos["final_obs"]["critic"]), step["final_critic"])
+        return
+    for world, final in enumerate(infos["final_obs"]):
+        assert (final is not None) == ended[world]
+        if final is not None:
+            np.testing.assert_array_equal(final["policy"], step["final_obs"][world])
+            np.testing.assert_array_equal(final["critic"], step["final_critic"][world])
+
+
+def test_results_of_a_step_do_not_change_with_the_next(hopper: GymnasiumVectorEnv) -> None:
+    hopper.reset(seed=0)
+    first = hopper.step(np.ones((N, 3), dtype=np.float32))
+    before = [value.copy() for value in first[:4]]
+    second = hopper.step(np.ones((N, 3), dtype=np.float32))
+    assert all(np.array_equal(a, b) for a, b in zip(before, first, strict=False))
+    assert not np.shares_memory(first[0], second[0])
+
+
+def test_without_copies_results_are_the_buffers(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    envs = vector(torch=True, copy=False)
+    obs, _ = envs.reset(seed=0)
+    assert obs["policy"].data_ptr() == envs.env.obs.data_ptr()
+    obs, _ = vector(copy=False).reset(seed=0)
+    assert np.shares_memory(obs["policy"], envs.env.obs.numpy())
+
+
+def test_a_disabled_reset_leaves_ended_worlds_until_the_mask_resets_them(
+    vector: Callable[..., GymnasiumVectorEnv],
+) -> None:
+    envs = vector(autoreset_mode=AutoresetMode.DISABLED)
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.DISABLED
+    envs.reset(seed=5)
+    ended = np.zeros(N, dtype=bool)
+    for action in actions():
+        obs, _, terminated, truncated, infos = envs.step(action)
+        assert (ended <= (terminated | truncated)).all() and "final_obs" not in infos
+        ended = terminated | truncated
+        if ended.any() and not ended.all():
+            break
+    np.testing.assert_array_equal(obs["policy"][ended], envs.env.final_obs.numpy()[ended])
+    reset, infos = envs.reset(options={"reset_mask": ended})
+    np.testing.assert_array_equal(reset["policy"][~ended], obs["policy"][~ended])
+    assert (reset["policy"][ended] != obs["policy"][ended]).any()
+    assert not envs.env.done.any() and (infos["done_reason"] == 0).all()
+    assert (envs.env.episode_step.numpy()[ended] == 0).all()
+
+
+def test_a_mask_may_be_a_tensor(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    envs = vector(torch=True)
+    before, _ = envs.reset(seed=1)
+    mask = torch.tensor([True, False, False, True])
+    after, _ = envs.reset(options={"reset_mask": mask})
+    torch.testing.assert_close(after["policy"][~mask], before["policy"][~mask], rtol=0, atol=0)
+    assert (after["policy"][mask] != before["policy"][mask]).any()
+
+
+def test_a_world_with_a_fault_shows_its_last_good_observation_without_automatic_resets(
+    vector: Callable[..., GymnasiumVectorEnv],
+) -> None:
+    envs = vector(autoreset_mode=AutoresetMode.DISABLED)
+    before, _ = envs.reset(seed=2)
+    action = np.zeros((N, 3), dtype=np.float32)
+    action[1] = np.nan
+    obs, reward, terminated, _, infos = envs.step(action)
+    np.testing.assert_array_equal(terminated, [False, True, False, False])
+    np.testing.assert_array_equal(obs["policy"][1], before["policy"][1])
+    assert reward[1] == 0 and infos["done_reason"][1] == lw.Done.ACTION
+
+
+def test_a_next_step_reset_follows_in_the_step_after_the_end(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    envs = vector(autoreset_mode=AutoresetMode.NEXT_STEP)
+    envs.reset(seed=5)
+    ended, ends = np.zeros(N, dtype=bool), 0
+    for action in actions():
+        obs, reward, terminated, truncated, infos = envs.step(action)
+        assert not (ended & (terminated | truncated)).any() and (reward[ended] == 0).all()
+        assert (envs.env.episode_step.numpy()[ended] == 0).all()
+        ended = terminated | truncated
+        np.testing.assert_array_equal(obs["policy"][ended], envs.env.final_obs.numpy()[ended])
+        assert "final_obs" not in infos
+        ends += ended.sum()
+    assert ends > 3
+
+
+def test_a_seed_gives_the_same_worlds_and_no_seed_others(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    envs = vector()
+    first, again = (envs.reset(seed=2**40 + 3)[0]["policy"] for _ in range(2))
+    other, going_on = envs.reset(seed=4)[0]["policy"], envs.reset()[0]["policy"]
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any() and (other != going_on).any()
+    assert len(np.unique(first[:, 0])) == N
+
+
+def test_the_first_reset_without_a_seed_draws_one(hopper: GymnasiumVectorEnv) -> None:
+    def first(**options: Any) -> np.ndarray:
+        return GymnasiumVectorEnv("hopper", 2, **options).reset()[0]
+
+    assert (first() != first()).any()
+    np.testing.assert_array_equal(first(seed=3), first(seed=3))
+
+
+def test_spaces_have_the_bounds_of_the_environment(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    envs = vector()
+    assert envs.single_action_space == gymnasium.spaces.Box(-1, 1, (3,), np.float32)
+    assert {name: space.shape for name, space in envs.observation_space.items()} == {
+        "policy": (N, 3),
+        "critic": (N, 10),
+    }
+    obs, _ = envs.reset(seed=0)
+    assert obs in envs.observation_space
+    assert vector(dict_obs=False).single_observation_space.shape == (3,)
+    assert GymnasiumVectorEnv("hopper", dict_obs=True).single_observation_space["policy"].shape == (11,)
+
+
+# Gymnasium's wrappers
+
+
+def test_statistics_of_episodes_are_those_of_the_steps(hopper: GymnasiumVectorEnv) -> None:
+    envs = wrappers.vector.RecordEpisodeStatistics(hopper)
+    envs.reset(seed=0)
+    envs.action_space.seed(0)
+    returns, lengths, episodes = np.zeros(N), np.zeros(N, dtype=int), 0
+    for _ in range(60):
+        _, reward, terminated, truncated, infos = envs.step(envs.action_space.sample())
+        returns, lengths = returns + reward, lengths + 1
+        ended = terminated | truncated
+        if ended.any():
+            np.testing.assert_allclose(infos["episode"]["r"][ended], returns[ended])
+            np.testing.assert_array_equal(infos["episode"]["l"][ended], lengths[ended])
+        returns[ended], lengths[ended], episodes = 0, 0, episodes + ended.sum()
+    assert episodes > 3 and envs.episode_count == episodes
+
+
+def test_a_wrapper_passes_the_mask_of_a_partial_reset_on(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    envs = wrappers.vector.RecordEpisodeStatistics(vector(autoreset_mode=AutoresetMode.DISABLED))
+    envs.reset(seed=5)
+    lengths = []
+    for action in actions():
+        *_, terminated, truncated, infos = envs.step(action)
+        if (ended := terminated | truncated).any():
+            lengths += infos["episode"]["l"][ended].tolist()
+            envs.reset(options={"reset_mask": ended})
+    assert len(lengths) > 3 and max(lengths) == 20
+
+
+OBSERVATION_WRAPPERS = {
+    "NormalizeObservation": wrappers.vector.NormalizeObservation,
+    "FlattenObservation": wrappers.vector.FlattenObservation,
+    "DtypeObservation": lambda envs: wrappers.vector.DtypeObservation(envs, np.float64),
+    "TransformObservation": lambda envs: wrappers.vector.TransformObservation(envs, lambda obs: np.clip(obs, -9, 9)),
+}
+"""Those that Gymnasium refuses in the mode SAME_STEP."""
+
+OTHER_WRAPPERS = {
+    "ClipAction": wrappers.vector.ClipAction,
+    "RescaleAction": lambda envs: wrappers.vector.RescaleAction(envs, np.float32(-2), np.float32(2)),
+    "ClipReward": lambda envs: wrappers.vector.ClipReward(envs, 0.0, 0.5),
+    "NormalizeReward": wrappers.vector.NormalizeReward,
+    "DictInfoToList": lambda envs: wrappers.vector.DictInfoToList(wrappers.vector.RecordEpisodeStatistics(envs)),
+}
+
+
+@pytest.mark.parametrize("name", [*OTHER_WRAPPERS, *OBSERVATION_WRAPPERS])
+def test_a_wrapper_of_gymnasium_works(
+    name: str, hopper: GymnasiumVectorEnv, hopper_in_next_step: GymnasiumVectorEnv
+) -> None:
+    if name in OTHER_WRAPPERS:
+        envs = OTHER_WRAPPERS[name](hopper)
+    else:
+        with pytest.raises(ValueError, match="NEXT_STEP"):
+            OBSERVATION_WRAPPERS[name](hopper)
+        envs = OBSERVATION_WRAPPERS[name](hopper_in_next_step)
+    envs.reset(seed=0)
+    envs.action_space.seed(0)
+    ends = 0
+    for _ in range(40):
+        obs, _, terminated, _, infos = envs.step(envs.action_space.sample())
+        assert obs in envs.observation_space
+        ends += terminated.sum()
+        if isinstance(infos, list):
+            assert all(("final_obs" in info) == end for info, end in zip(infos, terminated, strict=True))
+    assert ends
+
+
+# pictures
+
+
+def test_a_picture_shows_each_world_as_it_is(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    envs = vector(render_mode="rgb_array", render_size=(64, 48))
+    envs.reset(seed=0)
+    try:
+        frames = envs.render()
+    except NoVideoError as error:
+        pytest.skip(str(error))
+    assert frames is not None and len(frames) == N
+    assert all(frame.shape == (48, 64, 3) and frame.dtype == np.uint8 for frame in frames)
+    assert envs.call("render")[0].shape == (48, 64, 3)
+    for action in actions():
+        envs.step(action)
+    assert any((before != after).any() for before, after in zip(frames, envs.render() or (), strict=True))
+    envs.close()
+
+
+def test_without_a_render_mode_there_is_no_picture(hopper: GymnasiumVectorEnv) -> None:
+    assert hopper.render() is None
+
+
+# cost
+
+
+def test_a_step_runs_the_same_python_for_any_number_of_worlds() -> None:
+    def calls(num_envs: int, **options: Any) -> int:
+        envs = GymnasiumVectorEnv("hopper", num_envs, **options)
+        envs.reset(seed=0)
+        action: Any = np.zeros((num_envs, 3), dtype=np.float32)
+        action = torch.from_numpy(action) if options.get("torch") else action
+        envs.step(action)
+        count = 0
+
+        def counted(frame: Any, event: str, argument: Any) -> None:
+            nonlocal count
+            count += event in ("call", "c_call")
+
+        sys.setprofile(counted)
+        envs.step(action)
+        sys.setprofile(None)
+        return count
+
+    assert calls(2) == calls(64) > 10
+    assert calls(2, torch=True) == calls(64, torch=True) > 10
+
+
+# errors
+
+
+@pytest.mark.parametrize(
+    "action, message",
+    [
+        (np.zeros((4, 2), dtype=np.float32), r"float32 array of shape \(4, 3\), not a float32 array of shape \(4, 2\)"),
+        (np.zeros((4, 3), dtype=int), r"actions must be a float32 array of shape \(4, 3\), not a int64 array"),
+        (torch.zeros(4, 3), r"not a float32 tensor of shape \(4, 3\)"),
+        ([[0.0] * 3] * 4, r"float32 array of shape \(4, 3\), not list"),
+    ],
+)
+def test_actions_that_do_not_fit_are_refused(action: Any, message: str, hopper: GymnasiumVectorEnv) -> None:
+    hopper.reset(seed=0)
+    with pytest.raises(ValueError, match=message) as error:
+        hopper.step(action)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "action, message",
+    [
+        (
+            torch.zeros(4, 2),
+            r"actions must be a float32 tensor of shape \(4, 3\), not a float32 tensor of shape \(4, 2\)",
+        ),
+        (torch.zeros(4, 3, dtype=torch.float64), r"actions must be a float32 tensor .*, not a float64 tensor"),
+        (torch.zeros(4, 3, device="meta"), r"actions must lie on cpu, not on meta: move it with .to\(\)"),
+        (np.zeros((4, 3), dtype=np.float32), r"actions must be a float32 tensor .*, not a ndarray .*: torch=True"),
+    ],
+)
+def test_tensors_that_do_not_fit_are_refused(
+    action: Any, message: str, vector: Callable[..., GymnasiumVectorEnv]
+) -> None:
+    envs = vector(torch=True)
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        envs.step(action)
+
+
+def test_a_step_before_a_reset_is_refused(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    with pytest.raises(ResetNeeded, match="there was no reset before this step: call reset"):
+        vector().step(np.zeros((N, 3), dtype=np.float32))
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"mask": 1}, r"reset has no option 'mask': it takes options={\"reset_mask\": mask}"),
+        ({"reset_mask": np.ones(3, dtype=bool)}, r"the reset_mask must be a bool tensor of shape \(4,\), not a bool"),
+        ({"reset_mask": np.ones(4)}, r"the reset_mask must be a bool tensor of shape \(4,\), not a ndarray"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(options: dict[str, Any], message: str, hopper: GymnasiumVectorEnv) -> None:
+    with pytest.raises(ValueError, match=message):
+        hopper.reset(options=options)
+
+
+@pytest.mark.parametrize("seed", [-1, [1, 2, 3, 4], 0.5])
+def test_a_seed_that_is_not_a_whole_number_is_refused(seed: Any, hopper: GymnasiumVectorEnv) -> None:
+    with pytest.raises(ValueError, match="seed must be a whole number"):
+        hopper.reset(seed=seed)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"num_envs": 0}, "num_envs must be a whole number from 1"),
+        ({"nworld": 4}, "nworld= does not belong to an adapter: num_envs decides"),
+        ({"autoreset": True}, "autoreset= does not belong to an adapter"),
+        ({"autoreset_mode": "Never"}, "there is no autoreset_mode 'Never': use one of NextStep, SameStep, Disabled"),
+        ({"render_mode": "human"}, "there is no render_mode 'human': use 'rgb_array'"),
+        ({"render_size": (3, 4)}, "size must be two even numbers"),
+        ({"ctrl_cost": 1.0}, "no parameter 'ctrl_cost': did you mean ctrl_cost_weight"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        GymnasiumVectorEnv("hopper", **options)
+
+
+def test_an_environment_that_does_not_fit_is_refused(made: Callable[..., lw.Env]) -> None:
+    with pytest.raises(ValueError, match="has its options already: give horizon to lw.make"):
+        GymnasiumVectorEnv(made(), horizon=3)
+    with pytest.raises(ValueError, match="the environment has 4 worlds, not num_envs=3"):
+        GymnasiumVectorEnv(made(), 3)
+    with pytest.raises(ValueError, match="has autoreset=True: make it with autoreset=False"):
+        GymnasiumVectorEnv(made(), autoreset_mode=AutoresetMode.DISABLED)
+    assert GymnasiumVectorEnv(made(autoreset=False)).autoreset_mode is AutoresetMode.DISABLED
+
+
+@pytest.mark.parametrize("argument", ["wrappers", "vector_kwargs"])
+def test_arguments_for_another_vector_environment_are_refused(argument: str) -> None:
+    given: Any = {"wrappers": [gymnasium.wrappers.ClipAction], "vector_kwargs": {"copy": False}}[argument]
+    with pytest.raises(gymnasium.error.Error, match=f"{argument}") as error:
+        gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=2, **{argument: given})
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_with_a_task_makes_a_vector_environment(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="there is no task file"):
+        GymnasiumVectorEnv(str(tmp_path / "none.py"))

@@ -1,0 +1,184 @@
+"""Many worlds as Stable-Baselines3's vector environment: its numbers, its learners, its wrappers, its errors."""
+
+import warnings
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from full_task import Full
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+import lyceum_warp as lw
+from lyceum_warp.adapters.stable_baselines3 import StableBaselines3VecEnv
+from lyceum_warp.gym import GymnasiumEnv
+from lyceum_warp.viz.video import NoVideoError
+
+N = 4
+
+
+@pytest.fixture(scope="module")
+def full() -> StableBaselines3VecEnv:
+    return StableBaselines3VecEnv(Full, N, seed=3)
+
+
+@pytest.fixture(scope="module")
+def hopper() -> StableBaselines3VecEnv:
+    return StableBaselines3VecEnv("hopper", N)
+
+
+def test_a_step_has_the_numbers_of_the_environment_behind_it(full: StableBaselines3VecEnv) -> None:
+    twin = lw.make(Full, nworld=N)
+    full.seed(9)
+    np.testing.assert_array_equal(full.reset(), (twin.rand_reset(9), twin.obs.numpy())[1])
+    rng = np.random.default_rng(0)
+    returns, lengths, ends, timeouts = np.zeros(N), np.zeros(N, dtype=int), 0, 0
+    for _ in range(45):
+        action = rng.uniform(-1, 1, (N, 3)).astype(np.float32)
+        obs, reward, done, infos = full.step(action)
+        twin.step(torch.from_numpy(action))
+        np.testing.assert_array_equal(obs, twin.obs.numpy())
+        np.testing.assert_array_equal(reward, twin.reward.numpy())
+        np.testing.assert_array_equal(done, twin.done.numpy())
+        returns, lengths = returns + reward, lengths + 1
+        for world, info in enumerate(infos):
+            assert bool(info) == done[world]
+            if info:
+                np.testing.assert_array_equal(info["terminal_observation"], twin.final_obs[world].numpy())
+                assert info["TimeLimit.truncated"] == (twin.truncated[world] & ~twin.terminated[world]).item()
+                assert info["episode"]["r"] == pytest.approx(returns[world])
+                assert info["episode"]["l"] == lengths[world] and info["episode"]["t"] > 0
+                assert info["eval"] == twin.eval[world].item()
+                assert info["is_success"] == twin.success[world].item()
+                assert info["episode_metrics"]["cost"] == twin.episode_metrics["cost"][world].item()
+                timeouts += info["TimeLimit.truncated"]
+        returns[done], lengths[done], ends = 0, 0, ends + done.sum()
+    assert ends and timeouts
+
+
+def test_only_ended_worlds_cost_a_dictionary(hopper: StableBaselines3VecEnv) -> None:
+    hopper.reset()
+    *_, first = hopper.step(np.zeros((N, 3), dtype=np.float32))
+    *_, second = hopper.step(np.zeros((N, 3), dtype=np.float32))
+    assert first == [{}] * N and all(a is b for a, b in zip(first, second, strict=True)) and first is not second
+
+
+def test_results_of_a_step_do_not_change_with_the_next(hopper: StableBaselines3VecEnv) -> None:
+    hopper.reset()
+    obs, reward, *_ = hopper.step(np.ones((N, 3), dtype=np.float32))
+    kept = obs.copy(), reward.copy()
+    hopper.step(np.ones((N, 3), dtype=np.float32))
+    assert np.array_equal(kept[0], obs) and np.array_equal(kept[1], reward)
+
+
+def test_ppo_learns_and_keeps_statistics_of_episodes(hopper: StableBaselines3VecEnv) -> None:
+    model = PPO("MlpPolicy", hopper, n_steps=64, batch_size=64, n_epochs=2, seed=0, device="cpu")
+    before = [parameter.clone() for parameter in model.policy.parameters()]
+    model.learn(512)
+    assert any((a != b).any() for a, b in zip(before, model.policy.parameters(), strict=True))
+    assert model.ep_info_buffer and model.ep_info_buffer[0]["l"] > 1
+    mean, _ = evaluate_policy(model, hopper, n_eval_episodes=4)
+    assert mean > 0
+
+
+def test_an_off_policy_learner_stores_the_last_observation_and_no_time_limit(full: StableBaselines3VecEnv) -> None:
+    model = SAC("MlpPolicy", full, learning_starts=40, batch_size=16, buffer_size=2000, seed=0, device="cpu")
+    model.learn(200)
+    buffer = model.replay_buffer
+    assert buffer is not None and buffer.pos == 50 and buffer.timeouts[:50].any()
+    ended = np.argwhere(buffer.dones[:49])
+    assert len(ended)
+    for step, world in ended:  # the next observation is not the first one of the next episode
+        assert (buffer.next_observations[step, world] != buffer.observations[step + 1, world]).any()
+
+
+def test_stable_baselines3s_checker_accepts_a_single_world() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(GymnasiumEnv("hopper"), skip_render_check=True)
+
+
+def test_vector_wrappers_work(hopper: StableBaselines3VecEnv) -> None:
+    with pytest.warns(UserWarning, match="already wrapped with a `Monitor`"):
+        env = VecMonitor(VecNormalize(hopper))
+    env.reset()
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        *_, infos = env.step(rng.uniform(-1, 1, (N, 3)).astype(np.float32))
+        for info in infos:
+            assert ("terminal_observation" in info) == ("episode" in info)
+    assert env.episode_count
+
+
+def test_a_seed_gives_the_same_worlds(hopper: StableBaselines3VecEnv) -> None:
+    hopper.seed(2**31 + 1)
+    first = hopper.reset()
+    other = hopper.reset()
+    hopper.seed(2**31 + 1)
+    np.testing.assert_array_equal(first, hopper.reset())
+    assert (first != other).any() and len(np.unique(first[:, 0])) == N
+
+
+def test_attributes_and_methods_are_those_of_the_worlds() -> None:
+    env = StableBaselines3VecEnv("hopper", N, ctrl_cost_weight=0.5)
+    assert env.get_attr("render_mode") == [None] * N and env.has_attr("timestep") and not env.has_attr("colour")
+    assert env.get_attr("ctrl_cost_weight", indices=[0, 2]) == [0.5, 0.5]
+    env.set_attr("ctrl_cost_weight", 0.25)
+    assert env.env.given_params["ctrl_cost_weight"] == 0.25
+    env.set_attr("ctrl_cost_weight", [0.0, 1.0, 2.0, 3.0])
+    assert env.get_attr("ctrl_cost_weight", indices=[1, 3]) == [1.0, 3.0]
+    env.reset()
+    env.step(np.zeros((N, 3), dtype=np.float32))
+    assert [step.item() for step in env.get_attr("episode_step", indices=[1, 3])] == [1, 1]
+    assert torch.equal(env.env_method("get_eval", indices=2)[0], env.env.eval[2])
+    assert env.env_is_wrapped(Monitor) == [True] * N
+    assert env.env_is_wrapped(gymnasium.Wrapper, indices=[0]) == [False]
+    with pytest.raises(ValueError, match="'ctrl_cost_weight' belongs to all worlds together: leave indices out"):
+        env.set_attr("ctrl_cost_weight", 1.0, indices=[1])
+
+
+def test_groups_of_observations_are_a_dict_on_demand(full: StableBaselines3VecEnv) -> None:
+    assert full.observation_space.shape == (3,)
+    env = StableBaselines3VecEnv(full.env, dict_obs=True)
+    obs = env.reset()
+    assert obs["critic"].shape == (N, 10) and env.observation_space["critic"].shape == (10,)
+    model = PPO("MultiInputPolicy", env, n_steps=25, batch_size=50, n_epochs=1, device="cpu")
+    model.learn(100)
+
+
+def test_a_picture_shows_all_worlds() -> None:
+    env = StableBaselines3VecEnv("hopper", N, render_mode="rgb_array", render_size=(64, 48))
+    try:
+        assert env.render().shape == (2 * 48, 2 * 64, 3)
+    except NoVideoError as error:
+        pytest.skip(str(error))
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize(
+    "action, message",
+    [
+        (np.zeros((N, 2), dtype=np.float32), r"float32 array of shape \(4, 3\), not a float32 array of shape \(4, 2\)"),
+        (np.zeros((N, 3), dtype=int), r"not a int64 array of shape \(4, 3\)"),
+        (torch.zeros(N, 3), r"not a float32 tensor of shape \(4, 3\)"),
+    ],
+)
+def test_actions_that_do_not_fit_are_refused(action: Any, message: str, hopper: StableBaselines3VecEnv) -> None:
+    hopper.reset()
+    with pytest.raises(ValueError, match=message):
+        hopper.step(action)
+
+
+def test_a_step_before_a_reset_and_unknown_options_are_refused(full: StableBaselines3VecEnv) -> None:
+    env = StableBaselines3VecEnv(full.env)
+    with pytest.raises(RuntimeError, match="there was no reset before this step: call reset"):
+        env.step(np.zeros((N, 3), dtype=np.float32))
+    env.set_options({"mask": 1})
+    with pytest.raises(ValueError, match="reset has no option 'mask': leave set_options out"):
+        env.reset()

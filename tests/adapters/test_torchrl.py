@@ -1,0 +1,66 @@
+"""TorchRL's own GymWrapper on Gymnasium's vector environment."""
+
+from typing import Any
+
+import pytest
+import torch
+from full_task import Full
+from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector
+from torchrl.envs.libs.gym import GymWrapper
+from torchrl.envs.utils import check_env_specs
+from torchrl.objectives.value import GAE
+
+import lyceum_warp as lw
+from lyceum_warp.gym import GymnasiumVectorEnv
+
+N = 4
+CASES = [
+    pytest.param(mode, tensors, task, id=f"{mode}-{'torch' if tensors else 'numpy'}-{name}")
+    for mode, task, name in [
+        ("Disabled", Full, "full"),
+        ("Disabled", "hopper", "hopper"),
+        ("SameStep", "hopper", "hopper"),
+    ]
+    for tensors in (False, True)
+]
+"""TorchRL 0.14 takes groups of observations and nested infos only in the mode DISABLED."""
+
+
+def wrapped(mode: str, *, tensors: bool, task: Any) -> Any:
+    env = GymnasiumVectorEnv(task, N, autoreset_mode=mode, torch=tensors)
+    return GymWrapper(env, convert_actions_to_numpy=not tensors)
+
+
+@pytest.mark.parametrize("mode, tensors, task", CASES)
+def test_a_rollout_has_the_numbers_of_the_environment_behind_it(mode: str, tensors: bool, task: Any) -> None:
+    env, twin = wrapped(mode, tensors=tensors, task=task), lw.make(task, nworld=N)
+    check_env_specs(env)
+    key, group = ("critic", "critic") if task is Full else ("observation", "policy")
+    torch.manual_seed(0)
+    data = env.rollout(45, break_when_any_done=False, auto_reset=False, tensordict=env.reset(seed=5))
+    twin.rand_reset(5)
+    ends = 0
+    for t in range(45):
+        step = data[:, t]
+        torch.testing.assert_close(step[key], twin.obs_groups[group], rtol=0, atol=0)
+        twin.step(step["action"])
+        torch.testing.assert_close(step["next", "reward"][:, 0], twin.reward, rtol=0, atol=0)
+        assert torch.equal(step["next", "terminated"][:, 0], twin.terminated)
+        done = step["next", "done"][:, 0]
+        assert torch.equal(done, twin.done)
+        final = twin.final_obs_groups[group]
+        torch.testing.assert_close(step["next", key][done], final[done], rtol=0, atol=0)
+        ends += done.sum()
+    assert ends >= N
+
+
+def test_a_collector_and_advantages_work() -> None:
+    env = wrapped("SameStep", tensors=True, task="hopper")
+    policy = TensorDictModule(torch.nn.Linear(11, 3), in_keys=["observation"], out_keys=["action"])
+    value = TensorDictModule(torch.nn.Linear(11, 1), in_keys=["observation"], out_keys=["state_value"])
+    collector = Collector(env, policy, frames_per_batch=64, total_frames=128)
+    batches = [GAE(gamma=0.99, lmbda=0.95, value_network=value)(batch) for batch in collector]
+    collector.shutdown()
+    assert len(batches) == 2 and batches[1]["advantage"].shape == (N, 16, 1)
+    assert torch.isfinite(batches[1]["advantage"]).all()

@@ -1,0 +1,70 @@
+"""Gymnasium's ids of tasks."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import pytest
+from conftest import TaskFile
+from full_task import Full
+from tiny_task import TINY
+
+import lyceum_warp as lw
+import lyceum_warp.gym
+from lyceum_warp.gym import GymnasiumVectorEnv, register
+
+OURS = {id: spec for id, spec in gymnasium.registry.items() if id.startswith("lyceum/")}
+
+
+def test_every_task_of_the_package_has_an_id() -> None:
+    tasks = {spec.kwargs["task"] for spec in OURS.values()}
+    assert tasks >= set(lw.task_names()) and "lyceum/HalfCheetah-v0" in OURS and "lyceum/Walker2d-v0" in OURS
+
+
+def test_registering_reads_no_task_and_warns_of_nothing() -> None:
+    program = """
+import sys, warnings
+warnings.simplefilter("error")
+import lyceum_warp.gym
+assert not [name for name in sys.modules if name.startswith("lyceum_warp.tasks.")], sys.modules
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_a_class_gets_an_id() -> None:
+    assert register(Full) == register(Full) == "lyceum/Full-v0"
+    envs = gymnasium.make_vec("lyceum/Full-v0", num_envs=2, noise=0.25)
+    assert isinstance(envs, GymnasiumVectorEnv)
+    assert envs.env.given_params == {"noise": 0.25} and envs.spec is not None and envs.spec.kwargs["noise"] == 0.25
+
+
+def test_a_file_gets_an_id(task_file: TaskFile) -> None:
+    id = register(task_file("tiny_of_gymnasium.py", TINY))
+    assert id == "lyceum/Tiny-v0"
+    assert gymnasium.make_vec(id, num_envs=3).single_observation_space.shape == (1,)
+
+
+def test_options_of_an_environment_are_passed_on() -> None:
+    envs = gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=2, engine="mujoco", horizon=7, nthread=1)
+    assert isinstance(envs, GymnasiumVectorEnv) and envs.env.horizon == 7 and envs.env.options.nthread == 1
+
+
+def test_an_unknown_task_gets_no_id(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="there is no task 'hoper': did you mean hopper"):
+        register("hoper")
+    with pytest.raises(gymnasium.error.NameNotFound, match="Hopper"):
+        gymnasium.make("lyceum_warp.gym:lyceum/Hoper-v0")
+
+
+def test_a_task_whose_package_is_missing_says_so_when_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Missing(Full):
+        """A task with the model of a package that is not installed."""
+
+        model = lw.package_model("package_that_is_missing", "arm.xml", install="lyceum-warp[arm]")
+
+    id = register(Missing)
+    for make in (gymnasium.make, gymnasium.make_vec):
+        with pytest.raises(FileNotFoundError, match=r"is not installed: pip install 'lyceum-warp\[arm\]'") as error:
+            make(id)
+        assert "\n" not in str(error.value)
