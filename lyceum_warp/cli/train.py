@@ -14,6 +14,7 @@ from rich.console import Console
 
 from lyceum_warp.algos.distributed import Team, join
 from lyceum_warp.algos.evaluation import Episodes, evaluate, evaluation_seed, evaluation_worlds
+from lyceum_warp.algos.learner import fitted_config
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
@@ -49,7 +50,7 @@ from lyceum_warp.kept_task import KeptTask, run_env, run_params, run_task
 from lyceum_warp.machine import cpu_cores
 from lyceum_warp.runs import Run
 from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
-from lyceum_warp.training import check_resumable, checked_settings, fitted_config, learn, reopen, restore
+from lyceum_warp.training import check_resumable, checked_settings, learn, reopen, restore
 from lyceum_warp.validate import whole_number
 from lyceum_warp.versions import versions
 from lyceum_warp.viewer.follow import RunViewer
