@@ -219,7 +219,7 @@ class RslRlLearner:
             self._divergence(), self.policy.log_std.exp().mean(), self._finite(),
         ]  # fmt: skip
         # one copy brings the numbers to the host, and another one the returns
-        found = torch.stack([number.double() for number in numbers]).tolist()
+        found = torch.stack([number.detach().double() for number in numbers]).tolist()
         ended = rollout.episode_return[rollout.done & ~rollout.episode_return.isnan()]
         timer.mark()
         sums, rest = EpisodeSums(*found[: len(episodes)]), found[len(episodes) :]
