@@ -32,6 +32,9 @@ _FLAGS = ("use_clipped_value_loss", "normalize_advantage_per_mini_batch", "norma
 _ACTIVATIONS = {"leaky_relu": "lrelu", "silu": "swish"}
 """Activations that rsl_rl calls by another name."""
 
+_HERE = "lyceum_warp.adapters.rsl_rl"
+"""Where rsl_rl finds classes of this package."""
+
 _PPO = (
     "num_learning_epochs", "num_mini_batches", "clip_param", "gamma", "lam", "value_loss_coef", "entropy_coef",
     "learning_rate", "max_grad_norm", "optimizer", "use_clipped_value_loss", "schedule", "desired_kl",
@@ -168,21 +171,19 @@ class RslRlConfig:
                 f"{self.num_mini_batches} mini-batches are more than the {samples} samples: give more worlds"
             )
         network = {"class_name": "rsl_rl.models.MLPModel", "obs_normalization": self.normalize}
-        std = {
-            "class_name": "rsl_rl.modules.GaussianDistribution",
-            "init_std": self.init_std,
-            "std_type": self.std_type,
-        }
-        own = "lyceum_warp.adapters.rsl_rl_ppo:FinalObservationPPO"
+        gaussian = {"class_name": f"{_HERE}_distribution:AsynchronousGaussian", "std_type": self.std_type}
+        final = f"{_HERE}_ppo:FinalObservationPPO"
         return {
             "num_steps_per_env": self.num_steps_per_env,
             "save_interval": 50,
             "check_for_nan": False,  # it would wait for the device; numbers that are not finite are faults
             "obs_groups": {"actor": ["policy"], "critic": [self.group(env)]},
-            "actor": network | _layers(self.hidden, self.activation) | {"distribution_cfg": std},
+            "actor": network | _layers(self.hidden, self.activation) | {
+                "distribution_cfg": gaussian | {"init_std": self.init_std},
+            },
             "critic": network | _layers(self.value_hidden, self.value_activation),
             "algorithm": {name: getattr(self, name) for name in _PPO} | {
-                "class_name": own if self.bootstrap == "final" else "rsl_rl.algorithms.PPO", "rnd_cfg": None,
+                "class_name": final if self.bootstrap == "final" else "rsl_rl.algorithms.PPO", "rnd_cfg": None,
             },
             "multi_gpu": None,
             "torch_compile_mode": self.torch_compile_mode,
