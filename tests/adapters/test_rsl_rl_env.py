@@ -69,7 +69,7 @@ def test_clocks_that_do_not_fit_are_refused(env: lw.Env, steps: torch.Tensor, me
         RslRlVecEnv(env).episode_length_buf = steps
 
 
-def test_a_termination_is_no_time_out_and_a_fault_is_one(shared_env: SharedEnv) -> None:
+def test_a_fault_is_a_time_out_and_a_termination_is_not(shared_env: SharedEnv) -> None:
     env = shared_env(Metered, nworld=4, horizon=10)
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([0, 0, 9, 9])

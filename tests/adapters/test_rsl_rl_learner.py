@@ -45,7 +45,7 @@ def test_it_learns_for_a_fixed_seed() -> None:
         rows.append(iteration)
         if iteration.iteration == 40:
             break
-    assert rows[-1].mean_return is not None and rows[-1].mean_return > 180.0
+    assert rows[-1].mean_return is not None and rows[-1].mean_return > 150.0
     assert rows[-1].return_recent > rows[15].return_recent + 50.0
     assert rows[-1].samples == 40 * 24 * 32
 
