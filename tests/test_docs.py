@@ -54,7 +54,8 @@ QUICK = {
     "check": ["--nworld", "2", "--rule", "spaces", "--rule", "restoring"],
     "train": ["--iterations", "2", *TINY, "--no-video"],
     "train --algorithm": shlex.split(
-        "--iterations 2 --nworld 4 --horizon 32 --config.hidden 8 --config.value-hidden 8 --config.mean-every 1 --no-video"
+        "--iterations 2 --nworld 4 --horizon 32 --no-video "
+        "--config.hidden 8 --config.value-hidden 8 --config.mean-every 1"
     ),
     "train --resume": ["--iterations", "3", "--no-video"],
     "eval": ["--episodes", "2", "--no-video"],

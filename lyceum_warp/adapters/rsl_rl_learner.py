@@ -164,20 +164,17 @@ class RslRlLearner:
         check_kind("policy of RslRlLearner", policy, GaussianPolicy | None, "as lw.load(run) returns it")
         check_kind("value of RslRlLearner", value, ValueFunction | None, "as lw.load_value(run) returns it")
         config = config or RslRlConfig()
+        self.worlds = RslRlVecEnv(env)
         if policy is not None:
-            check_networks(policy, value)
+            check_networks(policy, value, env)
             config = fitted_config(config, policy.shape, value.shape if value is not None else {})
         elif value is not None:
             raise ValueError("a value function belongs to a policy: give the policy, too")
-        self.worlds = RslRlVecEnv(env)
+        if value is not None and value.group != config.group(env):
+            config = dataclasses.replace(config, value_group=value.group)
         self.env, self.team, self.config, self.seed = env, Team(), config, seed
         device, nobs, nact = env.obs.device, env.obs_space.size, env.action_space.size
         group = config.group(env)
-        if policy is not None and (policy.nobs, policy.nact) != (nobs, nact):
-            raise ValueError(
-                f"the policy takes {policy.nobs} observations and gives {policy.nact} actions, but the task "
-                f"{env.task.name!r} has {nobs} and {nact}"
-            )
         self._random = OwnRandomNumbers(device, seed)
         runner = config.runner_config(env)
         kind = resolve_callable(runner["algorithm"]["class_name"])
@@ -208,7 +205,7 @@ class RslRlLearner:
     def __next__(self) -> RslRlIteration:
         config, ppo, rollout = self.config, self.ppo, self.rollout
         timer = PhaseTimer(self.env.obs.device)
-        with self._random, _precision(tf32=config.tf32):
+        with self._random, _precision(tf32=config.tf32 and self.env.obs.device.type == "cuda"):
             self._sample()
             timer.mark()
             losses = ppo.update()

@@ -9,6 +9,7 @@ from torch import nn
 from lyceum_warp.algos.networks import Normalizer
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.env import Env
 
 ENDLESS = {"limit": math.inf}
 """rsl_rl does not clip normalised observations."""
@@ -63,12 +64,24 @@ def begin_with(actor: Any, critic: Any, policy: GaussianPolicy, value: ValueFunc
     _begin_with_statistics(critic.obs_normalizer, value.normalizer)
 
 
-def check_networks(policy: GaussianPolicy, value: ValueFunction | None) -> None:
+def check_networks(policy: GaussianPolicy, value: ValueFunction | None, env: Env) -> None:
     """Check that rsl_rl's networks can take the weights of a policy and of a value function.
 
+    Args:
+        policy: The policy.
+        value: The value function, if there is one.
+        env: The environment in which they learn.
+
     Raises:
-        ValueError: One of them does something that rsl_rl's networks cannot do.
+        ValueError: One of them does something that rsl_rl's networks cannot do, or has other sizes than the
+            environment.
     """
+    sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
+    if sizes != wanted:
+        raise ValueError(
+            f"the policy takes {sizes[0]} observations and gives {sizes[1]} actions, but the task {env.task.name!r} "
+            f"has {wanted[0]} and {wanted[1]}"
+        )
     if "own" in policy.shape:
         raise ValueError(f"rsl_rl's PPO cannot begin with a policy of a class of its own, {policy.shape['own']}")
     for name, module in (("policy", policy), ("value function", value)):
@@ -84,6 +97,13 @@ def check_networks(policy: GaussianPolicy, value: ValueFunction | None) -> None:
         raise ValueError("the value function has time features (time_orders), which rsl_rl's networks do not have")
     if value.shape["normalize"] != policy.shape["normalize"]:
         raise ValueError("policy and value function must both normalise observations, or neither of them")
+    space = env.obs_spaces.get(value.group)
+    if space is None or space.size != value.shape["nobs"]:
+        groups = ", ".join(f"{name!r} of {found.size}" for name, found in env.obs_spaces.items())
+        raise ValueError(
+            f"the value function takes the group {value.group!r} of {value.shape['nobs']} observations, but the task "
+            f"{env.task.name!r} has {groups}"
+        )
 
 
 def _copy_statistics(source: nn.Module, target: nn.Module) -> None:

@@ -364,7 +364,9 @@ def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, Learner]:
         raise ValueError(f"a resumed run stays in its folder {folder}: omit --out")
     content = run.read(note=note if team.leads else _silent)
     check_resumable(run, content, options.iterations, options.target_return, command=True)
-    origin = (content, run.checkpoint) if "from" in run.config else None
+    # a policy that Python gave may have a limit, for which there is no hyperparameter
+    given_networks = "from" in run.config or "limit" in content["policy"]["shape"]
+    origin = (content, run.checkpoint) if given_networks else None
     learner = _learner(run.config, team, run=run, origin=origin)
     restore(run, learner, content)
     return run, learner

@@ -173,6 +173,7 @@ def test_networks_that_rsl_rl_lacks_are_refused(shared_env: SharedEnv) -> None:
         (plain, lw.ValueFunction(2, normalize=True), "clips normalised observations"),
         (lw.GaussianPolicy(2, 1), None, "takes 2 observations and gives 1 actions, but the task 'metered' has 1 and 1"),
         (None, lw.ValueFunction(2), "give the policy, too"),
+        (plain, lw.ValueFunction(2), "takes the group 'policy' of 2 observations, but the task 'metered' has 'policy'"),
     ]:
         with pytest.raises(ValueError, match=message):
             RslRlLearner(env, policy, value, SMALL)
@@ -182,6 +183,8 @@ def test_networks_that_rsl_rl_lacks_are_refused(shared_env: SharedEnv) -> None:
     made = RslRlLearner(env, plain, scaled, SMALL)
     obs = torch.randn(5, 2)
     torch.testing.assert_close(made.value(obs, obs[:, 0]), scaled(obs, obs[:, 0]), rtol=1e-4, atol=1e-4)
+    assert made.config.value_group is None
+    assert RslRlLearner(env, plain, lw.ValueFunction(1), SMALL).config.value_group == "policy"
 
 
 @pytest.mark.gpu

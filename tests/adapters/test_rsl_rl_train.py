@@ -54,6 +54,7 @@ def test_the_run_is_shown_and_written_like_every_run(tmp_path: Path, capsys: pyt
     with (out / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["samples"] for row in rows] == ["48", "96", "144"]
+    assert json.loads((out / "versions.json").read_text())["rsl_rl_lib"] == importlib.metadata.version("rsl-rl-lib")
     assert {"return_mean", "return_recent", "mean_return", "kl", "value_loss", "time_update", "metrics/effort"} <= set(
         rows[0]
     )
@@ -114,6 +115,16 @@ def test_a_run_begins_with_the_networks_of_another(four: Path, tmp_path: Path) -
     assert config["rsl-rl"] == Run.open(four).config["rsl-rl"] and config["from"]["iteration"] == 4
     assert config["params"] == {"far": 2}
     assert cli.main(["train", "--resume", str(out), "--iterations", "2", *QUIET]) == 0
+
+
+def test_a_run_of_npg_goes_on_from_the_networks_of_rsl_rl(four: Path, tmp_path: Path) -> None:
+    """Their normaliser does not clip, also after the run is resumed."""
+    env = lw.make(METERED, nworld=2, horizon=10)
+    npg = lw.NPG(env, lw.load(four), lw.load_value(four), lw.NPGConfig(samples=40, mean_every=0))
+    folder = lw.train(npg, tmp_path / "run", iterations=1).folder
+    assert cli.main(["train", "--resume", str(folder), "--iterations", "2", *QUIET]) == 0
+    policy, far = lw.load(folder), torch.tensor([[1e4], [1e6]])
+    assert policy.normalizer.limit == float("inf") and not torch.equal(*policy(far))
 
 
 def test_a_target_return_ends_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
