@@ -27,7 +27,8 @@ _REAL = {
 _CHOICES = {"bootstrap": Bootstrap, "optimizer": Optimizer, "schedule": Schedule, "std_type": StdType}
 """The values of each choice."""
 
-_FLAGS = ("use_clipped_value_loss", "normalize_advantage_per_mini_batch", "normalize", "random_start", "tf32")
+_FLAGS = ("use_clipped_value_loss", "normalize_advantage_per_mini_batch", "normalize", "random_start", "tf32",
+          "captured_update")  # fmt: skip
 
 _ACTIVATIONS = {"leaky_relu": "lrelu", "silu": "swish"}
 """Activations that rsl_rl calls by another name."""
@@ -109,6 +110,9 @@ class RslRlConfig:
     """Whether the first episodes begin at random steps, so that time limits fall at all times."""
     tf32: bool = True
     """Whether matrix products on a GPU use TensorFloat-32."""
+    captured_update: bool = False
+    """Whether an epoch of the update is one CUDA graph, in which nothing waits for the device. It computes the same up
+    to rounding; without a GPU it has no advantage."""
     torch_compile_mode: str | None = None
     """Mode of torch.compile for the networks, as "default"; by default they are not compiled."""
     mean_every: int = 50
@@ -139,6 +143,11 @@ class RslRlConfig:
         for name in ("value_group", "torch_compile_mode"):
             if (word := getattr(self, name)) is not None and not isinstance(word, str):
                 raise ValueError(f"{name} must be a name, or None, not {word!r}")
+
+        if self.captured_update and self.optimizer not in ("adam", "adamw"):
+            raise ValueError(f"captured_update needs the optimizer 'adam' or 'adamw', not {self.optimizer!r}")
+        if self.captured_update and self.torch_compile_mode is not None:
+            raise ValueError("captured_update and torch_compile_mode exclude each other: leave out one of them")
 
     def group(self, env: Env) -> str:
         """The group of observations that the value function gets.

@@ -15,6 +15,7 @@ from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
 from lyceum_warp.adapters.rsl_rl_env import RslRlVecEnv
 from lyceum_warp.adapters.rsl_rl_networks import ENDLESS, begin_with, check_networks, copy_policy, copy_value
 from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl
+from lyceum_warp.adapters.rsl_rl_update import CapturedUpdate
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
 from lyceum_warp.algos.learner import LearnerIteration, fitted_config
@@ -189,6 +190,8 @@ class RslRlLearner:
         if policy is not None:
             begin_with(self.ppo.actor, self.ppo.critic, policy, value)
         self._copy_networks()
+        self._captured = CapturedUpdate(self.ppo) if config.captured_update else None
+        self._update = self._captured or self.ppo.update
 
         self.rollout = Rollout(env, config.num_steps_per_env)
         self.count = config.num_steps_per_env * env.nworld
@@ -208,7 +211,7 @@ class RslRlLearner:
         with self._random, _precision(tf32=config.tf32 and self.env.obs.device.type == "cuda"):
             self._sample()
             timer.mark()
-            losses = ppo.update()
+            losses = self._update()
         self._copy_networks()
         episodes = finished(rollout)
         numbers = [
@@ -330,6 +333,8 @@ class RslRlLearner:
             if "step" in entry:
                 entry["step"] = entry["step"].cpu()
         self.ppo.learning_rate = state["learning_rate"]
+        if self._captured is not None:
+            self._captured.bind()
         self._copy_networks()
         self._random.load_state_dict(state["random"])
         self.env.set_state(state["env"].to(self.env.obs.device))
