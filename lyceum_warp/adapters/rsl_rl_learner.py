@@ -13,12 +13,21 @@ import torch
 
 from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
 from lyceum_warp.adapters.rsl_rl_env import RslRlVecEnv
-from lyceum_warp.adapters.rsl_rl_networks import ENDLESS, begin_with, check_networks, copy_policy, copy_value
+from lyceum_warp.adapters.rsl_rl_networks import (
+    ENDLESS,
+    begin_with,
+    check_networks,
+    copy_policy,
+    copy_value,
+    make_writable,
+)
+from lyceum_warp.adapters.rsl_rl_random import OwnRandomNumbers
 from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl
+from lyceum_warp.adapters.rsl_rl_statistics import RECENT, RslRlIteration
 from lyceum_warp.adapters.rsl_rl_update import CapturedUpdate
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
-from lyceum_warp.algos.learner import LearnerIteration, fitted_config
+from lyceum_warp.algos.learner import fitted_config
 from lyceum_warp.algos.npg_statistics import EpisodeSums, episode_statistics, finished, finished_metrics
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.rollout_buffer import Rollout
@@ -31,80 +40,6 @@ from lyceum_warp.validate import check_kind
 check_rsl_rl()  # its error says more than that of the imports below
 
 from rsl_rl.utils import resolve_callable  # noqa: E402
-
-RECENT = 100
-"""Episodes in the mean that rsl_rl prints as the mean reward."""
-
-
-@document_attributes
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RslRlIteration(LearnerIteration):
-    """Statistics of one iteration of rsl_rl's PPO.
-
-    Numbers about episodes cover those that ended in the iteration; they are nan where none ended. The first episodes
-    of the worlds, which may begin at a random step, do not count.
-    """
-
-    iteration: int
-    """Number of the iteration, from 1."""
-    samples: int
-    """Samples in all iterations so far."""
-    reward_mean: float
-    """Mean reward of a step, over all samples."""
-    return_mean: float
-    """Mean return (sum of an episode's rewards) of the stochastic policy."""
-    return_std: float
-    """Standard deviation of these returns."""
-    return_min: float
-    """Smallest of these returns."""
-    return_max: float
-    """Largest of these returns."""
-    return_recent: float
-    """Mean return of the last 100 episodes that ended, in this iteration or before; rsl_rl prints it as the mean
-    reward."""
-    length_mean: float
-    """Mean number of steps in an episode."""
-    terminal_reward: float
-    """Mean reward of an episode's last step."""
-    eval_mean: float
-    """Mean evaluation metric at the end of an episode."""
-    success: float
-    """Share of the episodes that ended with the goal met; nan for a task without a success."""
-    mean_return: float | None
-    """Mean return of the mean policy; None in iterations without an evaluation of it. Episodes of a task without a
-    horizon are cut off after 1,000 steps."""
-    mean_length: float | None
-    """Mean number of steps in an episode of the mean policy, or None."""
-    mean_terminal_reward: float | None
-    """Mean reward of the last step of an episode of the mean policy, or None."""
-    mean_eval: float | None
-    """Mean evaluation metric at the end of an episode of the mean policy, or None."""
-    mean_success: float | None
-    """Share of the mean policy's episodes that ended with the goal met, or None; None for a task without a success."""
-    kl: float
-    """KL divergence from the old to the new policy, averaged over the samples."""
-    std_mean: float
-    """Mean standard deviation of the policy's actions."""
-    learning_rate: float
-    """Learning rate after the iteration."""
-    surrogate_loss: float
-    """Mean of the clipped surrogate loss over the mini-batches."""
-    entropy: float
-    """Mean entropy of the policy over the mini-batches."""
-    value_loss: float
-    """Mean of the value function's loss over the mini-batches."""
-    faults: int
-    """Faults of worlds in this iteration."""
-    time_sample: float
-    """Seconds of sampling."""
-    time_update: float
-    """Seconds of the update."""
-    time_mean: float
-    """Seconds of evaluating the mean policy."""
-    samples_per_second: float
-    """Samples divided by the seconds of sampling."""
-    metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Means of the task's metrics, each summed over an episode, by the metrics' names."""
 
 
 @document_attributes
@@ -179,14 +114,16 @@ class RslRlLearner:
         self._random = OwnRandomNumbers(device, seed)
         runner = config.runner_config(env)
         kind = resolve_callable(runner["algorithm"]["class_name"])
-        with self._random, contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
-            self.ppo = kind.construct_algorithm(self.worlds.get_observations(), self.worlds, runner, str(device))
         networks: dict[str, Any] = {"normalize": config.normalize, **(ENDLESS if config.normalize else {})}
-        self.policy = GaussianPolicy(nobs, nact, config.hidden, activation=config.activation, **networks).to(device)
-        self.value = ValueFunction(
-            env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation, scale=1.0,
-            discount=config.gamma, group=group, **networks,
-        ).to(device)  # fmt: skip
+        with self._random, contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints its networks
+            self.ppo = kind.construct_algorithm(self.worlds.get_observations(), self.worlds, runner, str(device))
+            self.policy = GaussianPolicy(nobs, nact, config.hidden, activation=config.activation, **networks)
+            self.value = ValueFunction(
+                env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation, scale=1.0,
+                discount=config.gamma, group=group, **networks,
+            )  # fmt: skip
+        self.policy.to(device)
+        self.value.to(device)
         if policy is not None:
             begin_with(self.ppo.actor, self.ppo.critic, policy, value)
         self._copy_networks()
@@ -328,6 +265,8 @@ class RslRlLearner:
         """
         if len(state["env"]) != self.env.nworld:
             raise ValueError(f"the state has {len(state['env'])} worlds, but the environment has {self.env.nworld}")
+        for network in (self.ppo.actor, self.ppo.critic):
+            make_writable(network)
         self.ppo.load(state["ppo"], None, True)
         for entry in self.ppo.optimizer.state.values():  # Adam counts its steps on the host
             if "step" in entry:
@@ -342,44 +281,6 @@ class RslRlLearner:
         self._recent.clear()
         self._recent.extend(state["recent"])
         self.iteration, self.samples = state["iteration"], state["samples"]
-
-
-class OwnRandomNumbers:
-    """A block in which torch's default generators continue a stream of their own, because rsl_rl draws from them.
-
-    Args:
-        device: The device whose generator is used beside the CPU's.
-        seed: Where the stream begins.
-    """
-
-    def __init__(self, device: torch.device, seed: int) -> None:
-        self._generators = [torch.default_generator]
-        if device.type == "cuda":
-            torch.cuda.init()
-            self._generators.append(torch.cuda.default_generators[device.index or 0])
-        self._others: list[torch.Tensor] = []
-        self._own = [torch.Generator(generator.device).manual_seed(seed).get_state() for generator in self._generators]
-
-    def __enter__(self) -> None:
-        self._others = self._exchanged(self._own)
-
-    def __exit__(self, *exception: object) -> None:
-        self._own = self._exchanged(self._others)
-
-    def _exchanged(self, states: list[torch.Tensor]) -> list[torch.Tensor]:
-        """Set the generators' states; returns those before."""
-        before = [generator.get_state() for generator in self._generators]
-        for generator, state in zip(self._generators, states, strict=True):
-            generator.set_state(state)
-        return before
-
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """The state of each generator, by the type of its device."""
-        return {generator.device.type: state for generator, state in zip(self._generators, self._own, strict=True)}
-
-    def load_state_dict(self, states: Mapping[str, torch.Tensor]) -> None:
-        """Continue where ``state_dict`` was taken."""
-        self._own = [states[generator.device.type].cpu() for generator in self._generators]
 
 
 @contextlib.contextmanager

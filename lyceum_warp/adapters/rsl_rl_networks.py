@@ -106,6 +106,14 @@ def check_networks(policy: GaussianPolicy, value: ValueFunction | None, env: Env
         )
 
 
+def make_writable(network: nn.Module) -> None:
+    """Replace buffers that were made in torch's inference mode, outside of which nothing can be written into them."""
+    for part in network.modules():
+        for name, buffer in list(part.named_buffers(recurse=False)):
+            if buffer.is_inference():
+                setattr(part, name, buffer.clone())
+
+
 def _copy_statistics(source: nn.Module, target: nn.Module) -> None:
     """Copy those of rsl_rl's normaliser, which divides by the standard deviation plus ``eps``."""
     if isinstance(target, Normalizer):

@@ -12,7 +12,7 @@ from lyceum_warp.adapters.rsl_rl_release import normalizes_while_sampling
 class CapturedUpdate:
     """Computes what ``PPO.update`` of rsl_rl computes, up to rounding and with fewer random numbers.
 
-    rsl_rl's own launches every operation of a mini-batch by itself, and reads its losses and the KL divergence on the
+    rsl_rl's own launches each operation of a mini-batch alone, and reads its losses and the KL divergence on the
     host. Here the learning rate stays on the device, and so do the losses, which one copy brings to the host at the end
     of the update. The mini-batches are the same in every epoch, as there, so that one shuffled copy of the samples
     serves all epochs, and an epoch can be captured. Without a GPU the same operations run one by one.

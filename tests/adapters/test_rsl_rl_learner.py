@@ -81,7 +81,8 @@ def test_it_draws_random_numbers_of_its_own(shared_env: SharedEnv) -> None:
     rows = []
     for seed in (1, 2):
         torch.manual_seed(seed)
-        made, state = learner(metered()), torch.get_rng_state()
+        state = torch.get_rng_state()
+        made = learner(metered())
         rows.append([next(made).row() for _ in range(2)])
         assert torch.equal(torch.get_rng_state(), state)
     assert rows[0][1]["kl"] == rows[1][1]["kl"] and rows[0][1]["reward_mean"] == rows[1][1]["reward_mean"]
@@ -123,6 +124,10 @@ def test_a_resumed_run_has_the_same_numbers(six: Path, tmp_path: Path) -> None:
         lw.train(learner(metered(), config), folder, iterations=9, resume=True)
     with pytest.raises(ValueError, match="has algorithm rsl-rl, not npg, and a run keeps its settings"):
         lw.train(lw.NPG(metered()), folder, iterations=9, resume=True)
+    again = learner(metered())
+    next(again)
+    again.load_state_dict(Run.open(folder).read()["state"])
+    assert again.iteration == 6 and torch.equal(again.env.get_state(), states[0]["env"])
     with pytest.raises(ValueError, match="the state has 4 worlds, but the environment has 2"):
         learner(lw.make(Metered, nworld=2)).load_state_dict(states[0])
 
