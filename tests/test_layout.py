@@ -23,7 +23,7 @@ LEVELS = {
     "env": 5,
     "openloop": 6,
     "algos": 7, "control": 7, "testing": 7,
-    "adapters": 8, "checkpoints": 8, "tensorboard": 8,
+    "checkpoints": 8, "tensorboard": 8,
     "runs": 9,
     "keeper": 10, "kept_task": 10, "viz": 10,
     "training": 11,

@@ -4,10 +4,12 @@ from typing import Any
 
 import torch
 
+from lyceum_warp.adapters.adapted_env import environment_of
 from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
-from lyceum_warp.validate import check_kind, described
+from lyceum_warp.task import Task
+from lyceum_warp.validate import described
 
 check_rsl_rl()  # its error says more than that of the imports below
 
@@ -16,17 +18,19 @@ from tensordict import TensorDict  # noqa: E402
 
 
 class RslRlVecEnv(VecEnv):  # type: ignore[misc]
-    """What rsl_rl's runners step: ``OnPolicyRunner(RslRlVecEnv(env), config, ...)``.
+    """What rsl_rl's runners step: ``OnPolicyRunner(RslRlVecEnv("hopper", 4096, device="cuda"), config, ...)``.
 
     Nothing in ``step`` waits for the device. Its observations are copies, because rsl_rl stores those of a step only
     after the next step. Everything else that it returns are buffers, or made from them, that the next step overwrites:
     rsl_rl copies them before.
 
     Args:
-        env: The environment, which resets automatically. rsl_rl never resets it.
+        task: A task as ``lw.make`` takes it, or an environment, which resets automatically. rsl_rl never resets it.
+        num_envs: Number of worlds; by default one, or those of the environment.
+        words: Options and parameters, as for ``lw.make``.
 
     Raises:
-        ValueError: It is not an environment, or does not reset automatically.
+        ValueError: An argument does not fit; the message names it.
         ImportError: rsl_rl is not installed, or is of another release (when this module is imported).
     """
 
@@ -41,11 +45,8 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     cfg: dict[str, Any]
     """The task, its parameters, the engine and the number of worlds, for rsl_rl's writers."""
 
-    def __init__(self, env: Env) -> None:
-        check_kind("env of RslRlVecEnv", env, Env, "as lw.make(...) makes it")
-        if not env.autoreset:
-            raise ValueError("rsl_rl needs an environment that resets automatically: make it with autoreset=True")
-        self.env = env
+    def __init__(self, task: str | type[Task] | Env, num_envs: int | None = None, **words: Any) -> None:
+        self.env = env = environment_of(task, num_envs, words, autoreset=True)
         self.num_envs, self.num_actions = env.nworld, env.action_space.size
         self.max_episode_length = env.horizon or 2**31 - 1
         self.device = env.obs.device

@@ -96,6 +96,7 @@ class RslRlLearner:
         *,
         seed: int = 0,
     ) -> None:
+        check_kind("env of RslRlLearner", env, Env, "as lw.make(...) makes it")
         check_kind("config of RslRlLearner", config, RslRlConfig | None, "as RslRlConfig(num_steps_per_env=24)")
         check_kind("policy of RslRlLearner", policy, GaussianPolicy | None, "as lw.load(run) returns it")
         check_kind("value of RslRlLearner", value, ValueFunction | None, "as lw.load_value(run) returns it")

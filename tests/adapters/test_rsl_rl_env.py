@@ -2,7 +2,7 @@
 
 import importlib
 import importlib.metadata
-import importlib.util
+import re
 import sys
 from pathlib import Path
 
@@ -16,7 +16,6 @@ from tensordict import TensorDict
 import lyceum_warp as lw
 from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
 from lyceum_warp.adapters.rsl_rl_env import RslRlVecEnv
-from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl
 
 
 @pytest.fixture
@@ -35,6 +34,11 @@ def test_a_step_gives_all_groups_and_the_buffers(env: lw.Env) -> None:
     for group in ("policy", "critic"):
         assert torch.equal(obs[group], env.obs_groups[group])
         assert torch.equal(extras["final_obs"][group], env.final_obs_groups[group])
+
+
+def test_a_task_is_made_with_its_options() -> None:
+    worlds = RslRlVecEnv(Metered, 3, horizon=7, far=2.0)
+    assert (worlds.num_envs, worlds.max_episode_length, worlds.cfg["params"]) == (3, 7, {"far": 2.0})
 
 
 def test_observations_survive_the_next_step(env: lw.Env) -> None:
@@ -102,10 +106,10 @@ def test_the_log_has_the_metrics_of_ended_episodes(env: lw.Env) -> None:
 
 
 def test_bad_environments_and_actions_are_refused(env: lw.Env, shared_env: SharedEnv) -> None:
-    with pytest.raises(ValueError, match="rsl_rl needs an environment that resets automatically: make it with auto"):
+    with pytest.raises(ValueError, match="the environment has autoreset=False: make it with autoreset=True"):
         RslRlVecEnv(shared_env(Metered, nworld=4, autoreset=False))
-    with pytest.raises(ValueError, match="env of RslRlVecEnv must be of type Env"):
-        RslRlVecEnv("hopper")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="nworld= does not belong to an adapter: num_envs decides"):
+        RslRlVecEnv(Metered, nworld=4)
     with pytest.raises(ValueError, match=r"action must be a float32 tensor of shape \(4, 1\), not a float32 tensor of"):
         RslRlVecEnv(env).step(torch.zeros(4, 2))
     endless = RslRlVecEnv(shared_env(Metered, nworld=2, horizon=0))
@@ -145,23 +149,25 @@ def test_rsl_rls_writer_gets_the_metrics(env: lw.Env, tmp_path: Path) -> None:
 # what is installed
 
 
-def test_a_missing_extra_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "rsl_rl" else find(name, *a))
-    monkeypatch.delitem(sys.modules, "lyceum_warp.adapters.rsl_rl_env")
-    with pytest.raises(ImportError, match=r"^rsl_rl's PPO needs rsl_rl: pip install 'lyceum-warp\[rsl-rl\]'$"):
-        importlib.import_module("lyceum_warp.adapters.rsl_rl_env")
+@pytest.mark.parametrize("release, found", [
+    (None, "this adapter needs the package rsl-rl-lib: "),
+    ("5.3.0", "this adapter needs rsl-rl-lib from 5.4.2 to below 6, and 5.3.0 is installed: "),
+    ("6.0.0", "this adapter needs rsl-rl-lib from 5.4.2 to below 6, and 6.0.0 is installed: "),
+])  # fmt: skip
+@pytest.mark.parametrize("module", ["env", "ppo", "distribution", "learner"])
+def test_a_missing_extra_and_another_major_version_are_one_line(
+    release: str | None, found: str, module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def version(name: str) -> str:
+        if release is None:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return release
 
-
-@pytest.mark.parametrize("release, fits", [("4.0.1", False), ("5.3.0", False), ("5.4.2", True), ("5.10.0", True),
-                                           ("6.0.0", False)])  # fmt: skip
-def test_another_major_version_is_one_line(monkeypatch: pytest.MonkeyPatch, release: str, fits: bool) -> None:
-    monkeypatch.setattr(importlib.metadata, "version", lambda name: release)
-    if fits:
-        check_rsl_rl()
-        return
-    with pytest.raises(ImportError, match=f"^rsl-rl-lib is {release} here, but the adapter needs 5.4 or a later rel"):
-        check_rsl_rl()
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    for name in [name for name in sys.modules if name.startswith("lyceum_warp.adapters.rsl_rl")]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(ImportError, match=f"^{re.escape(found)}pip install 'lyceum-warp.rsl-rl.'$"):
+        importlib.import_module(f"lyceum_warp.adapters.rsl_rl_{module}")
 
 
 @pytest.mark.gpu

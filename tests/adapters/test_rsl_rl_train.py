@@ -2,7 +2,6 @@
 
 import csv
 import importlib.metadata
-import importlib.util
 import json
 import os
 import shutil
@@ -176,19 +175,20 @@ def test_a_broken_configuration_is_one_line(four: Path, tmp_path: Path, capsys: 
         refused(capsys, message)
 
 
+@pytest.mark.parametrize("release", [None, "6.0.0"])
 def test_what_is_not_installed_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    release: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    find = importlib.util.find_spec
-    with monkeypatch.context() as patch:
-        patch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "rsl_rl" else find(name, *a))
-        assert train(tmp_path / "run") == 2
-        refused(capsys, "rsl_rl's PPO needs rsl_rl: pip install 'lyceum-warp[rsl-rl]'")
     version = importlib.metadata.version
-    changed = {"rsl-rl-lib": "6.0.0"}
-    monkeypatch.setattr(importlib.metadata, "version", lambda name: changed.get(name) or version(name))
+
+    def changed(name: str) -> str:
+        if name == "rsl-rl-lib" and release is None:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return release or version(name) if name == "rsl-rl-lib" else version(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", changed)
     assert train(tmp_path / "run") == 2
-    refused(capsys, "rsl-rl-lib is 6.0.0 here, but the adapter needs 5.4 or a later release of 5")
+    refused(capsys, "rsl-rl-lib", "and 6.0.0 is installed" if release else "needs the package", "lyceum-warp[rsl-rl]")
     assert not (tmp_path / "run").exists()
 
 
