@@ -9,8 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.algos.npg import NPG
-from lyceum_warp.algos.npg_statistics import Iteration
+from lyceum_warp.algos.learner import Learner, LearnerIteration
 from lyceum_warp.checkpoints import PolicyContent, policy_content
 from lyceum_warp.runs import Run
 
@@ -37,7 +36,7 @@ class Keeper:
 
     Args:
         run: The run.
-        npg: The algorithm.
+        learner: The algorithm.
         keep_every: Iterations between two numbered policies; 0 for none.
         save_every: Iterations between two complete states; 0 for a number that follows from their time.
         resumed: Whether the run holds the algorithm's present state.
@@ -46,12 +45,14 @@ class Keeper:
     iteration: int
     """Number of the boundary's iteration."""
 
-    def __init__(self, run: Run, npg: NPG, *, keep_every: int = 0, save_every: int = 0, resumed: bool = False) -> None:
-        self.run, self.npg, self.keep_every, self.save_every = run, npg, keep_every, save_every
-        self.iteration = npg.iteration
-        self._content = self._latest = policy_content(npg.iteration, npg.policy, npg.value)
+    def __init__(
+        self, run: Run, learner: Learner, *, keep_every: int = 0, save_every: int = 0, resumed: bool = False
+    ) -> None:
+        self.run, self.learner, self.keep_every, self.save_every = run, learner, keep_every, save_every
+        self.iteration = learner.iteration
+        self._content = self._latest = policy_content(learner.iteration, learner.policy, learner.value)
         self._state: dict[str, Any] | None = None
-        self._saved = npg.iteration if resumed else -1
+        self._saved = learner.iteration if resumed else -1
         self._complete: tuple[PolicyContent, dict[str, Any]] | None = None
         self._best = run.best_score()
         self._best_content: PolicyContent | None = None
@@ -62,34 +63,39 @@ class Keeper:
 
     def policy_due(self) -> bool:
         """Whether this iteration's policy is to be saved, and a copy of the complete state to be kept."""
-        if self.keep_every and self.npg.iteration % self.keep_every == 0:
+        if self.keep_every and self.learner.iteration % self.keep_every == 0:
             return True
         return time.perf_counter() - self._policy_when >= POLICY_SHARE * self._policy_seconds
 
     def due(self) -> bool:
         """Whether the next iteration's complete state is to be saved."""
         if self.save_every:
-            return (self.npg.iteration + 1) % self.save_every == 0
+            return (self.learner.iteration + 1) % self.save_every == 0
         return time.perf_counter() - self._when >= SHARE * self._seconds
 
-    def return_of(self, iteration: Iteration) -> float | None:
+    def return_of(self, iteration: LearnerIteration) -> float | None:
         """The return by which policies are compared, where the iteration has one."""
         number = iteration.mean_return if self._by_mean else iteration.return_mean
         return None if number is None or not math.isfinite(number) else number
 
     @property
     def _by_mean(self) -> bool:
-        return self.npg.config.mean_every > 0
+        return self.learner.config.mean_every > 0
 
     def take(self, state: dict[str, Any]) -> None:
         """Make the algorithm's present state the boundary."""
-        self.iteration = self.npg.iteration
+        self.iteration = self.learner.iteration
         if self._content["iteration"] != self.iteration:
-            self._content = policy_content(self.iteration, self.npg.policy, self.npg.value)
+            self._content = policy_content(self.iteration, self.learner.policy, self.learner.value)
         self._state = state
 
     def keep(
-        self, iteration: Iteration, state: dict[str, Any] | None, *, renewed: bool = True, start: float | None = None
+        self,
+        iteration: LearnerIteration,
+        state: dict[str, Any] | None,
+        *,
+        renewed: bool = True,
+        start: float | None = None,
     ) -> None:
         """Write the row of an iteration, and its policy.
 
@@ -106,7 +112,7 @@ class Keeper:
         better = score is not None and (self._best is None or score > self._best[1])
         before = self._latest
         if renewed or better or not self._by_mean:
-            self._latest = policy_content(self.npg.iteration, self.npg.policy, self.npg.value)
+            self._latest = policy_content(self.learner.iteration, self.learner.policy, self.learner.value)
         if score is not None and better:
             # the iteration's own episodes were sampled with the policy before its step
             self._best_content = self._latest if self._by_mean else before
@@ -114,7 +120,7 @@ class Keeper:
             self.run.save_best(self._best_content, self._score_name, score)
         if not renewed:
             return
-        self.iteration, self._state, self._content = self.npg.iteration, state, self._latest
+        self.iteration, self._state, self._content = self.learner.iteration, state, self._latest
         self.run.save_policy(self._content, number=bool(self.keep_every) and self.iteration % self.keep_every == 0)
         self._policy_when = time.perf_counter()
         self._policy_seconds = self._policy_when - start
@@ -123,7 +129,7 @@ class Keeper:
     def _score_name(self) -> str:
         return "mean_return" if self._by_mean else "return_mean"
 
-    def note_target(self, iteration: Iteration, reached: float) -> None:
+    def note_target(self, iteration: LearnerIteration, reached: float) -> None:
         """Note in the configuration that the run reached its return."""
         self.run.amend(reached={"iteration": iteration.iteration, "return": reached})
 
@@ -139,7 +145,7 @@ class Keeper:
         self.run.save_policy(self._content)
         self.run.save_state(self._content, self._state)
         # of several processes, this is all that can be saved elsewhere
-        self._complete = None if self.npg.team.size == 1 else (self._content, self._state)
+        self._complete = None if self.learner.team.size == 1 else (self._content, self._state)
         self._saved, self._when = self.iteration, time.perf_counter()
         self._seconds = self._when - start
 
@@ -160,8 +166,8 @@ class Keeper:
         except NotSavedError:
             raise
         except OSError as error:
-            if between and self.iteration != self.npg.iteration:
-                self.take(self.npg.state_dict())
+            if between and self.iteration != self.learner.iteration:
+                self.take(self.learner.state_dict())
             raise NotSavedError(self._rescued(error)) from error
 
     def _rescued(self, error: OSError) -> str:
@@ -228,7 +234,7 @@ class Keeper:
         try:
             if table:
                 run.metrics.write_bytes(table)
-            run.cut(self.npg.iteration)
+            run.cut(self.learner.iteration)
             last = max((row["iteration"] or 0 for row in (run.rows() if run.metrics.exists() else [])), default=-1)
         except (ValueError, KeyError):  # other content than a table
             run.metrics.write_bytes(self._files.get(run.metrics.name, b""))

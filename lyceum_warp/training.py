@@ -1,6 +1,5 @@
 """Training with a run's folder: the loop that the command line and ``lw.train`` share."""
 
-import dataclasses
 import json
 import math
 import time
@@ -11,9 +10,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.evaluation import evaluation_seed
-from lyceum_warp.algos.npg import NPG
-from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
-from lyceum_warp.algos.npg_statistics import Iteration
+from lyceum_warp.algos.learner import Learner, LearnerIteration
 from lyceum_warp.binding.registry import spelled_task
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.env import Env
@@ -27,11 +24,12 @@ from lyceum_warp.viz.cameras import CameraChoice, find_camera
 from lyceum_warp.viz.policy_videos import Videos
 from lyceum_warp.viz.video import check_video
 
-Callback = Callable[[Iteration], Any]
+Callback = Callable[[Any], Any]
+"""Called with the statistics of each iteration, which are of the algorithm's own class."""
 
 
 def train(
-    npg: NPG,
+    learner: Learner,
     folder: str | Path,
     *,
     iterations: int = 100,
@@ -57,7 +55,7 @@ def train(
     from the last one, to the same numbers.
 
     Args:
-        npg: The algorithm.
+        learner: The algorithm: ``NPG(env)``, or another ``lyceum_warp.algos.learner.Learner``.
         folder: The run's folder, new or empty.
         iterations: Iterations in all, including those before ``resume``.
         callback: Called with each iteration after it was saved. Training ends where it returns True, and where it
@@ -71,57 +69,59 @@ def train(
             which TensorBoard shows, too; 0 for none. Where one fails, a warning says so, and training goes on.
         camera: Camera of the videos: one of the model's by name or index, a ``viz.cameras.FreeCamera``, or "free" for
             MuJoCo's default free camera.
-        resume: Whether the folder holds a run that is continued; ``npg`` must be made with the same arguments.
+        resume: Whether the folder holds a run that is continued; ``learner`` must be made with the same arguments.
 
     Returns:
         The run. ``run.rows()`` returns the metrics.
 
     Raises:
-        ValueError: The folder holds something else, an argument is out of range, or the run does not fit ``npg``.
+        ValueError: The folder holds something else, an argument is out of range, or the run does not fit
+            ``learner``.
         ImportError: The extra ``tensorboard`` is not installed.
         NoVideoError: The extra ``viz`` is not installed, and there should be videos.
         NotSavedError: The folder could no longer be written; the message says where the run was saved instead.
-        FloatingPointError: Ten iterations in a row had an update that is not finite; see ``NPG``.
+        FloatingPointError: Ten iterations in a row had an update that is not finite; see ``NPG``. Other
+            algorithms say when they raise it.
         Interrupted: One of several processes received a signal.
     """
     iterations = whole_number("iterations", iterations, low=1)
     settings = checked_settings(target_return=target_return, keep_every=keep_every, save_every=save_every)
-    team, folder = npg.team, Path(folder)
+    team, folder = learner.team, Path(folder)
     shown = {"tensorboard": tensorboard, "video_every": whole_number("video_every", video_every, low=0)}
-    config = describe(npg) | {"iterations": iterations, **settings, **shown}
+    config = describe(learner) | {"iterations": iterations, **settings, **shown}
     with team.together():
         if tensorboard:
             check_tensorboard()
         if video_every:
             check_video()
-            find_camera(npg.env.model, camera)
+            find_camera(learner.env.model, camera)
         if resume:
             run = Run.open(folder)
             content = run.read()
             check_resumable(run, content, iterations, target_return)
-            _check_equal(run, config, npg.env)
+            _check_equal(run, config, learner.env)
             if team.leads:
-                note_changes(run, npg.env)
-            restore(run, npg, content)
+                note_changes(run, learner.env)
+            restore(run, learner, content)
         elif team.leads:
-            kept = KeptTask.of(npg.env)
-            run = Run.create(folder, config | kept.config, device=npg.env.options.device or "cpu")
+            kept = KeptTask.of(learner.env)
+            run = Run.create(folder, config | kept.config, device=learner.env.options.device or "cpu")
             kept.write(run)
         else:
             run = Run(folder, config)
     if resume and team.leads:
-        reopen(run, npg, iterations=iterations, **settings, **shown)
+        reopen(run, learner, iterations=iterations, **settings, **shown)
     board = TensorBoard(folder, run.config) if tensorboard and team.leads else None
-    seed = evaluation_seed(npg.env.options.seed + 1)
-    videos = Videos(npg, run.folder / "videos", video_every, seed, board, camera=camera)
+    seed = evaluation_seed(learner.env.options.seed + 1)
+    videos = Videos(learner, run.folder / "videos", video_every, seed, board, camera=camera)
 
-    def after(iteration: Iteration) -> Any:
+    def after(iteration: LearnerIteration) -> Any:
         videos(iteration)
         return None if callback is None else callback(iteration)
 
     with ending():
         learn(
-            run if team.leads else None, npg, iterations=iterations, callback=after, board=board, resumed=resume,
+            run if team.leads else None, learner, iterations=iterations, callback=after, board=board, resumed=resume,
             **settings,
         )  # fmt: skip
     return run
@@ -142,45 +142,28 @@ def checked_settings(*, target_return: float | None = None, keep_every: int = 0,
     }
 
 
-def describe(npg: NPG) -> dict[str, Any]:
+def describe(learner: Learner) -> dict[str, Any]:
     """The configuration of a run that an algorithm stands for, as config.json holds it."""
-    env, options = npg.env, npg.env.options
-    config = fitted_config(npg.config, npg.policy.shape, npg.value.shape)
-    if npg.value.group != ("critic" if "critic" in env.obs_groups else "policy"):
-        config = dataclasses.replace(config, value_group=npg.value.group)
+    env, options = learner.env, learner.env.options
     others = {name: value for name, value in options.given().items() if name in ("nthread", "horizon", "graphs")}
     others |= {name: list(names) for name in ("fields", "dynamics") if (names := getattr(options, name))}
     if isinstance(options.model, str | Path):
         others["model"] = str(Path(options.model).absolute()) if Path(options.model).is_file() else str(options.model)
-    seed = {} if npg.seed == options.seed else {"npg_seed": npg.seed}
+    seed = {} if learner.seed == options.seed else {f"{learner.algorithm}_seed": learner.seed}
     return {
-        "algorithm": "npg",
+        "algorithm": learner.algorithm,
         "task": spelled_task(env.task.task),
         "params": given_params(env),
         "physics": options.physics.given(),
         "engine": options.engine if isinstance(options.engine, str) else env.engine.name,
         "device": options.device or "cpu",
         "options": others,
-        "nworld": env.nworld * npg.team.size,
+        "nworld": env.nworld * learner.team.size,
         "threads": torch.get_num_threads(),
         "seed": options.seed,
         **seed,
-        "npg": dataclasses.asdict(config) | {"samples": enough_samples(config, env.nworld * npg.team.size)},
+        learner.algorithm: learner.settings(),
     }
-
-
-def fitted_config(config: NPGConfig, policy_shape: Mapping[str, Any], value_shape: Mapping[str, Any]) -> NPGConfig:
-    """Hyperparameters with the sizes of given networks, from which networks like these can be made.
-
-    Args:
-        config: The hyperparameters.
-        policy_shape: The ``shape`` of the policy.
-        value_shape: That of the value function.
-    """
-    entries = {"hidden": policy_shape.get("hidden"), "activation": policy_shape.get("activation")}
-    entries |= {f"value_{name}": value_shape.get(name) for name in ("hidden", "activation")}
-    entries |= {"normalize": policy_shape.get("normalize"), "time_orders": value_shape.get("time_orders")}
-    return dataclasses.replace(config, **{name: entry for name, entry in entries.items() if entry is not None})
 
 
 # continuing
@@ -219,15 +202,17 @@ def _check_equal(run: Run, config: Mapping[str, Any], env: Env) -> None:
     engine, engine_now = (engine_name(c["engine"], c["device"]) for c in (run.config, now))
     task = run.config.get("kept", {}).get("name", env.task.name)  # an older run lacks it
     names = [("task", task, env.task.name), ("engine", engine, engine_now)]
-    entries = [_entries(part, run.config.get(part), now[part]) for part in ("params", "physics", "npg", "nworld")]
+    names.append(("algorithm", run.config.get("algorithm"), now["algorithm"]))
+    parts = ("params", "physics", now["algorithm"], "nworld")
+    entries = [_entries(part, run.config.get(part), now[part]) for part in parts]
     options = _entries("options", run.config.get("options", {}), now["options"])
     others = [entry for entry in options if entry[0] not in _FREE_OPTIONS]
     for part in (names, *entries, others):
         for name, then, given in part:
             if then != given:
                 raise ValueError(
-                    f"the run in {run.folder} has {name} {then}, not {given}, and a run keeps its settings: make NPG "
-                    "with the same arguments, or give another folder"
+                    f"the run in {run.folder} has {name} {then}, not {given}, and a run keeps its settings: make "
+                    "the algorithm with the same arguments, or give another folder"
                 )
 
 
@@ -236,7 +221,7 @@ def _entries(name: str, then: Any, now: Any) -> list[tuple[str, Any, Any]]:
     if not isinstance(then, Mapping):
         return [(name, then, now)]
     # an older run lacks the newest hyperparameters
-    known = then if name == "npg" else {**then, **now}
+    known = {**then, **now} if name in ("params", "physics", "options") else then
     return [(entry, then.get(entry), now.get(entry)) for entry in known]
 
 
@@ -244,19 +229,19 @@ _FREE_OPTIONS = ("nthread", "graphs", "model")
 """Options that do not change a run's numbers, and the model, which is compared by its content."""
 
 
-def restore(run: Run, npg: NPG, content: Mapping[str, Any]) -> None:
+def restore(run: Run, learner: Learner, content: Mapping[str, Any]) -> None:
     """Put an algorithm into the state of a run's checkpoint.
 
     Args:
         run: The run.
-        npg: The algorithm.
+        learner: The algorithm.
         content: The content of the checkpoint.
 
     Raises:
         ValueError: The checkpoint does not fit the algorithm.
     """
     try:
-        npg.load_state_dict(_on(npg.env.obs.device, content["state"]))
+        learner.load_state_dict(_on(learner.env.obs.device, content["state"]))
     except (KeyError, RuntimeError, ValueError) as error:
         raise ValueError(
             f"{run.checkpoint} does not fit the configuration beside it: {' '.join(str(error).split())}"
@@ -272,9 +257,9 @@ def _on(device: torch.device, state: Any) -> Any:
     return [_on(device, part) for part in state] if isinstance(state, list) else state
 
 
-def reopen(run: Run, npg: NPG, **settings: Any) -> None:
+def reopen(run: Run, learner: Learner, **settings: Any) -> None:
     """Cut a run's table to the iterations of its checkpoint, and note new settings."""
-    run.cut(npg.iteration)
+    run.cut(learner.iteration)
     run.amend(**settings)
 
 
@@ -283,7 +268,7 @@ def reopen(run: Run, npg: NPG, **settings: Any) -> None:
 
 def learn(
     run: Run | None,
-    npg: NPG,
+    learner: Learner,
     *,
     iterations: int,
     callback: Callback | None = None,
@@ -300,7 +285,7 @@ def learn(
 
     Args:
         run: The run; None in processes that do not write.
-        npg: The algorithm.
+        learner: The algorithm.
         iterations: Iterations in all.
         callback: Called with each iteration after it was saved; see ``train``.
         target_return: The return at which training ends.
@@ -313,23 +298,23 @@ def learn(
         NotSavedError: The folder could no longer be written.
         Interrupted: One of several processes received a signal.
     """
-    alone = npg.team.size == 1
+    alone = learner.team.size == 1
     keeper = None if run is None else Keeper(
-        run, npg, keep_every=keep_every, save_every=save_every, resumed=resumed
+        run, learner, keep_every=keep_every, save_every=save_every, resumed=resumed
     )  # fmt: skip
     loop = None
     try:
         with postponed(not alone) as noted:
-            loop = _Loop(keeper, npg, noted, [board, callback], target_return, resumed=resumed)
+            loop = _Loop(keeper, learner, noted, [board, callback], target_return, resumed=resumed)
             loop.save()
-            while npg.iteration < iterations and not loop.ended:
+            while learner.iteration < iterations and not loop.ended:
                 loop.step()
             loop.save()
     except BaseException as error:
         if alone and keeper is not None and not isinstance(error, NotSavedError):
             with postponed():
                 if loop is not None and not loop.iterating:
-                    keeper.take(npg.state_dict())
+                    keeper.take(learner.state_dict())
                 keeper.save_boundary()
             if isinstance(error, Exception):
                 error.add_note(f"the run in {keeper.run.folder} is saved up to iteration {keeper.iteration}")
@@ -344,7 +329,7 @@ class _Loop:
 
     Args:
         keeper: Writes the files; None in processes that do not.
-        npg: The algorithm.
+        learner: The algorithm.
         noted: Signals that this process received and postponed.
         callbacks: Called with each iteration; some may be None.
         target_return: The return at which training ends.
@@ -352,27 +337,27 @@ class _Loop:
     """
 
     def __init__(
-        self, keeper: Keeper | None, npg: NPG, noted: list[int], callbacks: list[Callback | None],
+        self, keeper: Keeper | None, learner: Learner, noted: list[int], callbacks: list[Callback | None],
         target_return: float | None, *, resumed: bool,
     ) -> None:  # fmt: skip
-        self.keeper, self.npg, self.noted, self.target_return = keeper, npg, noted, target_return
+        self.keeper, self.learner, self.noted, self.target_return = keeper, learner, noted, target_return
         self.callbacks = [function for function in callbacks if function is not None]
-        self.alone = npg.team.size == 1
+        self.alone = learner.team.size == 1
         self.due = self.ended = self.iterating = False
-        self.saved = npg.iteration if resumed else -1
+        self.saved = learner.iteration if resumed else -1
         self.error: Exception | None = None
 
     def step(self) -> None:
         """Make an iteration, keep it, and decide whether it was the last."""
         complete = self.due
         self.iterating = True
-        iteration = next(self.npg)
+        iteration = next(self.learner)
         # a signal counts either before the iteration or after its row, so that the table and the state agree
         with postponed(self.alone):
             start = time.perf_counter()
             renewed = complete or (self.keeper is not None and self.keeper.policy_due())
             # the worlds of several processes are brought together only to be saved
-            state = self.npg.state_dict() if complete or (renewed and self.alone) else None
+            state = self.learner.state_dict() if complete or (renewed and self.alone) else None
             self._write(lambda keeper: keeper.keep(iteration, state, renewed=renewed, start=start))
             self.iterating = False
         if complete:
@@ -382,14 +367,14 @@ class _Loop:
 
     def save(self) -> None:
         """Save the complete state, unless it is saved."""
-        if self.saved < self.npg.iteration:
-            state = self.npg.state_dict()
+        if self.saved < self.learner.iteration:
+            state = self.learner.state_dict()
             self._write(lambda keeper: keeper.take(state))
             self._write_state()
             self._agree()
 
     def _write_state(self) -> None:
-        self.saved = self.npg.iteration
+        self.saved = self.learner.iteration
         self._write(lambda keeper: keeper.save_boundary())
 
     def _write(self, action: Callable[[Keeper], None]) -> None:
@@ -402,7 +387,7 @@ class _Loop:
             except Exception as error:
                 self.error = error
 
-    def _decide(self, iteration: Iteration) -> None:
+    def _decide(self, iteration: LearnerIteration) -> None:
         """Call the callbacks, and compare with the return at which training ends."""
         if self.keeper is None or self.error is not None:
             return
@@ -420,13 +405,13 @@ class _Loop:
         """Bring the processes to the same decisions, and raise what one of them met."""
         due = self.keeper is not None and self.keeper.due()
         numbers = max(self.noted, default=0), self.ended, self.error is not None, due
-        signal, ended, failed, complete = self.npg.team.largest(*map(int, numbers))
+        signal, ended, failed, complete = self.learner.team.largest(*map(int, numbers))
         self.ended, self.due = bool(ended), bool(complete)
         if self.error is not None:
             raise self.error
         if failed:
             raise SystemExit(2)
         if signal:
-            if self.saved < self.npg.iteration:
+            if self.saved < self.learner.iteration:
                 self.save()
             raise Interrupted(signal)

@@ -53,6 +53,10 @@ BLOCK = re.compile(r"^```(\w+)(?: title=(\S+))?\n(.*?)^```$", re.MULTILINE | re.
 QUICK = {
     "check": ["--nworld", "2", "--rule", "spaces", "--rule", "restoring"],
     "train": ["--iterations", "2", *TINY, "--no-video"],
+    "train --algorithm": shlex.split(
+        "--iterations 2 --nworld 4 --horizon 32 --no-video "
+        "--config.hidden 8 --config.value-hidden 8 --config.mean-every 1"
+    ),
     "train --resume": ["--iterations", "3", "--no-video"],
     "eval": ["--episodes", "2", "--no-video"],
     "plan": ["--steps", "3", "--samples", "4", "--no-video"],
@@ -97,7 +101,8 @@ class Walkthrough:
             case ["lyceum-warp", command, *options]:
                 if self.quick and "warp" in options:
                     return
-                kind = f"{command} --resume" if "--resume" in options else command
+                kinds = [f"{command} {option}" for option in ("--resume", "--algorithm") if option in options]
+                kind = kinds[0] if kinds else command
                 more = QUICK.get(kind, []) if self.quick else []
                 assert cli.main([command, *options, *more]) == 0, words
             case _:

@@ -2,6 +2,7 @@
 
 import copy
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Literal, TypeAlias, TypeVar, get_args
 
@@ -66,6 +67,9 @@ def mlp(
     return nn.Sequential(*layers)
 
 
+LIMIT = 10.0
+"""The largest normalised observation, unless another limit is given."""
+
 _Applied: TypeAlias = tuple[torch.Tensor, torch.Tensor]
 
 
@@ -74,7 +78,7 @@ class Normalizer(nn.Module):
 
     Args:
         size: Numbers in an observation.
-        limit: Normalised values are clipped to plus and minus this.
+        limit: Normalised values are clipped to plus and minus this; inf for no limit.
     """
 
     count: torch.Tensor
@@ -83,7 +87,7 @@ class Normalizer(nn.Module):
     shift: torch.Tensor
     scale: torch.Tensor
 
-    def __init__(self, size: int, limit: float = 10.0) -> None:
+    def __init__(self, size: int, limit: float = LIMIT) -> None:
         super().__init__()
         self.limit = limit
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
@@ -126,7 +130,8 @@ class Normalizer(nn.Module):
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Normalised observations, (..., size)."""
-        return ((obs - self.shift) * self.scale).clamp(-self.limit, self.limit)
+        normalized = (obs - self.shift) * self.scale
+        return normalized if self.limit == math.inf else normalized.clamp(-self.limit, self.limit)
 
 
 def moved(module: Module, env: Env) -> Module:

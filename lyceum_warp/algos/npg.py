@@ -6,6 +6,7 @@ step of a fixed length in the metric of the Fisher information.
 """
 
 import copy
+import dataclasses
 import logging
 import math
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ import warp as wp
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
+from lyceum_warp.algos.learner import fitted_config
 from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, flatten
 from lyceum_warp.algos.networks import Normalizer
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
@@ -79,6 +81,8 @@ class NPG:
             finite. Each such update is left out, and counted in ``Iteration.skipped_updates``.
     """
 
+    algorithm = "npg"
+    """The name of the algorithm in a run's config.json."""
     policy: GaussianPolicy
     """The policy that is learned."""
     value: ValueFunction
@@ -416,6 +420,13 @@ class NPG:
         kl = divergence(fraction)
         self.team.copy_leader(self.policy.parameters())
         return finite & kl.isfinite(), fraction, kl
+
+    def settings(self) -> dict[str, Any]:
+        """The hyperparameters, with the sizes of the networks, as a run's config.json holds them."""
+        config = fitted_config(self.config, self.policy.shape, self.value.shape)
+        if self.value.group != ("critic" if "critic" in self.env.obs_groups else "policy"):
+            config = dataclasses.replace(config, value_group=self.value.group)
+        return dataclasses.asdict(config) | {"samples": enough_samples(config, self.env.nworld * self.team.size)}
 
     def state_dict(self) -> dict[str, Any]:
         """The state on which the next iteration depends, with the worlds of all processes.

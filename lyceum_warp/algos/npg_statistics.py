@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import torch
 
+from lyceum_warp.algos.learner import LearnerIteration
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.docstrings import document_attributes
 
@@ -17,7 +18,7 @@ Scalar: TypeAlias = Any
 
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Iteration:
+class Iteration(LearnerIteration):
     """Statistics of one iteration.
 
     Numbers about episodes cover those that ended in the iteration; they are nan where none ended.
@@ -90,16 +91,6 @@ class Iteration:
     """Samples divided by the seconds of sampling."""
     metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Means of the task's metrics, each summed over an episode, by the metrics' names."""
-
-    def row(self) -> dict[str, Any]:
-        """The numbers by the names of their columns in metrics.csv; the metric ``forward`` is ``metrics/forward``."""
-        names = [field.name for field in dataclasses.fields(self) if field.name != "metrics"]
-        metrics = {METRIC_COLUMN + name: mean for name, mean in self.metrics.items()}
-        return {name: getattr(self, name) for name in names} | metrics
-
-
-METRIC_COLUMN = "metrics/"
-"""What the columns of a task's own metrics begin with."""
 
 
 class UpdateNumbers(NamedTuple):

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.networks import Activation, Normalizer, mlp
+from lyceum_warp.algos.networks import LIMIT, Activation, Normalizer, mlp
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.validate import described, layer_sizes
 
@@ -31,6 +31,7 @@ class GaussianPolicy(nn.Module):
         activation: What follows each hidden layer.
         log_std: Initial logarithm of the standard deviations.
         normalize: Whether to normalise observations by their running mean and variance.
+        limit: Normalised observations are clipped to plus and minus this; inf for no limit.
         generator: Draws the initial weights.
 
     Raises:
@@ -51,12 +52,15 @@ class GaussianPolicy(nn.Module):
         activation: Activation = "tanh",
         log_std: float = -0.5,
         normalize: bool = False,
+        limit: float = LIMIT,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.nobs, self.nact = nobs, nact
-        self.normalizer: nn.Module = Normalizer(nobs) if normalize else nn.Identity()
+        self.normalizer: nn.Module = Normalizer(nobs, limit) if normalize else nn.Identity()
         self.shape = {"nobs": nobs, "nact": nact, "normalize": normalize}
+        if limit != LIMIT:  # which files of earlier releases do not name
+            self.shape["limit"] = limit
         if network is None:
             self.shape |= {"hidden": layer_sizes(hidden), "activation": activation}
             # a last layer near zero starts every mean near the middle of its range (mjrl)

@@ -105,8 +105,8 @@ class Rollout:
         outputs = (env.final_obs, env.reward, env.eval, env.terminated, env.done, env.success, env.done_reason)
         self._inputs, self._outputs = [wp.from_torch(t) for t in inputs], [wp.from_torch(t) for t in outputs]
         graphs = Graphs(env.device, enabled=env.options.graphs)
-        self._before_step = graphs.sequence([Phase("store inputs", self._store_inputs)])
-        self._after_step = graphs.sequence([Phase("store outputs", self._store_outputs)])
+        self._before_step = graphs.sequence([Phase("store inputs", self._launch_inputs)])
+        self._after_step = graphs.sequence([Phase("store outputs", self._launch_outputs)])
 
     def _stored(self, source: torch.Tensor, into: list["_Rows"]) -> torch.Tensor:
         """Storage for rows of the environment, (steps, nworld, size), filled by the phases before or after a step."""
@@ -122,15 +122,27 @@ class Rollout:
             noise: Standard normal numbers, (steps, nworld, nact).
         """
         env = self.env
-        self._index.zero_()
-        self._fault.zero_()
+        self.begin()
         for t in range(self.steps):
             policy.sample(env.obs, noise[t], out=env.action)
-            for call in self._before_step:
-                call()
+            self.store_inputs()
             env.step()
-            for call in self._after_step:
-                call()
+            self.store_outputs()
+
+    def begin(self) -> None:
+        """Begin to fill the buffer from its first step on, for callers that step the environment themselves."""
+        self._index.zero_()
+        self._fault.zero_()
+
+    def store_inputs(self) -> None:
+        """Store what the next step starts from, the action included."""
+        for call in self._before_step:
+            call()
+
+    def store_outputs(self) -> None:
+        """Store the results of the step; the next ones go to the next place."""
+        for call in self._after_step:
+            call()
 
     def restart(self) -> None:
         """Begin new episodes in all worlds."""
@@ -190,14 +202,14 @@ class Rollout:
             "(value_rate) smaller"
         )
 
-    def _store_inputs(self) -> None:
+    def _launch_inputs(self) -> None:
         dim = (self.env.nworld, max(self.env.obs_space.size, self.env.action_space.size))
         args = [self._index, *self._inputs, self._arrays]
         wp.launch(collect.store_inputs, dim, args, device=self.env.device)
         for rows in self._rows_before:
             rows.store(self._index)
 
-    def _store_outputs(self) -> None:
+    def _launch_outputs(self) -> None:
         dim = (self.env.nworld, self.env.obs_space.size)
         args = [self._index, *self._outputs, self._first_only, self._return, self._fault, self._arrays]
         wp.launch(collect.store_outputs, dim, args, device=self.env.device)

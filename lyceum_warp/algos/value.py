@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.networks import Activation, Normalizer, mlp
+from lyceum_warp.algos.networks import LIMIT, Activation, Normalizer, mlp
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.validate import layer_sizes
 
@@ -24,6 +24,7 @@ class ValueFunction(nn.Module):
         time_orders: Highest power of the time feature; 0 for none. A time limit that the observation does not show
             makes the return depend on the step; the features t, t^2, ... with t = step / 1000 show it (mjrl).
         normalize: Whether to normalise observations by their running mean and variance.
+        limit: Normalised observations are clipped to plus and minus this; inf for no limit.
         discount: The discount of the returns that it is fitted to, where known.
         group: The group of observations that it gets.
         generator: Draws the initial weights.
@@ -55,6 +56,7 @@ class ValueFunction(nn.Module):
         scale: float = 200.0,
         time_orders: int = 0,
         normalize: bool = False,
+        limit: float = LIMIT,
         discount: float | None = None,
         group: str = "policy",
         generator: torch.Generator | None = None,
@@ -65,7 +67,9 @@ class ValueFunction(nn.Module):
             "nobs": nobs, "hidden": layer_sizes(hidden), "activation": activation, "scale": scale,
             "time_orders": time_orders, "normalize": normalize, "group": group,
         }  # fmt: skip
-        self.normalizer: nn.Module = Normalizer(nobs) if normalize else nn.Identity()
+        if limit != LIMIT:  # which files of earlier releases do not name
+            self._shape["limit"] = limit
+        self.normalizer: nn.Module = Normalizer(nobs, limit) if normalize else nn.Identity()
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
         # a last layer of zeros predicts the mean of the returns, whatever their scale
         self.network = mlp([nobs + time_orders, *hidden, 1], activation=activation, last_scale=0.0, generator=generator)

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from lyceum_warp.algos.npg_statistics import Iteration
+from lyceum_warp.algos.learner import LearnerIteration
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.control.control_report import ControlReport
 from lyceum_warp.control.episode_collector import ControlProgress
@@ -62,7 +62,7 @@ class Display:
     def __exit__(self, *exception: object) -> None:
         self.progress.stop()
 
-    def __call__(self, it: Iteration) -> None:
+    def __call__(self, it: LearnerIteration) -> None:
         """Show an iteration."""
         if it.mean_return is not None:
             self.mean = it.mean_return
@@ -71,8 +71,8 @@ class Display:
         result = f"reward {it.reward_mean:.3g} a step" if math.isnan(it.return_mean) else f"return {it.return_mean:.4g}"
         mean = "" if math.isnan(shown) else f"(mean policy {shown:.4g})"
         success = "" if math.isnan(it.success) else f"success {it.success:.0%}"
-        numbers = {"fault": it.faults, "outlier": it.outliers, "skipped update": it.skipped_updates}
-        bad = [counted(number, what) for what, number in numbers.items()]
+        row = it.row()
+        bad = [counted(row.get(column, 0), what) for column, what in _COUNTED.items()]
         rate = f"{it.samples_per_second / 1000:.3g}k"
         if self.console.is_terminal:
             most = [result, mean, success, *bad, f"{rate}/s"]
@@ -95,6 +95,9 @@ class Display:
         if done >= total:
             self.other = None
 
+
+_COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skipped update"}
+"""Columns with numbers of what went wrong, and the names of these things; not every algorithm has all of them."""
 
 _BAR_WIDTH = 36
 """Columns that the bar, the number of the iteration and the times take."""

@@ -14,12 +14,11 @@ from rich.console import Console
 
 from lyceum_warp.algos.distributed import Team, join
 from lyceum_warp.algos.evaluation import Episodes, evaluate, evaluation_seed, evaluation_worlds
+from lyceum_warp.algos.learner import Learner, LearnerIteration, fitted_config
 from lyceum_warp.algos.networks import moved
-from lyceum_warp.algos.npg import NPG
-from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
-from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.checkpoints import PolicyContent, check_sizes, policy_of, read_checkpoint, value_of
+from lyceum_warp.cli.algorithms import ALGORITHMS, Algorithm, AlgorithmName, NPGOptions, RslRlOptions
 from lyceum_warp.cli.arguments import (
     NO_FLAGS,
     CameraWords,
@@ -27,7 +26,6 @@ from lyceum_warp.cli.arguments import (
     Physics,
     Repeated,
     given,
-    optional_flags,
     parameters,
     portable,
     run_options,
@@ -49,7 +47,7 @@ from lyceum_warp.kept_task import KeptTask, run_env, run_params, run_task
 from lyceum_warp.machine import cpu_cores
 from lyceum_warp.runs import Run
 from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
-from lyceum_warp.training import check_resumable, checked_settings, fitted_config, learn, reopen, restore
+from lyceum_warp.training import check_resumable, checked_settings, learn, reopen, restore
 from lyceum_warp.validate import whole_number
 from lyceum_warp.versions import versions
 from lyceum_warp.viewer.follow import RunViewer
@@ -61,22 +59,9 @@ from lyceum_warp.viz.video import check_video
 _FINAL_EPISODES = 32
 
 
-@optional_flags(NPGConfig)
-class NPGOptions:
-    """Hyperparameters of the natural policy gradient."""
-
-    def checked(self) -> NPGConfig:
-        """The hyperparameters.
-
-        Raises:
-            ValueError: A value is of the wrong type, out of range or not finite.
-        """
-        return NPGConfig(**vars(self))
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Train:
-    """Train a policy on a task with the natural policy gradient.
+    """Train a policy on a task, with the natural policy gradient or with rsl_rl's PPO.
 
     The run's folder then holds config.json, versions.json, metrics.csv (one row for each iteration), policy.pt,
     best.pt, checkpoint.pt, curve.png and video.mp4. Ctrl-C loses at most the current iteration; where iterations are
@@ -88,6 +73,7 @@ class Train:
     $ lyceum-warp train humanoid --device cuda --integrator euler --solver iterations=4
     $ lyceum-warp train --resume runs/mine --iterations 200
     $ lyceum-warp train my_changed_task.py --from runs/mine --which best
+    $ lyceum-warp train hopper --algorithm rsl-rl --iterations 300 --config.learning-rate 3e-4
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
     Processes that torchrun starts share the worlds, also on several machines. With --device cuda each process takes the
@@ -99,6 +85,9 @@ class Train:
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
+    algorithm: AlgorithmName = "npg"
+    """npg, the natural policy gradient; or rsl-rl, rsl_rl's PPO, whose hyperparameters begin with --config. and which
+    needs pip install 'lyceum-warp[rsl-rl]'. All other hyperparameters are npg's."""
     iterations: int = 100
     """Iterations in total, including those before --resume."""
     seed: int = 0
@@ -123,8 +112,8 @@ class Train:
     tensorboard: bool = False
     """Whether to write the metrics for TensorBoard, too, into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Worlds of all processes together; by default 64, or 4096 for each GPU. Each makes samples / nworld steps in an
-    iteration: whole episodes where those fit (as in the paper: 10 worlds for 10,000 samples and episodes of 1,000
+    """Worlds of all processes together; by default 64, or 4096 for each GPU. Of npg, each makes samples / nworld steps
+    in an iteration: whole episodes where those fit (as in the paper: 10 worlds for 10,000 samples and episodes of 1,000
     steps), otherwise segments of episodes."""
     threads: int = 1
     """Threads of torch on the CPU. Small networks gain little from more. Runs are equal to the bit only with the same
@@ -151,6 +140,7 @@ class Train:
     env: tyro.conf.OmitArgPrefixes[EnvFlags] = dataclasses.field(default_factory=EnvFlags)
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
     npg: tyro.conf.OmitArgPrefixes[NPGOptions] = dataclasses.field(default_factory=NPGOptions)
+    config: RslRlOptions = dataclasses.field(default_factory=RslRlOptions)
 
 
 def train(options: Train) -> int:
@@ -166,20 +156,26 @@ def train(options: Train) -> int:
             run = None
             if team.leads:
                 Run.check_free(out)
-            npg = _algorithm(config, team, run=source, origin=origin)
-            _check_camera(options, npg)
+            learner = _learner(config, team, run=source, origin=origin)
+            _check_camera(options, learner)
             if team.leads:
-                kept = KeptTask.of(npg.env)
+                kept = KeptTask.of(learner.env)
                 run = Run.create(out, config | kept.config, device=options.env.device)
                 kept.write(run)
-        return _learn(run, npg, options)
+        return _learn(run, learner, options)
 
 
 def _origin(options: Train) -> tuple[PolicyContent, Path] | None:
     """The content and the file of the policy that a run begins with; None for a new policy."""
     if options.from_run is None:
         return None
-    path = Run.open(options.from_run).policy_file(options.which)
+    run = Run.open(options.from_run)
+    if (algorithm := run.config["algorithm"]) != options.algorithm:
+        raise ValueError(
+            f"the run in {options.from_run} was trained by {algorithm}, and --from begins with a run of the same "
+            f"algorithm: leave out --algorithm {options.algorithm}"
+        )
+    path = run.policy_file(options.which)
     return read_checkpoint(path, parts=("iteration", "policy", "value")), path
 
 
@@ -201,13 +197,15 @@ def _config(
         check_tensorboard()
     _check_videos(options)
     find_task(options.task)
-    npg, nworld = options.npg.checked(), options.nworld
+    algorithm, nworld = _algorithm(options), options.nworld
+    algorithm.check(team)
+    hyperparameters = getattr(options, algorithm.flags).checked()
     settings = checked_settings(
         target_return=options.target_return, keep_every=options.keep_every, save_every=options.save_every
     )
     source = {}
     if origin is not None and options.from_run is not None:
-        npg = _fitted(npg, *origin)
+        hyperparameters = _fitted(algorithm, hyperparameters, *origin)
         place = {"run": str(options.from_run.resolve()), "which": options.which, "iteration": origin[0]["iteration"]}
         source = {"from": place}
     if nworld is None:
@@ -216,7 +214,7 @@ def _config(
     if run is not None:  # a run of Python may have options without flags
         others |= {name: value for name, value in run.config.get("options", {}).items() if name in NO_FLAGS}
     return {
-        "algorithm": "npg",
+        "algorithm": algorithm.name,
         "task": portable(options.task),
         "params": parameters(options.param, options),
         "physics": options.physics.options().given(),
@@ -227,7 +225,7 @@ def _config(
         "threads": options.threads,
         "seed": options.seed,
         "iterations": options.iterations,
-        "npg": dataclasses.asdict(npg) | {"samples": enough_samples(npg, nworld)},
+        algorithm.name: algorithm.entry(hyperparameters, nworld),
         **settings,
         **_shown(options),
         **source,
@@ -239,17 +237,32 @@ def _shown(options: Train) -> dict[str, Any]:
     return {"tensorboard": options.tensorboard, "video_every": options.video_every}
 
 
-def _fitted(npg: NPGConfig, content: PolicyContent, path: Path) -> NPGConfig:
+def _algorithm(options: Train) -> Algorithm:
+    """The algorithm, without hyperparameters of another one.
+
+    Raises:
+        ValueError: A hyperparameter of another algorithm is given.
+    """
+    algorithm = ALGORITHMS[options.algorithm]
+    for other in ALGORITHMS.values():
+        if other is not algorithm and (names := list(given(getattr(options, other.flags)))):
+            flag = f"{other.prefix}{names[0].replace('_', '-')}"
+            raise ValueError(f"{flag} is a setting of {other.name}, not of {algorithm.name}: leave it out, or give "
+                             f"--algorithm {other.name}")  # fmt: skip
+    return algorithm
+
+
+def _fitted(algorithm: Algorithm, config: Any, content: PolicyContent, path: Path) -> Any:
     """Hyperparameters with the sizes of loaded networks.
 
     Raises:
         ValueError: Other sizes are given.
     """
-    fitted = fitted_config(npg, content["policy"]["shape"], content["value"]["shape"])
-    for field in dataclasses.fields(npg):
-        given, saved = getattr(npg, field.name), getattr(fitted, field.name)
+    fitted = fitted_config(config, content["policy"]["shape"], content["value"]["shape"])
+    for field in dataclasses.fields(config):
+        given, saved = getattr(config, field.name), getattr(fitted, field.name)
         if given != saved:  # the flags' defaults are those of the run
-            flag = f"--{field.name.replace('_', '-')}"
+            flag = f"{algorithm.prefix}{field.name.replace('_', '-')}"
             raise ValueError(f"the networks in {path} have {field.name} {saved}, not {given}: leave out {flag}")
     return fitted
 
@@ -264,26 +277,30 @@ def saved_options(folder: Path) -> Train:
 
     Raises:
         FileNotFoundError: The folder holds no run.
-        ValueError: The run's configuration is not one of NPG.
+        ValueError: The run's configuration is not one of a training.
     """
     config = Run.open(folder).config
+    algorithm = ALGORITHMS.get(config.get("algorithm", ""))
+    if algorithm is None:
+        raise ValueError(f"{folder / 'config.json'} is not the configuration of a training run")
     try:
-        npg = NPGOptions(**vars(_hyperparameters(config)))
+        own = {algorithm.flags: algorithm.options(config[algorithm.name])}
         known, params = run_options(config)
         for name in ("iterations", "seed", "nworld", "threads"):
             if not isinstance(config[name], int):
                 raise TypeError(f"{name} is {config[name]!r}")
         return Train(
-            task=config["task"], iterations=config["iterations"], seed=config["seed"], resume=folder,
-            nworld=config["nworld"], threads=config["threads"],
+            task=config["task"], algorithm=algorithm.name, iterations=config["iterations"], seed=config["seed"],
+            resume=folder, nworld=config["nworld"], threads=config["threads"],
             param=tuple(f"{name}={spelled(value)}" for name, value in params.items()),
             target_return=config.get("target_return"), keep_every=config.get("keep_every", 0),
             save_every=config.get("save_every", 0),
             tensorboard=config.get("tensorboard", False), video_every=config.get("video_every", 0),
-            env=EnvFlags.of(known), physics=Physics.of(known.physics), npg=npg,
+            env=EnvFlags.of(known), physics=Physics.of(known.physics), **own,
         )  # fmt: skip
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise ValueError(f"{folder / 'config.json'} is not the configuration of an NPG run ({error})") from error
+        text = f"{folder / 'config.json'} is not the configuration of an {algorithm.title} run ({error})"
+        raise ValueError(text) from error
 
 
 def origin_options(given: Train) -> Train:
@@ -294,7 +311,7 @@ def origin_options(given: Train) -> Train:
 
     Raises:
         FileNotFoundError: The folder holds no run.
-        ValueError: The run's configuration is not one of NPG.
+        ValueError: The run's configuration is not one of a training.
     """
     assert given.from_run is not None
     if given.resume is not None:
@@ -323,17 +340,19 @@ def resume(options: Train, folder: Path) -> int:
             if options.tensorboard:
                 check_tensorboard()
             _check_videos(options)
-            run, npg = _reopened(options, folder, team)
-            _check_camera(options, npg)
+            run, learner = _reopened(options, folder, team)
+            _check_camera(options, learner)
         if team.leads:
             _warn_of_versions(run)
-            reopen(run, npg, iterations=options.iterations, **settings, **_shown(options))
-        return _learn(run if team.leads else None, npg, options)
+            reopen(run, learner, iterations=options.iterations, **settings, **_shown(options))
+        return _learn(run if team.leads else None, learner, options)
 
 
-def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, NPG]:
+def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, Learner]:
     """A run, and its algorithm in the state of the checkpoint."""
     run = Run.open(folder)
+    if options.algorithm == run.config["algorithm"]:
+        _algorithm(options).check(team)
     given, saved = (_settings(o) for o in (options, saved_options(folder)))
     for name, value in given.items():
         if value != saved[name]:
@@ -345,30 +364,29 @@ def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, NPG]:
         raise ValueError(f"a resumed run stays in its folder {folder}: omit --out")
     content = run.read(note=note if team.leads else _silent)
     check_resumable(run, content, options.iterations, options.target_return, command=True)
-    origin = (content, run.checkpoint) if "from" in run.config else None
-    npg = _algorithm(run.config, team, run=run, origin=origin)
-    restore(run, npg, content)
-    return run, npg
+    # a policy that Python gave may have a limit, for which there is no hyperparameter
+    given_networks = "from" in run.config or "limit" in content["policy"]["shape"]
+    origin = (content, run.checkpoint) if given_networks else None
+    learner = _learner(run.config, team, run=run, origin=origin)
+    restore(run, learner, content)
+    return run, learner
 
 
 def _settings(options: Train) -> dict[str, Any]:
     """The settings that a resumed run must keep."""
-    free = ("iterations", "out", "resume", "video", "plot", "require_return", "npg", "param", "env", "physics",
-            "from_run", "which", "target_return", "keep_every", "save_every", "tensorboard",
+    free = ("iterations", "out", "resume", "video", "plot", "require_return", "npg", "config", "param", "env",
+            "physics", "from_run", "which", "target_return", "keep_every", "save_every", "tensorboard",
             "video_every", "camera")  # fmt: skip
     settings = {f.name: getattr(options, f.name) for f in dataclasses.fields(options) if f.name not in free}
     settings["task"] = portable(options.task or "")
     settings["param"] = parameters(options.param, options)
-    return settings | vars(options.env) | vars(options.physics.options()) | vars(options.npg)
+    hyperparameters = vars(getattr(options, ALGORITHMS[options.algorithm].flags))
+    return settings | vars(options.env) | vars(options.physics.options()) | hyperparameters
 
 
-def _hyperparameters(config: dict[str, Any]) -> NPGConfig:
-    return NPGConfig(**config["npg"])
-
-
-def _algorithm(
+def _learner(
     config: dict[str, Any], team: Team, *, run: Run | None = None, origin: tuple[PolicyContent, Path] | None = None
-) -> NPG:
+) -> Learner:
     """The algorithm of a configuration.
 
     Args:
@@ -395,7 +413,9 @@ def _algorithm(
     if origin is not None:
         policy, value = policy_of(*origin), value_of(*origin)
         check_sizes(policy, env, origin[1])
-    return NPG(env, policy, value, _hyperparameters(config), seed=config.get("npg_seed", config["seed"]), team=team)
+    algorithm = ALGORITHMS[config["algorithm"]]
+    seed = config.get(f"{algorithm.name}_seed", config["seed"])
+    return algorithm.learner(config[algorithm.name], env, (policy, value), seed=seed, team=team)
 
 
 def _check_videos(options: Train) -> None:
@@ -409,7 +429,7 @@ def _check_videos(options: Train) -> None:
         check_video()
 
 
-def _check_camera(options: Train, npg: NPG) -> None:
+def _check_camera(options: Train, learner: Learner) -> None:
     """Refuse a camera that the model does not have, or that no video uses.
 
     Raises:
@@ -418,7 +438,7 @@ def _check_camera(options: Train, npg: NPG) -> None:
     camera = parsed_camera(options.camera)
     if camera is not None and not (options.video or options.video_every):
         raise ValueError("--camera has no effect with --no-video: leave out one of them")
-    find_camera(npg.env.model, camera)
+    find_camera(learner.env.model, camera)
 
 
 def _silent(line: str) -> None:
@@ -430,21 +450,21 @@ def _engine(config: dict[str, Any]) -> str:
     return engine_name(config["engine"], config["device"])
 
 
-def _learn(run: Run | None, npg: NPG, options: Train) -> int:
+def _learn(run: Run | None, learner: Learner, options: Train) -> int:
     """Iterate; the process that has the run writes files and messages."""
     console = make_console()
     display = videos = board = None
     if run is not None:
         board = TensorBoard(run.folder, run.config) if options.tensorboard else None
-        console.print(_headline(run, npg, options), soft_wrap=True)
-        display = Display(console, npg.iteration, options.iterations)
+        console.print(_headline(run, learner, options), soft_wrap=True)
+        display = Display(console, learner.iteration, options.iterations)
         seed = evaluation_seed(options.seed + 1)
         videos = Videos(
-            npg, run.folder / "videos", options.video_every, seed, board, camera=parsed_camera(options.camera),
+            learner, run.folder / "videos", options.video_every, seed, board, camera=parsed_camera(options.camera),
             note=note, progress=display.work,
         )  # fmt: skip
 
-    def show(iteration: Iteration) -> None:
+    def show(iteration: LearnerIteration) -> None:
         if display is not None and videos is not None:
             display(iteration)
             videos(iteration)
@@ -453,7 +473,7 @@ def _learn(run: Run | None, npg: NPG, options: Train) -> int:
     try:
         with viewer, display or contextlib.nullcontext():
             learn(
-                run, npg, iterations=options.iterations, callback=show, board=board,
+                run, learner, iterations=options.iterations, callback=show, board=board,
                 target_return=options.target_return, keep_every=options.keep_every, save_every=options.save_every,
                 resumed=options.resume is not None,
             )  # fmt: skip
@@ -471,30 +491,30 @@ def _learn(run: Run | None, npg: NPG, options: Train) -> int:
     if run is None:
         return 0
     reached = run.config.get("reached", {})
-    if reached.get("iteration") == npg.iteration < options.iterations:
-        text = f"the target return is reached: {reached['return']:.6g} in iteration {npg.iteration}"
+    if reached.get("iteration") == learner.iteration < options.iterations:
+        text = f"the target return is reached: {reached['return']:.6g} in iteration {learner.iteration}"
         console.print(text, soft_wrap=True, markup=False)
-    return _report(run, npg, options, console)
+    return _report(run, learner, options, console)
 
 
-def _headline(run: Run, npg: NPG, options: Train) -> str:
+def _headline(run: Run, learner: Learner, options: Train) -> str:
     """The task, its worlds and where the run goes."""
-    env = npg.env
-    processes = f" each in {npg.team.size} processes" if npg.team.size > 1 else ""
+    env = learner.env
+    processes = f" each in {learner.team.size} processes" if learner.team.size > 1 else ""
     return (
         f"[bold]{env.task.name}[/]: {env.obs_space.size} observations, {env.action_space.size} actions; "
         f"{env.nworld} worlds{processes}, {_engine(run.config)} engine on {options.env.device}, "
-        f"{'segments' if npg.segments else 'episodes'} of {npg.rollout.steps} steps; run in {run.folder}"
+        f"{ALGORITHMS[learner.algorithm].sampling(learner)}; run in {run.folder}"
     )
 
 
-def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:
+def _report(run: Run, learner: Learner, options: Train, console: Console) -> int:
     """Print the table, evaluate the policy, draw the curve and the video; returns the exit code."""
     rows = run.rows()
     console.print(curve_table(rows))
-    few = evaluation_worlds(npg.env, _FINAL_EPISODES)
+    few = evaluation_worlds(learner.env, _FINAL_EPISODES)
     with LongWork("evaluating the mean policy", "steps", console) as work:
-        episodes = evaluate(few, moved(npg.policy, few), _FINAL_EPISODES, seed=options.seed + 1, progress=work)
+        episodes = evaluate(few, moved(learner.policy, few), _FINAL_EPISODES, seed=options.seed + 1, progress=work)
     console.print(f"mean policy, {len(episodes.returns)} new episodes: {_returns(episodes)}", soft_wrap=True)
     paths = [("checkpoint", str(run.checkpoint)), ("metrics", str(run.metrics))]
     if (best := run.best_score()) is not None:
@@ -505,11 +525,11 @@ def _report(run: Run, npg: NPG, options: Train, console: Console) -> int:
     if options.video:
         seed = evaluation_seed(options.seed + 1)
         video = policy_video(
-            npg.env, npg.policy, run.folder / "video.mp4", seed, camera=parsed_camera(options.camera)
+            learner.env, learner.policy, run.folder / "video.mp4", seed, camera=parsed_camera(options.camera)
         )  # fmt: skip
         paths.append(("video", video))
         if options.tensorboard and Path(video).is_file():
-            shown = tried(lambda: _show_video(run, video, npg.samples))
+            shown = tried(lambda: _show_video(run, video, learner.samples))
             if shown.startswith("none: "):
                 note(f"TensorBoard does not show the video ({shown.removeprefix('none: ')})")
     for name, path in paths:

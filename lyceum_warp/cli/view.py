@@ -11,6 +11,7 @@ from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.binding.registry import find_task, task_name
 from lyceum_warp.checkpoints import check_sizes
+from lyceum_warp.cli.algorithms import ALGORITHMS
 from lyceum_warp.cli.arguments import NO_FLAGS, Repeated, given, optional_flags, parameters, run_options
 from lyceum_warp.cli.display import note
 from lyceum_warp.cli.plan import Settings
@@ -164,7 +165,7 @@ def _kind(what: tuple[str, ...]) -> str:
         if not (first / "config.json").is_file() and any(first.glob("*.npz")):
             return "episodes"
         run = Run.open(first)
-        kind = "run" if run.config.get("algorithm") == "npg" else "episodes"
+        kind = "run" if run.config.get("algorithm") in ALGORITHMS else "episodes"
     else:
         kind = "task"
     if len(what) > 1 and kind != "episodes":

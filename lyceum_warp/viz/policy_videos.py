@@ -8,9 +8,8 @@ from typing import TypeAlias
 import torch
 
 from lyceum_warp.algos.evaluation import evaluation_worlds
+from lyceum_warp.algos.learner import Learner, LearnerIteration
 from lyceum_warp.algos.networks import moved
-from lyceum_warp.algos.npg import NPG
-from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.env import Env
 from lyceum_warp.tensorboard import TensorBoard
@@ -45,7 +44,7 @@ class Videos:
     further videos then, and training goes on.
 
     Args:
-        npg: The algorithm.
+        learner: The algorithm.
         folder: Folder of the videos, which have the numbers of their iterations.
         every: Iterations between two videos; 0 for none.
         seed: Seed of the initial state, the same for all videos.
@@ -56,20 +55,21 @@ class Videos:
     """
 
     def __init__(
-        self, npg: NPG, folder: Path, every: int, seed: int, board: TensorBoard | None, *, camera: CameraChoice = None,
-        note: Callable[[str], object] = log.warning, progress: NamedProgress | None = None,
+        self, learner: Learner, folder: Path, every: int, seed: int, board: TensorBoard | None, *,
+        camera: CameraChoice = None, note: Callable[[str], object] = log.warning,
+        progress: NamedProgress | None = None,
     ) -> None:  # fmt: skip
-        self.npg, self.folder, self.every, self.seed, self.board = npg, folder, every, seed, board
+        self.learner, self.folder, self.every, self.seed, self.board = learner, folder, every, seed, board
         self.camera, self.note, self.progress = camera, note, progress
 
-    def __call__(self, iteration: Iteration) -> None:
+    def __call__(self, iteration: LearnerIteration) -> None:
         """Write a video after an iteration, if it is time for one."""
         if not self.every or iteration.iteration % self.every:
             return
         path = self.folder / f"{iteration.iteration:06d}.mp4"
         try:
             env, states = policy_states(
-                self.npg.env, self.npg.policy, self.seed, progress=self._progress("running an episode", "steps")
+                self.learner.env, self.learner.policy, self.seed, progress=self._progress("running an episode", "steps")
             )
             write_video(env, states, path, camera=self.camera, progress=self._progress("drawing the video", "frames"))
             if self.board is not None:

@@ -1,0 +1,138 @@
+"""An environment as rsl_rl's VecEnv."""
+
+from typing import Any
+
+import torch
+
+from lyceum_warp.adapters.adapted_env import environment_of
+from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl
+from lyceum_warp.done import FAULTS
+from lyceum_warp.env import Env
+from lyceum_warp.task import Task
+from lyceum_warp.validate import described
+
+check_rsl_rl()  # its error says more than that of the imports below
+
+from rsl_rl.env import VecEnv  # noqa: E402
+from tensordict import TensorDict  # noqa: E402
+
+
+class RslRlVecEnv(VecEnv):  # type: ignore[misc]
+    """What rsl_rl's runners step: ``OnPolicyRunner(RslRlVecEnv("hopper", 4096, device="cuda"), config, ...)``.
+
+    Nothing in ``step`` waits for the device. Its observations are copies, because rsl_rl stores those of a step only
+    after the next step. Everything else that it returns are buffers, or made from them, that the next step overwrites:
+    rsl_rl copies them before.
+
+    Args:
+        task: A task as ``lw.make`` takes it, or an environment, which resets automatically. rsl_rl never resets it.
+        num_envs: Number of worlds; by default one, or those of the environment.
+        words: Options and parameters, as for ``lw.make``.
+
+    Raises:
+        ValueError: An argument does not fit; the message names it.
+        ImportError: rsl_rl is not installed, or is of another release (when this module is imported).
+    """
+
+    num_envs: int
+    """Number of worlds."""
+    num_actions: int
+    """Numbers in an action."""
+    max_episode_length: int
+    """Steps after which an episode is truncated; 2147483647 in a task without a horizon."""
+    device: torch.device
+    """Device of all tensors."""
+    cfg: dict[str, Any]
+    """The task, its parameters, the engine and the number of worlds, for rsl_rl's writers."""
+
+    def __init__(self, task: str | type[Task] | Env, num_envs: int | None = None, **words: Any) -> None:
+        self.env = env = environment_of(task, num_envs, words, autoreset=True)
+        self.num_envs, self.num_actions = env.nworld, env.action_space.size
+        self.max_episode_length = env.horizon or 2**31 - 1
+        self.device = env.obs.device
+        self.cfg = {
+            "task": env.task.name, "params": env.given_params, "engine": env.engine.name, "nworld": env.nworld,
+            "physics": env.options.physics.given(), "horizon": env.horizon,
+        }  # fmt: skip
+        self._obs, self._final_obs = (
+            TensorDict(groups, batch_size=[env.nworld], device=self.device)
+            for groups in (env.obs_groups, env.final_obs_groups)
+        )
+        self._metrics = torch.full((len(env.metrics),), torch.nan, device=self.device)
+
+    @property
+    def unwrapped(self) -> Env:
+        """The environment itself."""
+        return self.env
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Steps since the reset, (nworld,) int32, a live view for reading. Assigned, the worlds continue from there.
+
+        Time limits follow: a world at step ``max_episode_length - 1`` is truncated by the next step.
+        """
+        return self.env.episode_step
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: torch.Tensor) -> None:
+        env = self.env
+        if not isinstance(steps, torch.Tensor) or steps.shape != (env.nworld,) or steps.is_floating_point():
+            raise ValueError(
+                f"episode_length_buf must be whole numbers of shape {(env.nworld,)}, not {described(steps)}"
+            )
+        if env.horizon == 0:
+            raise ValueError(
+                f"episodes of {env.task.name!r} have no time limit to begin at a random step of: call learn with "
+                "init_at_random_ep_len=False, or give make() a horizon"
+            )
+        if ((steps < 0) | (steps >= env.horizon)).any():
+            raise ValueError(
+                f"episode_length_buf must be from 0 to {env.horizon - 1}, not from {steps.min()} to {steps.max()}"
+            )
+        state = env.get_state()
+        state[:, env.state_space.parts["step"]] = steps.to(state).unsqueeze(-1)
+        env.set_state(state)
+
+    def get_observations(self) -> TensorDict:
+        """The current observations by their groups, each (nworld, size of the group)."""
+        return self._obs.clone()
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Advance every world by one step; worlds whose episode ends begin a new one.
+
+        Args:
+            actions: (nworld, nact), float32.
+
+        Returns:
+            Observations, those of a new episode where one began; rewards, (nworld,); whether an episode ended,
+            (nworld,) bool; and a dictionary:
+
+            ============= =========================================================================================
+            ``time_outs`` whether the time limit or a fault cut the episode off, (nworld,) bool: the reward of a
+                          transition with a fault is 0, and its final observation the last good one
+            ``final_obs`` the observations that the step led to, before any reset, by their groups
+            ``log``       means of the task's metrics over the episodes that ended in this step, or, where none did, in
+                          the last step with such an end: ``metrics/NAME``; and ``faults/worlds``, worlds with a fault
+            ============= =========================================================================================
+
+        Raises:
+            ValueError: The actions have another shape, type or device.
+        """
+        env = self.env
+        env.step(actions)
+        faulty = (env.done_reason & FAULTS) != 0
+        extras = {
+            "time_outs": (env.truncated & ~env.terminated) | faulty,
+            "final_obs": self._final_obs,
+            "log": self._log() | {"faults/worlds": faulty.sum()},
+        }
+        return self._obs.clone(), env.reward, env.done, extras
+
+    def _log(self) -> dict[str, torch.Tensor]:
+        """Means of the metrics over the episodes that ended, without waiting for the number of these."""
+        env = self.env
+        if not env.metrics:
+            return {}
+        sums = env.episode_metric_sums.masked_fill(~env.done.unsqueeze(-1), 0.0).sum(0)
+        self._metrics = torch.where(env.done.any(), sums / env.done.sum(), self._metrics)
+        return {f"metrics/{name}": mean for name, mean in zip(env.metrics, self._metrics.unbind(), strict=True)}

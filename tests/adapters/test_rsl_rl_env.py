@@ -1,0 +1,185 @@
+"""An environment under rsl_rl's own runner, and what its VecEnv gives."""
+
+import importlib
+import importlib.metadata
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import SharedEnv
+from metered_task import Metered
+from rsl_rl.runners import OnPolicyRunner
+from tensordict import TensorDict
+
+import lyceum_warp as lw
+from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
+from lyceum_warp.adapters.rsl_rl_env import RslRlVecEnv
+
+
+@pytest.fixture
+def env(shared_env: SharedEnv) -> lw.Env:
+    return shared_env(Metered, nworld=4, horizon=10, far=1e3)
+
+
+def test_a_step_gives_all_groups_and_the_buffers(env: lw.Env) -> None:
+    worlds = RslRlVecEnv(env)
+    assert (worlds.num_envs, worlds.num_actions, worlds.max_episode_length) == (4, 1, 10)
+    assert worlds.device == env.obs.device and worlds.cfg["task"] == "metered" and worlds.unwrapped is env
+    obs, reward, done, extras = worlds.step(torch.ones(4, 1))
+    assert isinstance(obs, TensorDict) and set(obs.keys()) == {"policy", "critic"}
+    assert reward is env.reward and done is env.done
+    assert not extras["time_outs"].any() and extras["time_outs"].dtype == torch.bool
+    for group in ("policy", "critic"):
+        assert torch.equal(obs[group], env.obs_groups[group])
+        assert torch.equal(extras["final_obs"][group], env.final_obs_groups[group])
+
+
+def test_a_task_is_made_with_its_options() -> None:
+    worlds = RslRlVecEnv(Metered, 3, horizon=7, far=2.0)
+    assert (worlds.num_envs, worlds.max_episode_length, worlds.cfg["params"]) == (3, 7, {"far": 2.0})
+
+
+def test_observations_survive_the_next_step(env: lw.Env) -> None:
+    """rsl_rl stores the observations before a step once that step is done."""
+    worlds = RslRlVecEnv(env)
+    first = worlds.get_observations()
+    second, *_ = worlds.step(torch.ones(4, 1))
+    kept = first.clone(), second.clone()
+    worlds.step(torch.ones(4, 1))
+    assert not torch.equal(env.obs, second["policy"])
+    for obs, before in zip((first, second), kept, strict=True):
+        assert all(torch.equal(obs[group], before[group]) for group in ("policy", "critic"))
+
+
+def test_assigned_clocks_move_the_time_limit(env: lw.Env) -> None:
+    worlds = RslRlVecEnv(env)
+    worlds.episode_length_buf = torch.tensor([0, 9, 8, 3])
+    *_, extras = worlds.step(torch.zeros(4, 1))
+    assert extras["time_outs"].tolist() == [False, True, False, False]
+    assert worlds.episode_length_buf.tolist() == [1, 0, 9, 4]
+    *_, extras = worlds.step(torch.zeros(4, 1))
+    assert extras["time_outs"].tolist() == [False, False, True, False]
+
+
+@pytest.mark.parametrize("steps, message", [
+    (torch.zeros(3, dtype=torch.long), r"must be whole numbers of shape \(4,\), not a int64 tensor of shape \(3,\)"),
+    (torch.zeros(4), "must be whole numbers of shape"),
+    (torch.tensor([0, 1, 10, 2]), "must be from 0 to 9, not from 0 to 10"),
+])  # fmt: skip
+def test_clocks_that_do_not_fit_are_refused(env: lw.Env, steps: torch.Tensor, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        RslRlVecEnv(env).episode_length_buf = steps
+
+
+def test_a_fault_is_a_time_out_and_a_termination_is_not(shared_env: SharedEnv) -> None:
+    env = shared_env(Metered, nworld=4, horizon=10)
+    worlds = RslRlVecEnv(env)
+    worlds.episode_length_buf = torch.tensor([0, 0, 9, 9])
+    state = env.get_state()
+    state[[0, 2], env.state_space.parts["qpos"].start] = 5.0  # too far, the second at its time limit
+    env.set_state(state)
+    action = torch.zeros(4, 1)
+    action[1] = torch.nan
+    _, reward, done, extras = worlds.step(action)
+    assert done.tolist() == [True, True, True, True]
+    assert extras["time_outs"].tolist() == [False, True, False, True]
+    assert extras["log"]["faults/worlds"] == 1
+    assert reward[1] == 0.0 and extras["final_obs"]["critic"].isfinite().all()
+
+
+def test_the_log_has_the_metrics_of_ended_episodes(env: lw.Env) -> None:
+    worlds = RslRlVecEnv(env)
+    worlds.episode_length_buf = torch.tensor([7, 7, 5, 0])
+    action = torch.tensor([[0.1], [0.2], [0.3], [0.4]])
+    logs = []
+    for _ in range(6):
+        *_, extras = worlds.step(action)
+        logs.append({name: mean.clone() for name, mean in extras["log"].items()})
+    names = ["metrics/forward", "metrics/effort"]
+    assert [name for name in logs[0] if name.startswith("metrics/")] == names
+    assert all(logs[1][name].isnan() for name in names)  # no episode has ended
+    assert logs[2]["metrics/effort"].item() == pytest.approx(3 * (0.01 + 0.04) / 2)
+    assert logs[3]["metrics/effort"] == logs[2]["metrics/effort"]  # none ended in this step
+    assert logs[4]["metrics/effort"].item() == pytest.approx(5 * 0.09)
+
+
+def test_bad_environments_and_actions_are_refused(env: lw.Env, shared_env: SharedEnv) -> None:
+    with pytest.raises(ValueError, match="the environment has autoreset=False: make it with autoreset=True"):
+        RslRlVecEnv(shared_env(Metered, nworld=4, autoreset=False))
+    with pytest.raises(ValueError, match="nworld= does not belong to an adapter: num_envs decides"):
+        RslRlVecEnv(Metered, nworld=4)
+    with pytest.raises(ValueError, match=r"action must be a float32 tensor of shape \(4, 1\), not a float32 tensor of"):
+        RslRlVecEnv(env).step(torch.zeros(4, 2))
+    endless = RslRlVecEnv(shared_env(Metered, nworld=2, horizon=0))
+    assert endless.max_episode_length == 2**31 - 1
+    with pytest.raises(ValueError, match="'metered' have no time limit .* init_at_random_ep_len=False"):
+        endless.episode_length_buf = torch.zeros(2, dtype=torch.long)
+
+
+def test_rsl_rls_own_runner_learns(tmp_path: Path) -> None:
+    """The best possible return is about 250; a policy that has learned nothing is negative on average."""
+    env = lw.make("point_mass", nworld=32)
+    few = env.replicate(nworld=16)
+    config = RslRlConfig(hidden=(32, 32), value_hidden=(32, 32)).runner_config(env)
+    torch.manual_seed(0)
+    runner = OnPolicyRunner(RslRlVecEnv(env), config, str(tmp_path), "cpu")
+
+    def mean_return() -> float:
+        policy = runner.get_inference_policy()
+        shown = lw.evaluate(few, lambda obs: policy(TensorDict({"policy": obs}, [len(obs)])), 16, seed=1)
+        return shown.returns.mean().item()
+
+    before = mean_return()
+    runner.learn(40, init_at_random_ep_len=True)
+    assert mean_return() > max(before + 100.0, 150.0)
+    assert list(tmp_path.glob("model_*.pt"))  # its own checkpoints
+
+
+def test_rsl_rls_writer_gets_the_metrics(env: lw.Env, tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    config = RslRlConfig(hidden=(8,), value_hidden=(8,), num_steps_per_env=10).runner_config(env)
+    OnPolicyRunner(RslRlVecEnv(env), config, str(tmp_path), "cpu").learn(2)
+    found = EventAccumulator(str(tmp_path)).Reload().Tags()["scalars"]
+    assert {"metrics/forward", "metrics/effort", "faults/worlds", "Train/mean_reward"} <= set(found)
+
+
+# what is installed
+
+
+@pytest.mark.parametrize("release, found", [
+    (None, "this adapter needs the package rsl-rl-lib: "),
+    ("5.3.0", "this adapter needs rsl-rl-lib from 5.4.2 to below 6, and 5.3.0 is installed: "),
+    ("6.0.0", "this adapter needs rsl-rl-lib from 5.4.2 to below 6, and 6.0.0 is installed: "),
+])  # fmt: skip
+@pytest.mark.parametrize("module", ["env", "ppo", "distribution", "learner"])
+def test_a_missing_extra_and_another_major_version_are_one_line(
+    release: str | None, found: str, module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def version(name: str) -> str:
+        if release is None:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return release
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    for name in [name for name in sys.modules if name.startswith("lyceum_warp.adapters.rsl_rl")]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(ImportError, match=f"^{re.escape(found)}pip install 'lyceum-warp.rsl-rl.'$"):
+        importlib.import_module(f"lyceum_warp.adapters.rsl_rl_{module}")
+
+
+@pytest.mark.gpu
+def test_gpu_a_step_does_not_wait_for_the_device() -> None:
+    env = lw.make(Metered, nworld=64, device="cuda:0")
+    worlds = RslRlVecEnv(env)
+    action = torch.zeros(64, 1, device="cuda:0")
+    for _ in range(3):
+        worlds.step(action)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(5):
+            worlds.step(action)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")

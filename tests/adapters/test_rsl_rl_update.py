@@ -1,0 +1,69 @@
+"""The update of rsl_rl's PPO that can be captured, beside rsl_rl's own."""
+
+from typing import Any
+
+import pytest
+import torch
+from metered_task import Metered
+
+import lyceum_warp as lw
+from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
+from lyceum_warp.adapters.rsl_rl_learner import RslRlLearner
+
+
+def learner(*, device: str = "cpu", **changes: Any) -> RslRlLearner:
+    settings: dict[str, Any] = {"hidden": (16, 8), "value_hidden": (8,), "num_steps_per_env": 12, "mean_every": 0}
+    env = lw.make(Metered, nworld=8, horizon=10, device=device)
+    return RslRlLearner(env, config=RslRlConfig(**settings | changes))
+
+
+@pytest.mark.parametrize("changes", [
+    {}, {"schedule": "fixed"}, {"use_clipped_value_loss": False, "std_type": "log", "optimizer": "adamw"},
+    {"num_mini_batches": 5, "num_learning_epochs": 2, "clip_param": 0.05, "entropy_coef": 0.1},
+])  # fmt: skip
+def test_the_numbers_are_those_of_rsl_rls_own(changes: dict[str, Any]) -> None:
+    """After the first update; later ones draw other random numbers."""
+    own, captured = learner(**changes), learner(captured_update=True, **changes)
+    a, b = next(own).row(), next(captured).row()
+    for name in ("kl", "std_mean", "learning_rate", "surrogate_loss", "entropy", "value_loss"):
+        assert b[name] == pytest.approx(a[name], rel=1e-3, abs=1e-6), name
+    for one, other in ((own.ppo.actor, captured.ppo.actor), (own.ppo.critic, captured.ppo.critic)):
+        for name, weights in one.state_dict().items():
+            torch.testing.assert_close(other.state_dict()[name], weights, rtol=1e-3, atol=1e-4)
+
+
+def test_its_state_is_continued_exactly() -> None:
+    one = learner(captured_update=True)
+    next(one)
+    other = learner(captured_update=True, learning_rate=0.5)
+    other.load_state_dict(one.state_dict())
+    for _ in range(2):
+        first, second = next(one), next(other)
+        assert (first.kl, first.learning_rate, first.value_loss) == (second.kl, second.learning_rate, second.value_loss)
+
+
+def test_what_it_cannot_do_is_refused() -> None:
+    with pytest.raises(ValueError, match="captured_update needs the optimizer 'adam' or 'adamw', not 'sgd'"):
+        RslRlConfig(captured_update=True, optimizer="sgd")
+    with pytest.raises(ValueError, match="captured_update and torch_compile_mode exclude each other"):
+        RslRlConfig(captured_update=True, torch_compile_mode="default")
+
+
+@pytest.mark.gpu
+def test_gpu_a_captured_update_has_the_numbers_of_rsl_rls_own() -> None:
+    own, captured = learner(device="cuda:0", tf32=False), learner(device="cuda:0", tf32=False, captured_update=True)
+    a, b = next(own).row(), next(captured).row()
+    for name in ("learning_rate", "surrogate_loss", "entropy", "value_loss"):
+        assert b[name] == pytest.approx(a[name], rel=1e-2, abs=1e-4), name
+
+
+@pytest.mark.gpu
+def test_gpu_a_captured_update_is_continued_and_learns() -> None:
+    one = learner(device="cuda:0", captured_update=True)
+    for _ in range(3):
+        next(one)
+    other = learner(device="cuda:0", captured_update=True)
+    other.load_state_dict(one.state_dict())
+    first, second = next(one), next(other)
+    assert second.learning_rate == pytest.approx(first.learning_rate)
+    assert second.value_loss == pytest.approx(first.value_loss, rel=1e-2, abs=1e-4)
