@@ -43,8 +43,9 @@ class TaskFunction:
     optional: str = ""
     """Arguments at the end that a task's function may leave out, as they are written in its file."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Which fields of its arguments of type World it may write: "inputs", "memory", "lasting" (what resets leave as it
-    is), or "start" (all that a reset may write). Rows among its arguments that are results, such as ``obs``, may always be written."""
+    """Which fields of its arguments of type World it may write: "inputs", "memory", "lasting" (lasting memory and the
+    model), or "start" (all that a reset may write). Rows among its arguments that are results, such as ``obs``, may
+    always be written."""
 
     @property
     def signature(self) -> str:
@@ -99,8 +100,8 @@ FUNCTIONS = {
                      "Whether the state meets the task's goal; ``success_steps`` asks for several steps in a row. "
                      "Default: False.", "return False"),
         TaskFunction("startup", f"s: World, p: Params, {_RNG}", None,
-                     "Draws model fields and lasting memory once for each world, when its random stream starts. Default: "
-                     "keeps them.", "pass", writes={"s": "lasting"}),
+                     "Draws model fields and lasting memory once for each world, when its random stream starts. "
+                     "Default: keeps them.", "pass", writes={"s": "lasting"}),
         TaskFunction("initialize", "s: World, p: Params", None,
                      "Changes the fixed initial state, the model's own. Default: keeps it.", "pass",
                      writes={"s": "start"}),

@@ -1,11 +1,12 @@
-"""Go1Velocity: a Unitree Go1 walks at a commanded velocity, as in mjlab's Mjlab-Velocity-Flat-Unitree-Go1 (mjlab 1.6.0).
+"""Go1Velocity: a Unitree Go1 walks at a commanded velocity, as in mjlab 1.6.0's Mjlab-Velocity-Flat-Unitree-Go1.
 
-Numbers, observations, rewards, commands, pushes and resets are mjlab's. An action moves the targets of the joints' servos
-away from the default pose. Joints and feet are in the order FR, FL, RR, RL, each leg hip, thigh, calf.
+Observations, rewards, commands, pushes and resets have mjlab's numbers. An action moves the targets of the joints'
+servos away from the default pose. Joints and feet are in the order FR, FL, RR, RL, each leg hip, thigh, calf.
 
-All that the functions read belongs to the state after the last substep, but the force on a foot, which is that of the
-last substep. mjlab's rewards read poses and contacts one substep late, heights of feet one step late. A foot is a sphere
-on a plane, and so touches it where its centre is no higher than its radius. A reward that is not finite is a fault.
+Functions read the state after the last substep, while mjlab's rewards read velocities, orientations and contacts of the
+substep before, and heights of feet of the step before. Only the forces on the feet are those of the last substep's
+beginning, as for every task. Feet are spheres on a plane: one touches it where its centre is within its radius.
+A reward that is not finite is a fault; mjlab counts such a term as 0.
 """
 
 import math

@@ -1,0 +1,440 @@
+"""The go1_velocity task: formulas in NumPy on MuJoCo's own kinematics, clocks, commands, pushes, draws, curriculum.
+
+Its equality with mjlab is tested in tests/oracles/test_mjlab.py.
+"""
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from checks import check_uniform
+from conftest import SharedEnv
+
+import lyceum_warp as lw
+from lyceum_warp.tasks import go1_velocity
+
+GO1 = str(Path(go1_velocity.__file__).with_name("go1.xml"))
+NWORLD, DT, SUBSTEP = 64, 0.02, 0.005
+LEGS = ("FR", "FL", "RR", "RL")
+HOME = np.array([0.1, 0.9, -1.8, -0.1, 0.9, -1.8] * 2)
+NEVER = (1e6, 1e6)
+NOISELESS = {
+    f"{part}_noise": 0.0
+    for part in ("linear_velocity", "angular_velocity", "gravity", "joint_position", "joint_velocity")
+}
+STILL: dict[str, Any] = {**NOISELESS, "command_seconds": NEVER, "push_seconds": NEVER}
+"""Parameters without noise and without events."""
+
+
+class State:
+    """The parts of the worlds' states, in float64, and what MuJoCo computes from them."""
+
+    def __init__(self, env: lw.Env, state: torch.Tensor | None = None) -> None:
+        parts = env.state_space.split(env.get_state() if state is None else state)
+        self.parts = {name: part.numpy().copy() for name, part in parts.items()}
+        self.qpos, self.qvel, memory = self.parts["qpos"], self.parts["qvel"], self.parts["memory"]
+        self.force = self.parts["sensordata"].reshape(-1, 4, 3)
+        self.drawn, self.heading_target = memory[:, :3], memory[:, 3]
+        self.heading_controlled, self.standing = memory[:, 4] > 0, memory[:, 5] > 0
+        self.command_timer, self.push_timer = memory[:, 6], memory[:, 7]
+        self.last_action, self.contact_time, self.air_time = memory[:, 8:20], memory[:, 20:24], memory[:, 24:28]
+        lasting = self.parts["lasting_memory"]
+        self.bias, self.peak, self.env_steps = lasting[:, :12], lasting[:, 12:16], lasting[:, 16]
+        self._kinematics(env.model)
+
+    def _kinematics(self, own: mujoco.MjModel) -> None:
+        spec = mujoco.MjSpec.from_file(GO1)
+        for kind, name in ((mujoco.mjtSensor.mjSENS_VELOCIMETER, "v"), (mujoco.mjtSensor.mjSENS_GYRO, "w")):
+            spec.add_sensor(type=kind, name=name, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu")
+        model = spec.compile()
+        data, n = mujoco.MjData(model), len(self.qpos)
+        self.imu_velocity, self.gyro = np.zeros((n, 3)), np.zeros((n, 3))
+        self.v, self.w, self.gravity = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
+        self.heading, self.foot, self.foot_velocity = np.zeros(n), np.zeros((n, 4, 3)), np.zeros((n, 4, 3))
+        self.touching, motion = np.zeros((n, 4), bool), np.zeros(6)
+        for i in range(n):
+            data.qpos, data.qvel = self.qpos[i], self.qvel[i]
+            mujoco.mj_forward(model, data)
+            trunk, kind = data.body("trunk"), mujoco.mjtObj
+            axes = trunk.xmat.reshape(3, 3)
+            mujoco.mj_objectVelocity(model, data, kind.mjOBJ_XBODY, trunk.id, motion, 1)
+            self.w[i], self.v[i] = motion[:3], motion[3:]
+            self.gravity[i] = axes.T @ [0, 0, -1]
+            self.heading[i] = np.arctan2(axes[1, 0], axes[0, 0])
+            self.imu_velocity[i], self.gyro[i] = data.sensor("v").data, data.sensor("w").data
+            for k, leg in enumerate(LEGS):
+                site, geom = data.site(f"{leg}_foot"), data.geom(f"{leg}_foot").id
+                mujoco.mj_objectVelocity(model, data, kind.mjOBJ_SITE, site.id, motion, 0)
+                self.foot[i, k], self.foot_velocity[i, k] = site.xpos, motion[3:]
+                pairs = {frozenset(pair) for pair in data.contact.geom.tolist()}
+                self.touching[i, k] = frozenset((model.geom("floor").id, geom)) in pairs
+
+    @property
+    def height(self) -> np.ndarray:
+        return np.maximum(self.foot[..., 2], 0.0)
+
+    @property
+    def foot_speed(self) -> np.ndarray:
+        return np.linalg.norm(self.foot_velocity[..., :2], axis=-1)
+
+    def command(self, fastest: float = 0.5) -> np.ndarray:
+        command = self.drawn.copy()
+        error = (self.heading_target - self.heading + np.pi) % (2 * np.pi) - np.pi
+        command[self.heading_controlled, 2] = np.clip(0.5 * error, -fastest, fastest)[self.heading_controlled]
+        command[self.standing] = 0.0
+        return command
+
+
+def random_steps(env: lw.Env, steps: int, size: float = 1.0) -> list[torch.Tensor]:
+    """Actions that are similar from step to step, each (nworld, 12)."""
+    generator, found = torch.Generator().manual_seed(1), [torch.zeros(env.nworld, 12)]
+    for _ in range(steps):
+        found.append(0.8 * found[-1] + 0.6 * size * torch.randn(env.nworld, 12, generator=generator))
+    return found[1:]
+
+
+def roll_out(env: lw.Env, steps: int, size: float = 1.0) -> torch.Tensor:
+    """Random steps; returns the last action."""
+    actions = random_steps(env, steps, size)
+    for action in actions:
+        env.step(action)
+    return actions[-1]
+
+
+# observations
+
+
+def observation(s: State, bias: np.ndarray | float) -> np.ndarray:
+    joints = s.qpos[:, 7:] + bias - HOME
+    return np.hstack([s.imu_velocity, s.gyro, s.gravity, joints, s.qvel[:, 6:], s.last_action, s.command()])
+
+
+def test_observations_equal_their_formulas(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=NWORLD, **STILL)
+    assert (env.obs.shape[1], env.obs_groups["critic"].shape[1]) == (48, 72)
+    for _ in range(4):
+        roll_out(env, 9)
+        s = State(env)
+        logarithm = np.sign(s.force) * np.log1p(np.abs(s.force))
+        feet = np.hstack([s.height, s.air_time, s.touching, logarithm.reshape(-1, 12)])
+        np.testing.assert_allclose(env.obs.numpy(), observation(s, s.bias), rtol=1e-5, atol=1e-5)
+        critic = np.hstack([observation(s, 0.0), feet])
+        np.testing.assert_allclose(env.obs_groups["critic"].numpy(), critic, rtol=1e-5, atol=1e-5)
+        assert s.heading_controlled.any() and s.standing.any() and 0.1 < s.touching.mean() < 0.9
+
+
+def test_noise_of_the_policys_observations_is_uniform_and_the_critic_has_none(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=1000)
+    roll_out(env, 2)
+    clean = shared_env("go1_velocity", nworld=1000, **NOISELESS)
+    clean.set_state(env.get_state())
+    noise = (env.obs - clean.obs).numpy()
+    assert torch.equal(env.obs_groups["critic"], clean.obs_groups["critic"])
+    assert not noise[:, 33:].any()
+    sizes = np.repeat([0.5, 0.2, 0.05, 0.01, 1.5], [3, 3, 3, 12, 12])
+    check_uniform(noise[:, :33] / (sizes * (1 + 1e-3)))
+
+
+# rewards
+
+
+def expected_terms(s0: State, action: np.ndarray, s1: State, model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    c = s0.command()
+    amount = np.linalg.norm(c[:, :2], axis=1) + np.abs(c[:, 2])
+    active, std = amount > 0.05, np.where(amount[:, None] < 0.05, [0.05, 0.05, 0.1], [0.3, 0.3, 0.6])
+    low, high = model.jnt_range[1:].T
+    middle, half = (low + high) / 2, 0.9 * (high - low) / 2
+    q = s1.qpos[:, 7:]
+    landed = (s1.contact_time > 0) & (s1.contact_time < DT + 1e-6)
+    loaded = (s1.contact_time > SUBSTEP + 1e-6) & (s1.contact_time < DT + SUBSTEP + 1e-6)
+    linear = np.square(c[:, :2] - s1.v[:, :2]).sum(axis=1) + s1.v[:, 2] ** 2
+    angular = (c[:, 2] - s1.w[:, 2]) ** 2 + np.square(s1.w[:, :2]).sum(axis=1)
+    return {
+        "track_linear_velocity": 2.0 * np.exp(-linear / 0.25),
+        "track_angular_velocity": 2.0 * np.exp(-angular / 0.5),
+        "upright": np.exp(-np.square(s1.gravity[:, :2]).sum(axis=1) / 0.2),
+        "pose": np.exp(-np.square((q - HOME) / np.tile(std, 4)).mean(axis=1)),
+        "dof_pos_limits": -np.maximum(np.abs(q - middle) - half, 0.0).sum(axis=1),
+        "action_rate_l2": -0.1 * np.square(action - s0.last_action).sum(axis=1),
+        "foot_clearance": -2.0 * active * (np.abs(s1.height - 0.1) * s1.foot_speed).sum(axis=1),
+        "foot_swing_height": -0.25 * active * (landed * (s0.peak / 0.1 - 1.0) ** 2).sum(axis=1),
+        "foot_slip": -0.1 * active * (s1.touching * s1.foot_speed**2).sum(axis=1),
+        "soft_landing": -1e-5 * active * (loaded * np.linalg.norm(s1.force, axis=2)).sum(axis=1),
+    }
+
+
+def test_every_term_of_the_reward_equals_its_formula(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=NWORLD, autoreset=False, **STILL)
+    seen = dict.fromkeys(env.metrics, 0)
+    for action in random_steps(env, 24, 1.6):
+        s0 = State(env)
+        env.step(action)
+        s1 = State(env)
+        terms = {name: DT * term for name, term in expected_terms(s0, action.numpy(), s1, env.model).items()}
+        for name, term in terms.items():
+            atol = 1e-6 if name != "soft_landing" else 1e-9
+            np.testing.assert_allclose(env.metrics[name].numpy(), term, rtol=2e-4, atol=atol, err_msg=name)
+            seen[name] += int((np.abs(term) > 10 * atol).sum())
+        np.testing.assert_allclose(env.reward.numpy(), sum(terms.values()), rtol=1e-4, atol=5e-6)
+        error = s0.command() - np.hstack([s1.v[:, :2], s1.w[:, 2:]])
+        slip = np.linalg.norm(error[:, :2], axis=1)
+        np.testing.assert_allclose(env.metrics["velocity_error"].numpy(), slip, atol=1e-5)
+        np.testing.assert_allclose(env.metrics["yaw_rate_error"].numpy(), np.abs(error[:, 2]), atol=1e-5)
+        now = np.linalg.norm((s1.command() - np.hstack([s1.v[:, :2], s1.w[:, 2:]]))[:, :2], axis=1)
+        np.testing.assert_allclose(env.eval.numpy(), now, atol=1e-5)
+    assert min(seen[name] for name in terms) > 20
+
+
+def test_an_ideal_step_earns_six_a_second(shared_env: SharedEnv) -> None:
+    """Standing still in the default pose under the command to stand."""
+    env = shared_env("go1_velocity", nworld=2, autoreset=False, **STILL)
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    parts["memory"][:] = 0.0
+    parts["memory"][:, 5] = 1.0
+    parts["qvel"][:] = 0.0
+    reward = env.get_reward(state, torch.zeros(2, 12), state)
+    np.testing.assert_allclose(reward.numpy(), 0.12, rtol=1e-6)
+
+
+# contacts
+
+
+def test_clocks_count_substeps_of_contact_and_of_flight(shared_env: SharedEnv) -> None:
+    """Against MuJoCo's own contacts after every substep."""
+    env = shared_env("go1_velocity", nworld=4, autoreset=False, **STILL)
+    model = mujoco.MjModel.from_xml_path(GO1)
+    feet = [model.geom(f"{leg}_foot").id for leg in LEGS]
+    states = [State(env)]
+    actions = random_steps(env, 40)
+    for action in actions:
+        env.step(action)
+        states.append(State(env))
+    landings = 0
+    for i in range(env.nworld):
+        for s0, s1 in itertools.pairwise(states):
+            model.geom_friction[:] = s0.parts["geom_friction"][i].reshape(-1, 3)
+            model.body_ipos[:] = s0.parts["body_ipos"][i].reshape(-1, 3)
+            data = mujoco.MjData(model)
+            mujoco.mj_setConst(model, data)
+            data.qpos, data.qvel, data.ctrl = s0.qpos[i], s0.qvel[i], s1.parts["ctrl"][i]
+            data.qacc_warmstart = s0.parts["qacc_warmstart"][i]
+            contact, air = s0.contact_time[i].copy(), s0.air_time[i].copy()
+            for _ in range(4):
+                mujoco.mj_step(model, data)
+                mujoco.mj_forward(model, data)
+                touching = np.isin(feet, data.contact.geom[(data.contact.geom == 0).any(axis=1)])
+                landings += int((touching & (contact == 0)).sum())
+                contact, air = np.where(touching, contact + SUBSTEP, 0), np.where(touching, 0, air + SUBSTEP)
+            np.testing.assert_allclose(s1.contact_time[i], contact, atol=1e-6)
+            np.testing.assert_allclose(s1.air_time[i], air, atol=1e-6)
+    assert landings > 20
+
+
+def test_peak_heights_grow_in_the_air_and_end_at_landings_not_at_resets(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=16, autoreset=False, **STILL)
+    landings, before = 0, State(env)
+    for action in random_steps(env, 30):
+        env.step(action)
+        s = State(env)
+        landed = (s.contact_time > 0) & (s.contact_time < DT + 1e-6)
+        grown = np.where(s.touching, before.peak, np.maximum(before.peak, s.height))
+        np.testing.assert_allclose(s.peak, np.where(landed, 0.0, grown), atol=1e-6)
+        landings, before = landings + landed.sum(), s
+    assert landings > 50
+    env.rand_reset()
+    s = State(env)
+    assert np.array_equal(s.peak, before.peak) and s.peak.max() > 0.02
+    assert not s.contact_time.any() and not s.air_time.any() and not s.last_action.any()
+
+
+# commands
+
+
+@pytest.mark.usefixtures("freed")
+def test_commands_have_mjlabs_distribution() -> None:
+    env = lw.make("go1_velocity", nworld=4000, seed=0)
+    memory = env.state_space.split(env.get_state())["memory"].numpy()
+    vx, vy, yaw = memory[:, :3].T
+    forward = (vy == 0) & (yaw == 0)
+    for share, wanted in ((forward, 0.2), (memory[:, 4] == 1, 0.3), (memory[:, 5] == 1, 0.1)):
+        assert abs(share.mean() - wanted) < 4 * np.sqrt(wanted * (1 - wanted) / 4000)
+    drawn = np.stack([vx, vy, 2 * yaw, memory[:, 3] / np.pi, (memory[:, 6] - 5.5) / 2.5, memory[:, 7] - 2], axis=1)
+    check_uniform(drawn[~forward] / (1 + 1e-6))
+    assert vx[forward].min() == np.float32(0.3) and vx[forward].max() <= 1
+    assert abs((vx[forward] == np.float32(0.3)).mean() - 0.3) < 0.07
+    flags = np.stack([forward, memory[:, 4] == 1, memory[:, 5] == 1], axis=1)
+    assert np.abs(np.corrcoef(flags.T) - np.eye(3)).max() < 5.5 / np.sqrt(4000)
+
+
+def test_commands_change_when_their_time_is_over(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=NWORLD, autoreset=False, **NOISELESS, push_seconds=NEVER)
+    action = torch.zeros(NWORLD, 12)
+    changes, before = 0, env.state_space.split(env.get_state())["memory"].clone()
+    for _ in range(300):
+        env.step(action)
+        memory = env.state_space.split(env.get_state())["memory"].clone()
+        due = before[:, 6] - DT <= 1e-9
+        changed = (memory[:, :4] != before[:, :4]).any(dim=1)
+        assert torch.equal(changed, due)
+        torch.testing.assert_close(memory[~due, 6], before[~due, 6] - DT, atol=1e-6, rtol=0)
+        assert (memory[due, 6] >= 3).all() and (memory[due, 6] <= 8).all()
+        changes, before = changes + int(due.sum()), memory
+    assert 0.4 * NWORLD < changes < 0.8 * NWORLD  # within 6 s, of 3 to 8
+
+
+def test_headings_determine_the_yaw_rate_of_their_worlds(shared_env: SharedEnv) -> None:
+    """The shorter way round, and no faster than the command's range; the reward uses the state before the step."""
+    env = shared_env("go1_velocity", nworld=4, autoreset=False, **STILL)
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    parts["qpos"][:, 3:7] = torch.tensor([np.cos(1.5), 0.0, 0.0, np.sin(1.5)])  # a heading of 3 rad
+    parts["memory"][:, :3] = torch.tensor([0.5, 0.2, 0.3])
+    parts["memory"][:, 3] = torch.tensor([-3.0, 2.8, 0.0, -3.0])
+    parts["memory"][:, 4] = torch.tensor([1.0, 1.0, 1.0, 0.0])
+    parts["memory"][:, 5] = 0.0
+    env.set_state(state)
+    yaw = [0.5 * (2 * np.pi - 6.0), -0.1, -0.5, 0.3]
+    np.testing.assert_allclose(env.obs[:, 45:].numpy(), np.stack([[0.5] * 4, [0.2] * 4, yaw], axis=1), atol=1e-5)
+    parts["memory"][:, 5] = 1.0
+    env.set_state(state)
+    assert not env.obs[:, 45:].any()
+
+
+def test_the_curriculum_widens_commands_after_so_many_steps() -> None:
+    env = lw.make("go1_velocity", nworld=1000, **NOISELESS)
+    for steps, low, high, yaw in ((119_998, -1, 1, 0.5), (119_999, -1.5, 2, 0.7), (239_999, -2, 3, 0.7)):
+        state = env.get_state()
+        parts = env.state_space.split(state)
+        parts["lasting_memory"][:, 16] = steps
+        parts["memory"][:, 6] = 0.0
+        env.set_state(state)
+        env.step(torch.zeros(1000, 12))
+        memory = env.state_space.split(env.get_state())["memory"].numpy()
+        free = memory[:, 1] != 0
+        for column, bounds in ((0, (low, high)), (2, (-yaw, yaw))):
+            values, width = memory[free, column], bounds[1] - bounds[0]
+            assert bounds[0] <= values.min() < bounds[0] + 0.02 * width
+            assert bounds[1] >= values.max() > bounds[1] - 0.02 * width
+
+
+# events, ends, draws
+
+
+def test_pushes_add_velocity_in_the_worlds_axes(shared_env: SharedEnv) -> None:
+    pushed = shared_env("go1_velocity", nworld=1000, autoreset=False, **NOISELESS, command_seconds=NEVER)
+    weak = {"push_velocity": (0.0, 0.0, 0.0), "push_spin": (0.0, 0.0, 0.0)}
+    still = shared_env("go1_velocity", nworld=1000, autoreset=False, **NOISELESS, command_seconds=NEVER, **weak)
+    state = pushed.get_state()
+    parts = pushed.state_space.split(state)
+    parts["memory"][:, 7] = torch.where(torch.arange(1000) < 900, 0.02, 0.5)
+    still.set_state(state)
+    pushed.set_state(state)
+    action = torch.zeros(1000, 12)
+    pushed.step(action)
+    still.step(action)
+    assert torch.equal(pushed.reward, still.reward), "the transition ends before the push"
+    one, other = (env.state_space.split(env.get_state()) for env in (pushed, still))
+    assert torch.equal(one["qpos"], other["qpos"])
+    change = (one["qvel"] - other["qvel"]).numpy()
+    assert not change[900:].any() and np.abs(change[:, 6:]).max() < 1e-6  # a push rounds velocities to float32
+    axes = np.zeros((1000, 9))
+    for row, quat in zip(axes, one["qpos"][:, 3:7].numpy(), strict=True):
+        mujoco.mju_quat2Mat(row, quat)
+    spin = np.einsum("nij,nj->ni", axes.reshape(-1, 3, 3), change[:, 3:6])
+    sizes = np.array([0.5, 0.5, 0.4, 0.52, 0.52, 0.78])
+    check_uniform(np.hstack([change[:, :3], spin])[:900] / (sizes * (1 + 1e-4)))
+    timers = one["memory"][:, 7].numpy()
+    check_uniform((timers[:900, None] - 2) / (1 + 1e-6))
+    np.testing.assert_allclose(timers[900:], 0.48, atol=1e-6)
+
+
+def test_robots_differ_in_friction_centre_of_mass_and_encoders() -> None:
+    env = lw.make("go1_velocity", nworld=1000, seed=0)
+    friction = env.field("geom_friction").numpy().copy()
+    feet = [env.model.geom(f"{leg}_foot").id for leg in LEGS]
+    assert (friction[:, feet] == friction[:, feet[:1]]).all()
+    others = np.delete(np.arange(env.model.ngeom), feet)
+    assert (friction[:, others] == np.float32(env.model.geom_friction[others])).all()
+    drawn = friction[:, feet[0]].astype(np.float64)
+    drawn[:, 1:] = np.log(drawn[:, 1:])
+    bounds = np.array([[0.3, 1.5], np.log([1e-4, 2e-2]), np.log([1e-5, 5e-3])]).T
+    offset = env.field("body_ipos").numpy()[:, 1] - env.model.body_ipos[1]
+    bias = env.state_space.split(env.get_state())["lasting_memory"].numpy()[:, :12] / 0.015
+    scaled = (2 * drawn - bounds.sum(axis=0)) / (bounds[1] - bounds[0])
+    samples = np.hstack([scaled, offset / [0.025, 0.025, 0.03], bias])
+    check_uniform(samples / (1 + 1e-4))
+    env.rand_reset()
+    assert np.array_equal(env.field("geom_friction").numpy(), friction)
+    again = env.state_space.split(env.get_state())["lasting_memory"].numpy()[:, :12] / 0.015
+    assert np.array_equal(again, bias)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_resets_put_the_robot_above_the_floor_in_its_default_pose(shared_env: SharedEnv, engine: str) -> None:
+    n = 1000 if engine == "mujoco" else 4
+    env = shared_env("go1_velocity", engine=engine, nworld=n)
+    qpos, qvel = (env.state_space.split(env.get_state())[name].numpy() for name in ("qpos", "qvel"))
+    np.testing.assert_allclose(qpos[:, 7:], np.tile(HOME, (n, 1)), atol=1e-6)
+    assert not qvel.any() and not qpos[:, 4:6].any()
+    yaw = 2 * np.arctan2(qpos[:, 6], qpos[:, 3])
+    yaw = (yaw + np.pi) % (2 * np.pi) - np.pi
+    start = np.stack([qpos[:, 0] / 0.5, qpos[:, 1] / 0.5, (qpos[:, 2] - 0.308) / 0.02, yaw / 3.14], axis=1)
+    if engine == "mujoco":
+        check_uniform(start / (1 + 1e-4))
+    assert np.abs(start).max() < 1 + 1e-4
+    env.reset()
+    wanted = np.hstack([[0, 0, 0.278, 1, 0, 0, 0], HOME])
+    np.testing.assert_allclose(env.field("qpos").numpy(), np.tile(wanted, (n, 1)), atol=1e-6)
+
+
+def test_an_episode_ends_when_the_trunk_tilts_by_more_than_seventy_degrees(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=4)
+    state = env.get_state()
+    tilt = np.radians([69.9, 70.1, 69.9, 70.1]) / 2
+    parts = env.state_space.split(state)
+    parts["qpos"][:, 3:7] = 0.0
+    parts["qpos"][:, 3] = torch.from_numpy(np.cos(tilt))
+    parts["qpos"][torch.arange(4), torch.tensor([4, 4, 5, 5])] = torch.from_numpy(np.sin(tilt))
+    assert env.get_terminated(state).tolist() == [False, True, False, True]
+
+
+def test_an_episode_is_truncated_after_twenty_seconds(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=2)
+    assert env.timestep == DT
+    state = env.get_state()
+    env.state_space.split(state)["step"][:] = 998
+    env.set_state(state)
+    env.step(torch.zeros(2, 12))
+    assert not env.done.any()
+    env.step(torch.zeros(2, 12))
+    assert env.truncated.all() and not env.terminated.any()
+
+
+def test_actions_move_the_servos_targets_away_from_the_default_pose(shared_env: SharedEnv) -> None:
+    """Without clipping: the force limit bounds what they do."""
+    env = shared_env("go1_velocity", nworld=NWORLD)
+    bias, action = State(env).bias, 10 * random_steps(env, 1)[0]
+    env.step(action)
+    scale = np.tile([0.372753, 0.372753, 0.248502], 4)
+    np.testing.assert_allclose(env.field("ctrl").numpy(), HOME + scale * action.numpy() - bias, atol=2e-4)
+    assert not np.isfinite(env.action_space.high).any()
+    assert env.model.actuator_forcerange[:3, 1].tolist() == [23.7, 23.7, 35.55]
+
+
+def test_both_engines_agree_over_a_step(shared_env: SharedEnv) -> None:
+    """In observations, memory and rewards, on states of random steps."""
+    mine, theirs = (shared_env("go1_velocity", engine=engine, nworld=4, **STILL) for engine in ("mujoco", "warp"))
+    for action in random_steps(mine, 12):
+        theirs.set_state(mine.get_state())
+        mine.step(action)
+        theirs.step(action)
+        torch.testing.assert_close(mine.reward, theirs.reward, rtol=1e-3, atol=1e-4)
+        going = ~mine.done
+        torch.testing.assert_close(mine.obs[going], theirs.obs[going], rtol=1e-3, atol=2e-3)
+        states = [env.state_space.split(env.get_state())["memory"][going] for env in (mine, theirs)]
+        torch.testing.assert_close(*states, rtol=1e-5, atol=1e-5)
