@@ -179,7 +179,7 @@ def height(s: World, p: Params, leg: int) -> float:  # of the foot's centre; mjl
 @wp.func
 def speed(s: World, p: Params, leg: int) -> float:  # of the foot along the floor
     _, v = foot(s, p, leg)
-    return wp.sqrt(v[0] * v[0] + v[1] * v[1])
+    return wp.length(wp.vec2(v[0], v[1]))
 
 
 @wp.func
@@ -235,7 +235,7 @@ def command(s: World, p: Params) -> wp.vec3:
 
 @wp.func
 def amount(c: wp.vec3) -> float:  # of a command
-    return wp.sqrt(c[0] * c[0] + c[1] * c[1]) + wp.abs(c[2])
+    return wp.length(wp.vec2(c[0], c[1])) + wp.abs(c[2])
 
 
 @wp.func
@@ -322,21 +322,19 @@ def observe_critic(s: World, p: Params, obs: Row[float]):
 @wp.func
 def track_linear_velocity(s0: World, s1: World, p: Params) -> float:
     c, v = command(s0, p), linear_velocity(s1)
-    error = (c[0] - v[0]) * (c[0] - v[0]) + (c[1] - v[1]) * (c[1] - v[1]) + v[2] * v[2]
-    return wp.exp(-error / p.linear_velocity_variance)
+    return wp.exp(-wp.length_sq(wp.vec3(c[0], c[1], 0.0) - v) / p.linear_velocity_variance)
 
 
 @wp.func
 def track_angular_velocity(s0: World, s1: World, p: Params) -> float:
     c, w = command(s0, p), angular_velocity(s1)
-    error = (c[2] - w[2]) * (c[2] - w[2]) + w[0] * w[0] + w[1] * w[1]
-    return wp.exp(-error / p.angular_velocity_variance)
+    return wp.exp(-wp.length_sq(wp.vec3(0.0, 0.0, c[2]) - w) / p.angular_velocity_variance)
 
 
 @wp.func
 def upright(s1: World, p: Params) -> float:
     g = gravity(s1)
-    return wp.exp(-(g[0] * g[0] + g[1] * g[1]) / p.tilt_variance)
+    return wp.exp(-wp.length_sq(wp.vec2(g[0], g[1])) / p.tilt_variance)
 
 
 @wp.func
@@ -425,16 +423,13 @@ def terms(s0: World, action: Row[float], s1: World, p: Params) -> lw.vec10:
 
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    found, total = terms(s0, action, s1, p), float(0.0)
-    for i in range(10):
-        total += found[i]
-    return total
+    return wp.dot(terms(s0, action, s1, p), lw.vec10(1.0))
 
 
 @wp.func
 def velocity_error(c: wp.vec3, s: World) -> float:
     v = linear_velocity(s)
-    return wp.sqrt((c[0] - v[0]) * (c[0] - v[0]) + (c[1] - v[1]) * (c[1] - v[1]))
+    return wp.length(wp.vec2(c[0] - v[0], c[1] - v[1]))
 
 
 @wp.func
