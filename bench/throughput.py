@@ -74,6 +74,23 @@ class Options:
     """JSON file for the results."""
 
 
+def action_bounds(env: lw.Env) -> list[torch.Tensor]:
+    """Lowest and highest action, (nact,) each; -1 and 1 where there are no bounds."""
+    bounds = (torch.as_tensor(x, device=env.obs.device) for x in (env.action_space.low, env.action_space.high))
+    return [bound.nan_to_num(posinf=1.0, neginf=-1.0) for bound in bounds]
+
+
+def next_controls(env: lw.Env) -> torch.Tensor:
+    """The controls of the environment's next step, (nworld, nu)."""
+    if (control := env.task.kernels.control_worlds) is None:
+        low, high = (torch.as_tensor(x, device=env.obs.device) for x in (env.action_space.low, env.action_space.high))
+        return env.action.clamp(low, high)
+    controls = wp.zeros_like(env.engine.ctrl)
+    args = [env.worlds.after, env.worlds.params, env.worlds.action, controls]
+    wp.launch(control, env.nworld, args, device=env.device)
+    return wp.to_torch(controls)
+
+
 class BareC:
     """``mujoco.batch.Batch`` alone, on the states of an environment's C engine."""
 
@@ -84,11 +101,10 @@ class BareC:
         self.batch = Batch(engine.batch.model, env.nworld, engine.nthread)
         self.stage = engine.stage
         self.staged = Batch(engine.batch.model, env.nworld, engine.nthread, engine.batch.persistent)
-        self.bounds = env.action_space.low, env.action_space.high
 
     def snapshot(self) -> tuple[np.ndarray, np.ndarray]:
         """States and controls of the environment's next step."""
-        return self.rows.copy(), np.clip(self.env.action.numpy(), *self.bounds)
+        return self.rows.copy(), next_controls(self.env).numpy()
 
     def load(self, snapshot: tuple[np.ndarray, np.ndarray]) -> None:
         self.batch.state[:], self.batch.ctrl[:] = snapshot
@@ -121,14 +137,13 @@ class BareWarp:
                 for _ in range(env.task.frame_skip):
                     mjw.step(self.m, self.d)
         self.graph = capture.graph
-        self.bounds = [torch.as_tensor(x, device=env.obs.device) for x in (env.action_space.low, env.action_space.high)]
 
     def snapshot(self) -> tuple[wp.array, torch.Tensor]:
         """States and controls of the environment's next step."""
         with wp.ScopedDevice(self.env.device):
             state = wp.zeros((self.env.nworld, self.engine.integration_size), dtype=float)
             mjw.get_state(self.engine.m, self.engine.d, state, self.spec)
-        return state, self.env.action.clamp(*self.bounds)
+        return state, next_controls(self.env)
 
     def load(self, snapshot: tuple[wp.array, torch.Tensor]) -> None:
         with wp.ScopedDevice(self.env.device):
@@ -256,7 +271,7 @@ def first_step(task: str, nworld: int, options: Options) -> tuple[lw.Env, float]
 def measure_env(task: str, nworld: int, options: Options) -> Row:
     env, first = first_step(task, nworld, options)
     generator = torch.Generator(env.obs.device).manual_seed(0)
-    low, high = (torch.as_tensor(x, device=env.obs.device) for x in (env.action_space.low, env.action_space.high))
+    low, high = action_bounds(env)
     draws = torch.rand(BLOCK, *env.action.shape, generator=generator, device=env.obs.device)
     actions = draws * (high - low) + low
 

@@ -43,8 +43,9 @@ class TaskFunction:
     optional: str = ""
     """Arguments at the end that a task's function may leave out, as they are written in its file."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Which fields of its arguments of type World it may write: "inputs", "memory", "model", or "start" (all that a
-    reset may write). Rows among its arguments that are results, such as ``obs``, may always be written."""
+    """Which fields of its arguments of type World it may write: "inputs", "memory", "lasting" (lasting memory and the
+    model), or "start" (all that a reset may write). Rows among its arguments that are results, such as ``obs``, may
+    always be written."""
 
     @property
     def signature(self) -> str:
@@ -99,8 +100,8 @@ FUNCTIONS = {
                      "Whether the state meets the task's goal; ``success_steps`` asks for several steps in a row. "
                      "Default: False.", "return False"),
         TaskFunction("startup", f"s: World, p: Params, {_RNG}", None,
-                     "Draws model fields once for each world, when its random stream starts. Default: keeps them.",
-                     "pass", writes={"s": "model"}),
+                     "Draws model fields and lasting memory once for each world, when its random stream starts. "
+                     "Default: keeps them.", "pass", writes={"s": "lasting"}),
         TaskFunction("initialize", "s: World, p: Params", None,
                      "Changes the fixed initial state, the model's own. Default: keeps it.", "pass",
                      writes={"s": "start"}),
@@ -292,7 +293,7 @@ class Task:
       and model fields. At every reset these model fields get their nominal values back before ``initialize`` runs, so
       that draws never add up. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
       ``sensordata``): these are computed afterwards.
-    - ``startup``: model fields, which resets then leave as they are.
+    - ``startup``: model fields and lasting_memory, which resets then leave as they are.
     - ``substep``: memory and lasting_memory. ``advance``: the same of ``s1``.
 
     ``reject`` sees an initial state before it settles. While a new episode settles, no ``substep`` runs.
@@ -328,7 +329,8 @@ class Task:
     ``World`` must list it as ``memory: Row[float]``. A reset clears it."""
     lasting_memory: ClassVar[int] = 0
     """Number of floats in the field ``lasting_memory``, which outlives episodes, for instance the level of a
-    curriculum. It is cleared only when a world's random stream starts, by ``rand_reset(seed=...)``."""
+    curriculum. It is cleared only when a world's random stream starts, by ``rand_reset(seed=...)``, and ``startup``
+    may write it then."""
     actions: ClassVar[Mapping[str, int] | None] = None
     """The parts of an action and their sizes, as ``{"speed": 1, "turn": 1}``, where actions are not controls;
     ``control`` then turns them into inputs. None: an action has one number for each control."""

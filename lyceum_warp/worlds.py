@@ -455,11 +455,11 @@ class Worlds:
         args = [self.mask, self._seed, self.first_world, self.counters.key, self.counters.episode]
         wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
         self._clear(self.mask, "lasting_memory")
+        self._make_nominal(self.mask, [field.name for field in self.task.dynamics])
+        if self.task.kernels.start_worlds is not None:
+            args = [self.mask, self.after, self.params, self.counters]
+            wp.launch(self.task.kernels.start_worlds, self.nworld, args, device=self.device)
         if self.task.dynamics:
-            self._make_nominal(self.mask, [field.name for field in self.task.dynamics])
-            if self.task.kernels.start_worlds is not None:
-                args = [self.mask, self.after, self.params, self.counters]
-                wp.launch(self.task.kernels.start_worlds, self.nworld, args, device=self.device)
             self.engine.apply_model(self.mask)
 
     def set_mask(self, mask: torch.Tensor | None) -> None:

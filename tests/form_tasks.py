@@ -195,3 +195,16 @@ class Practiced(lw.Task):
     World = PracticedWorld
     Params = PuckParams
     observe, initialize, advance = observe_practice, start_further, count_steps
+
+
+@wp.func
+def draw_practice(s: PracticedWorld, p: PuckParams, rng: Row[wp.uint32]):
+    s.lasting_memory[0] = lw.uniform(rng, 1.0, 2.0)
+
+
+class Gifted(Practiced):
+    """The same with practice at the start, which is drawn once for each world; its model is the same in all worlds."""
+
+    World = PracticedWorld
+    Params = PuckParams
+    observe, initialize, advance, startup = observe_practice, start_further, count_steps, draw_practice

@@ -147,6 +147,8 @@ class MPPI:
             nominal,
         ) in self.env.engine.nominal.items():  # a robot has the nominal model, not one that startup drew
             self._initial[self.env.state_space.parts[name]] = torch_view(flat(nominal))[0].double()
+        if "lasting_memory" in self.env.task.writes.get("startup", ()):
+            self._initial[self.env.state_space.parts["lasting_memory"]] = 0.0
         with wp.ScopedDevice(self.env.device):
             self._keys = wp.zeros(nworld, dtype=wp.uint32)
             shapes = {name: (self.config.models, self.env.state_space.parts[name]) for name in drawn}

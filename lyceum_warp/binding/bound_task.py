@@ -209,7 +209,8 @@ class BoundTask:
     def _rights(self, function: TaskFunction) -> Rights:
         """What a function may write, by its arguments."""
         model = [name for name in self.types if is_model_field(name)]
-        groups = {"inputs": INPUTS, "memory": MEMORIES, "model": model, "start": (*INITIAL, *MEMORIES, *model)}
+        lasting = ("lasting_memory", *model)
+        groups = {"inputs": INPUTS, "memory": MEMORIES, "lasting": lasting, "start": (*INITIAL, *MEMORIES, *model)}
         return {
             name: None if name in RESULTS else groups.get(function.writes.get(name, ""), ())
             for name in function.argument_names

@@ -237,8 +237,11 @@ class _Visit:
                 self.names[target.id] = found | self._value(value)
         else:
             owners = _places(self._memory(target.value)) if isinstance(target, ast.Attribute) else []
-            replaced = any(owner.field is None and _is_struct(owner.kind) for owner in owners)
-            self.analysis.note(self._memory(target), self.source, target, replaced=replaced)
+            if all(isinstance(owner.kind, tuple) for owner in owners):  # rows in a struct of the function's own
+                owners = []
+            if owners or not isinstance(target, ast.Attribute):
+                replaced = any(owner.field is None and _is_struct(owner.kind) for owner in owners)
+                self.analysis.note(self._memory(target), self.source, target, replaced=replaced)
             root = target
             while isinstance(root, ast.Attribute | ast.Subscript):
                 root = root.value

@@ -188,6 +188,15 @@ def row_in_a_struct(s: World, p: Params):
 
 
 @wp.func
+def rows_in_a_struct(s: World, p: Params) -> float:
+    own = World()
+    own.qpos = s.memory
+    own.qvel = s.qvel[2:4]
+    own.time = 1.0
+    return own.qpos[0] + own.qvel[1]
+
+
+@wp.func
 def atomic(s: World, p: Params):
     wp.atomic_add(s.qpos, 0, 1.0)
 
@@ -257,7 +266,7 @@ def test_a_write_of_any_form_is_found(function: Any) -> None:
 
 
 def test_reading_and_changing_a_copy_writes_nothing() -> None:
-    assert fields(reads_only) == set()
+    assert fields(reads_only) == fields(rows_in_a_struct) == set()
     assert rows(reads_only) == {"obs"}
 
 

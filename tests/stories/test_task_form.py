@@ -11,7 +11,7 @@ import pytest
 import tiny_task
 import torch
 import warp as wp
-from form_tasks import Drawn, PuckParams, PuckWorld, Pushed
+from form_tasks import Drawn, Gifted, PuckParams, PuckWorld, Pushed
 from full_task import Full
 
 import lyceum_warp as lw
@@ -212,6 +212,25 @@ def test_a_rejected_draw_changes_no_lasting_memory() -> None:
         env.rand_reset()
         assert (tip >= 0.2).all()  # half of the draws are rejected
         assert (env.obs_groups["critic"][:, 7] == count).all()
+
+
+def test_startup_draws_lasting_memory_once_for_each_world() -> None:
+    env = lw.make(Gifted, nworld=8, seed=3)
+    drawn = env.obs[:, 1].clone()
+    assert drawn.unique().numel() == 8 and (drawn >= 1).all() and (drawn < 2).all()
+    env.rand_reset()
+    assert torch.equal(env.obs[:, 1], drawn)
+    env.rand_reset(seed=4)
+    assert not torch.isin(env.obs[:, 1], drawn).any()
+    env.rand_reset(seed=3)
+    assert torch.equal(env.obs[:, 1], drawn)
+
+
+def test_a_planner_leaves_out_what_startup_drew_where_a_robot_is_known_by_its_measurements() -> None:
+    plan = lw.MPPI(Gifted, samples=4, horizon=2)
+    columns = plan.env.state_space.parts["lasting_memory"]
+    assert plan.env.get_state()[0, columns].item() >= 1
+    assert plan.state_of()[columns].tolist() == [0.0]
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -1,0 +1,149 @@
+"""go1_velocity against mjlab's Mjlab-Velocity-Flat-Unitree-Go1: its model, observations, rewards and terminations.
+
+The numbers are mjlab's own, computed by its environment and stored by store_go1.py; the tests need no mjlab. All states
+are those that mjlab had after its forward pass, so that its poses and contacts were current, too.
+"""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from conftest import SharedEnv
+
+import lyceum_warp as lw
+from lyceum_warp.tasks.go1_velocity import Params
+
+STORED = dict(np.load(Path(__file__).parent.parent / "data" / "go1_mjlab.npz"))
+MODEL = [name.removeprefix("model/") for name in STORED if name.startswith("model/")]
+OPTIONS = [name.removeprefix("option/") for name in STORED if name.startswith("option/")]
+TERMS = [name.removeprefix("weight/") for name in STORED if name.startswith("weight/")]
+NWORLD = len(STORED["env/qpos"])
+LAST_ACTION, CONTACT_TIME, AIR_TIME = slice(8, 20), slice(20, 24), slice(24, 28)  # in memory
+ENCODER_BIAS, PEAK_HEIGHT = slice(0, 12), slice(12, 16)  # in lasting memory
+
+
+# the model
+
+
+def test_model_has_mjlabs_bodies_and_geoms(shared_env: SharedEnv) -> None:
+    model = shared_env("go1_velocity").model
+    assert [model.body(i).name for i in range(model.nbody)] == STORED["bodies"].tolist()
+    assert [model.geom(i).name for i in range(model.ngeom)] == ["floor", *STORED["geoms"][1:].tolist()]
+    assert (model.nq, model.nv, model.nu) == (19, 18, 12)
+    assert model.body_subtreemass[0] == pytest.approx(12.743, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", MODEL)
+def test_model_has_mjlabs_numbers(shared_env: SharedEnv, name: str) -> None:
+    np.testing.assert_allclose(getattr(shared_env("go1_velocity").model, name), STORED[f"model/{name}"], rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_model_has_mjlabs_options(shared_env: SharedEnv, name: str) -> None:
+    np.testing.assert_array_equal(getattr(shared_env("go1_velocity").model.opt, name), STORED[f"option/{name}"])
+
+
+@pytest.mark.parametrize("i", range(4))
+def test_trajectories_of_the_model_equal_mjlabs(shared_env: SharedEnv, i: int) -> None:
+    """200 substeps of MuJoCo under the same controls, from standing and tumbling, with self-collisions."""
+    model = shared_env("go1_velocity").model
+    data, wanted = mujoco.MjData(model), STORED["trajectory/qpos"][i]
+    data.qpos, data.qvel = wanted[0], STORED["trajectory/qvel0"][i]
+    bodies = model.geom_bodyid
+    touching, tangled = 0, 0
+    for controls, qpos in zip(STORED["trajectory/controls"][i], wanted[1:], strict=True):
+        data.ctrl = controls
+        mujoco.mj_step(model, data)
+        np.testing.assert_allclose(data.qpos, qpos, rtol=0, atol=1e-9)
+        touching += data.ncon
+        tangled += int((bodies[data.contact.geom] > 0).all(axis=1).sum())
+    assert touching > 100
+    assert tangled > 0 or i < 2
+
+
+# the environment
+
+
+@pytest.fixture(scope="module")
+def env(shared_env: SharedEnv) -> lw.Env:
+    return shared_env("go1_velocity", nworld=NWORLD, autoreset=False, **without_noise())
+
+
+def without_noise() -> dict[str, float]:
+    parts = ("linear_velocity", "angular_velocity", "gravity", "joint_position", "joint_velocity")
+    return {f"{part}_noise": 0.0 for part in parts}
+
+
+def stored(name: str) -> torch.Tensor:
+    return torch.from_numpy(STORED[f"env/{name}"].astype(np.float64))
+
+
+def mjlabs_states(env: lw.Env, *, heading: bool) -> torch.Tensor:
+    """The stored states, with commands as mjlab shows them, or with the headings that they follow."""
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    parts["qpos"].copy_(stored("qpos"))
+    parts["qvel"].copy_(stored("qvel"))
+    parts["sensordata"].copy_(stored("force").reshape(NWORLD, 12))
+    memory, lasting = parts["memory"], parts["lasting_memory"]
+    memory[:, :3] = stored("command")
+    memory[:, 3] = stored("heading")
+    memory[:, 4:6] = 0.0
+    if heading:
+        memory[:, 2] = (1.0 - stored("heading_controlled")) * stored("command")[:, 2]
+        memory[:, 4], memory[:, 5] = stored("heading_controlled"), stored("standing")
+    memory[:, LAST_ACTION] = stored("action")
+    memory[:, CONTACT_TIME], memory[:, AIR_TIME] = stored("contact_time"), stored("air_time")
+    lasting[:, ENCODER_BIAS], lasting[:, PEAK_HEIGHT] = stored("encoder_bias"), stored("peak_height")
+    return state
+
+
+@pytest.mark.parametrize("heading", [False, True])
+@pytest.mark.parametrize(("group", "theirs"), [("policy", "actor"), ("critic", "critic")])
+def test_observations_equal_mjlabs(env: lw.Env, group: str, theirs: str, heading: bool) -> None:
+    found = env.get_obs(mjlabs_states(env, heading=heading), group=group)
+    np.testing.assert_allclose(found.numpy(), STORED[f"env/{theirs}"], rtol=2e-5, atol=2e-5)
+
+
+def test_stored_states_hold_every_kind_of_command_and_contact() -> None:
+    assert 0 < stored("standing").sum() < stored("heading_controlled").sum() < NWORLD
+    contact = stored("critic")[:, 56:60]
+    assert 0.2 < contact.mean() < 0.8
+    assert (stored("critic")[:, 60:72] != 0).any()
+
+
+@pytest.mark.parametrize("term", TERMS)
+def test_terms_of_the_reward_equal_mjlabs(env: lw.Env, term: str) -> None:
+    """Each term alone, with mjlab's weight, by leaving out the others'."""
+    after = mjlabs_states(env, heading=False)
+    before = after.clone()
+    env.state_space.split(before)["memory"][:, LAST_ACTION] = stored("previous_action")
+    if term == "soft_landing":  # mjlab's forces are current there, ours come a substep after the contact
+        times = env.state_space.split(after)["memory"][:, CONTACT_TIME]
+        times += 0.005 * (times > 0)
+    weight = float(STORED[f"weight/{term}"])
+    try:
+        env.set_params(**dict.fromkeys(TERMS, 0.0) | {term: weight})
+        found = env.get_reward(before, stored("action").float(), after)
+    finally:
+        env.set_params(**{name: float(STORED[f"weight/{name}"]) for name in TERMS})
+    wanted = 0.02 * weight * STORED[f"env/term/{term}"]
+    np.testing.assert_allclose(found.numpy(), wanted, rtol=2e-5, atol=2e-7 * abs(weight))
+    assert np.unique(wanted).size > 5
+
+
+def test_weights_are_mjlabs(env: lw.Env) -> None:
+    assert {term: getattr(Params.cls, term) for term in TERMS} == {t: STORED[f"weight/{t}"] for t in TERMS}
+
+
+def test_falls_are_mjlabs(env: lw.Env) -> None:
+    state = mjlabs_states(env, heading=False)
+    assert np.array_equal(env.get_terminated(state).numpy(), STORED["env/fell"])
+
+
+def test_actions_become_mjlabs_targets(env: lw.Env) -> None:
+    env.set_state(mjlabs_states(env, heading=False))
+    env.step(stored("action").float())
+    np.testing.assert_allclose(env.field("ctrl").numpy(), STORED["env/target"], atol=1e-6)

@@ -1,0 +1,336 @@
+"""The go1_velocity task: formulas in NumPy on MuJoCo's own kinematics, clocks, commands, pushes, draws, curriculum.
+
+Its equality with mjlab is tested in tests/oracles/test_mjlab.py.
+"""
+
+import itertools
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from checks import check_uniform
+from conftest import SharedEnv
+from go1_formulas import DT, GO1, HOME, LEGS, NEVER, NOISELESS, STILL, SUBSTEP, State, expected_terms, random_steps
+
+import lyceum_warp as lw
+
+NWORLD = 64
+
+
+def roll_out(env: lw.Env, steps: int, size: float = 1.0) -> torch.Tensor:
+    """Random steps; returns the last action."""
+    actions = random_steps(env, steps, size)
+    for action in actions:
+        env.step(action)
+    return actions[-1]
+
+
+# observations
+
+
+def observation(s: State, bias: np.ndarray | float) -> np.ndarray:
+    joints = s.qpos[:, 7:] + bias - HOME
+    return np.hstack([s.imu_velocity, s.gyro, s.gravity, joints, s.qvel[:, 6:], s.last_action, s.command()])
+
+
+def test_observations_equal_their_formulas(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=NWORLD, **STILL)
+    assert (env.obs.shape[1], env.obs_groups["critic"].shape[1]) == (48, 72)
+    for _ in range(4):
+        roll_out(env, 9)
+        s = State(env)
+        logarithm = np.sign(s.force) * np.log1p(np.abs(s.force))
+        feet = np.hstack([s.height, s.air_time, s.touching, logarithm.reshape(-1, 12)])
+        np.testing.assert_allclose(env.obs.numpy(), observation(s, s.bias), rtol=1e-5, atol=1e-5)
+        critic = np.hstack([observation(s, 0.0), feet])
+        np.testing.assert_allclose(env.obs_groups["critic"].numpy(), critic, rtol=1e-5, atol=1e-5)
+        assert s.heading_controlled.any() and s.standing.any() and 0.1 < s.touching.mean() < 0.9
+
+
+def test_noise_of_the_policys_observations_is_uniform_and_the_critic_has_none(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=1000)
+    roll_out(env, 2)
+    clean = shared_env("go1_velocity", nworld=1000, **NOISELESS)
+    clean.set_state(env.get_state())
+    noise = (env.obs - clean.obs).numpy()
+    assert torch.equal(env.obs_groups["critic"], clean.obs_groups["critic"])
+    assert not noise[:, 33:].any()
+    sizes = np.repeat([0.5, 0.2, 0.05, 0.01, 1.5], [3, 3, 3, 12, 12])
+    check_uniform(noise[:, :33] / (sizes * (1 + 1e-3)))
+
+
+# rewards
+
+
+def test_every_term_of_the_reward_equals_its_formula(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=NWORLD, autoreset=False, **STILL)
+    seen = dict.fromkeys(env.metrics, 0)
+    for action in random_steps(env, 24, 1.6):
+        s0 = State(env)
+        env.step(action)
+        s1 = State(env)
+        terms = {name: DT * term for name, term in expected_terms(s0, action.numpy(), s1, env.model).items()}
+        for name, term in terms.items():
+            atol = 1e-6 if name != "soft_landing" else 1e-9
+            np.testing.assert_allclose(env.metrics[name].numpy(), term, rtol=2e-4, atol=atol, err_msg=name)
+            seen[name] += int((np.abs(term) > 10 * atol).sum())
+        np.testing.assert_allclose(env.reward.numpy(), sum(terms.values()), rtol=1e-4, atol=5e-6)
+        error = s0.command() - np.hstack([s1.v[:, :2], s1.w[:, 2:]])
+        slip = np.linalg.norm(error[:, :2], axis=1)
+        np.testing.assert_allclose(env.metrics["velocity_error"].numpy(), slip, atol=1e-5)
+        np.testing.assert_allclose(env.metrics["yaw_rate_error"].numpy(), np.abs(error[:, 2]), atol=1e-5)
+        now = np.linalg.norm((s1.command() - np.hstack([s1.v[:, :2], s1.w[:, 2:]]))[:, :2], axis=1)
+        np.testing.assert_allclose(env.eval.numpy(), now, atol=1e-5)
+    assert min(seen[name] for name in terms) > 20
+
+
+def test_an_ideal_step_earns_six_a_second(shared_env: SharedEnv) -> None:
+    """Standing still in the default pose under the command to stand."""
+    env = shared_env("go1_velocity", nworld=2, autoreset=False, **STILL)
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    parts["memory"][:] = 0.0
+    parts["memory"][:, 5] = 1.0
+    parts["qvel"][:] = 0.0
+    reward = env.get_reward(state, torch.zeros(2, 12), state)
+    np.testing.assert_allclose(reward.numpy(), 0.12, rtol=1e-6)
+
+
+# contacts
+
+
+def test_clocks_count_substeps_of_contact_and_of_flight(shared_env: SharedEnv) -> None:
+    """Against MuJoCo's own contacts after every substep."""
+    env = shared_env("go1_velocity", nworld=4, autoreset=False, **STILL)
+    model = mujoco.MjModel.from_xml_path(GO1)
+    feet = [model.geom(f"{leg}_foot").id for leg in LEGS]
+    states = [State(env)]
+    actions = random_steps(env, 40)
+    for action in actions:
+        env.step(action)
+        states.append(State(env))
+    landings = 0
+    for i in range(env.nworld):
+        for s0, s1 in itertools.pairwise(states):
+            model.geom_friction[:] = s0.parts["geom_friction"][i].reshape(-1, 3)
+            model.body_ipos[:] = s0.parts["body_ipos"][i].reshape(-1, 3)
+            data = mujoco.MjData(model)
+            mujoco.mj_setConst(model, data)
+            data.qpos, data.qvel, data.ctrl = s0.qpos[i], s0.qvel[i], s1.parts["ctrl"][i]
+            data.qacc_warmstart = s0.parts["qacc_warmstart"][i]
+            contact, air = s0.contact_time[i].copy(), s0.air_time[i].copy()
+            for _ in range(4):
+                mujoco.mj_step(model, data)
+                mujoco.mj_forward(model, data)
+                touching = np.isin(feet, data.contact.geom[(data.contact.geom == 0).any(axis=1)])
+                landings += int((touching & (contact == 0)).sum())
+                contact, air = np.where(touching, contact + SUBSTEP, 0), np.where(touching, 0, air + SUBSTEP)
+            np.testing.assert_allclose(s1.contact_time[i], contact, atol=1e-6)
+            np.testing.assert_allclose(s1.air_time[i], air, atol=1e-6)
+    assert landings > 20
+
+
+def test_peak_heights_grow_in_the_air_and_end_at_landings_not_at_resets(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=16, autoreset=False, **STILL)
+    landings, before = 0, State(env)
+    for action in random_steps(env, 30):
+        env.step(action)
+        s = State(env)
+        landed = (s.contact_time > 0) & (s.contact_time < DT + 1e-6)
+        grown = np.where(s.touching, before.peak, np.maximum(before.peak, s.height))
+        np.testing.assert_allclose(s.peak, np.where(landed, 0.0, grown), atol=1e-6)
+        landings, before = landings + landed.sum(), s
+    assert landings > 50
+    env.rand_reset()
+    s = State(env)
+    assert np.array_equal(s.peak, before.peak) and s.peak.max() > 0.02
+    assert not s.contact_time.any() and not s.air_time.any() and not s.last_action.any()
+
+
+# commands
+
+
+@pytest.mark.usefixtures("freed")
+def test_commands_have_mjlabs_distribution() -> None:
+    env = lw.make("go1_velocity", nworld=4000, seed=0)
+    memory = env.state_space.split(env.get_state())["memory"].numpy()
+    vx, vy, yaw = memory[:, :3].T
+    forward = (vy == 0) & (yaw == 0)
+    for share, wanted in ((forward, 0.2), (memory[:, 4] == 1, 0.3), (memory[:, 5] == 1, 0.1)):
+        assert abs(share.mean() - wanted) < 4 * np.sqrt(wanted * (1 - wanted) / 4000)
+    drawn = np.stack([vx, vy, 2 * yaw, memory[:, 3] / np.pi, (memory[:, 6] - 5.5) / 2.5, memory[:, 7] - 2], axis=1)
+    check_uniform(drawn[~forward] / (1 + 1e-6))
+    assert vx[forward].min() == np.float32(0.3) and vx[forward].max() <= 1
+    assert abs((vx[forward] == np.float32(0.3)).mean() - 0.3) < 0.07
+    flags = np.stack([forward, memory[:, 4] == 1, memory[:, 5] == 1], axis=1)
+    assert np.abs(np.corrcoef(flags.T) - np.eye(3)).max() < 5.5 / np.sqrt(4000)
+
+
+def test_commands_change_when_their_time_is_over(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=NWORLD, autoreset=False, **NOISELESS, push_seconds=NEVER)
+    action = torch.zeros(NWORLD, 12)
+    changes, before = 0, env.state_space.split(env.get_state())["memory"].clone()
+    for _ in range(300):
+        env.step(action)
+        memory = env.state_space.split(env.get_state())["memory"].clone()
+        due = before[:, 6] - DT <= 1e-9
+        changed = (memory[:, :4] != before[:, :4]).any(dim=1)
+        assert torch.equal(changed, due)
+        torch.testing.assert_close(memory[~due, 6], before[~due, 6] - DT, atol=1e-6, rtol=0)
+        assert (memory[due, 6] >= 3).all() and (memory[due, 6] <= 8).all()
+        changes, before = changes + int(due.sum()), memory
+    assert 0.4 * NWORLD < changes < 0.8 * NWORLD  # within 6 s, of 3 to 8
+
+
+def test_headings_determine_the_yaw_rate_of_their_worlds(shared_env: SharedEnv) -> None:
+    """The shorter way round, and no faster than the command's range; the reward uses the state before the step."""
+    env = shared_env("go1_velocity", nworld=4, autoreset=False, **STILL)
+    state = env.get_state()
+    parts = env.state_space.split(state)
+    parts["qpos"][:, 3:7] = torch.tensor([np.cos(1.5), 0.0, 0.0, np.sin(1.5)])  # a heading of 3 rad
+    parts["memory"][:, :3] = torch.tensor([0.5, 0.2, 0.3])
+    parts["memory"][:, 3] = torch.tensor([-3.0, 2.8, 0.0, -3.0])
+    parts["memory"][:, 4] = torch.tensor([1.0, 1.0, 1.0, 0.0])
+    parts["memory"][:, 5] = 0.0
+    env.set_state(state)
+    yaw = [0.5 * (2 * np.pi - 6.0), -0.1, -0.5, 0.3]
+    np.testing.assert_allclose(env.obs[:, 45:].numpy(), np.stack([[0.5] * 4, [0.2] * 4, yaw], axis=1), atol=1e-5)
+    parts["memory"][:, 5] = 1.0
+    env.set_state(state)
+    assert not env.obs[:, 45:].any()
+
+
+def test_the_curriculum_widens_commands_after_so_many_steps() -> None:
+    env = lw.make("go1_velocity", nworld=1000, **NOISELESS)
+    for steps, low, high, yaw in ((119_998, -1, 1, 0.5), (119_999, -1.5, 2, 0.7), (239_999, -2, 3, 0.7)):
+        state = env.get_state()
+        parts = env.state_space.split(state)
+        parts["lasting_memory"][:, 16] = steps
+        parts["memory"][:, 6] = 0.0
+        env.set_state(state)
+        env.step(torch.zeros(1000, 12))
+        memory = env.state_space.split(env.get_state())["memory"].numpy()
+        free = memory[:, 1] != 0
+        for column, bounds in ((0, (low, high)), (2, (-yaw, yaw))):
+            values, width = memory[free, column], bounds[1] - bounds[0]
+            assert bounds[0] <= values.min() < bounds[0] + 0.02 * width
+            assert bounds[1] >= values.max() > bounds[1] - 0.02 * width
+
+
+# events, ends, draws
+
+
+def test_pushes_add_velocity_in_the_worlds_axes(shared_env: SharedEnv) -> None:
+    pushed = shared_env("go1_velocity", nworld=1000, autoreset=False, **NOISELESS, command_seconds=NEVER)
+    weak = {"push_velocity": (0.0, 0.0, 0.0), "push_spin": (0.0, 0.0, 0.0)}
+    still = shared_env("go1_velocity", nworld=1000, autoreset=False, **NOISELESS, command_seconds=NEVER, **weak)
+    state = pushed.get_state()
+    parts = pushed.state_space.split(state)
+    parts["memory"][:, 7] = torch.where(torch.arange(1000) < 900, 0.02, 0.5)
+    still.set_state(state)
+    pushed.set_state(state)
+    action = torch.zeros(1000, 12)
+    pushed.step(action)
+    still.step(action)
+    assert torch.equal(pushed.reward, still.reward), "the transition ends before the push"
+    one, other = (env.state_space.split(env.get_state()) for env in (pushed, still))
+    assert torch.equal(one["qpos"], other["qpos"])
+    change = (one["qvel"] - other["qvel"]).numpy()
+    assert not change[900:].any() and np.abs(change[:, 6:]).max() < 1e-6  # a push rounds velocities to float32
+    axes = np.zeros((1000, 9))
+    for row, quat in zip(axes, one["qpos"][:, 3:7].numpy(), strict=True):
+        mujoco.mju_quat2Mat(row, quat)
+    spin = np.einsum("nij,nj->ni", axes.reshape(-1, 3, 3), change[:, 3:6])
+    sizes = np.array([0.5, 0.5, 0.4, 0.52, 0.52, 0.78])
+    check_uniform(np.hstack([change[:, :3], spin])[:900] / (sizes * (1 + 1e-4)))
+    timers = one["memory"][:, 7].numpy()
+    check_uniform((timers[:900, None] - 2) / (1 + 1e-6))
+    np.testing.assert_allclose(timers[900:], 0.48, atol=1e-6)
+
+
+def test_robots_differ_in_friction_centre_of_mass_and_encoders() -> None:
+    env = lw.make("go1_velocity", nworld=1000, seed=0)
+    friction = env.field("geom_friction").numpy().copy()
+    feet = [env.model.geom(f"{leg}_foot").id for leg in LEGS]
+    assert (friction[:, feet] == friction[:, feet[:1]]).all()
+    others = np.delete(np.arange(env.model.ngeom), feet)
+    assert (friction[:, others] == np.float32(env.model.geom_friction[others])).all()
+    drawn = friction[:, feet[0]].astype(np.float64)
+    drawn[:, 1:] = np.log(drawn[:, 1:])
+    bounds = np.array([[0.3, 1.5], np.log([1e-4, 2e-2]), np.log([1e-5, 5e-3])]).T
+    offset = env.field("body_ipos").numpy()[:, 1] - env.model.body_ipos[1]
+    bias = env.state_space.split(env.get_state())["lasting_memory"].numpy()[:, :12] / 0.015
+    scaled = (2 * drawn - bounds.sum(axis=0)) / (bounds[1] - bounds[0])
+    samples = np.hstack([scaled, offset / [0.025, 0.025, 0.03], bias])
+    check_uniform(samples / (1 + 1e-4))
+    env.rand_reset()
+    assert np.array_equal(env.field("geom_friction").numpy(), friction)
+    again = env.state_space.split(env.get_state())["lasting_memory"].numpy()[:, :12] / 0.015
+    assert np.array_equal(again, bias)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_resets_put_the_robot_above_the_floor_in_its_default_pose(shared_env: SharedEnv, engine: str) -> None:
+    n = 1000 if engine == "mujoco" else 4
+    env = shared_env("go1_velocity", engine=engine, nworld=n)
+    qpos, qvel = (env.state_space.split(env.get_state())[name].numpy() for name in ("qpos", "qvel"))
+    np.testing.assert_allclose(qpos[:, 7:], np.tile(HOME, (n, 1)), atol=1e-6)
+    assert not qvel.any() and not qpos[:, 4:6].any()
+    yaw = 2 * np.arctan2(qpos[:, 6], qpos[:, 3])
+    yaw = (yaw + np.pi) % (2 * np.pi) - np.pi
+    start = np.stack([qpos[:, 0] / 0.5, qpos[:, 1] / 0.5, (qpos[:, 2] - 0.308) / 0.02, yaw / 3.14], axis=1)
+    if engine == "mujoco":
+        check_uniform(start / (1 + 1e-4))
+    assert np.abs(start).max() < 1 + 1e-4
+    env.reset()
+    wanted = np.hstack([[0, 0, 0.278, 1, 0, 0, 0], HOME])
+    np.testing.assert_allclose(env.field("qpos").numpy(), np.tile(wanted, (n, 1)), atol=1e-6)
+
+
+def test_an_episode_ends_when_the_trunk_tilts_by_more_than_seventy_degrees(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=4)
+    state = env.get_state()
+    tilt = np.radians([69.9, 70.1, 69.9, 70.1]) / 2
+    parts = env.state_space.split(state)
+    parts["qpos"][:, 3:7] = 0.0
+    parts["qpos"][:, 3] = torch.from_numpy(np.cos(tilt))
+    parts["qpos"][torch.arange(4), torch.tensor([4, 4, 5, 5])] = torch.from_numpy(np.sin(tilt))
+    assert env.get_terminated(state).tolist() == [False, True, False, True]
+
+
+def test_an_episode_is_truncated_after_twenty_seconds(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=2)
+    assert env.timestep == DT
+    state = env.get_state()
+    env.state_space.split(state)["step"][:] = 998
+    env.set_state(state)
+    env.step(torch.zeros(2, 12))
+    assert not env.done.any()
+    env.step(torch.zeros(2, 12))
+    assert env.truncated.all() and not env.terminated.any()
+
+
+def test_actions_move_the_servos_targets_away_from_the_default_pose(shared_env: SharedEnv) -> None:
+    """Without clipping: the force limit bounds what they do."""
+    env = shared_env("go1_velocity", nworld=NWORLD)
+    bias, action = State(env).bias, 10 * random_steps(env, 1)[0]
+    env.step(action)
+    scale = np.tile([0.372753, 0.372753, 0.248502], 4)
+    np.testing.assert_allclose(env.field("ctrl").numpy(), HOME + scale * action.numpy() - bias, atol=2e-4)
+    assert not np.isfinite(env.action_space.high).any()
+    assert env.model.actuator_forcerange[:3, 1].tolist() == [23.7, 23.7, 35.55]
+
+
+def test_both_engines_agree_over_a_step(shared_env: SharedEnv) -> None:
+    """In observations, memory and rewards, on states of random steps."""
+    mine, theirs = (shared_env("go1_velocity", engine=engine, nworld=4, **STILL) for engine in ("mujoco", "warp"))
+    for action in random_steps(mine, 12):
+        theirs.set_state(mine.get_state())
+        mine.step(action)
+        theirs.step(action)
+        torch.testing.assert_close(mine.reward, theirs.reward, rtol=1e-3, atol=1e-4)
+        going = ~mine.done
+        torch.testing.assert_close(mine.obs[going], theirs.obs[going], rtol=1e-3, atol=2e-3)
+        states = [env.state_space.split(env.get_state())["memory"][going] for env in (mine, theirs)]
+        torch.testing.assert_close(*states, rtol=1e-5, atol=1e-5)
