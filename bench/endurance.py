@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import measurements
+import numpy as np
 import rich.box
 import torch
 import tyro
@@ -61,10 +62,11 @@ def run(options: Options, task: str) -> Row:
         task, engine=options.engine, device=options.device, nworld=options.nworld, seed=options.seed, fields=["qvel"]
     )
     low, high = env.action_space.low, env.action_space.high
-    middle = torch.zeros_like(env.action[0]) if low is None else torch.as_tensor((low + high) / 2).to(env.action)
-    reach = torch.ones_like(middle) if low is None else torch.as_tensor((high - low) / 2).to(env.action)
-    # an actuator without a control range takes any number
-    middle, reach = torch.nan_to_num(middle, 0.0, 0.0, 0.0), torch.nan_to_num(reach, 1.0, 1.0, 1.0)
+    # an action without bounds takes any number
+    low, high = (np.full(env.action.shape[1], np.inf) if bound is None else bound for bound in (low, high))
+    bounded = np.isfinite(low) & np.isfinite(high)
+    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+    middle, reach = (torch.as_tensor(half).to(env.action) for half in ((low + high) / 2, (high - low) / 2))
     generator = torch.Generator(env.action.device).manual_seed(options.seed)
     counts = torch.zeros(2, dtype=torch.int64, device=env.action.device)
     largest = torch.zeros((), device=env.action.device)

@@ -76,7 +76,7 @@ class Plain:
         update: str = "mppi",
         elites: int = 1,
         min_noise: Any = 0.0,
-        include_plan: bool = False,
+        include_plan: bool | None = None,
         knots: int | None = None,
         spline: str = "cubic",
         count: int | None = None,
@@ -96,7 +96,7 @@ class Plain:
         self.stop, self.value, self.repeat = termination == "stop", value, isinstance(fill, str) and fill == "repeat"
         self.fill = np.zeros(nu) if isinstance(fill, str) else np.asarray(fill, dtype=float)
         self.update, self.elites, self.min_noise, self.risk = update, elites, min_noise, risk
-        self.include_plan = include_plan
+        self.include_plan = update != "cem" if include_plan is None else include_plan
         self.grid = None if knots is None else Grid(horizon, knots, spline)
         if self.grid:
             self.smoothing = (1.0, 0.0, 0.0)

@@ -46,7 +46,8 @@ class MPPIConfig:
     """The smallest standard deviation to which CEM adapts its noise, as one number or one for each action. None is a
     tenth of ``noise``."""
     include_plan: bool | None = None
-    """Whether the first sample is the plan itself, without noise. None is True for predictive sampling alone."""
+    """Whether the first sample is the plan itself, without noise. None is True where there are several samples, except
+    for CEM."""
     smoothing: tuple[float, float, float] = (0.25, 0.8, 0.0)
     """Weights (b0, b1, b2) that smooth the noise n over time: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) from the third
     step on. (1, 0, 0) is white noise. Noise of knots is not smoothed."""
@@ -133,7 +134,7 @@ class MPPIConfig:
         discount = getattr(value, "discount", None)
         chosen: dict[str, Any] = {
             "discount": 1.0 if discount is None else discount,
-            "include_plan": self.update == "predictive_sampling",
+            "include_plan": self.update != "cem" and self.samples > 1,
         }
         if self.update == "cem":
             if np.ndim(self.noise) == 2:

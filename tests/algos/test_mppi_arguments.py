@@ -223,8 +223,8 @@ def test_settings_that_are_left_out_follow_from_the_update() -> None:
         config = arguments("reach", noise=[0.5] * 7, **words)[0]
         return config.include_plan, config.elites, config.min_noise
 
-    assert chosen() == chosen(update="mppi") == (False, None, None)
-    assert chosen(update="predictive_sampling") == (True, None, None)
+    assert chosen() == chosen(update="mppi") == chosen(update="predictive_sampling") == (True, None, None)
+    assert chosen(samples=1)[0] is False  # nothing else would be tried
     assert chosen(update="cem", samples=50) == (False, 5, (0.05,) * 7)
     assert [chosen(update="cem", samples=n)[1] for n in (1, 2, 19, 40)] == [1, 2, 2, 4]
 
@@ -307,7 +307,7 @@ def test_settings_are_what_json_can_hold() -> None:
     assert json.loads(json.dumps(plan.settings)) == plan.settings == {
         "horizon": 2, "samples": 2, "temperature": 0.1, "noise": [[0.5]], "smoothing": [0.25, 0.8, 0.0],
         "discount": 1.0, "iterations": 1, "fill": [0.1], "termination": "stop", "nominal_model": False,
-        "update": "mppi", "elites": None, "min_noise": None, "include_plan": False, "knots": None, "spline": "cubic",
+        "update": "mppi", "elites": None, "min_noise": None, "include_plan": True, "knots": None, "spline": "cubic",
         "models": 1, "risk": "mean",
         "solver": {"iterations": 3},
         "model": "MjSpec 'MuJoCo Model'", "limit": [1.0, 2.0], "wrong": 3.0, "fields": ["xpos"],
