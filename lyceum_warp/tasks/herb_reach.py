@@ -110,4 +110,6 @@ class HerbReach(lw.Task):
     metrics = ("reaching", "precision", "effort")
     horizon = 100
     success_steps = 10
-    planning = lw.Planning(settings={"horizon": 12, "samples": 64, "noise": 2 * (ARM_NOISE + FINGER_NOISE)})
+    planning = lw.Planning(
+        settings={"horizon": 12, "samples": 64, "noise": 2 * (ARM_NOISE + FINGER_NOISE), "include_plan": False}
+    )
