@@ -45,7 +45,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         autoreset_mode: SAME_STEP, DISABLED or NEXT_STEP of ``gymnasium.vector.AutoresetMode``, or its value; by default
             SAME_STEP, or DISABLED for an environment with ``autoreset=False``.
         torch: Whether to take and give tensors on the environment's device. A step then never waits for the device.
-        copy: Whether to give copies. Without, most arrays of the CPU and all tensors are live buffers, which change
+        copy: Whether to give copies. Without, most tensors and most arrays of the CPU are live buffers, which change
             with the next step.
         dict_obs: Whether an observation is a dict of the task's groups. By default it is where there are several;
             False gives the group ``policy`` alone.

@@ -12,7 +12,7 @@ from lyceum_warp.adapters.gymnasium_spaces import action_space, observation_spac
 from lyceum_warp.adapters.host_arrays import HostArrays
 from lyceum_warp.adapters.libraries import check_library
 from lyceum_warp.adapters.rendering import check_render_mode, frame_rate
-from lyceum_warp.adapters.step_results import Infos, Observations
+from lyceum_warp.adapters.step_results import Infos, Observations, episode_ends
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 from lyceum_warp.viz.cameras import CameraChoice
@@ -170,16 +170,17 @@ class StableBaselines3VecEnv(VecEnv):
         """Put the infos of ended episodes in their places, and begin to sum up the next ones."""
         env, count = self.env, self._observations.count
         index = torch.from_numpy(worlds).to(env.obs.device)
-        buffers = [*self._observations.final, env.terminated, *self._infos.tensors]
+        terminated, _ = episode_ends(env)
+        buffers = [*self._observations.final, terminated, *self._infos.tensors]
         values = self._host.of(*(buffer[index] for buffer in buffers))
-        rows, terminated = self._observations.rows(values[:count]), values[count]
+        rows, terminations = self._observations.rows(values[:count]), values[count]
         said = self._infos.named(values[count + 1 :])
         said.pop("metrics", None)
         seconds = round(time.time() - self._start, 6)
         for i, world in enumerate(worlds.tolist()):
             infos[world] = {
                 "terminal_observation": rows[i],
-                "TimeLimit.truncated": not terminated[i],
+                "TimeLimit.truncated": not terminations[i],
                 "episode": {"r": self._returns[world].item(), "l": self._lengths[world].item(), "t": seconds},
                 **_of_world(said, i),
             }

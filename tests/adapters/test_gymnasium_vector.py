@@ -172,16 +172,22 @@ def test_a_mask_may_be_a_tensor(vector: Callable[..., GymnasiumVectorEnv]) -> No
     assert (after["policy"][mask] != before["policy"][mask]).any()
 
 
-def test_a_world_with_a_fault_shows_its_last_good_observation_without_automatic_resets(
-    vector: Callable[..., GymnasiumVectorEnv],
+@pytest.mark.parametrize("tensors", [False, True], ids=["numpy", "torch"])
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_a_fault_truncates_the_episode_with_its_last_good_observation(
+    mode: AutoresetMode, tensors: bool, vector: Callable[..., GymnasiumVectorEnv]
 ) -> None:
-    envs = vector(autoreset_mode=AutoresetMode.DISABLED)
+    envs = vector(autoreset_mode=mode, torch=tensors)
     before, _ = envs.reset(seed=2)
-    action = np.zeros((N, 3), dtype=np.float32)
+    action: Any = np.zeros((N, 3), dtype=np.float32)
     action[1] = np.nan
-    obs, reward, terminated, _, infos = envs.step(action)
-    np.testing.assert_array_equal(terminated, [False, True, False, False])
-    np.testing.assert_array_equal(obs["policy"][1], before["policy"][1])
+    obs, reward, terminated, truncated, infos = envs.step(torch.from_numpy(action) if tensors else action)
+    assert not terminated.any()
+    np.testing.assert_array_equal(as_array(truncated), [False, True, False, False])
+    last = obs["policy"][1]
+    if mode is AutoresetMode.SAME_STEP:
+        last = infos["final_obs"]["policy"][1] if tensors else infos["final_obs"][1]["policy"]
+    np.testing.assert_array_equal(as_array(last), as_array(before["policy"][1]))
     assert reward[1] == 0 and infos["done_reason"][1] == lw.Done.ACTION
 
 

@@ -61,6 +61,16 @@ def test_a_step_has_the_numbers_of_the_environment_behind_it(full: StableBaselin
     assert ends and timeouts
 
 
+def test_a_fault_truncates_the_episode_with_its_last_good_observation(hopper: StableBaselines3VecEnv) -> None:
+    before = hopper.reset()
+    action = np.zeros((N, 3), dtype=np.float32)
+    action[1] = np.nan
+    _, reward, done, infos = hopper.step(action)
+    np.testing.assert_array_equal(done, [False, True, False, False])
+    assert reward[1] == 0 and infos[1]["TimeLimit.truncated"] and infos[1]["done_reason"] == lw.Done.ACTION
+    np.testing.assert_array_equal(infos[1]["terminal_observation"], before[1])
+
+
 def test_only_ended_worlds_cost_a_dictionary(hopper: StableBaselines3VecEnv) -> None:
     hopper.reset()
     *_, first = hopper.step(np.zeros((N, 3), dtype=np.float32))
