@@ -145,14 +145,14 @@ class StableBaselines3VecEnv(VecEnv):
         """Set a parameter of the task in all worlds, or an attribute of this environment.
 
         Raises:
-            ValueError: ``indices`` leaves worlds out.
+            ValueError: There is neither, or ``indices`` leaves worlds out.
         """
         if len(set(self._get_indices(indices))) != self.num_envs:
             raise ValueError(f"{attr_name!r} belongs to all worlds together: leave indices out")
-        if attr_name in self.env.task.parameters.values:
-            self.env.set_params(**{attr_name: value})
-        else:
+        if attr_name not in self.env.task.parameters.values and hasattr(self, attr_name):
             setattr(self, attr_name, value)
+        else:  # whose error has the closest names
+            self.env.set_params(**{attr_name: value})
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         """Call a method of the environment behind this one once; its result for each world, as in ``get_attr``."""
