@@ -119,6 +119,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             The observations and infos of all worlds.
 
         Raises:
+            ResetNeeded: There was no reset of all worlds before that of some.
             ValueError: The seed is not a whole number, or an option is unknown or has another shape or type.
         """
         mask = self._mask(options)
@@ -224,6 +225,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if isinstance(mask, np.ndarray) and mask.dtype == bool:
             mask = torch.from_numpy(mask).to(self.device)
         check_tensor(mask, "the reset_mask", self.env.done)
+        if not self._reset_once:
+            raise gymnasium.error.ResetNeeded("there was no reset before this reset_mask: call reset() without it first")
         return mask
 
 

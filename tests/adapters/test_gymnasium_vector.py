@@ -399,6 +399,14 @@ def test_a_step_before_a_reset_is_refused(vector: Callable[..., GymnasiumVectorE
         vector().step(np.zeros((N, 3), dtype=np.float32))
 
 
+@pytest.mark.parametrize("seed", [None, 3])
+def test_a_reset_of_some_worlds_before_one_of_all_is_refused(
+    seed: int | None, vector: Callable[..., GymnasiumVectorEnv]
+) -> None:
+    with pytest.raises(ResetNeeded, match="no reset before this reset_mask: call reset.. without it first"):
+        vector().reset(seed=seed, options={"reset_mask": np.array([True, False, False, False])})
+
+
 @pytest.mark.parametrize(
     "options, message",
     [
