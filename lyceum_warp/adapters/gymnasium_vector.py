@@ -148,10 +148,12 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             raise gymnasium.error.ResetNeeded("there was no reset before this step: call reset() first")
         env = self.env
         if self._host is None:
-            env.step(_tensor(actions, env.action))
+            env.action.copy_(_tensor(actions, env.action).detach())
         else:
             self._host.set_action(actions)
-            env.step()
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            env.action.masked_fill_(self._ended[:, None], 0.0)  # they are ignored, so that they must be no fault
+        env.step()
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             env.rand_reset(mask=self._ended)
             self._ended.copy_(env.done)

@@ -206,6 +206,19 @@ def test_a_next_step_reset_follows_in_the_step_after_the_end(vector: Callable[..
     assert ends > 3
 
 
+@pytest.mark.parametrize("tensors", [False, True], ids=["numpy", "torch"])
+def test_an_ignored_action_is_no_fault(tensors: bool, vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    envs = vector(autoreset_mode=AutoresetMode.NEXT_STEP, torch=tensors)
+    envs.reset(seed=5)
+    faults, ended, ends = envs.env.fault_counts, np.zeros(N, dtype=bool), 0
+    for action in actions():
+        action[ended] = np.nan
+        *_, terminated, truncated, _ = envs.step(torch.from_numpy(action) if tensors else action)
+        ended = as_array(terminated | truncated)
+        ends += ended.sum()
+    assert ends > 3 and envs.env.fault_counts == faults
+
+
 def test_a_seed_gives_the_same_worlds_and_no_seed_others(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector()
     first, again = (envs.reset(seed=2**40 + 3)[0]["policy"] for _ in range(2))
