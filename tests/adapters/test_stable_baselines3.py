@@ -86,14 +86,14 @@ def test_results_of_a_step_do_not_change_with_the_next(hopper: StableBaselines3V
     assert np.array_equal(kept[0], obs) and np.array_equal(kept[1], reward)
 
 
-def test_ppo_learns_and_keeps_statistics_of_episodes(hopper: StableBaselines3VecEnv) -> None:
+def test_ppo_updates_its_policy_and_keeps_statistics_of_episodes(hopper: StableBaselines3VecEnv) -> None:
     model = PPO("MlpPolicy", hopper, n_steps=64, batch_size=64, n_epochs=2, seed=0, device="cpu")
     before = [parameter.clone() for parameter in model.policy.parameters()]
     model.learn(512)
     assert any((a != b).any() for a, b in zip(before, model.policy.parameters(), strict=True))
     assert model.ep_info_buffer and model.ep_info_buffer[0]["l"] > 1
-    mean, _ = evaluate_policy(model, hopper, n_eval_episodes=4)
-    assert mean > 0
+    returns, lengths = evaluate_policy(model, hopper, n_eval_episodes=6, return_episode_rewards=True)
+    assert len(returns) == len(lengths) == 6 and len(set(returns)) > 1 and min(lengths) > 1
 
 
 def test_an_off_policy_learner_stores_the_last_observation_and_no_time_limit(full: StableBaselines3VecEnv) -> None:
