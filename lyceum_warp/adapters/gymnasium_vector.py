@@ -228,7 +228,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             mask = torch.from_numpy(mask).to(self.device)
         check_tensor(mask, "the reset_mask", self.env.done)
         if not self._reset_once:
-            raise gymnasium.error.ResetNeeded("there was no reset before this reset_mask: call reset() without it first")
+            raise gymnasium.error.ResetNeeded("no reset came before this reset_mask: call reset() without it first")
         return mask
 
 

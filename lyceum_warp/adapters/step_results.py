@@ -90,7 +90,7 @@ class Infos:
 def episode_ends(env: Env) -> tuple[torch.Tensor, torch.Tensor]:
     """Whether the last step terminated episodes, and whether it truncated them, each (nworld,) bool.
 
-    A fault truncates: it is no end that the task defines, so that learners bootstrap with the last good observation.
+    A fault truncates: the task did not end the episode, so that learners bootstrap with the last good observation.
     """
     fault = (env.done_reason & FAULTS) != 0
     return env.terminated & ~fault, env.truncated | fault

@@ -207,7 +207,7 @@ def test_a_next_step_reset_follows_in_the_step_after_the_end(vector: Callable[..
 
 
 @pytest.mark.parametrize("tensors", [False, True], ids=["numpy", "torch"])
-def test_an_ignored_action_is_no_fault(tensors: bool, vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_an_ignored_action_never_faults(tensors: bool, vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(autoreset_mode=AutoresetMode.NEXT_STEP, torch=tensors)
     envs.reset(seed=5)
     faults, ended, ends = envs.env.fault_counts, np.zeros(N, dtype=bool), 0
@@ -416,7 +416,7 @@ def test_a_step_before_a_reset_is_refused(vector: Callable[..., GymnasiumVectorE
 def test_a_reset_of_some_worlds_before_one_of_all_is_refused(
     seed: int | None, vector: Callable[..., GymnasiumVectorEnv]
 ) -> None:
-    with pytest.raises(ResetNeeded, match="no reset before this reset_mask: call reset.. without it first"):
+    with pytest.raises(ResetNeeded, match="no reset came before this reset_mask: call reset.. without it first"):
         vector().reset(seed=seed, options={"reset_mask": np.array([True, False, False, False])})
 
 
