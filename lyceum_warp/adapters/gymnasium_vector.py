@@ -45,7 +45,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         autoreset_mode: SAME_STEP, DISABLED or NEXT_STEP of ``gymnasium.vector.AutoresetMode``, or its value; by default
             SAME_STEP, or DISABLED for an environment with ``autoreset=False``.
         torch: Whether to take and give tensors on the environment's device. A step then never waits for the device.
-        copy: Whether to give copies. Without, most arrays of the CPU and all tensors are live buffers, which change
+        copy: Whether to give copies. Without, most tensors and most arrays of the CPU are live buffers, which change
             with the next step.
         dict_obs: Whether an observation is a dict of the task's groups. By default it is where there are several;
             False gives the group ``policy`` alone.
@@ -119,6 +119,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             The observations and infos of all worlds.
 
         Raises:
+            ResetNeeded: There was no reset of all worlds before that of some.
             ValueError: The seed is not a whole number, or an option is unknown or has another shape or type.
         """
         mask = self._mask(options)
@@ -147,10 +148,12 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             raise gymnasium.error.ResetNeeded("there was no reset before this step: call reset() first")
         env = self.env
         if self._host is None:
-            env.step(_tensor(actions, env.action))
+            env.action.copy_(_tensor(actions, env.action).detach())
         else:
             self._host.set_action(actions)
-            env.step()
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            env.action.masked_fill_(self._ended[:, None], 0.0)  # they are ignored, so that they must be no fault
+        env.step()
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             env.rand_reset(mask=self._ended)
             self._ended.copy_(env.done)
@@ -224,6 +227,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if isinstance(mask, np.ndarray) and mask.dtype == bool:
             mask = torch.from_numpy(mask).to(self.device)
         check_tensor(mask, "the reset_mask", self.env.done)
+        if not self._reset_once:
+            raise gymnasium.error.ResetNeeded("no reset came before this reset_mask: call reset() without it first")
         return mask
 
 

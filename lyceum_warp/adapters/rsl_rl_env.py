@@ -6,6 +6,7 @@ import torch
 
 from lyceum_warp.adapters.adapted_env import environment_of
 from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl
+from lyceum_warp.adapters.step_results import episode_ends
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
@@ -120,11 +121,11 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         """
         env = self.env
         env.step(actions)
-        faulty = (env.done_reason & FAULTS) != 0
+        terminated, _ = episode_ends(env)
         extras = {
-            "time_outs": (env.truncated & ~env.terminated) | faulty,
+            "time_outs": env.done & ~terminated,
             "final_obs": self._final_obs,
-            "log": self._log() | {"faults/worlds": faulty.sum()},
+            "log": self._log() | {"faults/worlds": ((env.done_reason & FAULTS) != 0).sum()},
         }
         return self._obs.clone(), env.reward, env.done, extras
 

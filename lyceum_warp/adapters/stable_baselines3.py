@@ -12,7 +12,7 @@ from lyceum_warp.adapters.gymnasium_spaces import action_space, observation_spac
 from lyceum_warp.adapters.host_arrays import HostArrays
 from lyceum_warp.adapters.libraries import check_library
 from lyceum_warp.adapters.rendering import check_render_mode, frame_rate
-from lyceum_warp.adapters.step_results import Infos, Observations
+from lyceum_warp.adapters.step_results import Infos, Observations, episode_ends
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 from lyceum_warp.viz.cameras import CameraChoice
@@ -145,14 +145,14 @@ class StableBaselines3VecEnv(VecEnv):
         """Set a parameter of the task in all worlds, or an attribute of this environment.
 
         Raises:
-            ValueError: ``indices`` leaves worlds out.
+            ValueError: There is neither, or ``indices`` leaves worlds out.
         """
         if len(set(self._get_indices(indices))) != self.num_envs:
             raise ValueError(f"{attr_name!r} belongs to all worlds together: leave indices out")
-        if attr_name in self.env.task.parameters.values:
-            self.env.set_params(**{attr_name: value})
-        else:
+        if attr_name not in self.env.task.parameters.values and hasattr(self, attr_name):
             setattr(self, attr_name, value)
+        else:  # whose error has the closest names
+            self.env.set_params(**{attr_name: value})
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         """Call a method of the environment behind this one once; its result for each world, as in ``get_attr``."""
@@ -170,16 +170,17 @@ class StableBaselines3VecEnv(VecEnv):
         """Put the infos of ended episodes in their places, and begin to sum up the next ones."""
         env, count = self.env, self._observations.count
         index = torch.from_numpy(worlds).to(env.obs.device)
-        buffers = [*self._observations.final, env.terminated, *self._infos.tensors]
+        terminated, _ = episode_ends(env)
+        buffers = [*self._observations.final, terminated, *self._infos.tensors]
         values = self._host.of(*(buffer[index] for buffer in buffers))
-        rows, terminated = self._observations.rows(values[:count]), values[count]
+        rows, terminations = self._observations.rows(values[:count]), values[count]
         said = self._infos.named(values[count + 1 :])
         said.pop("metrics", None)
         seconds = round(time.time() - self._start, 6)
         for i, world in enumerate(worlds.tolist()):
             infos[world] = {
                 "terminal_observation": rows[i],
-                "TimeLimit.truncated": not terminated[i],
+                "TimeLimit.truncated": not terminations[i],
                 "episode": {"r": self._returns[world].item(), "l": self._lengths[world].item(), "t": seconds},
                 **_of_world(said, i),
             }

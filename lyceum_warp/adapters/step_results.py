@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from lyceum_warp.arrays import torch_view
+from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 
 
@@ -86,6 +87,15 @@ class Infos:
         return infos
 
 
+def episode_ends(env: Env) -> tuple[torch.Tensor, torch.Tensor]:
+    """Whether the last step terminated episodes, and whether it truncated them, each (nworld,) bool.
+
+    A fault truncates: the task did not end the episode, so that learners bootstrap with the last good observation.
+    """
+    fault = (env.done_reason & FAULTS) != 0
+    return env.terminated & ~fault, env.truncated | fault
+
+
 class StepResults:
     """The results of a step as Gymnasium returns them.
 
@@ -96,13 +106,12 @@ class StepResults:
     """
 
     def __init__(self, env: Env, observations: Observations, given: Callable[..., list[Any]]) -> None:
-        self._buffers = env.reward, env.terminated, env.truncated
-        self._observations, self._infos, self._given = observations, Infos(env), given
+        self._env, self._observations, self._infos, self._given = env, observations, Infos(env), given
 
     def __call__(self) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Observations, rewards, terminations, truncations and infos."""
         shown = self._observations.current
-        values = iter(self._given(*shown, *self._buffers, *self._infos.tensors))
+        values = iter(self._given(*shown, self._env.reward, *episode_ends(self._env), *self._infos.tensors))
         obs = self._observations.formed(list(islice(values, len(shown))))
-        reward, terminated, truncated = islice(values, len(self._buffers))
+        reward, terminated, truncated = islice(values, 3)
         return obs, reward, terminated, truncated, self._infos.named(list(values))

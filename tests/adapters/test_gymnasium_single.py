@@ -78,6 +78,13 @@ def test_a_step_has_the_numbers_of_the_environment_behind_it() -> None:
         pytest.fail("no episode ended within the horizon")
 
 
+def test_a_fault_truncates_the_episode_with_its_last_good_observation(hopper: gymnasium.Env) -> None:
+    before, _ = hopper.reset(seed=0)
+    obs, reward, terminated, truncated, info = hopper.step(np.full(3, np.nan, dtype=np.float32))
+    assert (reward, terminated, truncated) == (0.0, False, True) and info["done_reason"] == lw.Done.ACTION
+    np.testing.assert_array_equal(obs, before)
+
+
 def test_wrappers_of_gymnasium_work(hopper: gymnasium.Env) -> None:
     env: Any = wrappers.TimeLimit(wrappers.NormalizeObservation(hopper), max_episode_steps=5)
     env = wrappers.RecordEpisodeStatistics(wrappers.ClipAction(wrappers.NormalizeReward(env)))

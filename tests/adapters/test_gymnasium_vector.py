@@ -1,5 +1,6 @@
 """Many worlds as Gymnasium's vector environment: its numbers, its modes, its wrappers, its errors."""
 
+import gc
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -172,16 +173,22 @@ def test_a_mask_may_be_a_tensor(vector: Callable[..., GymnasiumVectorEnv]) -> No
     assert (after["policy"][mask] != before["policy"][mask]).any()
 
 
-def test_a_world_with_a_fault_shows_its_last_good_observation_without_automatic_resets(
-    vector: Callable[..., GymnasiumVectorEnv],
+@pytest.mark.parametrize("tensors", [False, True], ids=["numpy", "torch"])
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_a_fault_truncates_the_episode_with_its_last_good_observation(
+    mode: AutoresetMode, tensors: bool, vector: Callable[..., GymnasiumVectorEnv]
 ) -> None:
-    envs = vector(autoreset_mode=AutoresetMode.DISABLED)
+    envs = vector(autoreset_mode=mode, torch=tensors)
     before, _ = envs.reset(seed=2)
-    action = np.zeros((N, 3), dtype=np.float32)
+    action: Any = np.zeros((N, 3), dtype=np.float32)
     action[1] = np.nan
-    obs, reward, terminated, _, infos = envs.step(action)
-    np.testing.assert_array_equal(terminated, [False, True, False, False])
-    np.testing.assert_array_equal(obs["policy"][1], before["policy"][1])
+    obs, reward, terminated, truncated, infos = envs.step(torch.from_numpy(action) if tensors else action)
+    assert not terminated.any()
+    np.testing.assert_array_equal(as_array(truncated), [False, True, False, False])
+    last = obs["policy"][1]
+    if mode is AutoresetMode.SAME_STEP:
+        last = infos["final_obs"]["policy"][1] if tensors else infos["final_obs"][1]["policy"]
+    np.testing.assert_array_equal(as_array(last), as_array(before["policy"][1]))
     assert reward[1] == 0 and infos["done_reason"][1] == lw.Done.ACTION
 
 
@@ -198,6 +205,19 @@ def test_a_next_step_reset_follows_in_the_step_after_the_end(vector: Callable[..
         assert "final_obs" not in infos
         ends += ended.sum()
     assert ends > 3
+
+
+@pytest.mark.parametrize("tensors", [False, True], ids=["numpy", "torch"])
+def test_an_ignored_action_never_faults(tensors: bool, vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    envs = vector(autoreset_mode=AutoresetMode.NEXT_STEP, torch=tensors)
+    envs.reset(seed=5)
+    faults, ended, ends = envs.env.fault_counts, np.zeros(N, dtype=bool), 0
+    for action in actions():
+        action[ended] = np.nan
+        *_, terminated, truncated, _ = envs.step(torch.from_numpy(action) if tensors else action)
+        ended = as_array(terminated | truncated)
+        ends += ended.sum()
+    assert ends > 3 and envs.env.fault_counts == faults
 
 
 def test_a_seed_gives_the_same_worlds_and_no_seed_others(vector: Callable[..., GymnasiumVectorEnv]) -> None:
@@ -339,9 +359,11 @@ def test_a_step_runs_the_same_python_for_any_number_of_worlds() -> None:
             nonlocal count
             count += event in ("call", "c_call")
 
+        gc.disable()  # finalizers of other tests' environments count, too
         sys.setprofile(counted)
         envs.step(action)
         sys.setprofile(None)
+        gc.enable()
         return count
 
     assert calls(2) == calls(64) > 10
@@ -391,6 +413,14 @@ def test_tensors_that_do_not_fit_are_refused(
 def test_a_step_before_a_reset_is_refused(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     with pytest.raises(ResetNeeded, match="there was no reset before this step: call reset"):
         vector().step(np.zeros((N, 3), dtype=np.float32))
+
+
+@pytest.mark.parametrize("seed", [None, 3])
+def test_a_reset_of_some_worlds_before_one_of_all_is_refused(
+    seed: int | None, vector: Callable[..., GymnasiumVectorEnv]
+) -> None:
+    with pytest.raises(ResetNeeded, match="no reset came before this reset_mask: call reset.. without it first"):
+        vector().reset(seed=seed, options={"reset_mask": np.array([True, False, False, False])})
 
 
 @pytest.mark.parametrize(

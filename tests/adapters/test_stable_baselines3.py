@@ -61,6 +61,16 @@ def test_a_step_has_the_numbers_of_the_environment_behind_it(full: StableBaselin
     assert ends and timeouts
 
 
+def test_a_fault_truncates_the_episode_with_its_last_good_observation(hopper: StableBaselines3VecEnv) -> None:
+    before = hopper.reset()
+    action = np.zeros((N, 3), dtype=np.float32)
+    action[1] = np.nan
+    _, reward, done, infos = hopper.step(action)
+    np.testing.assert_array_equal(done, [False, True, False, False])
+    assert reward[1] == 0 and infos[1]["TimeLimit.truncated"] and infos[1]["done_reason"] == lw.Done.ACTION
+    np.testing.assert_array_equal(infos[1]["terminal_observation"], before[1])
+
+
 def test_only_ended_worlds_cost_a_dictionary(hopper: StableBaselines3VecEnv) -> None:
     hopper.reset()
     *_, first = hopper.step(np.zeros((N, 3), dtype=np.float32))
@@ -76,14 +86,14 @@ def test_results_of_a_step_do_not_change_with_the_next(hopper: StableBaselines3V
     assert np.array_equal(kept[0], obs) and np.array_equal(kept[1], reward)
 
 
-def test_ppo_learns_and_keeps_statistics_of_episodes(hopper: StableBaselines3VecEnv) -> None:
+def test_ppo_updates_its_policy_and_keeps_statistics_of_episodes(hopper: StableBaselines3VecEnv) -> None:
     model = PPO("MlpPolicy", hopper, n_steps=64, batch_size=64, n_epochs=2, seed=0, device="cpu")
     before = [parameter.clone() for parameter in model.policy.parameters()]
     model.learn(512)
     assert any((a != b).any() for a, b in zip(before, model.policy.parameters(), strict=True))
     assert model.ep_info_buffer and model.ep_info_buffer[0]["l"] > 1
-    mean, _ = evaluate_policy(model, hopper, n_eval_episodes=4)
-    assert mean > 0
+    returns, lengths = evaluate_policy(model, hopper, n_eval_episodes=6, return_episode_rewards=True)
+    assert len(returns) == len(lengths) == 6 and len(set(returns)) > 1 and min(lengths) > 1
 
 
 def test_an_off_policy_learner_stores_the_last_observation_and_no_time_limit(full: StableBaselines3VecEnv) -> None:
@@ -140,6 +150,21 @@ def test_attributes_and_methods_are_those_of_the_worlds() -> None:
     assert env.env_is_wrapped(gymnasium.Wrapper, indices=[0]) == [False]
     with pytest.raises(ValueError, match="'ctrl_cost_weight' belongs to all worlds together: leave indices out"):
         env.set_attr("ctrl_cost_weight", 1.0, indices=[1])
+
+
+@pytest.mark.parametrize(
+    "name, message",
+    [
+        ("ctrl_cost_wieght", "the task 'hopper' has no parameter 'ctrl_cost_wieght': did you mean ctrl_cost_weight"),
+        ("horizon", "'horizon' is an option, not a parameter of the task 'hopper'"),
+        ("reward", "the task 'hopper' has no parameter 'reward': "),
+    ],
+)
+def test_an_attribute_without_effect_is_refused(name: str, message: str, hopper: StableBaselines3VecEnv) -> None:
+    with pytest.raises(ValueError, match=message) as error:
+        hopper.set_attr(name, 5)
+    assert "\n" not in str(error.value) and name not in vars(hopper)
+    hopper.set_attr("render_mode", hopper.render_mode)
 
 
 def test_groups_of_observations_are_a_dict_on_demand(full: StableBaselines3VecEnv) -> None:
