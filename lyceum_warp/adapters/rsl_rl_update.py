@@ -135,6 +135,8 @@ class CapturedUpdate:
         self._adapt(policy, tuple(samples[f"old/{i}"] for i in range(len(policy.params))))
 
         advantage, limit = samples["advantage"].squeeze(-1), ppo.clip_param
+        if ppo.normalize_advantage_per_mini_batch:
+            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
         ratio = torch.exp(policy.log_prob(samples["action"]) - samples["log_prob"].squeeze(-1))
         surrogate = torch.max(-advantage * ratio, -advantage * ratio.clamp(1.0 - limit, 1.0 + limit)).mean()
         error = (value - samples["return"]).square()

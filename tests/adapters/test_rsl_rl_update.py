@@ -37,6 +37,7 @@ def check_equal_over_iterations(device: str, close: dict[str, float]) -> None:
 @pytest.mark.parametrize("changes", [
     {}, {"schedule": "fixed"}, {"use_clipped_value_loss": False, "std_type": "log", "optimizer": "adamw"},
     {"num_mini_batches": 5, "num_learning_epochs": 2, "clip_param": 0.05, "entropy_coef": 0.1},
+    {"normalize_advantage_per_mini_batch": True},
 ])  # fmt: skip
 def test_the_numbers_are_those_of_rsl_rls_own(changes: dict[str, Any]) -> None:
     """After the first update; later ones draw other random numbers."""
