@@ -189,7 +189,9 @@ def test_networks_that_rsl_rl_lacks_are_refused(shared_env: SharedEnv) -> None:
     obs = torch.randn(5, 2)
     torch.testing.assert_close(made.value(obs, obs[:, 0]), scaled(obs, obs[:, 0]), rtol=1e-4, atol=1e-4)
     assert made.config.value_group is None
-    assert RslRlLearner(env, plain, lw.ValueFunction(1), SMALL).config.value_group == "policy"
+    for group in (None, "policy", "critic"):
+        config = RslRlConfig(**{**vars(SMALL), "value_group": group})
+        assert RslRlLearner(env, plain, lw.ValueFunction(1), config).config.value_group == "policy"
 
 
 @pytest.mark.gpu
