@@ -20,6 +20,9 @@ from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
     ({"bootstrap": "none"}, "bootstrap must be 'final' or 'before', not 'none'"),
     ({"schedule": "linear"}, "schedule must be 'adaptive' or 'fixed', not 'linear'"),
     ({"normalize": 1}, "normalize must be True or False, not 1"),
+    ({"torch_compile_mode": "max-autotune"},
+     "torch_compile_mode must be 'default' or 'max-autotune-no-cudagraphs', or None .* not 'max-autotune'"),
+    ({"torch_compile_mode": 1}, "torch_compile_mode must be .* not 1"),
     ({"value_group": 3}, "value_group must be a name, or None, not 3"),
 ])  # fmt: skip
 def test_values_that_are_not_valid_are_refused(words: dict[str, object], message: str) -> None:
