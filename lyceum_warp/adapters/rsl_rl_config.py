@@ -119,8 +119,8 @@ class RslRlConfig:
     torch_compile_mode: str | None = None
     """Mode of torch.compile for the networks, "default" or "max-autotune-no-cudagraphs"; by default they are not
     compiled."""
-    mean_every: int = 50
-    """Iterations between two evaluations of the mean policy; 0 for never."""
+    mean_every: int = 20
+    """Iterations between two evaluations of the mean policy; 0 for never. A shorter run has no best policy."""
     mean_episodes: int = 16
     """Episodes in an evaluation of the mean policy."""
 

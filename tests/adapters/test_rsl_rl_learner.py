@@ -50,6 +50,11 @@ def test_it_learns_for_a_fixed_seed() -> None:
     assert rows[-1].samples == 40 * 24 * 32
 
 
+def test_the_mean_policy_is_evaluated_every_twenty_iterations_by_default() -> None:
+    made = learner(metered(), RslRlConfig(hidden=(4,), value_hidden=(4,), num_steps_per_env=2, num_learning_epochs=1))
+    assert [it for it in range(1, 22) if next(made).mean_return is not None] == [20]
+
+
 def test_statistics_are_those_of_the_samples(shared_env: SharedEnv) -> None:
     """Every episode has 10 steps; that of a world with a random start does not count."""
     made = learner(shared_env(Metered, nworld=4, horizon=10, far=1e3))
