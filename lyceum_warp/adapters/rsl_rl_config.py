@@ -182,7 +182,8 @@ class RslRlConfig:
         """
         if self.num_mini_batches > (samples := self.num_steps_per_env * env.nworld):
             raise ValueError(
-                f"{self.num_mini_batches} mini-batches are more than the {samples} samples: give more worlds"
+                f"{self.num_mini_batches} mini-batches are more than the {samples} samples: give more worlds, or make "
+                "num_mini_batches smaller"
             )
         network = {"class_name": "rsl_rl.models.MLPModel", "obs_normalization": self.normalize}
         gaussian = {"class_name": f"{_HERE}_distribution:AsynchronousGaussian", "std_type": self.std_type}

@@ -36,7 +36,8 @@ def test_the_value_function_gets_the_critics_group_where_there_is_one(shared_env
     assert RslRlConfig(value_group="policy").runner_config(env)["obs_groups"]["critic"] == ["policy"]
     with pytest.raises(ValueError, match="'metered' has no group 'actor' of observations .* it has policy, critic"):
         RslRlConfig(value_group="actor").runner_config(env)
-    with pytest.raises(ValueError, match="200 mini-batches are more than the 96 samples: give more worlds"):
+    message = "200 mini-batches are more than the 96 samples: give more worlds, or make num_mini_batches smaller"
+    with pytest.raises(ValueError, match=message):
         RslRlConfig(num_mini_batches=200).runner_config(env)
 
 

@@ -100,6 +100,12 @@ def test_an_update_that_is_not_finite_ends_learning(shared_env: SharedEnv) -> No
         next(learner(shared_env(Metered, nworld=4, horizon=10), config))
 
 
+@pytest.mark.parametrize("seed", [1.5, -1])
+def test_a_seed_that_is_not_valid_is_refused(seed: Any, shared_env: SharedEnv) -> None:
+    with pytest.raises(ValueError, match=f"seed must be a whole number from 0 to 2147483647, not {seed}"):
+        learner(shared_env(Metered, nworld=4, horizon=10), seed=seed)
+
+
 # runs
 
 
