@@ -27,6 +27,9 @@ _REAL = {
 _CHOICES = {"bootstrap": Bootstrap, "optimizer": Optimizer, "schedule": Schedule, "std_type": StdType}
 """The values of each choice."""
 
+_COMPILE_MODES = ("default", "max-autotune-no-cudagraphs")
+"""The modes of torch.compile that rsl_rl takes: those without CUDA graphs."""
+
 _FLAGS = ("use_clipped_value_loss", "normalize_advantage_per_mini_batch", "normalize", "random_start", "tf32",
           "captured_update")  # fmt: skip
 
@@ -114,9 +117,10 @@ class RslRlConfig:
     """Whether an epoch of the update is one CUDA graph, in which nothing waits for the device. It computes the same up
     to rounding; without a GPU it has no advantage."""
     torch_compile_mode: str | None = None
-    """Mode of torch.compile for the networks, as "default"; by default they are not compiled."""
-    mean_every: int = 50
-    """Iterations between two evaluations of the mean policy; 0 for never."""
+    """Mode of torch.compile for the networks, "default" or "max-autotune-no-cudagraphs"; by default they are not
+    compiled."""
+    mean_every: int = 20
+    """Iterations between two evaluations of the mean policy; 0 for never. A shorter run has no best policy."""
     mean_episodes: int = 16
     """Episodes in an evaluation of the mean policy."""
 
@@ -140,10 +144,11 @@ class RslRlConfig:
         for name in _FLAGS:
             if not isinstance(flag := getattr(self, name), bool):
                 raise ValueError(f"{name} must be True or False, not {flag!r}")
-        for name in ("value_group", "torch_compile_mode"):
-            if (word := getattr(self, name)) is not None and not isinstance(word, str):
-                raise ValueError(f"{name} must be a name, or None, not {word!r}")
-
+        if self.value_group is not None and not isinstance(self.value_group, str):
+            raise ValueError(f"value_group must be a name, or None, not {self.value_group!r}")
+        if (mode := self.torch_compile_mode) is not None and mode not in _COMPILE_MODES:
+            modes = " or ".join(map(repr, _COMPILE_MODES))
+            raise ValueError(f"torch_compile_mode must be {modes}, or None for no compilation, not {mode!r}")
         if self.captured_update and self.optimizer not in ("adam", "adamw"):
             raise ValueError(f"captured_update needs the optimizer 'adam' or 'adamw', not {self.optimizer!r}")
         if self.captured_update and self.torch_compile_mode is not None:
@@ -177,7 +182,8 @@ class RslRlConfig:
         """
         if self.num_mini_batches > (samples := self.num_steps_per_env * env.nworld):
             raise ValueError(
-                f"{self.num_mini_batches} mini-batches are more than the {samples} samples: give more worlds"
+                f"{self.num_mini_batches} mini-batches are more than the {samples} samples: give more worlds, or make "
+                "num_mini_batches smaller"
             )
         network = {"class_name": "rsl_rl.models.MLPModel", "obs_normalization": self.normalize}
         gaussian = {"class_name": f"{_HERE}_distribution:AsynchronousGaussian", "std_type": self.std_type}

@@ -6,6 +6,7 @@ import torch
 
 from lyceum_warp.adapters.adapted_env import environment_of
 from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl
+from lyceum_warp.adapters.rsl_rl_statistics import RECENT
 from lyceum_warp.adapters.step_results import episode_ends
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
@@ -59,7 +60,8 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             TensorDict(groups, batch_size=[env.nworld], device=self.device)
             for groups in (env.obs_groups, env.final_obs_groups)
         )
-        self._metrics = torch.full((len(env.metrics),), torch.nan, device=self.device)
+        self._metrics = torch.zeros(len(env.metrics), device=self.device)
+        self._episodes = torch.zeros((), device=self.device)  # in the means, at most RECENT or those of the last step
 
     @property
     def unwrapped(self) -> Env:
@@ -112,8 +114,9 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             ``time_outs`` whether the time limit or a fault cut the episode off, (nworld,) bool: the reward of a
                           transition with a fault is 0, and its final observation the last good one
             ``final_obs`` the observations that the step led to, before any reset, by their groups
-            ``log``       means of the task's metrics over the episodes that ended in this step, or, where none did, in
-                          the last step with such an end: ``metrics/NAME``; and ``faults/worlds``, worlds with a fault
+            ``log``       means of the task's metrics over about the last 100 episodes that ended (all of this step's),
+                          ``metrics/NAME``, which are 0 before the first end; and ``faults/worlds``, worlds with a
+                          fault
             ============= =========================================================================================
 
         Raises:
@@ -130,10 +133,16 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         return self._obs.clone(), env.reward, env.done, extras
 
     def _log(self) -> dict[str, torch.Tensor]:
-        """Means of the metrics over the episodes that ended, without waiting for the number of these."""
+        """Means of the metrics over recent episodes, without waiting for the number of those that ended.
+
+        rsl_rl averages them over the steps of an iteration: means of the last step's ends alone would count a step in
+        which one episode ended as much as one in which a thousand did.
+        """
         env = self.env
         if not env.metrics:
             return {}
-        sums = env.episode_metric_sums.masked_fill(~env.done.unsqueeze(-1), 0.0).sum(0)
-        self._metrics = torch.where(env.done.any(), sums / env.done.sum(), self._metrics)
+        ended, sums = env.done.sum(), env.episode_metric_sums.masked_fill(~env.done.unsqueeze(-1), 0.0).sum(0)
+        kept = torch.minimum(self._episodes, (RECENT - ended).clamp_min(0))
+        self._episodes = kept + ended
+        self._metrics = (kept * self._metrics + sums) / self._episodes.clamp_min(1.0)
         return {f"metrics/{name}": mean for name, mean in zip(env.metrics, self._metrics.unbind(), strict=True)}

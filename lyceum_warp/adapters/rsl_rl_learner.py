@@ -35,7 +35,7 @@ from lyceum_warp.algos.timing import PhaseTimer, one_thread
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
-from lyceum_warp.validate import check_kind
+from lyceum_warp.validate import check_kind, whole_number
 
 check_rsl_rl()  # its error says more than that of the imports below
 
@@ -100,7 +100,7 @@ class RslRlLearner:
         check_kind("config of RslRlLearner", config, RslRlConfig | None, "as RslRlConfig(num_steps_per_env=24)")
         check_kind("policy of RslRlLearner", policy, GaussianPolicy | None, "as lw.load(run) returns it")
         check_kind("value of RslRlLearner", value, ValueFunction | None, "as lw.load_value(run) returns it")
-        config = config or RslRlConfig()
+        config, seed = config or RslRlConfig(), whole_number("seed", seed, low=0)
         self.worlds = RslRlVecEnv(env)
         if policy is not None:
             check_networks(policy, value, env)

@@ -36,7 +36,13 @@ class CapturedUpdate:
         self.bind()
 
     def bind(self) -> None:
-        """Take over the learning rate and Adam's moments, as after they were loaded."""
+        """Take over the learning rate, Adam's moments and the normalisers' buffers, as after they were loaded."""
+        self._buffers = [
+            (part, name, buffer)
+            for network in (self.ppo.actor, self.ppo.critic)
+            for part in network.modules()
+            for name, buffer in part.named_buffers(recurse=False)
+        ]
         self.rate.fill_(float(self.ppo.learning_rate))
         if self.cuda:
             for group in self.ppo.optimizer.param_groups:
@@ -49,6 +55,7 @@ class CapturedUpdate:
     def __call__(self) -> dict[str, float]:
         """Update the networks from the storage, which then is empty; returns the mean losses by rsl_rl's names."""
         ppo = self.ppo
+        self._put_back_buffers()
         self._shuffle()
         self._sums.zero_()
         for _ in range(ppo.num_learning_epochs):
@@ -61,6 +68,14 @@ class CapturedUpdate:
         means = self._sums / (ppo.num_learning_epochs * self.count)
         value, surrogate, entropy, ppo.learning_rate = torch.cat([means, self.rate[None]]).tolist()
         return {"value": value, "surrogate": surrogate, "entropy": entropy}
+
+    @torch.no_grad()
+    def _put_back_buffers(self) -> None:
+        """Copy buffers that rsl_rl replaced, as a normaliser's standard deviation, to where the graph reads them."""
+        for part, name, buffer in self._buffers:
+            if (new := getattr(part, name)) is not buffer:
+                buffer.copy_(new)
+                setattr(part, name, buffer)
 
     @torch.no_grad()
     def _shuffle(self) -> None:
@@ -120,6 +135,8 @@ class CapturedUpdate:
         self._adapt(policy, tuple(samples[f"old/{i}"] for i in range(len(policy.params))))
 
         advantage, limit = samples["advantage"].squeeze(-1), ppo.clip_param
+        if ppo.normalize_advantage_per_mini_batch:
+            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
         ratio = torch.exp(policy.log_prob(samples["action"]) - samples["log_prob"].squeeze(-1))
         surrogate = torch.max(-advantage * ratio, -advantage * ratio.clamp(1.0 - limit, 1.0 + limit)).mean()
         error = (value - samples["return"]).square()

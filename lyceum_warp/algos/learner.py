@@ -101,7 +101,7 @@ Config = TypeVar("Config")
 
 
 def fitted_config(config: Config, policy_shape: Mapping[str, Any], value_shape: Mapping[str, Any]) -> Config:
-    """Hyperparameters with the sizes of given networks, from which networks like these can be made.
+    """Hyperparameters with the sizes and the group of given networks, from which networks like these can be made.
 
     Args:
         config: The hyperparameters, a dataclass.
@@ -112,6 +112,8 @@ def fitted_config(config: Config, policy_shape: Mapping[str, Any], value_shape: 
     entries = {"hidden": policy_shape.get("hidden"), "activation": policy_shape.get("activation")}
     entries |= {f"value_{name}": value_shape.get(name) for name in ("hidden", "activation")}
     entries |= {"normalize": policy_shape.get("normalize"), "time_orders": value_shape.get("time_orders")}
+    if getattr(config, "value_group", None) is not None and value_shape:
+        entries["value_group"] = value_shape.get("group", "policy")
     known = {field.name for field in dataclasses.fields(config)}
     changes = {name: entry for name, entry in entries.items() if entry is not None and name in known}
     return dataclasses.replace(config, **changes)

@@ -253,10 +253,10 @@ def _algorithm(options: Train) -> Algorithm:
 
 
 def _fitted(algorithm: Algorithm, config: Any, content: PolicyContent, path: Path) -> Any:
-    """Hyperparameters with the sizes of loaded networks.
+    """Hyperparameters with the sizes and the group of loaded networks.
 
     Raises:
-        ValueError: Other sizes are given.
+        ValueError: Other sizes, or another group, are given.
     """
     fitted = fitted_config(config, content["policy"]["shape"], content["value"]["shape"])
     for field in dataclasses.fields(config):

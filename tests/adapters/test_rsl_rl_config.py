@@ -20,6 +20,9 @@ from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
     ({"bootstrap": "none"}, "bootstrap must be 'final' or 'before', not 'none'"),
     ({"schedule": "linear"}, "schedule must be 'adaptive' or 'fixed', not 'linear'"),
     ({"normalize": 1}, "normalize must be True or False, not 1"),
+    ({"torch_compile_mode": "max-autotune"},
+     "torch_compile_mode must be 'default' or 'max-autotune-no-cudagraphs', or None .* not 'max-autotune'"),
+    ({"torch_compile_mode": 1}, "torch_compile_mode must be .* not 1"),
     ({"value_group": 3}, "value_group must be a name, or None, not 3"),
 ])  # fmt: skip
 def test_values_that_are_not_valid_are_refused(words: dict[str, object], message: str) -> None:
@@ -33,7 +36,8 @@ def test_the_value_function_gets_the_critics_group_where_there_is_one(shared_env
     assert RslRlConfig(value_group="policy").runner_config(env)["obs_groups"]["critic"] == ["policy"]
     with pytest.raises(ValueError, match="'metered' has no group 'actor' of observations .* it has policy, critic"):
         RslRlConfig(value_group="actor").runner_config(env)
-    with pytest.raises(ValueError, match="200 mini-batches are more than the 96 samples: give more worlds"):
+    message = "200 mini-batches are more than the 96 samples: give more worlds, or make num_mini_batches smaller"
+    with pytest.raises(ValueError, match=message):
         RslRlConfig(num_mini_batches=200).runner_config(env)
 
 

@@ -89,20 +89,35 @@ def test_a_fault_is_a_time_out_and_a_termination_is_not(shared_env: SharedEnv) -
     assert reward[1] == 0.0 and extras["final_obs"]["critic"].isfinite().all()
 
 
-def test_the_log_has_the_metrics_of_ended_episodes(env: lw.Env) -> None:
+def test_the_log_has_the_mean_metrics_of_recent_episodes(env: lw.Env) -> None:
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([7, 7, 5, 0])
     action = torch.tensor([[0.1], [0.2], [0.3], [0.4]])
     logs = []
     for _ in range(6):
         *_, extras = worlds.step(action)
-        logs.append({name: mean.clone() for name, mean in extras["log"].items()})
-    names = ["metrics/forward", "metrics/effort"]
-    assert [name for name in logs[0] if name.startswith("metrics/")] == names
-    assert all(logs[1][name].isnan() for name in names)  # no episode has ended
-    assert logs[2]["metrics/effort"].item() == pytest.approx(3 * (0.01 + 0.04) / 2)
-    assert logs[3]["metrics/effort"] == logs[2]["metrics/effort"]  # none ended in this step
-    assert logs[4]["metrics/effort"].item() == pytest.approx(5 * 0.09)
+        logs.append(extras["log"])
+    assert [name for name in logs[0] if name.startswith("metrics/")] == ["metrics/forward", "metrics/effort"]
+    efforts = [log["metrics/effort"].item() for log in logs]
+    two = 3 * (0.01 + 0.04) / 2
+    three = (3 * (0.01 + 0.04) + 5 * 0.09) / 3
+    assert efforts == pytest.approx([0.0, 0.0, two, two, three, three])
+
+
+def test_the_log_forgets_old_episodes(shared_env: SharedEnv) -> None:
+    env = shared_env(Metered, nworld=4, horizon=1, far=1e3)
+    worlds = RslRlVecEnv(env)
+    for step in range(1, 61):
+        *_, extras = worlds.step(torch.full((4, 1), 0.0 if step < 26 else 1.0))
+        if step == 25:
+            assert extras["log"]["metrics/effort"] == 0.0
+        if step == 26:
+            assert extras["log"]["metrics/effort"].item() == pytest.approx(0.04)
+    assert 0.75 < extras["log"]["metrics/effort"] < 1.0
+    many = RslRlVecEnv(shared_env(Metered, nworld=128, horizon=1, far=1e3))
+    for action in (0.0, 1.0):
+        *_, extras = many.step(torch.full((128, 1), action))
+        assert extras["log"]["metrics/effort"].item() == pytest.approx(action)
 
 
 def test_bad_environments_and_actions_are_refused(env: lw.Env, shared_env: SharedEnv) -> None:

@@ -50,6 +50,11 @@ def test_it_learns_for_a_fixed_seed() -> None:
     assert rows[-1].samples == 40 * 24 * 32
 
 
+def test_the_mean_policy_is_evaluated_every_twenty_iterations_by_default() -> None:
+    made = learner(metered(), RslRlConfig(hidden=(4,), value_hidden=(4,), num_steps_per_env=2, num_learning_epochs=1))
+    assert [it for it in range(1, 22) if next(made).mean_return is not None] == [20]
+
+
 def test_statistics_are_those_of_the_samples(shared_env: SharedEnv) -> None:
     """Every episode has 10 steps; that of a world with a random start does not count."""
     made = learner(shared_env(Metered, nworld=4, horizon=10, far=1e3))
@@ -93,6 +98,12 @@ def test_an_update_that_is_not_finite_ends_learning(shared_env: SharedEnv) -> No
     config = RslRlConfig(**{**vars(SMALL), "learning_rate": 1e30, "schedule": "fixed"})
     with pytest.raises(FloatingPointError, match="the update of iteration 1 is not finite: make learning_rate, or the"):
         next(learner(shared_env(Metered, nworld=4, horizon=10), config))
+
+
+@pytest.mark.parametrize("seed", [1.5, -1])
+def test_a_seed_that_is_not_valid_is_refused(seed: Any, shared_env: SharedEnv) -> None:
+    with pytest.raises(ValueError, match=f"seed must be a whole number from 0 to 2147483647, not {seed}"):
+        learner(shared_env(Metered, nworld=4, horizon=10), seed=seed)
 
 
 # runs
@@ -189,7 +200,9 @@ def test_networks_that_rsl_rl_lacks_are_refused(shared_env: SharedEnv) -> None:
     obs = torch.randn(5, 2)
     torch.testing.assert_close(made.value(obs, obs[:, 0]), scaled(obs, obs[:, 0]), rtol=1e-4, atol=1e-4)
     assert made.config.value_group is None
-    assert RslRlLearner(env, plain, lw.ValueFunction(1), SMALL).config.value_group == "policy"
+    for group in (None, "policy", "critic"):
+        config = RslRlConfig(**{**vars(SMALL), "value_group": group})
+        assert RslRlLearner(env, plain, lw.ValueFunction(1), config).config.value_group == "policy"
 
 
 @pytest.mark.gpu

@@ -152,6 +152,8 @@ def test_wrong_settings_are_refused_before_the_folder_is_made(
     (["--resume", "RUN", "--iterations", "9", "--samples", "50"], "--samples is a setting of npg, not of rsl-rl"),
     (["--from", "RUN", "--algorithm", "npg"], "was trained by rsl-rl, and --from begins with a run of the same alg"),
     (["--from", "RUN", "--config.hidden", "9"], "have hidden (8,), not (9,): leave out --config.hidden"),
+    (["--from", "RUN", "--config.value-group", "policy"],
+     "have value_group critic, not policy: leave out --config.value-group"),
 ])  # fmt: skip
 def test_settings_of_another_run_are_refused(
     four: Path, options: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
