@@ -21,8 +21,8 @@ SECONDS = 120.0
 """A page must do within this time what a test waits for: without a GPU it draws a few frames a second."""
 
 
-CLICK_SECONDS = 6.0
-"""A click reaches the session within this time, on a busy machine as well."""
+INPUT_SECONDS = 6.0
+"""A click or a key reaches the session within this time, on a busy machine as well, unless it is lost."""
 
 
 WIDTH, HEIGHT, SCALE = 1000, 640, 0.25
@@ -147,8 +147,19 @@ class Tab:
             "n => new Promise(done => { const f = () => n-- > 0 ? requestAnimationFrame(f) : done(); f(); })", number
         )
 
-    def press(self, keys: str) -> None:
-        """Press keys, such as "Control+ArrowRight", for as long as the page needs to see each of them."""
+    def press(self, keys: str, until: Callable[[], Any] | None = None) -> None:
+        """Press keys, such as "Control+ArrowRight", for as long as the page needs to see each of them.
+
+        With ``until``, press them again where this does not hold within seconds: a busy machine may lose a key.
+        """
+        deadline = time.monotonic() + SECONDS
+        while True:
+            self._press(keys)
+            if until is None or self._soon(until):
+                return
+            assert time.monotonic() < deadline, f"{keys} did not do it in time"
+
+    def _press(self, keys: str) -> None:
         names = keys.split("+")
         for name in names:
             self.page.keyboard.down(name)
@@ -174,12 +185,18 @@ class Tab:
         """
         for shift in (0, 0, 20, -20, 0, 40, -40, 0):
             self.click(x, y + shift)
-            waited = time.monotonic() + CLICK_SECONDS
-            while time.monotonic() < waited:
-                if condition():
-                    return
-                self.page.wait_for_timeout(20)
+            if self._soon(condition):
+                return
         raise AssertionError("nothing near that place of the panel did it")
+
+    def _soon(self, condition: Callable[[], Any]) -> bool:
+        """Whether a condition holds within ``INPUT_SECONDS``."""
+        end = time.monotonic() + INPUT_SECONDS
+        while not condition():
+            if time.monotonic() > end:
+                return False
+            self.page.wait_for_timeout(20)
+        return True
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], button: Literal["left", "right"]) -> None:
         """Move the mouse with a button held down; it stays down."""

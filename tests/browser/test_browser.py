@@ -113,10 +113,8 @@ def test_the_page_shows_the_robot(tab: Tab) -> None:
 
 def test_keys_and_buttons_pause_and_go_on(tab: Tab) -> None:
     viewer = tab.viewer
-    tab.press("Space")
-    tab.wait(lambda: not viewer.status.paused and viewer.status.step > 5)
-    tab.press("Space")
-    tab.wait(lambda: viewer.status.paused)
+    tab.press("Space", until=lambda: not viewer.status.paused and viewer.status.step > 5)
+    tab.press("Space", until=lambda: viewer.status.paused)
     tab.click_near(*PAUSE, lambda: not viewer.status.paused)
     tab.click_near(*PAUSE, lambda: viewer.status.paused)
 
@@ -124,40 +122,35 @@ def test_keys_and_buttons_pause_and_go_on(tab: Tab) -> None:
 def test_keys_step_forwards_and_back(tab: Tab) -> None:
     viewer = tab.viewer
     before = viewer.session.env.get_state()
-    tab.press("Shift+ArrowRight")
-    tab.wait(lambda: viewer.status.step >= 50)
-    tab.press("ArrowRight")
-    tab.wait(lambda: viewer.status.step >= 51)
+    tab.press("Shift+ArrowRight", until=lambda: viewer.status.step >= 50)
+    tab.press("ArrowRight", until=lambda: viewer.status.step >= 51)
     tab.press("ArrowLeft")
     while viewer.status.step:
         step = viewer.status.step
-        tab.press("Shift+ArrowLeft")
-        tab.wait(lambda: viewer.status.step < step)  # noqa: B023
+        tab.press("Shift+ArrowLeft", until=lambda: viewer.status.step < step)  # noqa: B023
     assert torch.equal(viewer.session.env.get_state(), before)
 
 
 def test_controllers_are_switched_and_the_picture_follows(tab: Tab) -> None:
     viewer = tab.viewer
     middle = place(tab.silhouette())
-    tab.press("Control+ArrowLeft")
-    tab.wait(lambda: viewer.status.mode == "controller" and viewer.status.controller == "right")
-    tab.press("Shift+ArrowRight")
-    tab.wait(lambda: viewer.status.step >= 50)
+    tab.press(
+        "Control+ArrowLeft", until=lambda: viewer.status.mode == "controller" and viewer.status.controller == "right"
+    )
+    tab.press("Shift+ArrowRight", until=lambda: viewer.status.step >= 50)
     right = place(tab.silhouette())
     assert right > middle + 0.03
     tab.click_near(*LEFT, lambda: viewer.status.controller == "left")
     step = viewer.status.step
-    for _ in range(3):
-        tab.press("Shift+ArrowRight")
-    tab.wait(lambda: viewer.status.step >= step + 150)
+    for steps in (50, 100, 150):
+        tab.press("Shift+ArrowRight", until=lambda: viewer.status.step >= step + steps)  # noqa: B023
     assert place(tab.silhouette()) < right - 0.03
 
 
 def test_a_body_is_pushed_by_dragging(tab: Tab) -> None:
     viewer = tab.viewer
     middle = place(tab.silhouette())
-    tab.press("Space")
-    tab.wait(lambda: not viewer.status.paused)
+    tab.press("Space", until=lambda: not viewer.status.paused)
 
     def pushed() -> bool:
         return any(isinstance(command, Perturb) and command.forces[1, 0] > 0 for command in viewer.window.given)
@@ -188,9 +181,8 @@ def test_an_episode_is_scrubbed_and_played(tab: Tab) -> None:
     tab.click_near(right, height, lambda: viewer.status.step >= STEPS - 2)
     assert start < half < place(tab.silhouette())
     assert any(isinstance(command, Seek) for command in viewer.window.given)
-    tab.press("Control+r")
-    tab.press("Space")
-    tab.wait(lambda: viewer.status.backwards and viewer.status.step < STEPS / 2)
+    tab.press("Control+r", until=lambda: viewer.status.backwards)
+    tab.press("Space", until=lambda: viewer.status.backwards and viewer.status.step < STEPS / 2)
 
 
 # tabs and browsers that come and go
@@ -202,16 +194,14 @@ def test_two_tabs_show_the_same_and_one_controls(tab: Tab, browser: Browser) -> 
     second = Tab(context.new_page(), viewer)
     second.wait(lambda: second.logged("role=spectator"))
     tab.press("Control+ArrowLeft")
-    tab.press("Shift+ArrowRight")
-    tab.wait(lambda: viewer.status.step >= 50)
+    tab.press("Shift+ArrowRight", until=lambda: viewer.status.step >= 50)
     second.wait(lambda: abs(place(second.silhouette()) - place(tab.silhouette())) < 0.02)
     step = viewer.status.step
     second.press("Shift+ArrowRight")
     second.frames(10)
     assert viewer.status.step == step
     context.close()
-    tab.press("Shift+ArrowRight")
-    tab.wait(lambda: viewer.status.step > step)
+    tab.press("Shift+ArrowRight", until=lambda: viewer.status.step > step)
 
 
 def test_a_closed_tab_leaves_control_to_the_next(viewer: Viewer, browser: Browser, shared_tab: Tab) -> None:
@@ -221,8 +211,7 @@ def test_a_closed_tab_leaves_control_to_the_next(viewer: Viewer, browser: Browse
         next_tab = Tab(context.new_page(), viewer).loaded()
         next_tab.wait(lambda tab=next_tab: tab.logged("role=controller"))
         paused = viewer.status.paused
-        next_tab.press("Space")
-        next_tab.wait(lambda paused=paused: viewer.status.paused != paused)
+        next_tab.press("Space", until=lambda paused=paused: viewer.status.paused != paused)
         address = next_tab.page.url
         next_tab.page.close()
     again = Tab(context.new_page(), viewer, address)  # the cookie stays
