@@ -5,6 +5,7 @@ does not, so ``document_attributes`` appends these strings to the docstring of t
 """
 
 import ast
+import dataclasses
 import enum
 import inspect
 import itertools
@@ -40,8 +41,14 @@ def listed(docs: dict[str, str]) -> str:
 
 
 def document_attributes(cls: Class) -> Class:
-    """Class decorator: append the attributes' docstrings to the class's own, where ``help`` shows them."""
-    docs = attribute_docs(cls)
+    """Class decorator: append the attributes' docstrings to the class's own, where ``help`` shows them.
+
+    Those of a dataclass include the attributes of the dataclasses that it extends.
+    """
+    docs: dict[str, str] = {}
+    for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__[1:])):
+        docs |= attribute_docs(base)
+    docs |= attribute_docs(cls)
     if issubclass(cls, enum.Enum):
         docs = {f"{member.name} ({member.value})": docs[member.name] for member in cls if member.name in docs}
     if docs:

@@ -7,14 +7,17 @@ from typing import Any, Protocol, TypeVar
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
 
 METRIC_COLUMN = "metrics/"
 """What the columns of a task's own metrics begin with."""
 
 
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class LearnerIteration:
-    """What every algorithm's statistics of an iteration have; they are a dataclass with further numbers."""
+    """What every algorithm's statistics of an iteration have. An algorithm's own statistics are a subclass."""
 
     iteration: int
     """Number of the iteration, from 1."""
@@ -23,20 +26,50 @@ class LearnerIteration:
     reward_mean: float
     """Mean reward of a step, over all samples."""
     return_mean: float
-    """Mean return of the stochastic policy in the episodes that ended; nan where none ended."""
+    """Mean return (sum of an episode's rewards) of the stochastic policy."""
+    return_std: float
+    """Standard deviation of these returns."""
+    return_min: float
+    """Smallest of these returns."""
+    return_max: float
+    """Largest of these returns."""
+    length_mean: float
+    """Mean number of steps in an episode."""
+    terminal_reward: float
+    """Mean reward of an episode's last step."""
+    eval_mean: float
+    """Mean evaluation metric at the end of an episode."""
     success: float
-    """Share of these episodes that ended with the goal met; nan for a task without a success."""
+    """Share of the episodes that ended with the goal met; nan for a task without a success."""
     mean_return: float | None
-    """Mean return of the mean policy; None in iterations without an evaluation of it."""
+    """Mean return of the mean policy; None in iterations without an evaluation of it. Episodes of a task without a
+    horizon are cut off after 1,000 steps."""
+    mean_length: float | None
+    """Mean number of steps in an episode of the mean policy, or None."""
+    mean_terminal_reward: float | None
+    """Mean reward of the last step of an episode of the mean policy, or None."""
+    mean_eval: float | None
+    """Mean evaluation metric at the end of an episode of the mean policy, or None."""
+    mean_success: float | None
+    """Share of the mean policy's episodes that ended with the goal met, or None; None for a task without a success."""
+    kl: float
+    """KL divergence from the old to the new policy, averaged over the samples."""
+    std_mean: float
+    """Mean standard deviation of the policy's actions."""
+    faults: int
+    """Faults of worlds in this iteration."""
+    time_sample: float
+    """Seconds of sampling."""
+    time_mean: float
+    """Seconds of evaluating the mean policy."""
     samples_per_second: float
     """Samples divided by the seconds of sampling."""
-    metrics: Mapping[str, float]
+    metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Means of the task's metrics, each summed over an episode, by the metrics' names."""
 
     def row(self) -> dict[str, Any]:
         """The numbers by the names of their columns in metrics.csv; the metric ``forward`` is ``metrics/forward``."""
-        numbers: Any = self  # a dataclass
-        names = [field.name for field in dataclasses.fields(numbers) if field.name != "metrics"]
+        names = [field.name for field in dataclasses.fields(self) if field.name != "metrics"]
         metrics = {METRIC_COLUMN + name: mean for name, mean in self.metrics.items()}
         return {name: getattr(self, name) for name in names} | metrics
 

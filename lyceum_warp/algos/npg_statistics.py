@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import torch
@@ -19,78 +19,31 @@ Scalar: TypeAlias = Any
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Iteration(LearnerIteration):
-    """Statistics of one iteration.
+    """Statistics of one iteration of NPG.
 
     Numbers about episodes cover those that ended in the iteration; they are nan where none ended.
     """
 
-    iteration: int
-    """Number of the iteration, from 1."""
-    samples: int
-    """Samples in all iterations so far."""
-    reward_mean: float
-    """Mean reward of a step, over all samples."""
-    return_mean: float
-    """Mean return (sum of an episode's rewards) of the stochastic policy."""
-    return_std: float
-    """Standard deviation of these returns."""
-    return_min: float
-    """Smallest of these returns."""
-    return_max: float
-    """Largest of these returns."""
-    length_mean: float
-    """Mean number of steps in an episode."""
-    terminal_reward: float
-    """Mean reward of an episode's last step."""
-    eval_mean: float
-    """Mean evaluation metric at the end of an episode."""
-    success: float
-    """Share of the episodes that ended with the goal met; nan for a task without a success."""
-    mean_return: float | None
-    """Mean return of the mean policy; None in iterations without an evaluation of it. Episodes of a task without a
-    horizon are cut off after 1,000 steps."""
-    mean_length: float | None
-    """Mean number of steps in an episode of the mean policy, or None."""
-    mean_terminal_reward: float | None
-    """Mean reward of the last step of an episode of the mean policy, or None."""
-    mean_eval: float | None
-    """Mean evaluation metric at the end of an episode of the mean policy, or None."""
-    mean_success: float | None
-    """Share of the mean policy's episodes that ended with the goal met, or None; None for a task without a success."""
-    kl: float
-    """KL divergence from the old to the new policy, averaged over the samples."""
     step_norm: float
     """Euclidean length of the full step in the policy's parameters."""
     step_fraction: float
     """Share of the full step that was made; less than 1 where the full step exceeded the limit of the KL divergence."""
     gradient_norm: float
     """Euclidean length of the vanilla policy gradient."""
-    std_mean: float
-    """Mean standard deviation of the policy's actions."""
     value_error: float
     """Squared error of the value function before the fit, relative to the squared error of predicting 0."""
     explained_variance: float
     """Share of the returns' variance that the value function explained before the fit."""
-    faults: int
-    """Faults of worlds in this iteration."""
     outliers: int
     """Samples whose advantage exceeded ten standard deviations of the returns, and was set to that bound."""
     skipped_updates: int
     """Updates of this iteration that were not finite and were left out: the policy's step, the value function's fit."""
-    time_sample: float
-    """Seconds of sampling."""
     time_gradient: float
     """Seconds for advantages and the vanilla gradient."""
     time_solve: float
     """Seconds of conjugate gradient and of the step."""
     time_value: float
     """Seconds of fitting the value function."""
-    time_mean: float
-    """Seconds of evaluating the mean policy."""
-    samples_per_second: float
-    """Samples divided by the seconds of sampling."""
-    metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Means of the task's metrics, each summed over an episode, by the metrics' names."""
 
 
 class UpdateNumbers(NamedTuple):

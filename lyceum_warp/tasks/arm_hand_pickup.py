@@ -94,7 +94,7 @@ class ArmHandPickup(lw.Task):
     obs = {"joints": 9, "velocity": 9, "ball_velocity": 3, "ball": 3, "palm": 3, "goal": 3, "fingers": 9}
     metrics, action_range = ("palm_distance", "goal_distance", "finger_distances"), (-1.0, 1.0)
     planning = lw.Planning(  # whose reward shows the goal from afar and asks more for a closed hand
-        settings={"horizon": 32, "samples": 64, "temperature": 0.1, "noise": 0.8, "fill": "repeat"},
+        settings=dict(horizon=32, samples=64, temperature=0.1, noise=0.8, fill="repeat", include_plan=False),
         params={"far": 1.0, "finger_weight": 2.0},
     )
 

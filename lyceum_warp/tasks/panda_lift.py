@@ -93,7 +93,7 @@ class PandaLift(lw.Task):
     obs = {"position": 9, "velocity": 15, "target": 8, "cube": 3, "cube_axes": 9, "cube_from_grip": 3}
     metrics = ("reach", "orient", "grasp", "lift")
     action_range = (-1.0, 1.0)
-    planning = lw.Planning(settings={"horizon": 16, "samples": 64, "temperature": 0.5, "noise": 0.6})
+    planning = lw.Planning(settings=dict(horizon=16, samples=64, temperature=0.5, noise=0.6, include_plan=False))
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
