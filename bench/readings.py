@@ -63,10 +63,12 @@ def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uin
     seen = past(s1)
     for leg in range(4):
         peak = s0.lasting_memory[PAST_PEAK + leg]
+        position, _ = go1.foot(s0, p, leg)
+        seen_position, _ = go1.foot(seen, p, leg)
         if go1.landed(seen.memory[go1.CONTACT_TIME + leg], p):
             peak = 0.0
-        elif not go1.touches(seen, p, leg):
-            peak = wp.max(peak, go1.height(s0, p, leg))
+        elif not go1.touches(seen_position, seen, p):
+            peak = wp.max(peak, go1.height(position))
         s1.lasting_memory[PAST_PEAK + leg] = peak
 
 
@@ -75,7 +77,9 @@ def mjlabs_terms(s0: World, action: Row[float], s1: World, p: Params) -> lw.vec1
     seen = past(s1)
     clearance, swing, landing = float(0.0), float(0.0), float(0.0)
     for leg in range(4):
-        clearance += wp.abs(go1.height(s0, p, leg) - p.foot_height) * go1.speed(seen, p, leg)
+        position, _ = go1.foot(s0, p, leg)
+        _, velocity = go1.foot(seen, p, leg)
+        clearance += wp.abs(go1.height(position) - p.foot_height) * go1.speed(velocity)
         if go1.landed(seen.memory[go1.CONTACT_TIME + leg], p):
             error = s0.lasting_memory[PAST_PEAK + leg] / p.foot_height - 1.0
             swing += error * error

@@ -1,10 +1,15 @@
 """Host code for Warp arrays: views under another shape or in torch, and launches over masked rows."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
+
+WORLDS_A_BLOCK = 32
+"""Threads of a CUDA block where each thread has a world. Threads read the rows of their own worlds, of which a
+multiprocessor serves few at a time; larger blocks would leave most multiprocessors without worlds."""
 
 _SPARE = 256
 """Elements behind an array without elements."""
@@ -43,6 +48,11 @@ def with_memory(array: wp.array) -> wp.array:
 def torch_view(array: wp.array) -> torch.Tensor:
     """The torch tensor that shares an array's memory."""
     return wp.to_torch(array, requires_grad=False)
+
+
+def launch_worlds(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device | None) -> None:
+    """Launch a kernel of a task with a thread for each world."""
+    wp.launch(kernel, nworld, args, device=device, block_dim=WORLDS_A_BLOCK if wp.get_device(device).is_cuda else 1)
 
 
 def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.array) -> None:

@@ -159,7 +159,7 @@ class Field:
     refresh: Stage
     """The stage that must be computed after a step for this field to belong to the new state."""
     reset: Stage
-    """The stage that must be computed after a reset."""
+    """The stage that must be computed after a reset; none for a field that a reset clears."""
     lagged: bool
     """Whether the field stays as ``mj_step`` leaves it, one substep behind the state."""
     snapshot: bool
@@ -187,7 +187,9 @@ def is_data_field(name: str) -> bool:
     return name in STATE_FIELDS or name in DERIVED_FIELDS or name in SENSED
 
 
-def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False, written: bool = False) -> Field:
+def describe(
+    model: mujoco.MjModel, name: str, *, lagged: bool = False, cleared: bool = False, written: bool = False
+) -> Field:
     """Describe a field of a model.
 
     Positions, velocities and functions of them belong to the current state: after a step, after a restart and after
@@ -200,11 +202,12 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False, written:
         name: MuJoCo's name of the field, an attribute of MjData.
         lagged: Whether to keep the field as ``mj_step`` leaves it, one substep behind the state. Fields of the
             acceleration stage are always kept so; for a field of the integration state it has no effect.
+        cleared: Whether the field is 0 at the beginning of an episode, instead of belonging to its first state.
         written: Whether the task writes the field before a step. Controls are always written.
 
     Raises:
-        ValueError: There is no such field, the model has no enabled sensor that makes MuJoCo compute it, or it is
-            written and not one of ``INPUTS``.
+        ValueError: There is no such field, the model has no enabled sensor that makes MuJoCo compute it, it is
+            written and not one of ``INPUTS``, or it is cleared and belongs to the current state.
     """
     if written and name not in INPUTS:
         raise ValueError(f"the field {name!r} cannot be written before a step: the inputs are {', '.join(INPUTS)}")
@@ -231,6 +234,12 @@ def describe(model: mujoco.MjModel, name: str, *, lagged: bool = False, written:
         close = similar_data_fields(name)
         hint = f"did you mean {' or '.join(close)}?" if close else f"the fields are {', '.join(sorted(_KNOWN))}"
         raise ValueError(f"there is no field {name!r}: {hint}")
+    if cleared:
+        if not snapshot or refresh > Stage.NONE:
+            raise ValueError(
+                f"the field {name!r} cannot be cleared: it belongs to the current state, also when an episode begins"
+            )
+        reset = Stage.NONE
     shape: tuple[int, ...] = np.shape(getattr(mujoco.MjData(model), name))
     if len(shape) == 2:
         return Field(name, shape[:1], _TYPES[shape[1]], refresh, reset, lagged, snapshot, written)

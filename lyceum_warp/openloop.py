@@ -6,7 +6,7 @@ from functools import partial
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import flat, launch_rows, shared_rows, torch_view, with_memory
+from lyceum_warp.arrays import flat, launch_rows, launch_worlds, shared_rows, torch_view, with_memory
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
@@ -203,12 +203,12 @@ class OpenLoop:
                 for name in MEMORIES
             ]
             args = [*transition, worlds.counters, *memories]
-            wp.launch(kernels.advance_rows, n, args, device=device)
+            launch_worlds(kernels.advance_rows, n, args, device)
         else:  # they stay as they are at the start
             for buffer in self._memories.values():
                 for t in range(self.horizon):
                     wp.copy(buffer[t + 1], buffer[0])
-        wp.launch(kernels.judge_rows, len(actions), [*transition, self._reward, self._terminated], device=device)
+        launch_worlds(kernels.judge_rows, len(actions), [*transition, self._reward, self._terminated], device)
         wp.launch(planning.add_steps, n, [self.horizon, worlds.counters.step], device=device)
         self._end(self._last)
 
@@ -221,10 +221,10 @@ class OpenLoop:
         kernels = self.env.task.kernels
         transition = [worlds.before, worlds.after, worlds.params, self._actions[t]]
         if kernels.advance_memory is not None:
-            wp.launch(kernels.advance_memory, n, [*transition, worlds.counters], device=device)
+            launch_worlds(kernels.advance_memory, n, [*transition, worlds.counters], device)
         rows = slice(t * n, (t + 1) * n)
         args = [*transition, self._reward[rows], self._terminated[rows]]
-        wp.launch(kernels.judge_rows, n, args, device=device)
+        launch_worlds(kernels.judge_rows, n, args, device)
 
     def _end(self, batch: object) -> None:
         """Collect the worlds' faults, and observe where they ended."""
@@ -232,4 +232,4 @@ class OpenLoop:
         self.env.engine.find_faults(worlds.everyone)
         wp.launch(planning.merge_faults, n, [self.env.engine.fault, self._fault], device=device)
         args = [worlds.everyone, batch, worlds.params, worlds.counters, self._obs, self._obs]
-        wp.launch(self.env.task.kernels.observe_worlds, n, args, device=device)
+        launch_worlds(self.env.task.kernels.observe_worlds, n, args, device)

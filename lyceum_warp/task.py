@@ -324,6 +324,9 @@ class Task:
     far belong to the state, in its part ``success_steps``, where they count up to this number. A reset clears them."""
     lagged: ClassVar[tuple[str, ...]] = ()
     """Fields to read as ``mj_step`` leaves them, one substep behind the state, as some Gymnasium tasks do."""
+    cleared: ClassVar[tuple[str, ...]] = ()
+    """Fields left by the last substep, as forces, that are 0 at the beginning of an episode. Otherwise they are
+    computed there, which takes a forward pass of the worlds that restart. A reset clears them before ``initialize``."""
     memory: ClassVar[int] = 0
     """Number of floats in the field ``memory``, which the task writes in ``advance`` and which belongs to the state.
     ``World`` must list it as ``memory: Row[float]``. A reset clears it."""

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import flat, launch_rows, shared_rows, torch_view, with_memory
+from lyceum_warp.arrays import flat, launch_rows, launch_worlds, shared_rows, torch_view, with_memory
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
@@ -86,7 +86,9 @@ class Worlds:
         self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
         """Steps in a row with the goal met, up to ``success_steps``; without a column where one step is enough."""
         own = ("memory", "lasting_memory", "metric_sums", "success_counts")
-        self._zeros = {name: wp.zeros_like(getattr(self, name)) for name in own}
+        self._clearable = {name: getattr(self, name) for name in own}
+        self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}
+        self._zeros = wp.zeros(max(array.shape[1] for array in self._clearable.values()), dtype=float)
         # the fields of the state that a step leads to, live, and copies of those of the state before
         self.after, self.before = kernels.Batch(), kernels.Batch()
         self._copies: dict[str, wp.array] = {}
@@ -301,14 +303,14 @@ class Worlds:
     def act(self) -> None:
         """Keep the state that the step starts from, and turn actions into controls."""
         self.keep_before()
-        wp.launch(self.task.kernels.act, self.nworld, [
+        launch_worlds(self.task.kernels.act, self.nworld, [
             self.after, self.params, self.action, self.ranges, self.scale, self.counters, self.safe_action,
             self._action_fault, self.engine.ctrl,
-        ], device=self.device)  # fmt: skip
+        ], self.device)  # fmt: skip
 
     def _substep(self) -> None:
         args = [self.after, self.params]
-        wp.launch(self.task.kernels.substep_memory, self.nworld, args, device=self.device)
+        launch_worlds(self.task.kernels.substep_memory, self.nworld, args, self.device)
 
     def _judge_step(self) -> None:
         """Find faults, advance task memory, and judge the transition."""
@@ -322,17 +324,17 @@ class Worlds:
         """Advance task memory by one step."""
         if (advance := self.task.kernels.advance_memory) is not None:
             args = [self.before, self.after, self.params, self.safe_action, self.counters]
-            wp.launch(advance, self.nworld, args, device=self.device)
+            launch_worlds(advance, self.nworld, args, self.device)
 
     def _judge(
         self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, keep_reason: bool = False
     ) -> None:
         """Reward, metrics, evaluation, ends and observations of the masked worlds; see ``kernels.steps``."""
-        wp.launch(self.task.kernels.judge, self.nworld, [
+        launch_worlds(self.task.kernels.judge, self.nworld, [
             mask, self.before, self.after, self.params, self.safe_action, self.counters, self.horizon, transition,
             keep_reason, fault, action_fault, self.outcome, self.metric_sums, self.obs, self.final_obs,
             self.restarting,
-        ], device=self.device)  # fmt: skip
+        ], self.device)  # fmt: skip
         self._hold_success(mask, transition=transition)
 
     def _hold_success(self, mask: wp.array, *, transition: bool) -> None:
@@ -344,18 +346,19 @@ class Worlds:
     def _restart(self, mask: wp.array, *, randomly: bool, again: bool = False) -> None:
         """Put the masked worlds into an initial state of the task."""
         self.engine.reset(mask)
-        self._clear(mask, "memory", *([] if again else ["metric_sums", "success_counts"]))
+        self._clear(mask, "memory", *self.task.task.cleared, *([] if again else ["metric_sums", "success_counts"]))
         if self.task.kernels.reject_worlds is not None:  # a rejected draw changes nothing else
             kept, live = self._lasting_before, self.lasting_memory
             launch_rows(state.copy_rows, mask, *((kept, live) if again else (live, kept)))
         self._make_nominal(mask, self.task.reset_dynamics)
         args = [mask, randomly, again, self.after, self.params, self.counters]
-        wp.launch(self.task.kernels.restart, self.nworld, args, device=self.device)
+        launch_worlds(self.task.kernels.restart, self.nworld, args, self.device)
         self.engine.commit(mask)
 
     def _clear(self, mask: wp.array, *names: str) -> None:
         for name in names:
-            launch_rows(state.copy_rows, mask, self._zeros[name], getattr(self, name))
+            if (array := self._clearable[name]).size:
+                launch_rows(state.fill_rows, mask, self._zeros[: array.shape[1]], array)
 
     def _make_nominal(self, mask: wp.array, names: Iterable[str]) -> None:
         """Give model fields of the masked worlds their nominal values."""
@@ -371,7 +374,7 @@ class Worlds:
                 return
             self.engine.refresh(self._drawing)
             args = [self._drawing, self.after, self.params, self._drawing]
-            wp.launch(self.task.kernels.reject_worlds, self.nworld, args, device=self.device)
+            launch_worlds(self.task.kernels.reject_worlds, self.nworld, args, self.device)
             self._restart(self._drawing, randomly=True, again=True)
             if self.task.reset_dynamics:
                 self.engine.apply_model(self._drawing)
@@ -383,9 +386,9 @@ class Worlds:
         drawn = {name: self.engine.arrays[name] for name in self._model_copies}
         for name, array in (live | drawn).items():
             wp.copy(self._before_event(name), array)
-        wp.launch(self.task.kernels.run_events, self.nworld, [
+        launch_worlds(self.task.kernels.run_events, self.nworld, [
             self.restarting, self.after, self.params, self.counters, self._going_on, self._moved, self.changed,
-        ], device=self.device)  # fmt: skip
+        ], self.device)  # fmt: skip
         for name, array in (live | drawn).items():
             self._mark_changes(self._before_event(name), array, self.changed if name in MEMORIES else self._moved)
         wp.launch(steps.merge_masks, self.nworld, [self._moved, self.changed], device=self.device)
@@ -403,7 +406,7 @@ class Worlds:
     def _observe(self, mask: wp.array) -> None:
         """Observe the masked worlds; the others were observed when they were judged."""
         args = [mask, self.after, self.params, self.counters, self.final_obs, self.obs]
-        wp.launch(self.task.kernels.observe_worlds, self.nworld, args, device=self.device)
+        launch_worlds(self.task.kernels.observe_worlds, self.nworld, args, self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Observe and judge the states of the masked worlds, without a transition."""
@@ -458,7 +461,7 @@ class Worlds:
         self._make_nominal(self.mask, [field.name for field in self.task.dynamics])
         if self.task.kernels.start_worlds is not None:
             args = [self.mask, self.after, self.params, self.counters]
-            wp.launch(self.task.kernels.start_worlds, self.nworld, args, device=self.device)
+            launch_worlds(self.task.kernels.start_worlds, self.nworld, args, self.device)
         if self.task.dynamics:
             self.engine.apply_model(self.mask)
 

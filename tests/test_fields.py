@@ -74,6 +74,13 @@ def test_a_field_names_the_stage_that_makes_it_current(
     assert (field.refresh, field.reset, field.snapshot) == (refresh, reset, snapshot)
 
 
+def test_a_cleared_field_needs_no_stage_after_a_reset(model: mujoco.MjModel) -> None:
+    assert describe(model, "qacc", cleared=True).reset == Stage.NONE
+    for name in ("qpos", "xpos", "sensordata"):
+        with pytest.raises(ValueError, match=f"the field '{name}' cannot be cleared: it belongs to the current state"):
+            describe(model, name, cleared=True)
+
+
 def test_every_field_is_one_of_mujocos(model: mujoco.MjModel) -> None:
     for name in (*STATE_FIELDS, *DERIVED_FIELDS):
         assert hasattr(mujoco.MjData(model), name)

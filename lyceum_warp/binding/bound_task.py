@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from lyceum_warp.arrays import launch_worlds
 from lyceum_warp.binding import models
 from lyceum_warp.binding.codegen import kernels_of
 from lyceum_warp.binding.functions import TaskSource
@@ -168,7 +169,7 @@ class BoundTask:
         self.timestep: float = self.model.opt.timestep * self.frame_skip
         inputs = self.writes.get("control", frozenset())
         self.fields: list[Field] = [
-            describe(self.model, name, lagged=name in task.lagged, written=name in inputs)
+            describe(self.model, name, lagged=name in task.lagged, cleared=name in task.cleared, written=name in inputs)
             for name in dict.fromkeys([*own, "time", "ctrl"])
         ]
         """The fields that the engine keeps: the task's own, further ones, time and controls."""
@@ -270,9 +271,10 @@ class BoundTask:
                 f"{task.keyframe!r}"
             )
         self._check_metrics()
-        for name in task.lagged:
-            if name not in self.types:
-                raise ValueError(f"the task {self.name!r} wants {name!r} lagged but does not list it in World")
+        for kind in ("lagged", "cleared"):
+            for name in getattr(task, kind):
+                if name not in self.types:
+                    raise ValueError(f"the task {self.name!r} wants {name!r} {kind} but does not list it in World")
         for name in ("obs", "model"):
             if not hasattr(task, name) and (name == "obs" or model is None):
                 raise ValueError(f"the task {self.name!r} has no {name}: add {_MISSING[name]} to its class")
@@ -420,7 +422,7 @@ class BoundTask:
         last = 0
         for unwritten in (math.nan, _UNWRITTEN):
             row = wp.full((1, size + _SPARE), unwritten, dtype=float, device=params.device)
-            wp.launch(kernel, 1, [batch, params, action, row], device=params.device)
+            launch_worlds(kernel, 1, [batch, params, action, row], params.device)
             written = np.flatnonzero(_is_written(row.numpy()[0], unwritten))
             last = max(last, int(written.max(initial=-1)) + 1)
         return last
@@ -434,7 +436,7 @@ class BoundTask:
             rows = self.kernels.Observations()
             for group, size in sizes.items():
                 setattr(rows, group, wp.full((1, size + _SPARE), unwritten, dtype=float, device=device))
-            wp.launch(self.kernels.observe_worlds, 1, [mask, batch, params, counters, rows, rows], device=device)
+            launch_worlds(self.kernels.observe_worlds, 1, [mask, batch, params, counters, rows, rows], device)
             found = {group: getattr(rows, group).numpy()[0] for group in sizes}
             for group, row in found.items():
                 written[group] |= _is_written(row, unwritten)

@@ -5,7 +5,7 @@ servos away from the default pose. Joints and feet are in the order FR, FL, RR, 
 
 Functions read the state after the last substep, while mjlab's rewards read velocities, orientations and contacts of the
 substep before, and heights of feet of the step before. Only the forces on the feet are those of the last substep's
-beginning, as for every task. Feet are spheres on a plane: one touches it where its centre is within its radius.
+beginning, as for every task, and 0 when an episode begins. Feet are spheres on a plane: one touches it where its centre is within its radius.
 A reward that is not finite is a fault; mjlab counts such a term as 0.
 """
 
@@ -171,20 +171,17 @@ def foot(s: World, p: Params, leg: int) -> tuple[wp.vec3, wp.vec3]:
 
 
 @wp.func
-def height(s: World, p: Params, leg: int) -> float:  # of the foot's centre; mjlab's rays end after 1 m
-    x, _ = foot(s, p, leg)
+def height(x: wp.vec3) -> float:  # of a foot's centre; mjlab's rays end after 1 m
     return wp.clamp(x[2], 0.0, 1.0)
 
 
 @wp.func
-def speed(s: World, p: Params, leg: int) -> float:  # of the foot along the floor
-    _, v = foot(s, p, leg)
+def speed(v: wp.vec3) -> float:  # of a foot along the floor
     return wp.length(wp.vec2(v[0], v[1]))
 
 
 @wp.func
-def touches(s: World, p: Params, leg: int) -> bool:
-    x, _ = foot(s, p, leg)
+def touches(x: wp.vec3, s: World, p: Params) -> bool:
     return x[2] <= s.geom_size[p.fr_foot][0]
 
 
@@ -203,7 +200,8 @@ def force(s: World, p: Params, leg: int) -> wp.vec3:
 @wp.func
 def substep(s: World, p: Params):
     for leg in range(4):
-        touching = touches(s, p, leg)
+        x, _ = foot(s, p, leg)
+        touching = touches(x, s, p)
         s.memory[CONTACT_TIME + leg] = wp.where(touching, s.memory[CONTACT_TIME + leg] + p.substep_dt, 0.0)
         s.memory[AIR_TIME + leg] = wp.where(touching, 0.0, s.memory[AIR_TIME + leg] + p.substep_dt)
 
@@ -308,9 +306,10 @@ def observe(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):
 def observe_critic(s: World, p: Params, obs: Row[float]):
     k = put_robot(s, p, obs, 0.0)
     for leg in range(4):
-        obs[k + leg] = height(s, p, leg)
+        x, _ = foot(s, p, leg)
+        obs[k + leg] = height(x)
         obs[k + 4 + leg] = s.memory[AIR_TIME + leg]
-        obs[k + 8 + leg] = wp.where(touches(s, p, leg), 1.0, 0.0)
+        obs[k + 8 + leg] = wp.where(touches(x, s, p), 1.0, 0.0)
         f = force(s, p, leg)
         for i in range(3):
             obs[k + 12 + 3 * leg + i] = wp.sign(f[i]) * wp.log(1.0 + wp.abs(f[i]))
@@ -372,7 +371,8 @@ def action_rate_l2(s0: World, action: Row[float]) -> float:
 def foot_clearance(s0: World, s1: World, p: Params) -> float:
     total = float(0.0)
     for leg in range(4):
-        total += wp.abs(height(s1, p, leg) - p.foot_height) * speed(s1, p, leg)
+        x, v = foot(s1, p, leg)
+        total += wp.abs(height(x) - p.foot_height) * speed(v)
     return total * active(s0, p)
 
 
@@ -390,8 +390,9 @@ def foot_swing_height(s0: World, s1: World, p: Params) -> float:
 def foot_slip(s0: World, s1: World, p: Params) -> float:
     total = float(0.0)
     for leg in range(4):
-        if touches(s1, p, leg):
-            total += speed(s1, p, leg) * speed(s1, p, leg)
+        x, v = foot(s1, p, leg)
+        if touches(x, s1, p):
+            total += speed(v) * speed(v)
     return total * active(s0, p)
 
 
@@ -462,10 +463,11 @@ def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uin
     s1.lasting_memory[ENV_STEPS] = s0.lasting_memory[ENV_STEPS] + 1.0
     for leg in range(4):
         peak = s0.lasting_memory[PEAK_HEIGHT + leg]
+        x, _ = foot(s1, p, leg)
         if landed(s1.memory[CONTACT_TIME + leg], p):
             peak = 0.0
-        elif not touches(s1, p, leg):
-            peak = wp.max(peak, height(s1, p, leg))
+        elif not touches(x, s1, p):
+            peak = wp.max(peak, height(x))
         s1.lasting_memory[PEAK_HEIGHT + leg] = peak
 
 
@@ -554,4 +556,5 @@ class Go1Velocity(lw.Task):
         "velocity_error",
         "yaw_rate_error",
     )
+    cleared = ("sensordata",)  # no substep has been made; mjlab computes them for the first state
     memory, lasting_memory = 28, 17

@@ -1,9 +1,8 @@
 """Rules about what a task may have beside an observation and a reward: groups, noise, metrics, memory and events."""
 
 import torch
-import warp as wp
 
-from lyceum_warp.arrays import torch_view
+from lyceum_warp.arrays import launch_worlds, torch_view
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import steps
@@ -211,7 +210,7 @@ def check_substep(ctx: Context) -> None:
             start(state, action)
             for _ in range(a.task.frame_skip):
                 b.engine.step(1)
-                wp.launch(substep, b.nworld, [b.worlds.after, b.worlds.params], device=b.device)
+                launch_worlds(substep, b.nworld, [b.worlds.after, b.worlds.params], b.device)
             b.worlds.advance_memory()
             found = b.get_state()
             for columns in memory:

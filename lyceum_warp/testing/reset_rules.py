@@ -4,7 +4,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import torch_view
+from lyceum_warp.arrays import launch_worlds, torch_view
 from lyceum_warp.testing.context import Context
 from lyceum_warp.testing.physics_rules import check_closer, predicted
 
@@ -56,7 +56,7 @@ def check_rejection(ctx: Context) -> None:
             ctx.that((count >= 1).all() and (count <= task.draws).all(), f"reset {i} took {count.tolist()} draws")
             if not task.settle:
                 args = [a.worlds.everyone, a.worlds.after, a.worlds.params, rejected]
-                wp.launch(reject, a.nworld, args, device=a.device)
+                launch_worlds(reject, a.nworld, args, a.device)
                 bad = torch_view(rejected).cpu() & (count < task.draws)
                 ctx.that(not bad.any(), f"reset {i} kept a rejected state after {count.tolist()} draws")
             alone = torch.arange(a.nworld, device=a.obs.device) == i % a.nworld

@@ -27,6 +27,7 @@ def bound(file: Path, **options: Any) -> BoundTask:
         ("obs = 10", "obs of the task 'tiny' is 10: add the parts of its observation"),
         ("memory = 1", "the task 'tiny' needs both, memory = ... in the class and memory in World"),
         ("lagged = ('qvel',)", "the task 'tiny' wants 'qvel' lagged but does not list it in World"),
+        ("cleared = ('qacc',)", "the task 'tiny' wants 'qacc' cleared but does not list it in World"),
         ("frame_skip = 0", "frame_skip of the task 'tiny' must be a whole number from 1 to .*, not 0"),
         *(
             (

@@ -98,6 +98,27 @@ def test_lagged_fields_belong_to_the_new_state_after_a_reset(file: Path, engine:
     torch.testing.assert_close(env.obs[:, :2], torch.full((2, 2), 0.5))
 
 
+CLEARED = TASK.replace('lagged = ("sensordata",)', 'lagged = cleared = ("sensordata",)').replace("Filtered", "Cleared")
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_cleared_fields_are_zero_when_an_episode_begins(task_file: TaskFile, engine: str) -> None:
+    env = lw.make(task_file("cleared.py", CLEARED), engine=engine, nworld=2)
+    assert torch.equal(env.obs[:, :2], torch.tensor([[0.5, 0.0]] * 2))
+    for _ in range(6):
+        env.step(torch.ones(2, 1))
+        assert env.done.any() or env.obs[:, 1].all()
+    assert env.truncated.all() and env.final_obs[:, 1].all()
+    assert torch.equal(env.obs[:, :2], torch.tensor([[0.5, 0.0]] * 2))
+    state = env.get_state()
+    env.step(torch.ones(2, 1))
+    stepped = env.obs.clone()
+    env.set_state(state)
+    assert torch.equal(env.obs[:, :2], torch.tensor([[0.5, 0.0]] * 2))
+    env.step(torch.ones(2, 1))
+    assert torch.equal(env.obs, stepped)
+
+
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_controls_are_saved_and_reset_with_the_state(file: Path, engine: str) -> None:
     """A filtering control continues from restored controls, and starts from zero after a reset."""

@@ -48,6 +48,16 @@ def test_observations_equal_their_formulas(shared_env: SharedEnv) -> None:
         assert s.heading_controlled.any() and s.standing.any() and 0.1 < s.touching.mean() < 0.9
 
 
+def test_forces_are_zero_until_the_first_substep(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=NWORLD)
+    roll_out(env, 20)
+    env.rand_reset()
+    assert not env.field("sensordata").any() and not env.obs_groups["critic"][:, -12:].any()
+    for _ in range(10):
+        roll_out(env, 1, 0.0)
+    assert (env.field("sensordata")[:, 2::3].abs() > 1.0).any(dim=1).float().mean() > 0.9  # standing on their feet
+
+
 def test_noise_of_the_policys_observations_is_uniform_and_the_critic_has_none(shared_env: SharedEnv) -> None:
     env = shared_env("go1_velocity", nworld=1000)
     roll_out(env, 2)
