@@ -5,7 +5,8 @@ servos away from the default pose. Joints and feet are in the order FR, FL, RR, 
 
 Functions read the state after the last substep, while mjlab's rewards read velocities, orientations and contacts of the
 substep before, and heights of feet of the step before. Only the forces on the feet are those of the last substep's
-beginning, as for every task, and 0 when an episode begins. Feet are spheres on a plane: one touches it where its centre is within its radius.
+beginning, as for every task, and 0 when an episode begins. Feet are spheres on a plane: one touches it where its centre
+is within its radius.
 A reward that is not finite is a fault; mjlab counts such a term as 0.
 """
 
