@@ -1,21 +1,23 @@
-"""Seconds until rsl_rl's PPO, through the adapter, first reaches given mean rewards.
+"""Seconds until rsl_rl's PPO, through the adapter, or NPG first reaches given mean rewards.
 
-python bench/ppo.py go1_velocity --device cuda --nworld 4096 --targets 20 40 50 60 70 75 80 --seeds 42 43 44 \\
-    --out bench/results/ppo-go1_velocity-h200.csv
+python bench/time_to_reward.py go1_velocity --device cuda --nworld 4096 --targets 20 40 50 60 70 75 80 \\
+    --seeds 42 43 44 --ppo.captured-update --out bench/results/ppo-go1_velocity-h200.csv
+python bench/time_to_reward.py go1_velocity --algorithm npg --npg.gamma 0.99 --npg.lam 0.95 ...
 
 The mean reward is the mean return of the last 100 episodes that ended, as rsl_rl prints it, but without the worlds'
 first episodes, which begin at a random step. The clock runs from the first rollout on. It counts captures of graphs,
-sampling, updates and the statistics; it does not count the compilation of kernels, for which a learner with two worlds
-runs before, nor the evaluations of the mean policy (--config.mean-every), which are off unless asked for.
+sampling, updates and the statistics, but not the compilation of kernels, for which a learner with few worlds runs
+before, nor the evaluations of the mean policy (--ppo.mean-every, --npg.mean-every), which are off unless asked for.
 """
 
+import collections
 import csv
 import dataclasses
 import gc
 import statistics
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import measurements
 import torch
@@ -25,17 +27,22 @@ from rich.table import Table
 
 import lyceum_warp as lw
 from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
-from lyceum_warp.adapters.rsl_rl_learner import RslRlIteration, RslRlLearner
+from lyceum_warp.adapters.rsl_rl_learner import RslRlLearner
+from lyceum_warp.checkpoints import policy_content, serialized
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Seconds to mean rewards by rsl_rl's PPO."""
+    """Seconds to mean rewards."""
 
     task: tyro.conf.Positional[str]
     """Task: a name, or a file."""
-    config: RslRlConfig = dataclasses.field(default_factory=lambda: RslRlConfig(mean_every=0))
-    """Hyperparameters."""
+    algorithm: Literal["rsl-rl", "npg"] = "rsl-rl"
+    """Algorithm."""
+    ppo: RslRlConfig = dataclasses.field(default_factory=lambda: RslRlConfig(mean_every=0))
+    """Hyperparameters of rsl_rl's PPO."""
+    npg: lw.NPGConfig = dataclasses.field(default_factory=lambda: lw.NPGConfig(mean_every=0))
+    """Hyperparameters of NPG."""
     targets: tuple[float, ...] = ()
     """Mean rewards; a run ends at the largest one."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -71,7 +78,7 @@ class Result:
     sampling: float
     """Seconds of sampling."""
     update: float
-    """Seconds of updates."""
+    """Seconds of updates and statistics."""
     last: float
     """The mean reward at the end."""
 
@@ -81,47 +88,50 @@ KEPT = ("seed", "iteration", "samples", "seconds", "return_recent", "return_mean
 """Columns of the table."""
 
 
-def learner(options: Options, seed: int, nworld: int) -> RslRlLearner:
+RECENT = 100
+"""Episodes in the mean reward."""
+
+
+def learner(options: Options, seed: int, nworld: int) -> RslRlLearner | lw.NPG:
     env = lw.make(options.task, nworld=nworld, seed=seed, device=options.device, engine=options.engine)
-    return RslRlLearner(env, config=options.config, seed=seed)
+    if options.algorithm == "npg":
+        return lw.NPG(env, config=options.npg, seed=seed)
+    return RslRlLearner(env, config=options.ppo, seed=seed)
 
 
 def run(options: Options, seed: int) -> tuple[Result, list[dict[str, Any]]]:
     """One run; returns its result and its iterations."""
     made = learner(options, seed, options.nworld)
     rows: list[dict[str, Any]] = []
-    its: list[RslRlIteration] = []
+    recent: collections.deque[float] = collections.deque(maxlen=RECENT)
     seconds = 0.0
     reached: dict[str, tuple[float, int] | None] = {f"{target:g}": None for target in options.targets}
     while len(rows) < options.iterations and (options.seconds is None or seconds < options.seconds):
         start = time.perf_counter()
         it = next(made)  # it ends with a copy to the host, so that the device has done its work
         seconds += time.perf_counter() - start - it.time_mean
-        its.append(it)
-        rows.append(it.row() | {"seed": seed, "seconds": seconds})
+        returns = made.rollout.episode_return[made.rollout.done]
+        recent.extend(returns[~returns.isnan()][-RECENT:].tolist())
+        mean = statistics.fmean(recent) if recent else float("nan")
+        rows.append(it.row() | {"seed": seed, "seconds": seconds, "return_recent": mean})
         for target in options.targets:
-            if it.return_recent >= target and reached[f"{target:g}"] is None:
+            if mean >= target and reached[f"{target:g}"] is None:
                 reached[f"{target:g}"] = seconds, it.samples
         if options.targets and all(reached.values()):
             break
     if options.keep is not None:
-        save(made, options.keep / f"{seed}.pt")
-    sums = sum(it.time_sample for it in its), sum(it.time_update for it in its)
-    return Result(seed, reached, len(rows), made.samples, seconds, *sums, its[-1].return_recent), rows
-
-
-def save(made: RslRlLearner, path: Path) -> None:
-    """A file with the policy and the value function, as lw.load reads it."""
-    from lyceum_warp.checkpoints import policy_content, serialized
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(serialized(policy_content(made.iteration, made.policy, made.value)))
+        path = options.keep / f"{seed}.pt"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(serialized(policy_content(made.iteration, made.policy, made.value)))
+    sampling = sum(row["time_sample"] for row in rows)
+    last = rows[-1]["return_recent"]
+    return Result(seed, reached, len(rows), made.samples, seconds, sampling, seconds - sampling, last), rows
 
 
 def main(options: Options) -> None:
     torch.set_num_threads(options.threads)
     # kernels and libraries; at least as many worlds as fill the mini-batches
-    next(learner(options, 0, max(2, options.config.num_mini_batches)))
+    next(learner(options, 0, max(2, options.ppo.num_mini_batches)))
     console, results, rows = Console(width=130), [], []
     for seed in options.seeds:
         gc.collect()
