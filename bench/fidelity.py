@@ -1,0 +1,558 @@
+"""Fidelity: how long trajectories of the two engines stay together, and what the same policy earns on each.
+
+    lyceum-warp bench fidelity --device cuda
+    lyceum-warp bench fidelity --tasks hopper --policy runs/hopper-20260101-120000
+
+Divergence. Worlds of both engines begin in the same states, every number one of float32, and get the same actions. The
+C engine (float64) is the reference of three others: the Warp engine (float32), the C engine with its state rounded to
+float32 after every step, and the C engine whose positions and velocities were moved once, at the start, by at most the
+rounding of a float32 number. Those two are the unit: an engine is as faithful as its precision allows where its
+trajectories stay with the reference for as long as theirs do. The differences of a world are its largest ones, of
+observations and rewards relative to the larger of 1 and the number, of positions absolute. Contact forces in
+observations, which a solver finds only to its tolerance, are left out. Worlds go on after the end of their episode, and
+leave the comparison after a fault.
+
+With pyramidal friction cones, MuJoCo Warp chooses other tangents than MuJoCo where a capsule lies on a plane. Such
+tasks are compared with elliptic cones, too, which do not depend on the tangents.
+
+Returns. Each engine runs whole episodes of a policy from the same states with the same random streams. The difference
+of an episode's returns is paired; intervals are 95 % percentile intervals of a bootstrap over the episodes. The
+episodes from the moved states say how far returns differ by chance.
+"""
+
+import dataclasses
+import functools
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import experiment
+import numpy as np
+import torch
+from experiment import Experiment, Row, Skipped, Table
+from matplotlib.figure import Figure
+
+import lyceum_warp as lw
+from lyceum_warp.done import FAULTS
+from lyceum_warp.runs import Run
+from lyceum_warp.spaces import COUNTERS
+from lyceum_warp.validate import positive_number, whole_number
+from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure
+
+ZERO, RANDOM, TRAINED = "zero", "random", "trained"
+OWN, ELLIPTIC = "own", "elliptic"
+
+ALREADY_ELLIPTIC = ("aloha_lift", "arm_hand_pickup", "go1_velocity", "panda_lift", "soft_ball")
+"""Tasks whose own friction cones are elliptic."""
+
+STEPS = (1, 2, 3, 5, 7, 10, 14, 20, 30, 50, 70, 100, 140, 200, 300, 500, 700, 1000)
+"""Steps at which differences are kept."""
+
+SETTLING = 20
+"""Steps under random actions that lead to the states at the start, so that there are contacts."""
+
+ROUNDING = 2.0**-24
+"""Largest relative error of a number that is rounded to float32."""
+
+FORCES = ("contact_force",)
+"""Parts of observations that are left out."""
+
+PAIRS = {"engines": "Warp engine", "rounded": "C engine, state rounded to float32", "moved": "C engine, start moved"}
+"""What is compared with the C engine."""
+
+COST = {
+    "adroit_door": (1, 1),
+}
+"""Microseconds of a world's step on two cores: C engine, Warp engine on the CPU."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(experiment.Options):
+    """Agreement of the engines."""
+
+    policy: Path | None = None
+    """Folder of a run, whose mean policy acts in its task, too."""
+    steps: int = 1000
+    """Steps over which trajectories are compared, at most those of an episode."""
+    nworld: int = 256
+    """Worlds, and episodes of a policy."""
+    iterations: int = 50
+    """NPG's iterations of 10,000 samples for the trained policies; 0 for none."""
+    tolerance: float = 0.01
+    """Difference of observations from which on two trajectories count as apart."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Divergence:
+    """Trajectories from the same states under the same actions."""
+
+    task: str
+    actions: str
+    """Who acts, in the C engine's worlds: random, trained, or the folder of a run."""
+    cone: str
+    nworld: int
+    steps: int
+    tolerance: float
+    iterations: int
+    device: str
+    seed: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Returns:
+    """Episodes of a policy from the same states."""
+
+    task: str
+    policy: str
+    """zero, random, trained, or the folder of a run."""
+    episodes: int
+    iterations: int
+    device: str
+    seed: int
+
+
+Case = Divergence | Returns
+
+
+def cases(options: Options) -> list[Case]:
+    tasks = experiment.choose(options.tasks, lw.task_names(), ("hopper",) if options.short else (), what="task")
+    own = {} if options.policy is None else {Run.open(options.policy).task_name: str(options.policy)}
+    if own.keys() - set(tasks):
+        raise ValueError(f"the policy of {options.policy} acts in {next(iter(own))}, which is not among the tasks")
+    nworld, steps = (whole_number(f"--{name}", getattr(options, name), low=1) for name in ("nworld", "steps"))
+    iterations = whole_number("--iterations", options.iterations, low=0)
+    positive_number("--tolerance", options.tolerance, "of observations")
+    if options.short:
+        nworld, steps, iterations = min(nworld, 8), min(steps, 20), 0
+    trained = (TRAINED,) if iterations else ()
+    found: list[Case] = []
+    for seed in options.seeds or (0,):
+        for task in tasks:
+            learnt = (*trained, *([own[task]] if task in own else []))
+            variants = [(RANDOM, OWN), *((RANDOM, ELLIPTIC) for _ in [0] if task not in ALREADY_ELLIPTIC)]
+            variants += [(policy, OWN) for policy in learnt]
+            found += [
+                Divergence(task, actions, cone, nworld, steps, options.tolerance,
+                           iterations if actions == TRAINED else 0, options.device, seed)
+                for actions, cone in variants
+            ]  # fmt: skip
+            found += [
+                Returns(task, policy, nworld, iterations if policy == TRAINED else 0, options.device, seed)
+                for policy in (ZERO, RANDOM, *learnt)
+            ]
+    return found
+
+
+def estimate(case: Case) -> float:
+    c, warp = COST.get(case.task, (100.0, 1000.0))
+    if isinstance(case, Divergence):
+        steps = case.nworld * min(case.steps, _horizon(case.task))
+        times = 3.5  # the reference, those moved and rounded, and their states
+    else:
+        steps, times = case.episodes * _horizon(case.task), 2.0
+    on_gpu = 5e-3 * steps / (case.nworld if isinstance(case, Divergence) else case.episodes)
+    slow = on_gpu if case.device.startswith("cuda") else 1e-6 * warp * steps
+    return 10.0 + slow + 1e-6 * c * (times * steps + 10_000 * case.iterations) + 0.3 * case.iterations
+
+
+def _horizon(task: str) -> int:
+    from lyceum_warp.binding.registry import find_task
+
+    return find_task(task).horizon
+
+
+# worlds and policies
+
+
+def make(case: Case, options: Options, **words: Any) -> lw.Env:
+    """Worlds of the case's task, on the C engine if nothing else is said.
+
+    Raises:
+        Skipped: The package that brings the task's model is not installed.
+    """
+    words = {"engine": "mujoco", "seed": case.seed} | words
+    if words["engine"] == "mujoco":
+        words["nthread"] = options.threads
+    if isinstance(case, Divergence) and case.cone != OWN:
+        words["cone"] = case.cone
+    try:
+        return lw.make(case.task, **words)
+    except (FileNotFoundError, ImportError) as error:
+        raise Skipped(f"{case.task}: {error}") from error
+
+
+Policy = Callable[[torch.Tensor], torch.Tensor]
+
+
+def policy_of(name: str, case: Case, env: lw.Env, options: Options) -> Policy:
+    """What acts: called with observations on the CPU, (nworld, nobs), returns actions, (nworld, nact), there."""
+    if name == ZERO:
+        return lambda obs: torch.zeros(len(obs), env.action_space.size)
+    if name == RANDOM:
+        low, high = bounds(env)
+        generator = torch.Generator().manual_seed(case.seed)
+        return lambda obs: low + (high - low) * torch.rand(len(obs), len(low), generator=generator)
+    if name == TRAINED:
+        return trained(case.task, case.iterations, case.seed, options.threads)
+    return lw.load(name)
+
+
+def bounds(env: lw.Env) -> tuple[torch.Tensor, torch.Tensor]:
+    """Least and greatest actions; -1 and 1 where there are no bounds."""
+    space = env.action_space
+    low = np.full(space.shape, -np.inf) if space.low is None else space.low
+    high = np.full(space.shape, np.inf) if space.high is None else space.high
+    finite = np.nan_to_num(low, neginf=-1.0), np.nan_to_num(high, posinf=1.0)
+    return torch.from_numpy(finite[0]).float(), torch.from_numpy(finite[1]).float()
+
+
+@functools.cache
+def trained(task: str, iterations: int, seed: int, threads: int | None) -> lw.GaussianPolicy:
+    """A policy after some iterations of NPG on the C engine."""
+    with torch.enable_grad():
+        learner = lw.NPG(lw.make(task, engine="mujoco", nworld=64, nthread=threads, seed=seed), seed=seed)
+        for _ in range(iterations):
+            next(learner)
+    return learner.policy.requires_grad_(False)
+
+
+def start(env: lw.Env, policy: Policy, seed: int, steps: int) -> torch.Tensor:
+    """States after some steps from random initial ones, rounded to float32 (counters excepted)."""
+    env.rand_reset(seed)
+    for _ in range(steps):
+        env.step(policy(env.obs))
+    return rounded(env, env.get_state())
+
+
+def rounded(env: lw.Env, state: torch.Tensor) -> torch.Tensor:
+    """States with every number, but for the counters, one of float32."""
+    near = state.float().double()
+    for name in COUNTERS:
+        if (part := env.state_space.parts.get(name)) is not None:
+            near[:, part] = state[:, part]
+    return near
+
+
+def moved(env: lw.Env, state: torch.Tensor, seed: int) -> torch.Tensor:
+    """States with positions and velocities moved by at most the rounding of float32, of 1 or of the number."""
+    generator, near = torch.Generator().manual_seed(seed), state.clone()
+    for name in ("qpos", "qvel"):
+        values = near[:, env.state_space.parts[name]]
+        draws = 2.0 * torch.rand(values.shape, generator=generator, dtype=torch.float64) - 1.0
+        values += ROUNDING * draws * values.abs().clamp(min=1.0)
+    return near
+
+
+def faulty(env: lw.Env) -> torch.Tensor:
+    return (env.done_reason & int(FAULTS) != 0).cpu()
+
+
+def step(env: lw.Env, action: torch.Tensor) -> float:
+    """One step; returns its seconds, up to the moment at which observations are on the CPU."""
+    began = time.perf_counter()
+    env.step(action.to(env.action.device))
+    env.obs.cpu()
+    return time.perf_counter() - began
+
+
+# divergence
+
+
+def divergence(case: Divergence, options: Options) -> dict[str, Any]:
+    first = make(case, options, nworld=case.nworld)
+    actor = policy_of(case.actions, case, first, options)
+    state = start(first, actor, case.seed, SETTLING)
+    steps = min(case.steps, first.horizon or case.steps)
+    c = first.replicate(autoreset=False, horizon=0)
+    endless = {"nworld": case.nworld, "autoreset": False, "horizon": 0}
+    others = {
+        "engines": make(case, options, engine="warp", device=case.device, **endless),
+        "rounded": c.replicate(),
+        "moved": c.replicate(),
+    }
+    c.set_state(state)
+    for name, env in others.items():
+        given = moved(env, state, case.seed) if name == "moved" else state
+        env.set_state(given.to(env.obs.device))
+    compared = torch.ones(c.obs_space.size, dtype=torch.bool)
+    for name in FORCES:
+        if (part := c.obs_space.parts.get(name)) is not None:
+            compared[part] = False
+    qpos = c.state_space.parts["qpos"]
+    quantities = ("obs", "reward", "qpos")
+    errors = {name: {what: torch.full((steps, case.nworld), torch.nan) for what in quantities} for name in others}
+    good = {name: torch.ones(case.nworld, dtype=torch.bool) for name in others}
+    ends = {name: torch.full((case.nworld,), steps) for name in ("c", *others)}
+    seconds = dict.fromkeys(("c", *others), 0.0)
+    bad = torch.zeros(case.nworld, dtype=torch.bool)
+    for t in range(steps):
+        action = actor(c.obs)
+        seconds["c"] += step(c, action)
+        bad |= faulty(c)
+        mark_ends(ends["c"], c, t)
+        positions = c.get_state()[:, qpos]
+        for name, env in others.items():
+            seconds[name] += step(env, action)
+            good[name] &= ~faulty(env) & ~bad
+            mark_ends(ends[name], env, t)
+            after = env.get_state()
+            found = {
+                "obs": relative(env.obs.cpu(), c.obs)[:, compared].amax(1),
+                "reward": relative(env.reward.cpu(), c.reward),
+                "qpos": (after[:, qpos].cpu() - positions).abs().amax(1),
+            }
+            for what, error in found.items():
+                errors[name][what][t] = error.masked_fill(~good[name], torch.nan)
+            if name == "rounded":
+                env.set_state(rounded(env, after), check=False)
+    kept = [t for t in (*(t for t in STEPS if t < steps), steps)]
+    pairs = {
+        name: {
+            **{what: quantiles(error, kept) for what, error in errors[name].items()},
+            **apart(errors[name]["obs"], good[name], case.tolerance),
+            "same_end": mean(ends[name][good[name]] == ends["c"][good[name]]),
+            "faults": int((~good[name]).sum()),
+        }
+        for name in others
+    }
+    each = 1e6 / (steps * case.nworld)
+    return {
+        "steps": kept, "pairs": pairs,
+        "c_us": seconds["c"] * each, "warp_us": seconds["engines"] * each, "cone": str(c.model.opt.cone),
+    }  # fmt: skip
+
+
+def relative(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Difference, relative to the larger of 1 and the second number."""
+    return (a - b).abs() / b.abs().clamp(min=1.0)
+
+
+def mark_ends(ends: torch.Tensor, env: lw.Env, t: int) -> None:
+    """Write down the step of worlds that terminate for the first time."""
+    over = env.terminated.cpu()
+    ends[over] = ends[over].clamp(max=t)
+
+
+def quantiles(error: torch.Tensor, kept: Sequence[int]) -> dict[str, list[float | None]]:
+    """Median and 99 % quantile over worlds, after some numbers of steps."""
+    rows = error[[t - 1 for t in kept]].double()
+    found = {name: rows.nanquantile(q, dim=1).tolist() for name, q in (("median", 0.5), ("p99", 0.99))}
+    return {name: [value if math.isfinite(value) else None for value in values] for name, values in found.items()}
+
+
+def apart(error: torch.Tensor, good: torch.Tensor, tolerance: float) -> dict[str, Any]:
+    """After how many steps a tenth and half of the worlds are apart (None: they are together at the end)."""
+    beyond = error[:, good] > tolerance
+    never = len(error) + 1
+    first = torch.where(beyond.any(0), beyond.int().argmax(0) + 1, never).sort().values
+    found: dict[str, Any] = {}
+    for name, share in (("tenth_apart", 0.1), ("half_apart", 0.5)):
+        at = int(first[math.ceil(share * len(first)) - 1]) if len(first) else never
+        found[name] = None if at == never else at
+    return found | {"together": mean(first == never)}
+
+
+def mean(flags: torch.Tensor) -> float | None:
+    """Share of the flags that are set; None of none."""
+    return flags.double().mean().item() if len(flags) else None
+
+
+# returns
+
+
+def returns(case: Returns, options: Options) -> dict[str, Any]:
+    c = make(case, options, nworld=case.episodes, autoreset=False)
+    c.rand_reset(case.seed)
+    state = rounded(c, c.get_state())
+    warp = make(case, options, engine="warp", device=case.device, nworld=case.episodes, autoreset=False)
+    found: dict[str, Episodes] = {}
+    for name, env, given in (("c", c, state), ("moved", c, moved(c, state, case.seed)), ("warp", warp, state)):
+        env.set_state(given.to(env.obs.device))
+        found[name] = episodes(env, policy_of(case.policy, case, c, options))
+    good = ~(found["c"].fault | found["moved"].fault | found["warp"].fault)
+    if not good.any():
+        raise Skipped(f"{case.task}: every episode under {case.policy} had a fault")
+    values = {name: of.returns[good].numpy() for name, of in found.items()}
+    lengths = {name: of.lengths[good].double().mean().item() for name, of in found.items()}
+    success = {name: of.success[good].double().mean().item() for name, of in found.items()}
+    named = {name: interval(value, case.seed) for name, value in values.items()}
+    return {
+        **named,
+        "difference": interval(values["warp"] - values["c"], case.seed),
+        "chance": interval(values["moved"] - values["c"], case.seed),
+        "std": float(values["c"].std(ddof=1)) if len(values["c"]) > 1 else None,
+        "lengths": lengths,
+        "success": success if c.task.functions["success"] is not None else None,
+        "same_length": mean(found["warp"].lengths[good] == found["c"].lengths[good]),
+        "same_length_by_chance": mean(found["moved"].lengths[good] == found["c"].lengths[good]),
+        "episodes": int(good.sum()),
+        "faults": int((~good).sum()),
+    }
+
+
+@dataclasses.dataclass
+class Episodes:
+    """An episode of each world, on the CPU."""
+
+    returns: torch.Tensor
+    lengths: torch.Tensor
+    success: torch.Tensor
+    """Whether the goal was met at the end."""
+    fault: torch.Tensor
+
+
+def episodes(env: lw.Env, policy: Policy) -> Episodes:
+    """Run every world from its state to the end of its episode."""
+    nworld = env.nworld
+    total, success = torch.zeros(nworld, dtype=torch.float64), torch.zeros(nworld, dtype=torch.bool)
+    lengths, fault = torch.zeros(nworld, dtype=torch.long), torch.zeros(nworld, dtype=torch.bool)
+    running = torch.ones(nworld, dtype=torch.bool)
+    while running.any():
+        env.step(policy(env.obs.cpu()).to(env.action.device))
+        total += torch.where(running, env.reward.cpu().double(), 0.0)
+        lengths += running
+        fault |= running & faulty(env)
+        over = running & env.done.cpu()
+        success |= over & env.success.cpu()
+        running &= ~over
+    return Episodes(total, lengths, success, fault)
+
+
+def interval(values: np.ndarray, seed: int, draws: int = 10_000) -> list[float]:
+    """Mean, and the limits of its 95 % percentile interval from a bootstrap over the values."""
+    random = np.random.default_rng(seed)
+    means = values[random.integers(0, len(values), (draws, len(values)))].mean(axis=1)
+    return [float(values.mean()), *(float(q) for q in np.quantile(means, (0.025, 0.975)))]
+
+
+def measure(case: Case, options: Options) -> dict[str, Any]:
+    with torch.no_grad():
+        return divergence(case, options) if isinstance(case, Divergence) else returns(case, options)
+
+
+# tables and figure
+
+
+def tables(rows: Sequence[Row]) -> list[Table]:
+    trajectories, whole = split(rows)
+    found = []
+    if trajectories:
+        found.append(
+            Table(
+                "Differences of observations from the C engine's: median and 99 % over worlds after some steps; steps "
+                f"after which half of the worlds are apart by {trajectories[0].case['tolerance']:g}; episodes that end "
+                "in the same step. *Rounded* and *moved* are the C engine itself, with its state rounded to float32 "
+                "after every step, and with a start moved by the rounding of float32.",
+                ("task", "actions", "cone", "1 step", "10", "100", "half apart", "rounded", "moved", "same end",
+                 "faults"),
+                [divergence_cells(row) for row in trajectories],
+            )
+        )  # fmt: skip
+    if whole:
+        found.append(
+            Table(
+                "Mean returns of the same episodes on both engines, and means of the paired differences to the C "
+                "engine with 95 % intervals (bootstrap): the Warp engine's, and the C engine's from moved states.",
+                ("task", "policy", "episodes", "C engine", "Warp engine", "difference", "by chance"),
+                [returns_cells(row) for row in whole],
+            )
+        )
+    return found
+
+
+def split(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
+    """Rows of divergence, and rows of returns."""
+    return [row for row in rows if "actions" in row.case], [row for row in rows if "policy" in row.case]
+
+
+def divergence_cells(row: Row) -> list[str]:
+    engines, steps, at = row.result["pairs"]["engines"], row.result["steps"], []
+    for wanted in (1, 10, 100):
+        pair = [engines["obs"][name][steps.index(wanted)] if wanted in steps else None for name in ("median", "p99")]
+        at.append("" if None in pair else f"{pair[0]:.0e}, {pair[1]:.0e}")
+    half = [row.result["pairs"][name]["half_apart"] for name in PAIRS]
+    return [
+        row.case["task"], actor_name(row.case["actions"]), row.case["cone"], *at,
+        *(str(value) if value else f"> {steps[-1]}" for value in half),
+        "" if engines["same_end"] is None else f"{engines['same_end']:.0%}", str(engines["faults"]),
+    ]  # fmt: skip
+
+
+def returns_cells(row: Row) -> list[str]:
+    result = row.result
+    spread = [f"{result[name][0]:+.3g} ({result[name][1]:+.3g} to {result[name][2]:+.3g})"
+              for name in ("difference", "chance")]  # fmt: skip
+    means = (f"{result[name][0]:.5g}" for name in ("c", "warp"))
+    return [row.case["task"], actor_name(row.case["policy"]), str(result["episodes"]), *means, *spread]
+
+
+def actor_name(name: str) -> str:
+    """A policy's name, or the last part of the path of its run."""
+    return Path(name).name
+
+
+def figure(rows: Sequence[Row]) -> Figure:
+    """Differences of observations over the steps, one panel a task: medians, and 99 % of the engines'."""
+    trajectories, _ = split(rows)
+    if not trajectories:
+        raise ValueError("the results have no trajectories to draw")
+    tasks = list(dict.fromkeys(row.case["task"] for row in trajectories))
+    across = min(5, len(tasks))
+    down = -(-len(tasks) // across)
+    drawn: Figure = new_figure("divergence", max(5.0, 2.9 * across), 2.3 * down + 0.8)
+    panels = drawn.subplots(down, across, squeeze=False, sharex=True, sharey=True).flatten()
+    lines: dict[str, Any] = {}
+    for task, axes in zip(tasks, panels, strict=False):
+        for row in (row for row in trajectories if row.case["task"] == task):
+            if row.case["actions"] == RANDOM:
+                lines |= draw(axes, row)
+        axes.axhline(trajectories[0].case["tolerance"], color="#9aa0a6", linewidth=0.8, linestyle=":")
+        axes.set_title(task, loc="left", fontsize=9)
+        axes.set(xscale="log", yscale="log", ylim=(2e-9, 30.0))
+    for axes in panels[len(tasks) :]:
+        axes.set_visible(False)
+    for axes in panels[max(0, len(tasks) - across) : len(tasks)]:
+        axes.set_xlabel("step")
+        axes.tick_params(labelbottom=True)
+    for axes in panels[::across]:
+        axes.set_ylabel("difference of observations")
+    finish_axes(panels[: len(tasks)])
+    drawn.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=min(len(lines), 2 + across // 2),
+                 frameon=False, fontsize=8)  # fmt: skip
+    return drawn
+
+
+COLORS = {"engines": ACCENT, "rounded": LINE, "moved": "#3d6fa5"}
+
+
+def draw(axes: Any, row: Row) -> dict[str, Any]:
+    """Draw a row; returns its lines by their labels."""
+    found, steps = {}, row.result["steps"]
+
+    def line(pair: str, which: str, label: str, **style: Any) -> None:
+        values = row.result["pairs"][pair]["obs"][which]
+        # 0 has no place on the axis: equal numbers stand at its lower end
+        heights = [math.nan if value is None else max(value, 3e-9) for value in values]
+        found[label] = axes.plot(steps, heights, color=COLORS[pair], **style)[0]
+
+    if row.case["cone"] == ELLIPTIC:
+        line("engines", "median", f"{PAIRS['engines']}, elliptic cones", linestyle="--", linewidth=1.2)
+        return found
+    line("engines", "median", f"{PAIRS['engines']}, median", linewidth=1.6)
+    line("engines", "p99", f"{PAIRS['engines']}, 99 %", linewidth=0.8, alpha=0.6)
+    line("rounded", "median", PAIRS["rounded"], linewidth=1.1)
+    line("moved", "median", PAIRS["moved"], linewidth=1.1)
+    return found
+
+
+EXPERIMENT = Experiment(
+    name="fidelity",
+    summary="agreement of the engines: divergence of trajectories, returns of the same policy",
+    cases=cases, estimate=estimate, measure=measure, tables=tables, figure=figure, options=Options,
+)  # fmt: skip
+
+if __name__ == "__main__":
+    sys.exit(experiment.main(EXPERIMENT))
