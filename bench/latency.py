@@ -10,7 +10,8 @@ with the threads that are left, always from the newest state. A deadline is met 
 the world. The age of an action is the time, in the world's steps, from the state that its plan began with to its use; 1
 is the least for a planner that does not stop the world. Nothing else should run on the machine meanwhile.
 
-The last cases slow a planner down on purpose, to several steps of the world: what a planner that is too slow looks like.
+The last case is a planner that is slowed down on purpose, to several steps of the world: what a planner that is too
+slow looks like.
 """
 
 import dataclasses
@@ -40,8 +41,8 @@ LABELS = {C: "C engine", WARP: "Warp engine"}
 TASKS = ("cartpole_swingup", "reach", "half_cheetah", "adroit_pen", "herb_reach", "humanoid")
 """From few to many degrees of freedom; two with a hand or arms in contact."""
 
-SLOWED = ("reach", 64, 32)
-"""Task, samples and horizon of the planner that is slowed down."""
+SLOWED = ("reach", 16, 32)
+"""Task, samples and horizon of the planner that is slowed down, too."""
 
 PLANS = 1000
 """Most plans for the planning time."""
@@ -98,8 +99,8 @@ def cases(options: Options) -> list[Case]:
         positive_number("--slow", value, "steps")
     sizes = [(samples, horizon) for horizon in options.horizons for samples in options.samples]
     if options.short:
-        sizes, seconds = [(16, 8), (64, 32)], min(seconds, 1.0)
-    planners = [(task, *size, 0.0) for task in tasks for size in sizes]
+        sizes, seconds = [(16, 8), SLOWED[1:]], min(seconds, 1.0)
+    planners: list[tuple[str, int, int, float]] = [(task, *size, 0.0) for task in tasks for size in sizes]
     if SLOWED[0] in tasks:
         planners += [(*SLOWED, slow) for slow in options.slow]
     threads = cpu_cores() if options.threads is None else whole_number("--threads", options.threads, low=1)
@@ -269,16 +270,19 @@ def figure(rows: Sequence[Row]) -> Figure:
     tasks = list(dict.fromkeys(row.case["task"] for row in rows))
     engines = [name for name in ENGINES if any(row.case["contestant"] == name for row in rows)]
     samples, horizons = (sorted({row.case[name] for row in rows}) for name in ("samples", "horizon"))
-    wide, high = 1.2 + 0.55 * len(samples), 0.9 + 0.42 * len(horizons)
-    drawn: Figure = new_figure("planning times", max(5.0, wide * len(tasks)) + 1.0, high * len(engines) + 0.8)
-    panels = drawn.subplots(len(engines), len(tasks), squeeze=False)
-    image = None
-    for i, engine in enumerate(engines):
-        for j, task in enumerate(tasks):
-            axes = panels[i][j]
+    across = min(3, len(tasks))
+    places = [(tasks[i : i + across], engine) for i in range(0, len(tasks), across) for engine in engines]
+    wide, high = max(2.2, 0.7 + 0.45 * len(samples)), 0.8 + 0.38 * len(horizons)
+    drawn: Figure = new_figure("planning times", max(4.5, wide * across) + 1.2, high * len(places) + 0.8)
+    panels = drawn.subplots(len(places), across, squeeze=False)
+    for i, (group, engine) in enumerate(places):
+        for j, axes in enumerate(panels[i]):
+            if j >= len(group):
+                axes.set_visible(False)
+                continue
             heights = [[math.nan] * len(samples) for _ in horizons]
             for row in rows:
-                if (row.case["task"], row.case["contestant"]) == (task, engine):
+                if (row.case["task"], row.case["contestant"]) == (group[j], engine):
                     y, x = horizons.index(row.case["horizon"]), samples.index(row.case["samples"])
                     heights[y][x] = math.log10(row.result["median_ms"] / row.result["period_ms"])
                     write(axes, x, y, row)
@@ -288,12 +292,11 @@ def figure(rows: Sequence[Row]) -> Figure:
             axes.set_yticks(range(len(horizons)), [str(n) for n in horizons], fontsize=7)
             axes.tick_params(length=0)
             axes.spines[:].set_visible(False)
-            if i == 0:
-                axes.set_title(task, loc="left", fontsize=9)
-            if i == len(engines) - 1:
+            axes.set_title(f"{group[j]}, {LABELS[engine]}", loc="left", fontsize=8)
+            if i == len(places) - 1:
                 axes.set_xlabel("samples", fontsize=8)
             if j == 0:
-                axes.set_ylabel(f"{LABELS[engine]}\nhorizon, steps", fontsize=8)
+                axes.set_ylabel("horizon, steps", fontsize=8)
     bar = drawn.colorbar(image, ax=panels.ravel().tolist(), ticks=[-2, -1, 0, 1, 2], shrink=0.9)
     bar.ax.set_yticklabels(["0.01", "0.1", "1", "10", "100"], fontsize=7)
     bar.set_label("planning time by the world's step", fontsize=8)
@@ -305,8 +308,9 @@ def figure(rows: Sequence[Row]) -> Figure:
 def write(axes: Any, x: int, y: int, row: Row) -> None:
     """Write a planning time into its cell."""
     value, met = row.result["median_ms"], row.result.get("met")
-    text = f"{value:.2g}" if value < 10 else f"{value:,.0f}"
-    axes.text(x, y, text, ha="center", va="center", fontsize=7,
+    dark = not 0.05 < value / row.result["period_ms"] < 20.0
+    axes.text(x, y, f"{value:.2g}" if value < 10 else f"{value:,.0f}", ha="center", va="center", fontsize=7,
+              color="white" if dark else "black",
               fontweight="bold" if met is not None and met >= 0.99 else "normal")  # fmt: skip
 
 
