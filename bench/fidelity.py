@@ -36,6 +36,7 @@ from experiment import Experiment, Row, Skipped, Table
 from matplotlib.figure import Figure
 
 import lyceum_warp as lw
+from lyceum_warp.binding.registry import find_task
 from lyceum_warp.done import FAULTS
 from lyceum_warp.runs import Run
 from lyceum_warp.spaces import COUNTERS
@@ -64,9 +65,21 @@ PAIRS = {"engines": "Warp engine", "rounded": "C engine, state rounded to float3
 """What is compared with the C engine."""
 
 COST = {
-    "adroit_door": (1, 1),
-}
-"""Microseconds of a world's step on two cores: C engine, Warp engine on the CPU."""
+    "adroit_door": (500, 3500), "adroit_hammer": (650, 5000), "adroit_pen": (400, 1900),
+    "adroit_relocate": (400, 2600), "aloha_lift": (700, 3000), "ant": (180, 700), "arm_hand_pickup": (200, 550),
+    "cartpole": (15, 25), "cartpole_swingup": (15, 25), "go1_velocity": (500, 2500), "half_cheetah": (40, 200),
+    "herb_reach": (700, 6000), "hopper": (40, 200), "humanoid": (200, 1300), "humanoid_standup": (250, 1700),
+    "inverted_double_pendulum": (30, 200), "inverted_pendulum": (15, 80), "panda_lift": (300, 750),
+    "point_mass": (10, 20), "pusher": (30, 150), "reach": (30, 50), "reacher": (20, 100), "soft_ball": (500, 3000),
+    "swimmer": (30, 200), "walker2d": (60, 300),
+}  # fmt: skip
+"""Microseconds of a world's step on two cores: C engine, and Warp engine on one of them."""
+
+NPG_SAMPLES = 10_000
+"""Samples in an iteration of NPG."""
+
+GPU_STEP = 5e-3
+"""Seconds of a step of all worlds on a GPU."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,21 +160,19 @@ def cases(options: Options) -> list[Case]:
 
 
 def estimate(case: Case) -> float:
-    c, warp = COST.get(case.task, (100.0, 1000.0))
+    """Seconds on two cores, without the compilation of a task's kernels."""
+    c, warp = COST.get(case.task, (200.0, 1000.0))
     if isinstance(case, Divergence):
-        steps = case.nworld * min(case.steps, _horizon(case.task))
-        times = 3.5  # the reference, those moved and rounded, and their states
+        steps, nworld, c_worlds = episode_steps(case.task, case.steps), case.nworld, 3.5 * case.nworld
     else:
-        steps, times = case.episodes * _horizon(case.task), 2.0
-    on_gpu = 5e-3 * steps / (case.nworld if isinstance(case, Divergence) else case.episodes)
-    slow = on_gpu if case.device.startswith("cuda") else 1e-6 * warp * steps
-    return 10.0 + slow + 1e-6 * c * (times * steps + 10_000 * case.iterations) + 0.3 * case.iterations
+        steps, nworld, c_worlds = episode_steps(case.task, 1000), case.episodes, 2.0 * case.episodes
+    warp_step = GPU_STEP if case.device.startswith("cuda") else 1e-6 * warp * nworld
+    return 6.0 + steps * (warp_step + 1e-6 * c * c_worlds) + case.iterations * (0.3 + 1e-6 * c * NPG_SAMPLES)
 
 
-def _horizon(task: str) -> int:
-    from lyceum_warp.binding.registry import find_task
-
-    return find_task(task).horizon
+def episode_steps(task: str, most: int) -> int:
+    """The steps of a task's episode, or a number if that is smaller."""
+    return min(most, find_task(task).horizon or most)
 
 
 # worlds and policies
@@ -213,7 +224,8 @@ def bounds(env: lw.Env) -> tuple[torch.Tensor, torch.Tensor]:
 def trained(task: str, iterations: int, seed: int, threads: int | None) -> lw.GaussianPolicy:
     """A policy after some iterations of NPG on the C engine."""
     with torch.enable_grad():
-        learner = lw.NPG(lw.make(task, engine="mujoco", nworld=64, nthread=threads, seed=seed), seed=seed)
+        env = lw.make(task, engine="mujoco", nworld=64, nthread=threads, seed=seed)
+        learner = lw.NPG(env, config=lw.NPGConfig(samples=NPG_SAMPLES), seed=seed)
         for _ in range(iterations):
             next(learner)
     return learner.policy.requires_grad_(False)
@@ -228,7 +240,7 @@ def start(env: lw.Env, policy: Policy, seed: int, steps: int) -> torch.Tensor:
 
 
 def rounded(env: lw.Env, state: torch.Tensor) -> torch.Tensor:
-    """States with every number, but for the counters, one of float32."""
+    """States with every number, counters excepted, one of float32."""
     near = state.float().double()
     for name in COUNTERS:
         if (part := env.state_space.parts.get(name)) is not None:
@@ -265,7 +277,7 @@ def divergence(case: Divergence, options: Options) -> dict[str, Any]:
     first = make(case, options, nworld=case.nworld)
     actor = policy_of(case.actions, case, first, options)
     state = start(first, actor, case.seed, SETTLING)
-    steps = min(case.steps, first.horizon or case.steps)
+    steps = episode_steps(case.task, case.steps)
     c = first.replicate(autoreset=False, horizon=0)
     endless = {"nworld": case.nworld, "autoreset": False, "horizon": 0}
     others = {
@@ -359,7 +371,7 @@ def apart(error: torch.Tensor, good: torch.Tensor, tolerance: float) -> dict[str
 
 
 def mean(flags: torch.Tensor) -> float | None:
-    """Share of the flags that are set; None of none."""
+    """Share of the flags that are set; None without flags."""
     return flags.double().mean().item() if len(flags) else None
 
 
@@ -368,6 +380,8 @@ def mean(flags: torch.Tensor) -> float | None:
 
 def returns(case: Returns, options: Options) -> dict[str, Any]:
     c = make(case, options, nworld=case.episodes, autoreset=False)
+    if c.horizon == 0:
+        raise Skipped(f"{case.task}: its episodes may never end, as it has no horizon")
     c.rand_reset(case.seed)
     state = rounded(c, c.get_state())
     warp = make(case, options, engine="warp", device=case.device, nworld=case.episodes, autoreset=False)
@@ -458,8 +472,19 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         found.append(
             Table(
                 "Mean returns of the same episodes on both engines, and means of the paired differences to the C "
-                "engine with 95 % intervals (bootstrap): the Warp engine's, and the C engine's from moved states.",
-                ("task", "policy", "cone", "episodes", "C engine", "Warp engine", "difference", "by chance"),
+                "engine with 95 % intervals (bootstrap): the Warp engine's, and the C engine's from moved states. The "
+                "standard deviation is that of the C engine's episodes.",
+                (
+                    "task",
+                    "policy",
+                    "cone",
+                    "episodes",
+                    "C engine",
+                    "standard deviation",
+                    "Warp engine",
+                    "difference",
+                    "by chance",
+                ),
                 [returns_cells(row) for row in whole],
             )
         )
@@ -488,9 +513,11 @@ def returns_cells(row: Row) -> list[str]:
     result = row.result
     spread = [f"{result[name][0]:+.3g} ({result[name][1]:+.3g} to {result[name][2]:+.3g})"
               for name in ("difference", "chance")]  # fmt: skip
-    means = (f"{result[name][0]:.5g}" for name in ("c", "warp"))
-    case = row.case
-    return [case["task"], actor_name(case["policy"]), case["cone"], str(result["episodes"]), *means, *spread]
+    case, std = row.case, "" if result["std"] is None else f"{result['std']:.3g}"
+    return [
+        case["task"], actor_name(case["policy"]), case["cone"], str(result["episodes"]), f"{result['c'][0]:.5g}", std,
+        f"{result['warp'][0]:.5g}", *spread,
+    ]  # fmt: skip
 
 
 def actor_name(name: str) -> str:
