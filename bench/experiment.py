@@ -6,6 +6,7 @@ the file of results has from the same hardware and versions, and writes each res
 program that is killed loses one case at most. The same command then continues.
 """
 
+import concurrent.futures
 import contextlib
 import dataclasses
 import datetime
@@ -13,7 +14,9 @@ import difflib
 import importlib
 import importlib.metadata
 import json
+import multiprocessing
 import os
+import queue
 import statistics
 import sys
 import time
@@ -60,6 +63,8 @@ class Options:
     """How often every comparison is repeated."""
     seeds: tuple[int, ...] = ()
     """Seeds, where the experiment has some."""
+    jobs: int = 1
+    """Cases at the same time, each on as many cores of its own as there are threads, where the experiment allows it."""
     dry_run: bool = False
     """Print the cases and their time, and measure nothing."""
 
@@ -116,6 +121,8 @@ class Experiment:
     options: type[Options] = Options
     packages: tuple[str, ...] = ()
     """Peers whose versions belong to the provenance."""
+    apart: bool = False
+    """Whether each case is a process of its own, on cores of its own, so that several can run at the same time."""
 
 
 def load(name: str) -> Experiment:
@@ -324,8 +331,10 @@ def run(experiment: Experiment, options: Options) -> int:
     now = Row({}, {}, provenance(experiment, options.device), 0.0)
     known = {key(row.case) for row in rows if (machine(row), _software(row)) == (machine(now), _software(now))}
     left = {name: case for name, case in cases.items() if name not in known}
-    took = duration(sum(map(experiment.estimate, left.values())))
+    took = duration(sum(map(experiment.estimate, left.values())) / max(1, options.jobs))
     print(f"{experiment.name}: {len(cases) - len(left)} of {len(cases)} cases are there; the rest takes about {took}")
+    if options.jobs != 1 and not experiment.apart:
+        raise ValueError(f"the cases of {experiment.name} compete for the cores, so that jobs must be 1")
     if options.dry_run:
         for case in left.values():
             print(f"  {_text(case)}: {duration(experiment.estimate(case))}")
@@ -335,21 +344,17 @@ def run(experiment: Experiment, options: Options) -> int:
         os.truncate(path, size)
     skipped: set[str] = set()
     failed = 0
-    for number, case in enumerate(left.values(), start=1):
-        began = time.perf_counter()
-        try:
-            result = experiment.measure(case, options)
-        except Skipped as reason:
-            if str(reason) not in skipped:
-                print(f"skipped: {reason}", flush=True)
-            skipped.add(str(reason))
+    for number, (case, result, seconds) in enumerate(outcomes(experiment, list(left.values()), options), start=1):
+        if isinstance(result, Skipped):
+            if str(result) not in skipped:
+                print(f"skipped: {result}", flush=True)
+            skipped.add(str(result))
             continue
-        except Exception:  # the other cases are worth measuring
+        if isinstance(result, Exception):  # the other cases are worth measuring
             failed += 1
-            traceback.print_exc()
+            traceback.print_exception(result)
             print(f"failed: {_text(case)}", file=sys.stderr, flush=True)
             continue
-        seconds = time.perf_counter() - began
         row = Row(dataclasses.asdict(case), result, provenance(experiment, options.device), seconds)
         append(path, row)
         print(f"[{number}/{len(left)}] {_text(case)}: {_values(result)}", flush=True)
@@ -361,6 +366,65 @@ def run(experiment: Experiment, options: Options) -> int:
     if here:
         print(f"\nresults: {path}; lyceum-warp bench plot {experiment.name} draws them")
     return 1 if failed else 0
+
+
+def outcomes(
+    experiment: Experiment, cases: Sequence[Any], options: Options
+) -> Iterator[tuple[Any, dict[str, Any] | Exception, float]]:
+    """Cases with their results, or the exceptions that they ended with, and the seconds that they took."""
+    if not experiment.apart:
+        for case in cases:
+            began = time.perf_counter()
+            try:
+                result: dict[str, Any] | Exception = experiment.measure(case, options)
+            except Exception as error:
+                result = error
+            yield case, result, time.perf_counter() - began
+        return
+    places = queue.SimpleQueue[set[int]]()
+    for place in core_sets(options.jobs, options.threads):
+        places.put(place)
+
+    def alone(case: Any) -> tuple[Any, dict[str, Any] | Exception, float]:
+        began, place = time.perf_counter(), places.get()
+        os.sched_setaffinity(0, place)  # of this thread, from which the process inherits it
+        try:
+            with concurrent.futures.ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+                return case, process.submit(experiment.measure, case, options).result(), time.perf_counter() - began
+        except Exception as error:
+            return case, error, time.perf_counter() - began
+        finally:
+            places.put(place)
+
+    threads = concurrent.futures.ThreadPoolExecutor(options.jobs)
+    try:
+        for future in concurrent.futures.as_completed([threads.submit(alone, case) for case in cases]):
+            yield future.result()
+    finally:
+        threads.shutdown(cancel_futures=True)
+
+
+def core_sets(jobs: int, threads: int | None) -> list[set[int]]:
+    """Disjoint sets of cores, one for each job; cores that share their hardware come last.
+
+    Raises:
+        ValueError: There are too few cores.
+    """
+    usable = sorted(os.sched_getaffinity(0), key=lambda core: (_siblings(core).index(core), core))
+    each = threads or len(usable) // max(1, jobs)
+    if jobs < 1 or each < 1 or jobs * each > len(usable):
+        raise ValueError(f"{jobs} jobs with {each} threads need as many cores, and {len(usable)} are here")
+    return [set(usable[job * each : (job + 1) * each]) for job in range(jobs)]
+
+
+def _siblings(core: int) -> list[int]:
+    """The logical cores that share a core's hardware, itself included."""
+    try:
+        text = Path(f"/sys/devices/system/cpu/cpu{core}/topology/thread_siblings_list").read_text()
+        found = [range(int(part.split("-")[0]), int(part.split("-")[-1]) + 1) for part in text.strip().split(",")]
+        return [sibling for part in found for sibling in part]
+    except (OSError, ValueError):
+        return [core]
 
 
 def _text(case: Any) -> str:
