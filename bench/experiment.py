@@ -123,6 +123,8 @@ class Experiment:
     """Peers whose versions belong to the provenance."""
     apart: bool = False
     """Whether each case is a process of its own, on cores of its own, so that several can run at the same time."""
+    parallel: bool = False
+    """Whether the same holds where several run at the same time, and only then."""
 
 
 def load(name: str) -> Experiment:
@@ -333,7 +335,7 @@ def run(experiment: Experiment, options: Options) -> int:
     left = {name: case for name, case in cases.items() if name not in known}
     took = duration(sum(map(experiment.estimate, left.values())) / max(1, options.jobs))
     print(f"{experiment.name}: {len(cases) - len(left)} of {len(cases)} cases are there; the rest takes about {took}")
-    if options.jobs != 1 and not experiment.apart:
+    if options.jobs != 1 and not (experiment.apart or experiment.parallel):
         raise ValueError(f"the cases of {experiment.name} compete for the cores, so that jobs must be 1")
     if options.dry_run:
         for case in left.values():
@@ -372,7 +374,7 @@ def outcomes(
     experiment: Experiment, cases: Sequence[Any], options: Options
 ) -> Iterator[tuple[Any, dict[str, Any] | Exception, float]]:
     """Cases with their results, or the exceptions that they ended with, and the seconds that they took."""
-    if not experiment.apart:
+    if not experiment.apart and options.jobs == 1:
         for case in cases:
             began = time.perf_counter()
             try:

@@ -1,6 +1,6 @@
 """Fidelity: how long trajectories of the two engines stay together, and what the same policy earns on each.
 
-    lyceum-warp bench fidelity --device cuda
+    lyceum-warp bench fidelity --device cuda --jobs 4
     lyceum-warp bench fidelity --tasks hopper --policy runs/hopper-20260101-120000
 
 Divergence. Worlds of both engines begin in the same states, every number one of float32, and get the same actions. The
@@ -15,7 +15,10 @@ leave the comparison after a fault.
 With pyramidal friction cones, MuJoCo Warp chooses other tangents than MuJoCo where a capsule lies on a plane. Such
 tasks are compared with elliptic cones, too, which do not depend on the tangents.
 
-Returns. Each engine runs whole episodes of a policy from the same states with the same random streams. The difference
+Policies. Zero actions, random ones, those of a policy that NPG trained for a while on the C engine (with the case's
+cones), or those of a run. Trajectories get the actions that the policy takes in the C engine's worlds.
+
+Returns. Each engine runs whole episodes of the policy from the same states with the same random streams. The difference
 of an episode's returns is paired; intervals are 95 % percentile intervals of a bootstrap over the episodes. The
 episodes from the moved states say how far returns differ by chance.
 """
@@ -38,6 +41,7 @@ from matplotlib.figure import Figure
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.done import FAULTS
+from lyceum_warp.machine import cpu_cores
 from lyceum_warp.runs import Run
 from lyceum_warp.spaces import COUNTERS
 from lyceum_warp.validate import positive_number, whole_number
@@ -49,11 +53,17 @@ OWN, ELLIPTIC = "own", "elliptic"
 CAPSULES_ON_A_PLANE = ("ant", "half_cheetah", "hopper", "humanoid", "humanoid_standup", "walker2d")
 """Tasks with pyramidal cones whose capsules lie on a plane."""
 
+LEARNT = (
+    "ant", "cartpole", "cartpole_swingup", "half_cheetah", "hopper", "humanoid", "inverted_double_pendulum",
+    "inverted_pendulum", "point_mass", "pusher", "reach", "reacher", "swimmer", "walker2d",
+)  # fmt: skip
+"""Tasks that NPG makes progress in within a few iterations."""
+
 STEPS = (1, 2, 3, 5, 7, 10, 14, 20, 30, 50, 70, 100, 140, 200, 300, 500, 700, 1000)
 """Steps at which differences are kept."""
 
 SETTLING = 20
-"""Steps under random actions that lead to the states at the start, so that there are contacts."""
+"""Steps of the policy that lead to the states at the start of the trajectories, so that there are contacts."""
 
 ROUNDING = 2.0**-24
 """Largest relative error of a number that is rounded to float32."""
@@ -73,7 +83,7 @@ COST = {
     "point_mass": (10, 20), "pusher": (30, 150), "reach": (30, 50), "reacher": (20, 100), "soft_ball": (500, 3000),
     "swimmer": (30, 200), "walker2d": (60, 300),
 }  # fmt: skip
-"""Microseconds of a world's step on two cores: C engine, and Warp engine on one of them."""
+"""Microseconds of a world's step: C engine on two cores, Warp engine on one."""
 
 NPG_SAMPLES = 10_000
 """Samples in an iteration of NPG."""
@@ -90,45 +100,29 @@ class Options(experiment.Options):
     """Folder of a run, whose mean policy acts in its task, too."""
     steps: int = 1000
     """Steps over which trajectories are compared, at most those of an episode."""
-    nworld: int = 256
+    nworld: int = 128
     """Worlds, and episodes of a policy."""
-    iterations: int = 50
-    """NPG's iterations of 10,000 samples for the trained policies; 0 for none."""
+    iterations: int = 30
+    """NPG's iterations of 10,000 samples for the trained policies; 0 for no such policies."""
     tolerance: float = 0.01
     """Difference of observations from which on two trajectories count as apart."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Divergence:
-    """Trajectories from the same states under the same actions."""
-
-    task: str
-    actions: str
-    """Who acts, in the C engine's worlds: random, trained, or the folder of a run."""
-    cone: str
-    nworld: int
-    steps: int
-    tolerance: float
-    iterations: int
-    device: str
-    seed: int
-
-
-@dataclasses.dataclass(frozen=True)
-class Returns:
-    """Episodes of a policy from the same states."""
+class Case:
+    """Trajectories and episodes of one policy in one task."""
 
     task: str
     policy: str
     """zero, random, trained, or the folder of a run."""
     cone: str
-    episodes: int
+    nworld: int
+    steps: int
+    """Of the trajectories."""
+    tolerance: float
     iterations: int
     device: str
     seed: int
-
-
-Case = Divergence | Returns
 
 
 def cases(options: Options) -> list[Case]:
@@ -141,33 +135,30 @@ def cases(options: Options) -> list[Case]:
     positive_number("--tolerance", options.tolerance, "of observations")
     if options.short:
         nworld, steps, iterations = min(nworld, 8), min(steps, 20), 0
-    trained = (TRAINED,) if iterations else ()
     found: list[Case] = []
     for seed in options.seeds or (0,):
         for task in tasks:
-            learnt = (*trained, *([own[task]] if task in own else []))
-            for cone in (OWN, ELLIPTIC) if task in CAPSULES_ON_A_PLANE and not options.short else (OWN,):
-                found += [
-                    Divergence(task, actions, cone, nworld, steps, options.tolerance,
-                               iterations if actions == TRAINED else 0, options.device, seed)
-                    for actions in (RANDOM, *learnt)
-                ]  # fmt: skip
-                found += [
-                    Returns(task, policy, cone, nworld, iterations if policy == TRAINED else 0, options.device, seed)
-                    for policy in (ZERO, RANDOM, *learnt)
-                ]
+            learnt = [TRAINED] * (iterations > 0 and task in LEARNT) + [name for of, name in own.items() if of == task]
+            variants = [(policy, OWN) for policy in (ZERO, RANDOM, *learnt)]
+            if task in CAPSULES_ON_A_PLANE and not options.short:
+                variants += [(policy, ELLIPTIC) for policy in (RANDOM, *learnt)]
+            found += [
+                Case(task, policy, cone, nworld, steps, options.tolerance, iterations if policy == TRAINED else 0,
+                     options.device, seed)
+                for policy, cone in variants
+            ]  # fmt: skip
     return found
 
 
 def estimate(case: Case) -> float:
-    """Seconds on two cores, without the compilation of a task's kernels."""
+    """Seconds, without the compilation of a task's kernels."""
     c, warp = COST.get(case.task, (200.0, 1000.0))
-    if isinstance(case, Divergence):
-        steps, nworld, c_worlds = episode_steps(case.task, case.steps), case.nworld, 3.5 * case.nworld
-    else:
-        steps, nworld, c_worlds = episode_steps(case.task, 1000), case.episodes, 2.0 * case.episodes
-    warp_step = GPU_STEP if case.device.startswith("cuda") else 1e-6 * warp * nworld
-    return 6.0 + steps * (warp_step + 1e-6 * c * c_worlds) + case.iterations * (0.3 + 1e-6 * c * NPG_SAMPLES)
+    c *= 2e-6 / min(8, cpu_cores())  # more cores gain less, or are shared by jobs
+    warp_step = GPU_STEP if case.device.startswith("cuda") else 1e-6 * warp * case.nworld
+    # the trajectories of the C engine's three sets of worlds, with their states, and two sets of episodes
+    steps, episodes = episode_steps(case.task, case.steps), episode_steps(case.task, 1000)
+    c_steps = case.nworld * (3.5 * steps + 2.0 * episodes)
+    return 10.0 + (steps + episodes) * warp_step + c * c_steps + case.iterations * (0.3 + c * NPG_SAMPLES)
 
 
 def episode_steps(task: str, most: int) -> int:
@@ -198,17 +189,18 @@ def make(case: Case, options: Options, **words: Any) -> lw.Env:
 Policy = Callable[[torch.Tensor], torch.Tensor]
 
 
-def policy_of(name: str, case: Case, env: lw.Env, options: Options) -> Policy:
-    """What acts: called with observations on the CPU, (nworld, nobs), returns actions, (nworld, nact), there."""
-    if name == ZERO:
+def policy_of(case: Case, env: lw.Env, options: Options) -> Policy:
+    """What acts: called with observations on the CPU, (nworld, nobs), returns actions, (nworld, nact), there.
+
+    Random actions are those of a stream that begins here, so that equal calls get equal ones.
+    """
+    if case.policy == ZERO:
         return lambda obs: torch.zeros(len(obs), env.action_space.size)
-    if name == RANDOM:
+    if case.policy == RANDOM:
         low, high = bounds(env)
         generator = torch.Generator().manual_seed(case.seed)
         return lambda obs: low + (high - low) * torch.rand(len(obs), len(low), generator=generator)
-    if name == TRAINED:
-        return trained(case.task, case.iterations, case.seed, options.threads)
-    return lw.load(name)
+    return trained(case, options) if case.policy == TRAINED else lw.load(case.policy)
 
 
 def bounds(env: lw.Env) -> tuple[torch.Tensor, torch.Tensor]:
@@ -220,13 +212,12 @@ def bounds(env: lw.Env) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(finite[0]).float(), torch.from_numpy(finite[1]).float()
 
 
-@functools.cache
-def trained(task: str, iterations: int, seed: int, threads: int | None) -> lw.GaussianPolicy:
+@functools.lru_cache(maxsize=1)
+def trained(case: Case, options: Options) -> lw.GaussianPolicy:
     """A policy after some iterations of NPG on the C engine."""
     with torch.enable_grad():
-        env = lw.make(task, engine="mujoco", nworld=64, nthread=threads, seed=seed)
-        learner = lw.NPG(env, config=lw.NPGConfig(samples=NPG_SAMPLES), seed=seed)
-        for _ in range(iterations):
+        learner = lw.NPG(make(case, options, nworld=64), config=lw.NPGConfig(samples=NPG_SAMPLES), seed=case.seed)
+        for _ in range(case.iterations):
             next(learner)
     return learner.policy.requires_grad_(False)
 
@@ -273,9 +264,9 @@ def step(env: lw.Env, action: torch.Tensor) -> float:
 # divergence
 
 
-def divergence(case: Divergence, options: Options) -> dict[str, Any]:
+def divergence(case: Case, options: Options) -> dict[str, Any]:
     first = make(case, options, nworld=case.nworld)
-    actor = policy_of(case.actions, case, first, options)
+    actor = policy_of(case, first, options)
     state = start(first, actor, case.seed, SETTLING)
     steps = episode_steps(case.task, case.steps)
     c = first.replicate(autoreset=False, horizon=0)
@@ -336,7 +327,7 @@ def divergence(case: Divergence, options: Options) -> dict[str, Any]:
     each = 1e6 / (steps * case.nworld)
     return {
         "steps": kept, "pairs": pairs,
-        "c_us": seconds["c"] * each, "warp_us": seconds["engines"] * each, "cone": str(c.model.opt.cone),
+        "c_us": seconds["c"] * each, "warp_us": seconds["engines"] * each,
     }  # fmt: skip
 
 
@@ -378,20 +369,21 @@ def mean(flags: torch.Tensor) -> float | None:
 # returns
 
 
-def returns(case: Returns, options: Options) -> dict[str, Any]:
-    c = make(case, options, nworld=case.episodes, autoreset=False)
+def returns(case: Case, options: Options) -> dict[str, Any] | None:
+    """None where the task has no horizon, so that an episode may never end, or where every episode has a fault."""
+    c = make(case, options, nworld=case.nworld, autoreset=False)
     if c.horizon == 0:
-        raise Skipped(f"{case.task}: its episodes may never end, as it has no horizon")
+        return None
     c.rand_reset(case.seed)
     state = rounded(c, c.get_state())
-    warp = make(case, options, engine="warp", device=case.device, nworld=case.episodes, autoreset=False)
+    warp = make(case, options, engine="warp", device=case.device, nworld=case.nworld, autoreset=False)
     found: dict[str, Episodes] = {}
     for name, env, given in (("c", c, state), ("moved", c, moved(c, state, case.seed)), ("warp", warp, state)):
         env.set_state(given.to(env.obs.device))
-        found[name] = episodes(env, policy_of(case.policy, case, c, options))
+        found[name] = episodes(env, policy_of(case, c, options))
     good = ~(found["c"].fault | found["moved"].fault | found["warp"].fault)
     if not good.any():
-        raise Skipped(f"{case.task}: every episode under {case.policy} had a fault")
+        return None
     values = {name: of.returns[good].numpy() for name, of in found.items()}
     lengths = {name: of.lengths[good].double().mean().item() for name, of in found.items()}
     success = {name: of.success[good].double().mean().item() for name, of in found.items()}
@@ -446,78 +438,72 @@ def interval(values: np.ndarray, seed: int, draws: int = 10_000) -> list[float]:
 
 
 def measure(case: Case, options: Options) -> dict[str, Any]:
+    torch.set_num_threads(1)
     with torch.no_grad():
-        return divergence(case, options) if isinstance(case, Divergence) else returns(case, options)
+        return divergence(case, options) | {"returns": returns(case, options)}
 
 
 # tables and figure
 
 
+def ordered(rows: Sequence[Row]) -> list[Row]:
+    """Rows by task, cone and policy; jobs finish in any order."""
+    policies = {name: place for place, name in enumerate((ZERO, RANDOM, TRAINED))}
+    return sorted(
+        rows, key=lambda row: (row.case["task"], row.case["cone"] != OWN, policies.get(row.case["policy"], 3))
+    )
+
+
 def tables(rows: Sequence[Row]) -> list[Table]:
-    trajectories, whole = split(rows)
-    found = []
-    if trajectories:
-        found.append(
-            Table(
-                "Differences of observations from the C engine's: median and 99 % over worlds after some steps; steps "
-                f"after which half of the worlds are apart by {trajectories[0].case['tolerance']:g}; episodes that end "
-                "in the same step. *Rounded* and *moved* are the C engine itself, with its state rounded to float32 "
-                "after every step, and with a start moved by the rounding of float32.",
-                ("task", "actions", "cone", "1 step", "10", "100", "half apart", "rounded", "moved", "same end",
-                 "faults"),
-                [divergence_cells(row) for row in trajectories],
-            )
-        )  # fmt: skip
-    if whole:
-        found.append(
-            Table(
-                "Mean returns of the same episodes on both engines, and means of the paired differences to the C "
-                "engine with 95 % intervals (bootstrap): the Warp engine's, and the C engine's from moved states. The "
-                "standard deviation is that of the C engine's episodes.",
-                (
-                    "task",
-                    "policy",
-                    "cone",
-                    "episodes",
-                    "C engine",
-                    "standard deviation",
-                    "Warp engine",
-                    "difference",
-                    "by chance",
-                ),
-                [returns_cells(row) for row in whole],
-            )
-        )
-    return found
+    rows = ordered(rows)
+    if not rows:
+        return []
+    return [
+        Table(
+            "Differences of observations from the C engine's: median and 99 % over worlds after some steps; steps "
+            f"after which half of the worlds are apart by {rows[0].case['tolerance']:g}; episodes that end in the same "
+            "step. *Rounded* and *moved* are the C engine itself, with its state rounded to float32 after every step, "
+            "and with a start moved by the rounding of float32.",
+            ("task", "policy", "cones", "1 step", "10", "100", "half apart", "rounded", "moved", "same end", "faults"),
+            [trajectory_cells(row) for row in rows],
+        ),
+        Table(
+            "Mean returns of the same episodes on both engines, and means of the paired differences from the C engine "
+            "with 95 % intervals (bootstrap): the Warp engine's, and the C engine's from moved states. The standard "
+            "deviation is that of the C engine's episodes.",
+            ("task", "policy", "cones", "episodes", "C engine", "standard deviation", "Warp engine", "difference",
+             "by chance"),
+            [return_cells(row) for row in rows if row.result["returns"] is not None],
+        ),
+    ]  # fmt: skip
 
 
-def split(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
-    """Rows of divergence, and rows of returns."""
-    return [row for row in rows if "actions" in row.case], [row for row in rows if "policy" in row.case]
+def first_cells(row: Row) -> list[str]:
+    """Task, policy and cones."""
+    return [row.case["task"], actor_name(row.case["policy"]), row.case["cone"]]
 
 
-def divergence_cells(row: Row) -> list[str]:
+def trajectory_cells(row: Row) -> list[str]:
     engines, steps, at = row.result["pairs"]["engines"], row.result["steps"], []
     for wanted in (1, 10, 100):
         pair = [engines["obs"][name][steps.index(wanted)] if wanted in steps else None for name in ("median", "p99")]
-        at.append("" if None in pair else f"{pair[0]:.0e}, {pair[1]:.0e}")
+        at.append("" if None in pair else ", ".join(f"{value:.0e}" if value else "0" for value in pair))
     half = [row.result["pairs"][name]["half_apart"] for name in PAIRS]
     return [
-        row.case["task"], actor_name(row.case["actions"]), row.case["cone"], *at,
-        *(str(value) if value else f"> {steps[-1]}" for value in half),
+        *first_cells(row), *at, *(str(value) if value else f"> {steps[-1]}" for value in half),
         "" if engines["same_end"] is None else f"{engines['same_end']:.0%}", str(engines["faults"]),
     ]  # fmt: skip
 
 
-def returns_cells(row: Row) -> list[str]:
-    result = row.result
-    spread = [f"{result[name][0]:+.3g} ({result[name][1]:+.3g} to {result[name][2]:+.3g})"
-              for name in ("difference", "chance")]  # fmt: skip
-    case, std = row.case, "" if result["std"] is None else f"{result['std']:.3g}"
-    return [
-        case["task"], actor_name(case["policy"]), case["cone"], str(result["episodes"]), f"{result['c'][0]:.5g}", std,
-        f"{result['warp'][0]:.5g}", *spread,
-    ]  # fmt: skip
+def return_cells(row: Row) -> list[str]:
+    result = row.result["returns"]
+    spread = [
+        f"{result[name][0]:+.3g} ({result[name][1]:+.3g} to {result[name][2]:+.3g})"
+        for name in ("difference", "chance")
+    ]
+    std = "" if result["std"] is None else f"{result['std']:.3g}"
+    means = [f"{result[name][0]:.5g}" for name in ("c", "warp")]
+    return [*first_cells(row), str(result["episodes"]), means[0], std, means[1], *spread]
 
 
 def actor_name(name: str) -> str:
@@ -526,21 +512,23 @@ def actor_name(name: str) -> str:
 
 
 def figure(rows: Sequence[Row]) -> Figure:
-    """Differences of observations over the steps, one panel a task: medians, and 99 % of the engines'."""
-    trajectories, _ = split(rows)
-    if not trajectories:
-        raise ValueError("the results have no trajectories to draw")
-    tasks = list(dict.fromkeys(row.case["task"] for row in trajectories))
+    """Differences of observations under random actions over the steps, one panel a task.
+
+    Lines are medians, one also the engines' 99 % quantile.
+    """
+    rows = [row for row in ordered(rows) if row.case["policy"] == RANDOM]
+    if not rows:
+        raise ValueError("the results have no trajectories under random actions to draw")
+    tasks = list(dict.fromkeys(row.case["task"] for row in rows))
     across = min(5, len(tasks))
     down = -(-len(tasks) // across)
     drawn: Figure = new_figure("divergence", max(5.0, 2.9 * across), 2.3 * down + 0.8)
     panels = drawn.subplots(down, across, squeeze=False, sharex=True, sharey=True).flatten()
     lines: dict[str, Any] = {}
     for task, axes in zip(tasks, panels, strict=False):
-        for row in (row for row in trajectories if row.case["task"] == task):
-            if row.case["actions"] == RANDOM:
-                lines |= draw(axes, row)
-        axes.axhline(trajectories[0].case["tolerance"], color="#9aa0a6", linewidth=0.8, linestyle=":")
+        for row in (row for row in rows if row.case["task"] == task):
+            lines |= draw(axes, row)
+        axes.axhline(rows[0].case["tolerance"], color="#9aa0a6", linewidth=0.8, linestyle=":")
         axes.set_title(task, loc="left", fontsize=9)
         axes.set(xscale="log", yscale="log", ylim=(2e-9, 30.0))
     for axes in panels[len(tasks) :]:
@@ -583,6 +571,7 @@ EXPERIMENT = Experiment(
     name="fidelity",
     summary="agreement of the engines: divergence of trajectories, returns of the same policy",
     cases=cases, estimate=estimate, measure=measure, tables=tables, figure=figure, options=Options,
+    parallel=True,
 )  # fmt: skip
 
 if __name__ == "__main__":
