@@ -136,6 +136,12 @@ def test_plan_that_takes_too_long_is_measured_once(latency: ModuleType, monkeypa
     assert found["plans"] == 1 and found["median_ms"] >= 20.0 and "met" not in found
 
 
+def test_planner_of_the_warp_engine_is_measured(latency: ModuleType) -> None:
+    case = latency.Case("point_mass", "warp", "cpu", 1, 4, 4, 0.0, 0.3, 0, 0)
+    found = latency.measure(case, options(latency, *SMALL))
+    assert found["plans"] >= 10 and found["steps"] == 15 and found["real_time_threads"] == 1
+
+
 def test_episodes_follow_each_other_until_the_time_is_over(latency: ModuleType) -> None:
     """Hopper falls after a few steps under an action that does nothing."""
     plant = lw.make("hopper", nthread=1, autoreset=False, horizon=0)
