@@ -24,7 +24,7 @@ import lyceum_warp as lw
 
 WORKER = "environments/sampling.py"
 sys.path.append(str((peers.FOLDER / WORKER).parent))
-import sampling  # a worker of the peers, whose clock and actions we share
+import sampling  # noqa: E402  # a worker of the peers, whose clock and actions we share
 
 LABELS = {
     "c": "ours, C engine",
