@@ -86,10 +86,10 @@ def cases(options: Options) -> list[Case]:
         if name in named and contestants.takes_part(name, task)
     ]
     by_worlds = [
-        Case("worlds", task, repeat, name, many, max(threads), options.device if name == "warp" else "cpu", seconds, warm)
+        Case("worlds", task, repeat, name, many, max(threads), device, seconds, warm)
         for task in tasks
         for repeat in range(repeats)
-        for name in PARTS["worlds"]
+        for name, device in (("warp", options.device), ("c", "cpu"))
         if name in named and (name != "warp" or gpu or options.contestants)
         for many in sizes(name)
     ]  # fmt: skip

@@ -200,7 +200,12 @@ def figure(rows: Sequence[Row]) -> Any:
                         ecolor="#555", error_kw={"linewidth": 0.8}, label=LABELS[name] if i == 0 else None,
                     )  # fmt: skip
         axes.axhline(1.0, color=COLORS["native"], linewidth=1.0)
-        axes.set_yscale("log")
+        if part == "sampling":
+            axes.set_yscale("log")
+            axes.set_yticks([0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100])
+            axes.minorticks_off()
+            axes.set_ylim(*_limits(groups, names, unit))
+            axes.yaxis.set_major_formatter("{x:g}")
         axes.set_xticks(range(len(groups)), groups)
         axes.set_ylabel(f"env steps per second,\n{LABELS[unit]} = 1")
         threads = max(row.case["threads"] for same in groups.values() for row in same)
@@ -208,6 +213,15 @@ def figure(rows: Sequence[Row]) -> Any:
         axes.legend(frameon=False, ncols=3, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.1))
     finish_axes(panels)
     return made
+
+
+def _limits(groups: dict[str, list[Row]], names: Sequence[str], unit: str) -> tuple[float, float]:
+    """Ends of an axis of ratios that holds all of them and 1."""
+    ratios = [1.0]
+    for same in groups.values():
+        found = experiment.paired(same, "env_steps_per_second", unit)
+        ratios += [ratio for name in names for ratio in found.get(name, [])]
+    return 0.7 * min(ratios), 1.4 * max(ratios)
 
 
 EXPERIMENT = Experiment(
