@@ -464,7 +464,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
             f"after which half of the worlds are apart by {rows[0].case['tolerance']:g}; episodes that end in the same "
             "step. *Rounded* and *moved* are the C engine itself, with its state rounded to float32 after every step, "
             "and with a start moved by the rounding of float32.",
-            ("task", "policy", "cones", "1 step", "10", "100", "half apart", "rounded", "moved", "same end", "faults"),
+            ("task", "policy", "cones", "1 step", "10", "100", "last", "half apart", "rounded", "moved", "same end",
+             "faults"),
             [trajectory_cells(row) for row in rows],
         ),
         Table(
@@ -485,7 +486,7 @@ def first_cells(row: Row) -> list[str]:
 
 def trajectory_cells(row: Row) -> list[str]:
     engines, steps, at = row.result["pairs"]["engines"], row.result["steps"], []
-    for wanted in (1, 10, 100):
+    for wanted in (1, 10, 100, steps[-1]):
         pair = [engines["obs"][name][steps.index(wanted)] if wanted in steps else None for name in ("median", "p99")]
         at.append("" if None in pair else ", ".join(f"{value:.0e}" if value else "0" for value in pair))
     half = [row.result["pairs"][name]["half_apart"] for name in PAIRS]

@@ -99,7 +99,7 @@ def test_tables_and_figure_need_results_alone(fidelity: ModuleType, results: Pat
     rows = experiment.read(results)
     first, second = fidelity.tables(rows)
     assert [cells[:3] for cells in first.rows] == [[TASK, "zero", "own"], [TASK, "random", "own"]]
-    assert first.rows[0][6:9] == ["> 4"] * 3 and [cells[3] for cells in second.rows] == ["3", "3"]
+    assert first.rows[0][7:10] == ["> 4"] * 3 and [cells[3] for cells in second.rows] == ["3", "3"]
     assert fidelity.tables(rows[::-1])[0].rows == first.rows  # jobs finish in any order
     drawn = fidelity.figure(rows)
     assert [axes.get_title(loc="left") for axes in drawn.axes] == [TASK]
