@@ -58,18 +58,26 @@ class Peer:
 
 
 @functools.cache
-def peer(name: str) -> Peer:
+def peer(name: str, worker: str | None = None) -> Peer:
     """A peer; its virtual environment is made if there is none yet.
+
+    Args:
+        name: Name of its folder.
+        worker: Its program in the folder of all peers; by default ``NAME/worker.py``.
 
     Raises:
         experiment.Skipped: The environment cannot be made, for example without a network.
     """
     requirements = FOLDER / name / "requirements.txt"
-    worker = requirements.with_name("worker.py")
     reason = _failure(name, requirements)
     if reason:
         raise experiment.Skipped(reason)
-    return Peer(name, _environment(name, requirements) / "bin" / "python", worker)
+    return Peer(name, _environment(name, requirements) / "bin" / "python", FOLDER / (worker or f"{name}/worker.py"))
+
+
+def peer_here(name: str, worker: str) -> Peer:
+    """A peer that shares our environment, run in a process of its own."""
+    return Peer(name, Path(sys.executable), FOLDER / worker)
 
 
 def _environment(name: str, requirements: Path) -> Path:
