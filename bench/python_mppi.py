@@ -48,7 +48,7 @@ class GymnasiumEnv:
     Args:
         name: Gymnasium's name.
         model: Our model, which describes the states.
-        target: A body that lies in the model there and is our first mocap body; its orientation is part of the state.
+        target: A body that is a part of the model there and a mocap body of ours: its orientation is in our state.
     """
 
     def __init__(self, name: str, model: mujoco.MjModel, target: str | None = None) -> None:
@@ -59,7 +59,9 @@ class GymnasiumEnv:
         self.env: Any = gymnasium.make(name).unwrapped
         self.env.reset(seed=0)
         self.model, self.ours, self.size = model, mujoco.MjData(model), mujoco.mj_stateSize(model, STATE)
-        self.target = None if target is None else self.env.model.body(target).id
+        self.target = None
+        if target is not None:
+            self.target = self.env.model.body(target).id, model.body(target).mocapid[0]
 
     def set_state(self, state: np.ndarray) -> None:
         data, ours = self.env.data, self.ours
@@ -67,7 +69,8 @@ class GymnasiumEnv:
         data.time = ours.time
         data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = ours.qpos, ours.qvel, ours.qacc_warmstart
         if self.target is not None:
-            self.env.model.body_quat[self.target] = ours.mocap_quat[0]
+            there, here = self.target
+            self.env.model.body_quat[there] = ours.mocap_quat[here]
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         return self.env.step(action)
