@@ -16,9 +16,9 @@ from typing import Any
 import measurements
 import torch
 import tyro
+from kept import seconds
 from rich.console import Console
 from rich.table import Table
-from throughput import seconds
 
 import lyceum_warp as lw
 from lyceum_warp.done import FAULTS

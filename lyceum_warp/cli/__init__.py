@@ -1,4 +1,4 @@
-"""The command line: tasks, new, check, train, eval, export, plan, view, warmup."""
+"""The command line: tasks, new, check, train, eval, export, plan, view, warmup, bench."""
 
 import importlib.metadata
 import os
@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from lyceum_warp.cli.bench import Bench, bench
 from lyceum_warp.cli.check import Check, check
 from lyceum_warp.cli.evaluate import Eval, evaluate_run
 from lyceum_warp.cli.export import Export, export
@@ -28,7 +29,8 @@ _Command = Annotated[Tasks, tyro.conf.subcommand("tasks")] \
     | Annotated[Export, tyro.conf.subcommand("export")] \
     | Annotated[Plan, tyro.conf.subcommand("plan")] \
     | Annotated[View, tyro.conf.subcommand("view")] \
-    | Annotated[Warmup, tyro.conf.subcommand("warmup")]  # fmt: skip
+    | Annotated[Warmup, tyro.conf.subcommand("warmup")] \
+    | Annotated[Bench, tyro.conf.subcommand("bench")]  # fmt: skip
 
 _DESCRIPTION = """Batched MuJoCo worlds for robot learning.
 
@@ -41,6 +43,7 @@ $ lyceum-warp export runs/hopper-20260101-120000 --to policy.onnx
 $ lyceum-warp plan reach --real-time
 $ lyceum-warp view reach --mppi
 $ lyceum-warp warmup hopper --device cuda:0
+$ lyceum-warp bench throughput --short
 """
 
 
@@ -55,9 +58,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv == ["--version"]:
         print(f"lyceum-warp {importlib.metadata.version('lyceum-warp')}")
         return 0
+    # what follows the name of a program of bench/ is parsed by that program
+    argv, rest = (argv[:2], argv[2:]) if argv[:1] == ["bench"] else (argv, [])
     try:
         with signals():
             command = _parse(argv)
+            if isinstance(command, Bench):
+                return bench(command, rest)
             if isinstance(command, Tasks):
                 return list_tasks(command)
             if isinstance(command, New):

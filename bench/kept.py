@@ -1,0 +1,247 @@
+"""What a step costs beside the bare engine on the same states.
+
+Environment and bare engine take turns of ten steps: each state that the environment starts a step from is copied to
+the bare engine, outside the clock, so that both step the same states, resets included, under the same load of the
+machine. The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the same model,
+controls and number of substeps. ``kept`` is bare time by environment time; ``added`` is the difference. ``refresh`` is
+the time for fields that ``mj_step`` leaves behind, as a share of the step. On the Warp engine it counts those of the
+new state where the task reads positions, and a forward pass of the restarted worlds where it reads forces; what the
+next step takes over is counted, too. On the C engine it is what ``Batch.step`` itself takes longer if it computes the
+stage that the task needs.
+
+Beside the package's tasks there is ``quadruped``, dm_control's, which reads sensors; dm_control must be installed.
+The experiment throughput prints these numbers.
+"""
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import contestants
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import torch
+import warp as wp
+from mujoco.batch import Batch
+
+import lyceum_warp as lw
+from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
+from lyceum_warp.engines.warp.warp_engine import WarpEngine
+from lyceum_warp.fields import Stage
+
+FILES = {"quadruped": Path(__file__).with_name("quadruped.py")}
+"""Tasks of this folder."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """What is measured."""
+
+    task: str
+    nworld: int
+    engine: str = "mujoco"
+    device: str = "cpu"
+    nthread: int = 0
+    """Threads of the C engine; 0 for all cores."""
+    blocks: int = 50
+    """Blocks of ten steps; the results are medians over them."""
+    apart: bool = False
+    """Whether the worlds are at different steps of their episodes, so that some restart in every step."""
+    npg: bool = False
+    """Whether NPG samples: the policy's forward passes, the noise and the rollout buffer are part of the step."""
+
+
+def next_controls(env: lw.Env) -> torch.Tensor:
+    """The controls of the environment's next step, (nworld, nu)."""
+    if (control := env.task.kernels.control_worlds) is None:
+        low, high = (torch.as_tensor(x, device=env.obs.device) for x in (env.action_space.low, env.action_space.high))
+        return env.action.clamp(low, high)
+    controls = wp.zeros_like(env.engine.ctrl)
+    args = [env.worlds.after, env.worlds.params, env.worlds.action, controls]
+    wp.launch(control, env.nworld, args, device=env.device)
+    return wp.to_torch(controls)
+
+
+class BareC:
+    """``mujoco.batch.Batch`` alone, on the states of an environment's C engine."""
+
+    def __init__(self, env: lw.Env) -> None:
+        self.env, engine = env, env.engine
+        assert isinstance(engine, MujocoEngine)
+        self.rows = engine.batch.state
+        self.batch = Batch(engine.batch.model, env.nworld, engine.nthread)
+        self.stage = engine.stage
+        self.staged = Batch(engine.batch.model, env.nworld, engine.nthread, engine.batch.persistent)
+
+    def snapshot(self) -> tuple[np.ndarray, np.ndarray]:
+        """States and controls of the environment's next step."""
+        return self.rows.copy(), next_controls(self.env).numpy()
+
+    def load(self, snapshot: tuple[np.ndarray, np.ndarray]) -> None:
+        self.batch.state[:], self.batch.ctrl[:] = snapshot
+
+    def step(self) -> None:
+        self.batch.step(nstep=self.env.task.frame_skip)
+
+    def load_staged(self, snapshot: tuple[np.ndarray, np.ndarray]) -> None:
+        """Make ready for a step that goes on from the stage which the last one computed."""
+        self.staged.state[:], self.staged.ctrl[:] = snapshot
+        self.staged.forward(stage=self.stage)
+
+    def step_staged(self) -> None:
+        """A step that computes the stage which the task needs."""
+        self.staged.step(nstep=self.env.task.frame_skip, stage=self.stage)
+
+
+class BareWarp:
+    """A graph of ``mujoco_warp.step`` alone, on the states of an environment's Warp engine."""
+
+    def __init__(self, env: lw.Env) -> None:
+        self.env, engine = env, env.engine
+        assert isinstance(engine, WarpEngine)
+        self.engine = engine
+        self.spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
+        with wp.ScopedDevice(env.device):
+            self.m, self.d = engine.bare()
+            mjw.step(self.m, self.d)
+            with wp.ScopedCapture() as capture:
+                for _ in range(env.task.frame_skip):
+                    mjw.step(self.m, self.d)
+        self.graph = capture.graph
+
+    def snapshot(self) -> tuple[wp.array, torch.Tensor]:
+        """States and controls of the environment's next step."""
+        with wp.ScopedDevice(self.env.device):
+            state = wp.zeros((self.env.nworld, self.engine.integration_size), dtype=float)
+            mjw.get_state(self.engine.m, self.engine.d, state, self.spec)
+        return state, next_controls(self.env)
+
+    def load(self, snapshot: tuple[wp.array, torch.Tensor]) -> None:
+        with wp.ScopedDevice(self.env.device):
+            mjw.set_state(self.m, self.d, snapshot[0], self.spec)
+        wp.to_torch(self.d.ctrl).copy_(snapshot[1])
+        synchronize(self.env)
+
+    def step(self) -> None:
+        wp.capture_launch(self.graph)
+
+
+def bare_engine(env: lw.Env) -> BareC | BareWarp:
+    return BareC(env) if isinstance(env.engine, MujocoEngine) else BareWarp(env)
+
+
+def synchronize(env: lw.Env) -> None:
+    if not env.device.is_cpu:
+        wp.synchronize_device(env.device)
+
+
+def seconds(env: lw.Env, function: Callable[[], None]) -> float:
+    start = time.perf_counter()
+    function()
+    synchronize(env)
+    return time.perf_counter() - start
+
+
+BLOCK = 10
+"""Steps after which environment and bare engine change places."""
+
+
+def compare(
+    env: lw.Env, blocks: int, act: Callable[[int], None], block: Callable[[], None], first: float
+) -> dict[str, Any]:
+    """Time an environment and the bare engine on the same states; seconds are medians over the blocks.
+
+    Args:
+        env: The environment.
+        blocks: How often.
+        act: Sets the actions of step t of a block.
+        block: Makes the steps of a block, with those actions.
+        first: Seconds until the environment's first step was done.
+    """
+    bare = bare_engine(env)
+    whole, alone, staged = [], [], []
+    warm = max(2, env.horizon // 500)  # graphs are captured, and states are no longer the first ones
+    for repetition in range(warm + blocks):
+        start = env.get_state()
+        time_env = seconds(env, block)
+        env.set_state(start)
+        snapshots = []
+        for t in range(BLOCK):
+            act(t)
+            snapshots.append(bare.snapshot())
+            env.step()
+        time_bare = time_staged = 0.0
+        for snapshot in snapshots:
+            bare.load(snapshot)
+            time_bare += seconds(env, bare.step)
+            if isinstance(bare, BareC) and bare.stage > Stage.NONE:
+                bare.load_staged(snapshot)
+                time_staged += seconds(env, bare.step_staged)
+        if repetition >= warm:
+            staged.append((time_staged or time_bare) / BLOCK)
+            whole.append(time_env / BLOCK)
+            alone.append(time_bare / BLOCK)
+    kept = statistics.median(b / a for a, b in zip(whole, alone, strict=True))
+    step, step_alone = statistics.median(whole), statistics.median(alone)
+    added = statistics.median(a - b for a, b in zip(whole, alone, strict=True)) * 1e6
+    rate = env.nworld / step
+    longer = statistics.median(c - b for b, c in zip(alone, staged, strict=True))
+    refresh = refresh_seconds(env) if isinstance(env.engine, WarpEngine) else longer
+    return {
+        "env_steps_per_second": rate,
+        "bare_steps_per_second": env.nworld / step_alone,
+        "kept": kept,
+        "added_microseconds": added,
+        "refresh": refresh / step,
+        "bytes_per_world": env.bytes_per_world,
+        "first_step_seconds": first,  # with a cold cache, mostly compilation
+    }
+
+
+def refresh_seconds(env: lw.Env) -> float:
+    """Seconds of a step's refreshes alone, for the worlds that restarted in the last step."""
+    engine = env.engine
+    assert isinstance(engine, WarpEngine)
+    if engine.stage == engine.reset_stage == Stage.NONE:
+        return 0.0
+    with wp.ScopedDevice(env.device), wp.ScopedCapture() as capture:
+        engine.refresh_current(env.worlds.everyone)
+        engine.refresh(env.worlds.restarting)
+    times = [seconds(env, lambda: wp.capture_launch(capture.graph)) for _ in range(30)]
+    return statistics.median(times)
+
+
+def first_step(setting: Setting) -> tuple[lw.Env, float]:
+    """The environment, and the seconds until its first step was done."""
+    began = time.perf_counter()
+    place = {"nthread": setting.nthread} if setting.engine == "mujoco" else {"device": setting.device}
+    env = lw.make(FILES.get(setting.task, setting.task), nworld=setting.nworld, engine=setting.engine, **place)
+    first = time.perf_counter() - began + seconds(env, env.step)
+    if setting.apart:
+        state = env.get_state()
+        step = env.state_space.split(state)["step"]
+        step.copy_(torch.randint(0, env.horizon, step.shape, device=state.device))
+        env.set_state(state)
+    return env, first
+
+
+def measure(setting: Setting) -> dict[str, Any]:
+    """What of the bare engine's rate is kept."""
+    env, first = first_step(setting)
+    if setting.npg:
+        npg = lw.NPG(env, config=lw.NPGConfig(samples=BLOCK * setting.nworld, mean_every=0))
+        return compare(
+            env, setting.blocks, lambda t: npg.policy.sample(env.obs, npg.noise[t], out=env.action), npg.sample, first
+        )
+    actions = contestants.actions(env, seed=0)
+
+    def block() -> None:
+        for t in range(BLOCK):
+            env.action.copy_(actions[t])
+            env.step()
+
+    return compare(env, setting.blocks, lambda t: env.action.copy_(actions[t]), block, first)

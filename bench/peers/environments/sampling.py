@@ -1,0 +1,228 @@
+"""Environment steps per second of other libraries' environments: a worker of bench/peers.py.
+
+It reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints one. Actions are uniform in
+their bounds, drawn before the clock starts; an episode that ends restarts within the step where the library can do so.
+"""
+
+import json
+import multiprocessing
+import sys
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+
+KEPT_ACTIONS = 16
+"""Steps after which the actions are repeated."""
+
+ENVPOOL = {
+    "hopper": "Hopper-v5",
+    "walker2d": "Walker2d-v5",
+    "half_cheetah": "HalfCheetah-v5",
+    "swimmer": "Swimmer-v5",
+    "ant": "Ant-v5",
+    "humanoid": "Humanoid-v5",
+    "cartpole": "CartpoleBalance-v1",
+}
+"""EnvPool's names of the tasks."""
+
+
+def draw(low: np.ndarray, high: np.ndarray, envs: int, seed: int) -> np.ndarray:
+    """Actions of some steps, (KEPT_ACTIONS, envs, nact)."""
+    return np.random.default_rng(seed).uniform(low, high, (KEPT_ACTIONS, envs, *low.shape))
+
+
+class Gymnasium:
+    """Gymnasium's vector environments, or with ``gymnasium`` alone a single environment."""
+
+    def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
+        import gymnasium
+        from python_tasks import GYMNASIUM
+
+        name = GYMNASIUM[task]
+        self.single = contestant == "gymnasium"
+        if self.single:
+            self.env: Any = gymnasium.make(name)
+            space = self.env.action_space
+        else:
+            kind = {"gym-sync": gymnasium.vector.SyncVectorEnv, "gym-async": gymnasium.vector.AsyncVectorEnv}
+            mode = gymnasium.vector.AutoresetMode.SAME_STEP
+            self.env = kind[contestant]([lambda: gymnasium.make(name)] * envs, autoreset_mode=mode)
+            space = self.env.single_action_space
+        self.actions = draw(space.low, space.high, envs, seed).astype(np.float32)
+        self.env.reset(seed=seed)
+
+    def step(self, t: int) -> None:
+        if not self.single:
+            self.env.step(self.actions[t])
+            return
+        _, _, terminated, truncated, _ = self.env.step(self.actions[t, 0])
+        if terminated or truncated:
+            self.env.reset()
+
+    def close(self) -> None:
+        self.env.close()
+
+
+class DmControl:
+    """dm_control's environments in persistent processes, or with one environment in this one.
+
+    Its authors recommend processes (github.com/google-deepmind/dm_control/issues/94). Each process steps its share of
+    the environments and gets one message a step; actions and results are in shared memory.
+    """
+
+    def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
+        from python_tasks import dm_control_env
+
+        first = dm_control_env(task, seed)
+        spec = first.action_spec()
+        self.actions = draw(spec.minimum, spec.maximum, envs, seed)
+        self.pipes: list[Connection] = []
+        if envs == 1:
+            self.one = Share(task, [seed], None, None)
+            return
+        context = multiprocessing.get_context("fork")
+        nobs = sum(int(np.prod(part.shape)) for part in first.observation_spec().values())
+        self.shared_actions = shared(context, (envs, *spec.shape))
+        results = shared(context, (envs, nobs + 2))
+        for part in np.array_split(np.arange(envs), threads):
+            here, there = context.Pipe()
+            args = (there, task, [seed + int(i) for i in part], self.shared_actions[part[0] : part[-1] + 1],
+                    results[part[0] : part[-1] + 1])  # fmt: skip
+            context.Process(target=Share.serve, args=args, daemon=True).start()
+            self.pipes.append(here)
+        for pipe in self.pipes:
+            pipe.recv_bytes()
+
+    def step(self, t: int) -> None:
+        if not self.pipes:
+            self.one.step(self.actions[t])
+            return
+        self.shared_actions[:] = self.actions[t]
+        for pipe in self.pipes:
+            pipe.send_bytes(b"step")
+        for pipe in self.pipes:
+            pipe.recv_bytes()
+
+    def close(self) -> None:
+        for pipe in self.pipes:
+            pipe.send_bytes(b"end")
+
+
+def shared(context: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """An array that forked processes share."""
+    memory = context.RawArray("d", int(np.prod(shape)))
+    return np.frombuffer(memory).reshape(shape)
+
+
+class Share:
+    """The environments of one process."""
+
+    def __init__(self, task: str, seeds: list[int], actions: Any, results: Any) -> None:
+        from python_tasks import dm_control_env
+
+        self.envs = [dm_control_env(task, seed) for seed in seeds]
+        for env in self.envs:
+            env.reset()
+        self.actions, self.results = actions, results
+
+    def step(self, actions: np.ndarray) -> None:
+        for i, env in enumerate(self.envs):
+            step = env.step(actions[i])
+            reward, end = step.reward, step.last()
+            if end:
+                step = env.reset()
+            obs = np.concatenate([np.ravel(part) for part in step.observation.values()])
+            if self.results is not None:
+                self.results[i, :-2], self.results[i, -2], self.results[i, -1] = obs, reward, end
+
+    @classmethod
+    def serve(cls, pipe: Connection, *args: Any) -> None:
+        share = cls(*args)
+        pipe.send_bytes(b"ready")
+        while pipe.recv_bytes() == b"step":
+            share.step(share.actions)
+            pipe.send_bytes(b"done")
+
+
+class EnvPool:
+    """EnvPool: all environments step together (``envpool``), or those that are ready do (``envpool-async``)."""
+
+    def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
+        import envpool
+
+        self.together = contestant == "envpool"
+        batch = envs if self.together else envs // 2
+        self.env = envpool.make(
+            ENVPOOL[task], env_type="gymnasium", num_envs=envs, batch_size=batch, num_threads=threads, seed=seed
+        )
+        space = self.env.action_space
+        self.actions = draw(space.low, space.high, batch, seed).astype(space.dtype)
+        if self.together:
+            self.env.reset()
+        else:
+            self.env.async_reset()
+
+    def step(self, t: int) -> None:
+        if self.together:
+            self.env.step(self.actions[t])
+            return
+        ids = self.env.recv()[-1]["env_id"]
+        self.env.send(self.actions[t], ids)
+
+    def close(self) -> None:
+        self.env.close()
+
+
+CONTESTANTS: dict[str, Callable[..., Any]] = {
+    "gymnasium": Gymnasium,
+    "gym-sync": Gymnasium,
+    "gym-async": Gymnasium,
+    "dm_control": DmControl,
+    "envpool": EnvPool,
+    "envpool-async": EnvPool,
+}
+
+
+def timed(
+    step: Callable[[int], None], warm: int, seconds: float, wait: Callable[[], None] = lambda: None
+) -> tuple[int, float]:
+    """Number of steps, and the seconds that they took.
+
+    Args:
+        step: Makes a step with the actions of a number below ``KEPT_ACTIONS``.
+        warm: Steps before the clock starts.
+        seconds: How long to step.
+        wait: Waits for the steps to end, where they run behind.
+    """
+    for t in range(warm):
+        step(t % KEPT_ACTIONS)
+    wait()
+    count, block, start = 0, 1, time.perf_counter()
+    now = start
+    while now - start < seconds:
+        began = now
+        for _ in range(block):
+            step(count % KEPT_ACTIONS)
+            count += 1
+        wait()
+        now = time.perf_counter()
+        if now - began < 0.01:  # reading the clock must not count
+            block *= 2
+    return count, now - start
+
+
+def main() -> None:
+    given = json.load(sys.stdin)
+    settings = {name: given[name] for name in ("contestant", "task", "envs", "threads", "seed")}
+    made = CONTESTANTS[given["contestant"]](**settings)
+    steps, seconds = timed(made.step, given["warm"], given["seconds"])
+    width = made.actions.shape[1]
+    made.close()
+    print(json.dumps({"env_steps_per_second": steps * width / seconds, "steps": steps}))
+
+
+if __name__ == "__main__":
+    main()

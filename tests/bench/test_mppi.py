@@ -1,0 +1,111 @@
+"""MPPI's experiment, in the mechanics of its short mode."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import lyceum_warp as lw
+
+BENCH = Path(__file__).parents[2] / "bench"
+
+
+@pytest.fixture
+def mppi(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCH))
+    import mppi
+
+    return mppi
+
+
+def main(mppi: ModuleType, out: Path, *words: str) -> int:
+    import experiment
+
+    return experiment.main(mppi.EXPERIMENT, ["--short", "--threads", "1", "--out", str(out), *words])
+
+
+@pytest.mark.parametrize("task", ["reach", "half_cheetah", "adroit_pen"])
+def test_python_environments_earn_our_rewards(mppi: ModuleType, task: str) -> None:
+    if task == "adroit_pen":
+        pytest.importorskip("gymnasium_robotics")
+    env = lw.make(task, autoreset=False, nthread=1, seed=3)
+    theirs = mppi.python_mppi.ENVS[task](lw.make(task, nthread=1).model)
+    env.step(torch.full_like(env.action, 0.1))  # not from the initial state
+    theirs.set_state(env.get_state()[0].numpy())
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(5):
+        env.step(2.0 * torch.rand(env.action.shape, generator=generator) - 1.0)
+        assert theirs.step(env.action[0].numpy().astype(float))[1] == pytest.approx(env.reward.item(), abs=2e-4)
+
+
+def test_the_short_mode_runs_and_resumes(mppi: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "mppi.jsonl"
+    assert main(mppi, out, "--contestants", "mppi", "python", "python_stepwise") == 0
+    text = capsys.readouterr().out
+    assert "0 of 6 cases are there" in text and "| reach | 30 x 16 | ours, C engine |" in text
+    assert main(mppi, out, "--contestants", "mppi", "python", "python_stepwise") == 0
+    assert "6 of 6 cases are there" in capsys.readouterr().out
+    import experiment
+
+    rows = experiment.read(out)
+    plans = {row.case["contestant"]: row.result for row in rows if row.case["part"] == "plans"}
+    assert 0.0 < plans["mppi"]["kept"] < 1.5 and plans["python_stepwise"]["plan_ms"] > plans["python"]["plan_ms"]
+    episodes = {row.case["contestant"]: row.result for row in rows if row.case["part"] == "episodes"}
+    returns = [result["return"] for result in episodes.values()]
+    assert max(returns) - min(returns) < 0.2 * abs(min(returns))  # the same planner on the same plant
+    mppi.figure(rows).savefig(tmp_path / "mppi.svg")
+
+
+def test_judo_is_skipped_where_it_cannot_be_installed(
+    mppi: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(mppi.peers, "_failure", lambda name, requirements: f"{name} cannot be installed: no network")
+    words = ["--tasks", "cartpole_swingup", "--parts", "cartpole", "--contestants", "mppi", "judo"]
+    assert main(mppi, tmp_path / "mppi.jsonl", *words) == 0
+    text = capsys.readouterr().out
+    assert text.count("skipped: judo cannot be installed: no network\n") == 1
+    assert "| 16 | ours, C engine |" in text
+
+
+def test_judos_worker_has_our_reward(monkeypatch: pytest.MonkeyPatch) -> None:
+    stub: Any = SimpleNamespace(
+        Task=object, TaskConfig=object, MujocoState=None, Controller=None, ControllerConfig=None, MPPI=None,
+        MPPIConfig=None,
+    )  # fmt: skip
+    stub.tasks = SimpleNamespace(base=stub)
+    for name in ("judo", "judo.tasks", "judo.tasks.base", "judo.app", "judo.app.structs", "judo.controller",
+                 "judo.controller.controller", "judo.optimizers", "judo.optimizers.mppi"):  # fmt: skip
+        monkeypatch.setitem(sys.modules, name, stub)
+    spec = importlib.util.spec_from_file_location("judo_worker", BENCH / "peers" / "judo" / "worker.py")
+    worker = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(worker)
+    env = lw.make("cartpole_swingup", nworld=64, nthread=1)
+    env.rand_reset(0)
+    for _ in range(30):
+        env.step(2.4 * torch.rand(env.action.shape) - 1.2)
+        parts, state = env.state_space.parts, env.get_state().numpy()
+        after = np.concatenate([state[:, parts["qpos"]], state[:, parts["qvel"]]], axis=1)
+        controls = env.action.clamp(-1.0, 1.0).numpy()
+        assert worker.rewards(after, controls) == pytest.approx(env.reward.numpy(), abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--parts", "episode"], "there is no part 'episode': did you mean episodes?"),
+        (["--contestants", "hydrax"], "there is no contestant 'hydrax'"),
+        (["--jobs", "2"], "the cases of mppi compete for the cores, so that jobs must be 1"),
+        (["--block", "0"], "block and repeats must be at least 1"),
+    ],
+)
+def test_bad_input_gets_one_line(
+    mppi: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    assert main(mppi, tmp_path / "mppi.jsonl", *words) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1

@@ -1,0 +1,34 @@
+"""lyceum-warp bench."""
+
+from pathlib import Path
+
+import pytest
+
+from lyceum_warp.cli import bench as bench_command
+from lyceum_warp.cli import main
+
+
+def test_bench_lists_the_experiments(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench"]) == 0
+    out = capfd.readouterr().out
+    assert "--short" in out and "lyceum-warp bench plot" in out
+
+
+def test_bench_passes_options_and_exit_code_of_a_program(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "measurements", "--help"]) == 0
+    assert "Ratios of the numbers in two files" in capfd.readouterr().out
+    assert main(["bench", "plot", "no_experiment"]) == 2
+    assert capfd.readouterr().err.startswith("plot: there is no experiment 'no_experiment': ")
+
+
+def test_bench_refuses_unknown_programs(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "throughputs"]) == 2
+    assert "there is no program 'throughputs' in bench/: did you mean throughput?" in capfd.readouterr().err
+
+
+def test_bench_says_that_it_needs_a_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(bench_command.__globals__, "FOLDER", tmp_path / "bench")
+    assert main(["bench"]) == 2
+    assert "the experiments belong to a checkout of the repository" in capfd.readouterr().err
