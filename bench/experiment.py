@@ -324,7 +324,10 @@ def run(experiment: Experiment, options: Options) -> int:
     Raises:
         ValueError: An option is wrong.
     """
-    if options.device.startswith("cuda") and not torch.cuda.is_available():
+    kind, _, number = options.device.partition(":")
+    if kind not in ("cpu", "cuda") or (number and not number.isdigit()):
+        raise ValueError(f"there is no device {options.device!r}: give cpu, cuda or cuda:1")
+    if kind == "cuda" and int(number or 0) >= torch.cuda.device_count():
         raise ValueError(f"there is no GPU for --device {options.device}")
     cases = {key(dataclasses.asdict(case)): case for case in experiment.cases(options)}
     folder = RESULTS / "short" if options.short else RESULTS

@@ -27,6 +27,8 @@ PARTS = {"cores": ("native", "c", "envpool", "gym-async", "dm_control"), "worlds
 WORLDS = {"warp": (1, 8, 64, 512, 2_048, 8_192, 16_384, 32_768, 65_536, 131_072), "c": (1, 8, 64, 512, 4_096)}
 CPU_WORLDS = 512
 """Most worlds of the Warp engine on the CPU."""
+FEW_WORLDS = 16_384
+"""Up to so many worlds a step is short, and the clock starts late."""
 SATURATED = 0.9
 """Share of the highest rate from which on more worlds gain little."""
 
@@ -86,7 +88,7 @@ def cases(options: Options) -> list[Case]:
         if name in named and contestants.takes_part(name, task)
     ]
     by_worlds = [
-        Case("worlds", task, repeat, name, many, max(threads), device, seconds, warm)
+        Case("worlds", task, repeat, name, many, max(threads), device, seconds, warm if many <= FEW_WORLDS else 20)
         for task in tasks
         for repeat in range(repeats)
         for name, device in (("warp", options.device), ("c", "cpu"))
