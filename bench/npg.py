@@ -48,7 +48,7 @@ CONFIGS = {
     "hopper": lw.NPGConfig(mean_every=0),
     "walker2d": lw.NPGConfig(mean_every=0),
 }
-"""Settings of NPG: the default ones, but for Swimmer's discount, with which an earlier table learns it."""
+"""Settings of NPG: the default ones, except for Swimmer's discount, which an earlier table chose."""
 
 SHORT = {"samples": 500, "value_epochs": 1}
 """Other settings of NPG in the short mode."""
@@ -289,8 +289,10 @@ class GymnasiumRollout(Rollout):
 def vector(task: str, nworld: int, mode: str) -> VectorEnv:
     """Gymnasium's vector environment, without the checks that are for writers of environments."""
     made = [functools.partial(gymnasium.make, TASKS[task], disable_env_checker=True)] * nworld
-    kind = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}[mode]
-    return kind(made, autoreset_mode=AutoresetMode.SAME_STEP)
+    if mode == "sync":
+        return SyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP)
+    # Gymnasium's own way on Linux; new interpreters would import all of this program, once for each world
+    return AsyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP, context="fork")
 
 
 def rates(task: str, nworld: int, steps: int) -> dict[str, float]:
