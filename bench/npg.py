@@ -16,11 +16,15 @@ exist. Every case is a process of its own on cores of its own.
 import contextlib
 import copy
 import dataclasses
+import fcntl
 import functools
+import os
 import statistics
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import comparison
@@ -138,7 +142,7 @@ class Case:
 
 
 def cases(options: Options) -> list[Case]:
-    """The runs; those that are compared have the same seeds and follow one another."""
+    """The runs; those that are compared have the same seeds and follow one another, those on a GPU come last."""
     short, cuda = options.short, options.device.startswith("cuda")
     contestants = choose(options.contestants, CONTESTANTS, ON_CPU + (ON_GPU if cuda else ()), what="contestant")
     for name in contestants:
@@ -154,9 +158,10 @@ def cases(options: Options) -> list[Case]:
             (3.0 if short else options.gpu_seconds) if name in ON_GPU else None,
             2 if short else options.judgements, 2 if short else options.episodes, short,
         )
+        for group in (ON_CPU, ON_GPU)
         for seed in options.seeds or (range(2) if short else range(5))
         for task in choose(options.tasks, TASKS, ("swimmer",) if short else (), what="task")
-        for name in contestants
+        for name in contestants if name in group
     ]  # fmt: skip
 
 
@@ -432,10 +437,20 @@ RUN = {"npg": npg, "npg_gymnasium": npg, "npg_gpu": npg, "ppo_rsl_rl": rsl_rl, "
        "trpo_sb3": stable_baselines3}  # fmt: skip
 
 
+@contextlib.contextmanager
+def alone(name: str) -> Iterator[None]:
+    """Wait until no other process of this machine is in here: jobs would share the GPU."""
+    path = Path(tempfile.gettempdir()) / f"lyceum_warp-{os.getuid()}-{name}.lock"
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
 def measure(case: Case, options: Options) -> dict[str, Any]:
     torch.set_num_threads(case.threads)
     curve = Curve(case)
-    more = RUN[case.contestant](case, options, curve)
+    with alone("gpu") if case.contestant in ON_GPU else contextlib.nullcontext():
+        more = RUN[case.contestant](case, options, curve)
     samples, seconds, mean, noisy = curve.points[-1]
     return {"samples": samples, "seconds": seconds, "mean_return": mean, "noisy_return": noisy, **more,
             "curve": curve.points}  # fmt: skip
