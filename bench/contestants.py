@@ -33,7 +33,8 @@ LABELS = {
     "envpool": "EnvPool",
     "gym-async": "Gymnasium, AsyncVectorEnv",
     "gym-sync": "Gymnasium, SyncVectorEnv",
-    "gymnasium": "Gymnasium, one environment",
+    "gymnasium": "Gymnasium",
+    "gymnasium-newton": "Gymnasium, Newton's solver",
     "dm_control": "dm_control",
 }
 
@@ -51,6 +52,9 @@ def worlds(contestant: str, threads: int, device: str) -> int:
 
 
 def takes_part(contestant: str, task: str) -> bool:
+    """Whether a contestant has a task; Newton's solver is another one than the model's own for humanoid alone."""
+    if contestant == "gymnasium-newton":
+        return task == "humanoid"
     return contestant != "envpool" or task in sampling.ENVPOOL
 
 
@@ -80,13 +84,13 @@ def measure(
         else:
             settings = {"contestant": contestant, "task": task, "envs": worlds, "threads": threads}
             return worker(contestant).run(**settings, seed=seed, seconds=seconds, warm=warm)
-        steps, passed = sampling.timed(made.step, warm, seconds, made.wait)
+        steps, passed = sampling.timed(made.step, len(made.actions), warm, seconds, made.wait)
     return {"env_steps_per_second": steps * worlds / passed, "steps": steps}
 
 
 def worker(contestant: str) -> peers.Peer:
     """The program that measures another library."""
-    if contestant in ("gymnasium", "gym-sync", "gym-async"):
+    if contestant in ("gymnasium", "gymnasium-newton", "gym-sync", "gym-async"):
         return peers.peer_here("gymnasium", WORKER)
     if contestant == "envpool" and importlib.util.find_spec("envpool"):
         return peers.peer_here("envpool", WORKER)
@@ -121,11 +125,11 @@ class Ours:
             wp.synchronize_device(self.env.device)
 
 
-def actions(env: lw.Env, seed: int) -> torch.Tensor:
-    """Actions of some steps, (KEPT_ACTIONS, nworld, nact)."""
+def actions(env: lw.Env, seed: int) -> list[torch.Tensor]:
+    """Actions of some steps, (nworld, nact) each; a list, because taking a tensor's rows would be timed, too."""
     low, high = (np.nan_to_num(x, posinf=1.0, neginf=-1.0) for x in (env.action_space.low, env.action_space.high))
     drawn = sampling.draw(np.asarray(low), np.asarray(high), env.nworld, seed)
-    return torch.as_tensor(drawn, dtype=torch.float32, device=env.obs.device)
+    return list(torch.as_tensor(drawn, dtype=torch.float32, device=env.obs.device))
 
 
 class Native:
@@ -140,14 +144,14 @@ class Native:
         env, engine = ours.env, ours.env.engine
         self.model, nstep = engine.native_model, env.task.frame_skip
         for t in range(warm):
-            ours.step(t % sampling.KEPT_ACTIONS)
-        self.inputs = []
-        for t in range(sampling.KEPT_ACTIONS):
+            ours.step(t % len(ours.actions))
+        self.actions = []
+        for t in range(16):
             start = engine.batch.state.copy()
             ours.step(t)
             controls = env.field("ctrl").double().numpy()
-            self.inputs.append((*self._split(start), np.repeat(controls[:, None], nstep, axis=1)))
-        size = self.inputs[0][0].shape[1]
+            self.actions.append((*self._split(start), np.repeat(controls[:, None], nstep, axis=1)))
+        size = self.actions[0][0].shape[1]
         self.out = np.zeros((nworld, nstep, size)), np.zeros((nworld, nstep, self.model.nsensordata))
         self.data = [mujoco.MjData(self.model) for _ in range(threads)]
         self.rollout = Rollout(nthread=threads)
@@ -165,7 +169,7 @@ class Native:
         return physics, warmstart
 
     def step(self, t: int) -> None:
-        physics, warmstart, controls = self.inputs[t]
+        physics, warmstart, controls = self.actions[t]
         state, sensordata = self.out
         self.rollout.rollout(
             self.model, self.data, physics, controls, initial_warmstart=warmstart, state=state, sensordata=sensordata

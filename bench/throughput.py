@@ -26,14 +26,14 @@ TASKS = ("cartpole", "hopper", "walker2d", "half_cheetah", "swimmer", "ant", "hu
 SHORT_TASKS = ("half_cheetah", "humanoid")
 PARTS = {
     "sampling": ("native", "c", "warp", "envpool", "gym-async", "gym-sync", "dm_control"),
-    "single": ("gymnasium", "c", "envpool", "dm_control"),
+    "single": ("gymnasium", "c", "gymnasium-newton", "envpool", "dm_control"),
     "kept": ("c", "warp", "npg"),
 }
 """Contestants of each part. The Warp engine takes part on a GPU, or where it is named."""
 
 COLORS = {
     "native": "#3d4654", "c": "#c8502d", "warp": "#e39a6f", "envpool": "#3d6fa5", "gym-async": "#5a8f4e",
-    "gym-sync": "#9cc28f", "gymnasium": "#5a8f4e", "dm_control": "#8a6bb1",
+    "gym-sync": "#9cc28f", "gymnasium": "#5a8f4e", "gymnasium-newton": "#9cc28f", "dm_control": "#8a6bb1",
 }  # fmt: skip
 
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-KEPT_ACTIONS = 16
-"""Steps after which the actions are repeated."""
+KEPT_ACTIONS = 4096
+"""Actions that are drawn before the clock starts, of all environments together; at least those of 16 steps."""
 
 ENVPOOL = {
     "hopper": "Hopper-v5",
@@ -30,21 +30,24 @@ ENVPOOL = {
 
 
 def draw(low: np.ndarray, high: np.ndarray, envs: int, seed: int) -> np.ndarray:
-    """Actions of some steps, (KEPT_ACTIONS, envs, nact)."""
-    return np.random.default_rng(seed).uniform(low, high, (KEPT_ACTIONS, envs, *low.shape))
+    """Actions of some steps, which are then repeated, (steps, envs, nact)."""
+    return np.random.default_rng(seed).uniform(low, high, (max(16, KEPT_ACTIONS // envs), envs, *low.shape))
 
 
 class Gymnasium:
-    """Gymnasium's vector environments, or with ``gymnasium`` alone a single environment."""
+    """Gymnasium's vector environments, or a single one: as it is, or with Newton's solver, which ours has."""
 
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
         import gymnasium
+        import mujoco
         from python_tasks import GYMNASIUM
 
         name = GYMNASIUM[task]
-        self.single = contestant == "gymnasium"
+        self.single = contestant in ("gymnasium", "gymnasium-newton")
         if self.single:
             self.env: Any = gymnasium.make(name)
+            if contestant == "gymnasium-newton":
+                self.env.unwrapped.model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
             space = self.env.action_space
         else:
             kind = {"gym-sync": gymnasium.vector.SyncVectorEnv, "gym-async": gymnasium.vector.AsyncVectorEnv}
@@ -58,7 +61,7 @@ class Gymnasium:
         if not self.single:
             self.env.step(self.actions[t])
             return
-        _, _, terminated, truncated, _ = self.env.step(self.actions[t, 0])
+        _, _, terminated, truncated, _ = self.env.step(self.actions[t][0])
         if terminated or truncated:
             self.env.reset()
 
@@ -178,6 +181,7 @@ class EnvPool:
 
 CONTESTANTS: dict[str, Callable[..., Any]] = {
     "gymnasium": Gymnasium,
+    "gymnasium-newton": Gymnasium,
     "gym-sync": Gymnasium,
     "gym-async": Gymnasium,
     "dm_control": DmControl,
@@ -187,25 +191,26 @@ CONTESTANTS: dict[str, Callable[..., Any]] = {
 
 
 def timed(
-    step: Callable[[int], None], warm: int, seconds: float, wait: Callable[[], None] = lambda: None
+    step: Callable[[int], None], period: int, warm: int, seconds: float, wait: Callable[[], None] = lambda: None
 ) -> tuple[int, float]:
     """Number of steps, and the seconds that they took.
 
     Args:
-        step: Makes a step with the actions of a number below ``KEPT_ACTIONS``.
+        step: Makes a step with the actions of a number below the period.
+        period: After how many steps the actions are repeated.
         warm: Steps before the clock starts.
         seconds: How long to step.
         wait: Waits for the steps to end, where they run behind.
     """
     for t in range(warm):
-        step(t % KEPT_ACTIONS)
+        step(t % period)
     wait()
     count, block, start = 0, 1, time.perf_counter()
     now = start
     while now - start < seconds:
         began = now
         for _ in range(block):
-            step(count % KEPT_ACTIONS)
+            step(count % period)
             count += 1
         wait()
         now = time.perf_counter()
@@ -218,7 +223,7 @@ def main() -> None:
     given = json.load(sys.stdin)
     settings = {name: given[name] for name in ("contestant", "task", "envs", "threads", "seed")}
     made = CONTESTANTS[given["contestant"]](**settings)
-    steps, seconds = timed(made.step, given["warm"], given["seconds"])
+    steps, seconds = timed(made.step, len(made.actions), given["warm"], given["seconds"])
     width = made.actions.shape[1]
     made.close()
     print(json.dumps({"env_steps_per_second": steps * width / seconds, "steps": steps}))

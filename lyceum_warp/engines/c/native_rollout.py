@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from mujoco.batch import Batch
 
-from lyceum_warp.engines.c.batch_faults import errors_as_warnings
+from lyceum_warp.engines.c.batch_faults import ErrorsAsWarnings
 from lyceum_warp.engines.c.world_models import WorldModels
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
 from lyceum_warp.model_fields import ModelField
@@ -107,10 +107,10 @@ class NativeRollout:
         np.copyto(self.by_step, controls.transpose(1, 0, 2)[:, :, None])
         rows: dict[str, Any] = {"record": list(self.rows), "out": self.rows}
         # a world that MuJoCo warns of stops there and repeats its last row: only the warning shows it
-        with errors_as_warnings(batch):
+        with ErrorsAsWarnings(batch):
             batch.rollout(nstep=self.control.shape[1], control=self.control, **rows)
         if self.stage > Stage.NONE:
-            with errors_as_warnings(batch):
+            with ErrorsAsWarnings(batch):
                 batch.forward(stage=self.stage)
         with np.errstate(over="ignore"):  # a world with a fault may hold numbers beyond float32
             for field in self.fields:

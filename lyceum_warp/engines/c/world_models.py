@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import MODEL_FIELDS, Batch
 
-from lyceum_warp.engines.c.batch_faults import errors_as_warnings
+from lyceum_warp.engines.c.batch_faults import ErrorsAsWarnings
 from lyceum_warp.model_fields import ModelField
 
 
@@ -66,7 +66,7 @@ class WorldModels:
     def _set_const(self, worlds: np.ndarray) -> None:
         """Recompute constants; a world where MuJoCo refuses to gets a warning, and is tried again next time."""
         counted = self.batch.warning[:, :, 1].sum(axis=1)
-        with errors_as_warnings(self.batch):
+        with ErrorsAsWarnings(self.batch):
             self.batch.set_const(worlds)
         self._stale[worlds] = (self.batch.warning[:, :, 1].sum(axis=1) > counted)[worlds]
 
