@@ -36,7 +36,7 @@ from experiment import Row, Table, choose, installed, median_and_range
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, NullFormatter
 
 import lyceum_warp as lw
 from lyceum_warp.algos.distributed import Team
@@ -563,7 +563,7 @@ def agreement(task: str, same: dict[str, list[Row]]) -> Table | None:
 def figure(rows: Sequence[Row]) -> Figure:
     """Returns against samples and against seconds: mean over the seeds with its 95 % interval."""
     found = runs(rows)
-    drawn = Figure(figsize=(4.0 * len(found), 6.4), layout="constrained")
+    drawn = Figure(figsize=(max(4.0 * len(found), 7.0), 6.6), layout="constrained")
     FigureCanvasAgg(drawn)
     axes = drawn.subplots(2, len(found), squeeze=False)
     for column, (task, same) in enumerate(found.items()):
@@ -575,23 +575,26 @@ def figure(rows: Sequence[Row]) -> Figure:
         axes[0, column].set_xlabel("samples")
         axes[1, column].set_xlabel("seconds of learning")
         axes[1, column].set_xscale("log")
+        axes[1, column].xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes[1, column].xaxis.set_minor_formatter(NullFormatter())
         axes[0, column].xaxis.set_major_formatter(EngFormatter(sep=""))
     for row in axes:
         row[0].set_ylabel("return of the mean policy\n(dotted: of the policy with its noise)")
     handles = {label: handle for panel in axes.flat for handle, label in zip(*panel.get_legend_handles_labels(),
                                                                              strict=True)}  # fmt: skip
-    drawn.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3, frameon=False)
+    drawn.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=min(3, len(found) + 1), frameon=False
+    )
     finish_axes(axes.flat)
     return drawn
 
 
 def draw(axes: Any, group: Sequence[Row], name: str, x: int) -> None:
     """The curves of a contestant against samples (x = 0) or seconds (x = 1)."""
-    count = min(len(row.result["curve"]) for row in group)
     last = min(row.result["curve"][-1][x] for row in group)
-    # before the first update there is no time to draw on a logarithmic axis
-    grid = np.array([statistics.fmean(row.result["curve"][i][x] for row in group) for i in range(x, count)])
-    grid = grid[grid <= last]
+    # the first policy is at 0 seconds, which a logarithmic axis does not have
+    first = min(max(row.result["curve"][x][x] for row in group), last)
+    grid = np.linspace(first, last, 101) if x == 0 else np.geomspace(first, last, 101)
     for column, style in ((2, "-"), (3, ":")):
         curves = []
         for row in group:
