@@ -31,9 +31,10 @@ import peers
 import python_mppi
 import torch
 import warp as wp
-from experiment import Row, Skipped, Table, choose, median_and_range
+from experiment import Row, Skipped, Table, choose, installed, median_and_range
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
 from mujoco.batch import Batch
 
 import lyceum_warp as lw
@@ -366,6 +367,8 @@ RUN = {"plans": run_plans, "episodes": run_episodes, "cartpole": run_cartpole}
 
 @torch.no_grad()
 def measure(case: Case, options: Options) -> dict[str, Any]:
+    if case.task == "adroit_pen":
+        installed("gymnasium_robotics", "gymnasium-robotics")
     # threads and processes that start now use these cores alone
     with experiment.cores(case.threads):
         return RUN[case.part](case, options)
@@ -464,40 +467,43 @@ def cartpole_table(found: dict[tuple[str, int | None], dict[str, list[Row]]]) ->
 
 
 def figure(rows: Sequence[Row]) -> Figure:
-    """Bars: seconds of an episode with its success, or milliseconds of a plan."""
-    panels: list[tuple[str, str, list[tuple[str, float, str]]]] = []
+    """Seconds of an episode with its success, or milliseconds of a plan, as points on a logarithmic axis."""
+    panels: list[tuple[str, str, list[tuple[str, float, str]]]] = []  # title, unit, contestants
     for (task, _), same in grouped(rows, "episodes").items():
-        bars = []
+        points = []
         for name, group in same.items():
             each = [episode for row in group for episode in row.result["each"]]
             share = statistics.fmean(int(episode[1]) for episode in each)
             seconds = statistics.fmean(episode[3] for episode in each)
-            bars.append((name, seconds, f"{seconds:.3g} s, {share:.0%} succeed"))
-        panels.append((task, "seconds of an episode", bars))
+            points.append((name, seconds, f"{seconds:.3g} s, {share:.0%} succeed"))
+        panels.append((task, "seconds of an episode", points))
     for part in ("plans", "cartpole"):
         for (task, samples), same in grouped(rows, part).items():
             if part == "plans" and any(panel[0] == task for panel in panels):
                 continue
-            bars = []
+            points = []
             for name, group in same.items():
                 plan = statistics.median(row.result["plan_ms"] for row in group)
                 earned = f", return {statistics.fmean(row.result['return'] for row in group):.0f}"
-                bars.append((name, plan, f"{plan:.3g} ms{earned if part == 'cartpole' else ''}"))
-            panels.append((task if samples is None else f"{task}, {samples} samples", "milliseconds of a plan", bars))
+                points.append((name, plan, f"{plan:.3g} ms{earned if part == 'cartpole' else ''}"))
+            panels.append((task if samples is None else f"{task}, {samples} samples", "milliseconds of a plan", points))
     drawn = Figure(figsize=(10.0, 1.0 + 1.9 * ((len(panels) + 1) // 2)), layout="constrained")
     FigureCanvasAgg(drawn)
     axes = drawn.subplots((len(panels) + 1) // 2, 2, squeeze=False).flatten()
-    for panel, (task, unit, bars) in zip(axes, panels, strict=False):
+    for panel, (task, unit, points) in zip(axes, panels, strict=False):
         panel.set_title(task, loc="left", fontsize=10)
         panel.set_xlabel(unit)
         panel.set_xscale("log")
-        names, values, texts = zip(*bars, strict=True)
-        places = np.arange(len(bars))[::-1]
-        panel.barh(places, values, color=[COLORS[name] for name in names], height=0.62)
+        names, values, texts = zip(*points, strict=True)
+        places = np.arange(len(points))[::-1]
+        panel.scatter(values, places, s=60, color=[COLORS[name] for name in names], zorder=2)
         panel.set_yticks(places, [CONTESTANTS[name] for name in names])
-        panel.set_xlim(min(values) / 3, max(values) * 30)  # room for the text beside the longest bar
+        panel.set_ylim(-0.7, len(points) - 0.3)
+        panel.set_xlim(min(values) / 2, max(values) * 20)  # room for the text beside the last point
+        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        panel.xaxis.set_minor_formatter(NullFormatter())
         for place, value, text in zip(places, values, texts, strict=True):
-            panel.annotate(text, (value, place), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8)
+            panel.annotate(text, (value, place), xytext=(8, 0), textcoords="offset points", va="center", fontsize=8)
     for panel in axes[len(panels) :]:
         panel.set_visible(False)
     finish_axes(axes)

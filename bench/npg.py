@@ -16,11 +16,15 @@ exist. Every case is a process of its own on cores of its own.
 import contextlib
 import copy
 import dataclasses
+import fcntl
 import functools
+import os
 import statistics
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import comparison
@@ -32,7 +36,7 @@ from experiment import Row, Table, choose, installed, median_and_range
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, NullFormatter
 
 import lyceum_warp as lw
 from lyceum_warp.algos.distributed import Team
@@ -48,7 +52,7 @@ CONFIGS = {
     "hopper": lw.NPGConfig(mean_every=0),
     "walker2d": lw.NPGConfig(mean_every=0),
 }
-"""Settings of NPG: the default ones, but for Swimmer's discount, with which an earlier table learns it."""
+"""Settings of NPG: the default ones, except for Swimmer's discount, which an earlier table chose."""
 
 SHORT = {"samples": 500, "value_epochs": 1}
 """Other settings of NPG in the short mode."""
@@ -138,7 +142,7 @@ class Case:
 
 
 def cases(options: Options) -> list[Case]:
-    """The runs; those that are compared have the same seeds and follow one another."""
+    """The runs; those that are compared have the same seeds and follow one another, those on a GPU come last."""
     short, cuda = options.short, options.device.startswith("cuda")
     contestants = choose(options.contestants, CONTESTANTS, ON_CPU + (ON_GPU if cuda else ()), what="contestant")
     for name in contestants:
@@ -154,9 +158,10 @@ def cases(options: Options) -> list[Case]:
             (3.0 if short else options.gpu_seconds) if name in ON_GPU else None,
             2 if short else options.judgements, 2 if short else options.episodes, short,
         )
+        for group in (ON_CPU, ON_GPU)
         for seed in options.seeds or (range(2) if short else range(5))
         for task in choose(options.tasks, TASKS, ("swimmer",) if short else (), what="task")
-        for name in contestants
+        for name in contestants if name in group
     ]  # fmt: skip
 
 
@@ -289,8 +294,10 @@ class GymnasiumRollout(Rollout):
 def vector(task: str, nworld: int, mode: str) -> VectorEnv:
     """Gymnasium's vector environment, without the checks that are for writers of environments."""
     made = [functools.partial(gymnasium.make, TASKS[task], disable_env_checker=True)] * nworld
-    kind = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}[mode]
-    return kind(made, autoreset_mode=AutoresetMode.SAME_STEP)
+    if mode == "sync":
+        return SyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP)
+    # Gymnasium's own way on Linux; new interpreters would import all of this program, once for each world
+    return AsyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP, context="fork")
 
 
 def rates(task: str, nworld: int, steps: int) -> dict[str, float]:
@@ -430,10 +437,20 @@ RUN = {"npg": npg, "npg_gymnasium": npg, "npg_gpu": npg, "ppo_rsl_rl": rsl_rl, "
        "trpo_sb3": stable_baselines3}  # fmt: skip
 
 
+@contextlib.contextmanager
+def alone(name: str) -> Iterator[None]:
+    """Wait until no other process of this machine is in here: jobs would share the GPU."""
+    path = Path(tempfile.gettempdir()) / f"lyceum_warp-{os.getuid()}-{name}.lock"
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
 def measure(case: Case, options: Options) -> dict[str, Any]:
     torch.set_num_threads(case.threads)
     curve = Curve(case)
-    more = RUN[case.contestant](case, options, curve)
+    with alone("gpu") if case.contestant in ON_GPU else contextlib.nullcontext():
+        more = RUN[case.contestant](case, options, curve)
     samples, seconds, mean, noisy = curve.points[-1]
     return {"samples": samples, "seconds": seconds, "mean_return": mean, "noisy_return": noisy, **more,
             "curve": curve.points}  # fmt: skip
@@ -546,7 +563,7 @@ def agreement(task: str, same: dict[str, list[Row]]) -> Table | None:
 def figure(rows: Sequence[Row]) -> Figure:
     """Returns against samples and against seconds: mean over the seeds with its 95 % interval."""
     found = runs(rows)
-    drawn = Figure(figsize=(4.0 * len(found), 6.4), layout="constrained")
+    drawn = Figure(figsize=(max(4.0 * len(found), 7.0), 6.6), layout="constrained")
     FigureCanvasAgg(drawn)
     axes = drawn.subplots(2, len(found), squeeze=False)
     for column, (task, same) in enumerate(found.items()):
@@ -558,23 +575,26 @@ def figure(rows: Sequence[Row]) -> Figure:
         axes[0, column].set_xlabel("samples")
         axes[1, column].set_xlabel("seconds of learning")
         axes[1, column].set_xscale("log")
+        axes[1, column].xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes[1, column].xaxis.set_minor_formatter(NullFormatter())
         axes[0, column].xaxis.set_major_formatter(EngFormatter(sep=""))
     for row in axes:
         row[0].set_ylabel("return of the mean policy\n(dotted: of the policy with its noise)")
     handles = {label: handle for panel in axes.flat for handle, label in zip(*panel.get_legend_handles_labels(),
                                                                              strict=True)}  # fmt: skip
-    drawn.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3, frameon=False)
+    drawn.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=min(3, len(found) + 1), frameon=False
+    )
     finish_axes(axes.flat)
     return drawn
 
 
 def draw(axes: Any, group: Sequence[Row], name: str, x: int) -> None:
     """The curves of a contestant against samples (x = 0) or seconds (x = 1)."""
-    count = min(len(row.result["curve"]) for row in group)
     last = min(row.result["curve"][-1][x] for row in group)
-    # before the first update there is no time to draw on a logarithmic axis
-    grid = np.array([statistics.fmean(row.result["curve"][i][x] for row in group) for i in range(x, count)])
-    grid = grid[grid <= last]
+    # the first policy is at 0 seconds, which a logarithmic axis does not have
+    first = min(max(row.result["curve"][x][x] for row in group), last)
+    grid = np.linspace(first, last, 101) if x == 0 else np.geomspace(first, last, 101)
     for column, style in ((2, "-"), (3, ":")):
         curves = []
         for row in group:

@@ -100,6 +100,7 @@ class Processes:
             pipe, other = context.Pipe()
             process = context.Process(target=target, args=(other, *arguments[i]), daemon=True)
             process.start()
+            other.close()  # so that the end of the process ends our waiting for it
             self.pipes.append(pipe)
             self.processes.append(process)
         for pipe in self.pipes:

@@ -1,5 +1,6 @@
 """The learning curves of NPG and of its peers, in the mechanics of their short mode."""
 
+import contextlib
 import dataclasses
 import os
 import sys
@@ -67,6 +68,19 @@ def test_gymnasium_fills_the_buffer_with_the_numbers_of_our_environments(npg: Mo
         assert torch.equal(ours.episode_return[:until, world].isnan(), fed.episode_return[:until, world].isnan())
     later = fed.done.cumsum(0).roll(1, 0) > 0
     assert not fed.episode_return[1:][later[1:]].isnan().any()
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_gymnasiums_first_episodes_are_as_short_as_ours(npg: ModuleType, mode: str) -> None:
+    env = lw.make("swimmer", nworld=2, nthread=1)
+    state = env.get_state()
+    state[:, env.state_space.parts["step"]] = torch.tensor([[995.0], [998.0]], dtype=torch.float64)
+    env.set_state(state)
+    with contextlib.closing(npg.vector("swimmer", 2, mode)) as envs:
+        fed = npg.GymnasiumRollout(env, 8, envs, seed=0, segments=True)
+        fed.collect(lw.GaussianPolicy(8, 2), torch.zeros(8, 2, 2))
+    assert fed.done.nonzero().tolist() == [[1, 1], [4, 0]] and not fed.terminated.any()
+    assert fed.step[:, 0].tolist() == [995, 996, 997, 998, 999, 0, 1, 2]
 
 
 @pytest.mark.parametrize("contestant", ["npg", "npg_gymnasium"])

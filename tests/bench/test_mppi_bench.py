@@ -61,6 +61,22 @@ def test_the_short_mode_runs_and_resumes(mppi: ModuleType, tmp_path: Path, capsy
     mppi.figure(rows).savefig(tmp_path / "mppi.svg")
 
 
+def test_a_python_environment_that_cannot_be_made_is_skipped(mppi: ModuleType) -> None:
+    import experiment
+
+    with pytest.raises(experiment.Skipped, match="^Python's environment of cartpole cannot be made"):
+        mppi.python_planner("cartpole", "python", 1)
+
+
+def test_a_missing_model_is_skipped_with_one_line(
+    mppi: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
+    assert main(mppi, tmp_path / "mppi.jsonl", "--tasks", "adroit_pen") == 0
+    line = "skipped: gymnasium_robotics is not installed: pip install gymnasium-robotics\n"
+    assert capsys.readouterr().out.count(line) == 1
+
+
 def test_judo_is_skipped_where_it_cannot_be_installed(
     mppi: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
