@@ -29,6 +29,7 @@ import warp as wp
 from mujoco.batch import Batch
 
 import lyceum_warp as lw
+from lyceum_warp.arrays import launch_worlds
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import Stage
@@ -62,7 +63,7 @@ def next_controls(env: lw.Env) -> torch.Tensor:
         return env.action.clamp(low, high)
     controls = wp.zeros_like(env.engine.ctrl)
     args = [env.worlds.after, env.worlds.params, env.worlds.action, controls]
-    wp.launch(control, env.nworld, args, device=env.device)
+    launch_worlds(control, env.nworld, args, env.device)
     return wp.to_torch(controls)
 
 
