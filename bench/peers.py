@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -44,6 +45,7 @@ class Peer:
             **arguments: Entries of the object.
 
         Raises:
+            experiment.Skipped: The worker misses a package.
             RuntimeError: The worker failed.
         """
         # our own packages must not be found in the peer's environment
@@ -53,6 +55,8 @@ class Peer:
             command, input=json.dumps(arguments), env=env, timeout=timeout, capture_output=True, text=True
         )
         if done.returncode != 0:
+            if missing := re.search(r"^ModuleNotFoundError: No module named '(\w+)", done.stderr, re.MULTILINE):
+                raise experiment.Skipped(f"{self.name} needs the package {missing[1]}, which is not installed")
             raise RuntimeError(f"{self.name} failed with {arguments}:\n{done.stderr[-3000:]}")
         return json.loads(done.stdout.strip().splitlines()[-1])
 
