@@ -103,9 +103,13 @@ def _failure(name: str, requirements: Path) -> str:
             return ""
         print(f"making a virtual environment for {name}: {folder}", flush=True)
         shutil.rmtree(folder, ignore_errors=True)
-        pip = [str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-        limits = ["--retries", "1", "--timeout", "15"]
-        for command in ([sys.executable, "-m", "venv", str(folder)], [*pip, *limits, "-r", str(requirements)]):
+        # our own pip installs into it: to copy pip there first takes seconds
+        python = ["--python", str(folder / "bin" / "python")]
+        pip = [sys.executable, "-m", "pip", *python, "--disable-pip-version-check", "--retries", "1", "--timeout", "15"]
+        for command in (
+            [sys.executable, "-m", "venv", "--without-pip", str(folder)],
+            [*pip, "install", "--quiet", "-r", str(requirements)],
+        ):
             done = subprocess.run(command, capture_output=True, text=True)
             if done.returncode != 0:
                 shutil.rmtree(folder, ignore_errors=True)
