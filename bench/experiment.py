@@ -28,7 +28,6 @@ from typing import Any
 import measurements
 import torch
 import tyro
-from matplotlib.figure import Figure
 
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
@@ -116,8 +115,8 @@ class Experiment:
     """Measures a case with the options; raises Skipped where that is impossible here."""
     tables: Callable[[Sequence[Row]], Sequence[Table]]
     """Tables from the results of one machine alone."""
-    figure: Callable[[Sequence[Row]], Figure] | None
-    """Figure from the results of one machine alone."""
+    figure: Callable[[Sequence[Row]], Any] | None
+    """Figure of matplotlib, which may be missing where cases are measured, from the results of one machine alone."""
     options: type[Options] = Options
     packages: tuple[str, ...] = ()
     """Peers whose versions belong to the provenance."""
