@@ -245,7 +245,8 @@ def described(row: Row) -> str:
         parts.append(f"{found['gpu']} (driver {found.get('driver')})")
     names = {"mujoco": "mujoco", "mujoco_warp": "mujoco_warp", "warp_lang": "Warp", "torch": "torch"}
     parts.append(", ".join(f"{label} {found.get(name)}" for name, label in names.items()))
-    parts.append(f"commit {str(found.get('commit'))[:10]}, {found['date'][:10]}")
+    commit = [f"commit {found['commit'][:10]}"] if found.get("commit") else []
+    parts.append(", ".join([*commit, found["date"][:10]]))
     return "; ".join(parts)
 
 
