@@ -17,11 +17,14 @@ import json
 import multiprocessing
 import os
 import queue
+import signal
 import statistics
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -390,23 +393,62 @@ def outcomes(
     for place in core_sets(options.jobs, options.threads):
         places.put(place)
 
+    running: set[Any] = set()
+
     def alone(case: Any) -> tuple[Any, dict[str, Any] | Exception, float]:
         began, place = time.perf_counter(), places.get()
         os.sched_setaffinity(0, place)  # of this thread, from which the process inherits it
+        context = multiprocessing.get_context("spawn")
+        pipe, other = context.Pipe()
+        process = context.Process(target=_measure_apart, args=(other, experiment.measure, case, options))
+        process.start()
+        running.add(process)
+        other.close()
         try:
-            with concurrent.futures.ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-                return case, process.submit(experiment.measure, case, options).result(), time.perf_counter() - began
-        except Exception as error:
-            return case, error, time.perf_counter() - began
-        finally:
-            places.put(place)
+            result = pipe.recv()
+        except EOFError:
+            process.join()
+            result = RuntimeError(f"the process of the case ended with exit code {process.exitcode}")
+        process.join()
+        running.discard(process)
+        places.put(place)
+        return case, result, time.perf_counter() - began
 
     threads = concurrent.futures.ThreadPoolExecutor(options.jobs)
     try:
         for future in concurrent.futures.as_completed([threads.submit(alone, case) for case in cases]):
             yield future.result()
     finally:
-        threads.shutdown(cancel_futures=True)
+        threads.shutdown(wait=False, cancel_futures=True)
+        for process in list(running):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process.pid, signal.SIGTERM)
+        threads.shutdown()
+
+
+def _measure_apart(pipe: Connection, measure: Callable[[Any, Any], Any], case: Any, options: Options) -> None:
+    """A case's process: sends its result, or the exception that it ended with; it ends with the program."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, which the shell can make a program ignore
+    threading.Thread(target=_interrupt_after_parent, daemon=True).start()
+    try:
+        result = measure(case, options)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except Exception as error:
+        error.add_note("".join(traceback.format_tb(error.__traceback__)))
+        result = error
+    try:
+        pipe.send(result)
+    except Exception as error:  # of a result that cannot be pickled
+        pipe.send(RuntimeError(f"the result cannot be sent: {error!r}; it is {result!r}"))
+
+
+def _interrupt_after_parent() -> None:
+    """Interrupt this process when the program that started it has ended, so that it ends its own processes, too."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def core_sets(jobs: int, threads: int | None) -> list[set[int]]:

@@ -535,10 +535,13 @@ def interval(found: tuple[float, float], form: str = ",.0f") -> str:
 
 
 def agreement(task: str, same: dict[str, list[Row]]) -> Table | None:
-    """The mean policy's return of both NPGs at every hundred thousand samples, and whether they differ."""
+    """The mean policy's return of both NPGs at every hundred thousand samples, and whether they differ.
+
+    None with a single seed, or with runs that end before.
+    """
     ours, fed = (np.array([values_at(row, EVERY_100K) for row in same[name]]) for name in ("npg", "npg_gymnasium"))
     there = ~np.isnan(np.concatenate([ours, fed])).any(axis=0)
-    if not there.any():
+    if not there.any() or min(len(ours), len(fed)) < 2:
         return None
     ours, fed, places = ours[:, there], fed[:, there], np.array(EVERY_100K)[there]
     p = comparison.permutation_test(ours, fed)
