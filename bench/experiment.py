@@ -31,7 +31,6 @@ from typing import Any
 import measurements
 import torch
 import tyro
-from matplotlib.figure import Figure
 
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
@@ -119,8 +118,8 @@ class Experiment:
     """Measures a case with the options; raises Skipped where that is impossible here."""
     tables: Callable[[Sequence[Row]], Sequence[Table]]
     """Tables from the results of one machine alone."""
-    figure: Callable[[Sequence[Row]], Figure] | None
-    """Figure from the results of one machine alone."""
+    figure: Callable[[Sequence[Row]], Any] | None
+    """Figure of matplotlib, which may be missing where cases are measured, from the results of one machine alone."""
     options: type[Options] = Options
     packages: tuple[str, ...] = ()
     """Peers whose versions belong to the provenance."""
@@ -249,7 +248,8 @@ def described(row: Row) -> str:
         parts.append(f"{found['gpu']} (driver {found.get('driver')})")
     names = {"mujoco": "mujoco", "mujoco_warp": "mujoco_warp", "warp_lang": "Warp", "torch": "torch"}
     parts.append(", ".join(f"{label} {found.get(name)}" for name, label in names.items()))
-    parts.append(f"commit {str(found.get('commit'))[:10]}, {found['date'][:10]}")
+    commit = [f"commit {found['commit'][:10]}"] if found.get("commit") else []
+    parts.append(", ".join([*commit, found["date"][:10]]))
     return "; ".join(parts)
 
 

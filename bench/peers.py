@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -44,6 +45,7 @@ class Peer:
             **arguments: Entries of the object.
 
         Raises:
+            experiment.Skipped: The worker misses a package.
             RuntimeError: The worker failed.
         """
         # our own packages must not be found in the peer's environment
@@ -53,6 +55,8 @@ class Peer:
             command, input=json.dumps(arguments), env=env, timeout=timeout, capture_output=True, text=True
         )
         if done.returncode != 0:
+            if missing := re.search(r"^ModuleNotFoundError: No module named '(\w+)", done.stderr, re.MULTILINE):
+                raise experiment.Skipped(f"{self.name} needs the package {missing[1]}, which is not installed")
             raise RuntimeError(f"{self.name} failed with {arguments}:\n{done.stderr[-3000:]}")
         return json.loads(done.stdout.strip().splitlines()[-1])
 
@@ -99,9 +103,13 @@ def _failure(name: str, requirements: Path) -> str:
             return ""
         print(f"making a virtual environment for {name}: {folder}", flush=True)
         shutil.rmtree(folder, ignore_errors=True)
-        pip = [str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-        limits = ["--retries", "1", "--timeout", "15"]
-        for command in ([sys.executable, "-m", "venv", str(folder)], [*pip, *limits, "-r", str(requirements)]):
+        # our own pip installs into it: to copy pip there first takes seconds
+        python = ["--python", str(folder / "bin" / "python")]
+        pip = [sys.executable, "-m", "pip", *python, "--disable-pip-version-check", "--retries", "1", "--timeout", "15"]
+        for command in (
+            [sys.executable, "-m", "venv", "--without-pip", str(folder)],
+            [*pip, "install", "--quiet", "-r", str(requirements)],
+        ):
             done = subprocess.run(command, capture_output=True, text=True)
             if done.returncode != 0:
                 shutil.rmtree(folder, ignore_errors=True)

@@ -19,10 +19,13 @@ import kept
 from contestants import LABELS
 from experiment import Experiment, Row, Table, choose, median_and_range
 
+import lyceum_warp as lw
 from lyceum_warp.machine import cpu_cores
 from lyceum_warp.viz.style import finish_axes, new_figure
 
 TASKS = ("cartpole", "hopper", "walker2d", "half_cheetah", "swimmer", "ant", "humanoid", "herb_reach")
+OTHER_TASKS = (*sorted({*lw.task_names()} - {*TASKS}), *kept.FILES)
+"""Further tasks that the part kept can measure."""
 SHORT_TASKS = ("half_cheetah", "humanoid")
 PARTS = {
     "sampling": ("native", "c", "warp", "envpool", "gym-async", "gym-sync", "dm_control"),
@@ -45,6 +48,8 @@ class Options(experiment.Options):
     """Parts: sampling, single, kept; by default all."""
     seconds: float = 1.0
     """How long each contestant is timed in each repeat."""
+    worlds: int | None = None
+    """Number of worlds of our engines and of native C; by default 64 for each thread, and 16,384 on a GPU."""
     apart: bool = False
     """In the part kept, whether the worlds are at different steps of their episodes."""
 
@@ -67,7 +72,7 @@ class Case:
 def cases(options: Options) -> list[Case]:
     everything = dict.fromkeys(name for names in PARTS.values() for name in names)
     named = choose(options.contestants, everything, what="contestant")
-    tasks = choose(options.tasks, (*TASKS, "reach", *kept.FILES), SHORT_TASKS if options.short else TASKS, what="task")
+    tasks = choose(options.tasks, (*TASKS, *OTHER_TASKS), SHORT_TASKS if options.short else TASKS, what="task")
     parts = choose(options.parts, PARTS, what="part")
     threads = options.threads or cpu_cores()
     gpu = options.device.startswith("cuda")
@@ -76,10 +81,13 @@ def cases(options: Options) -> list[Case]:
 
     def case(part: str, task: str, repeat: int, name: str) -> Case:
         single = part == "single"
-        many = 1 if single else contestants.worlds("c" if name == "npg" else name, threads, options.device)
+        many = contestants.worlds("c" if name == "npg" else name, threads, options.device)
+        if options.worlds and name in ("native", "c", "warp", "npg"):
+            many = options.worlds
         device = options.device if name == "warp" else "cpu"
         steps = int(options.apart) if part == "kept" else warm
-        return Case(part, task, repeat, name, many, 1 if single else threads, device, seconds, steps)
+        size = (1, 1) if single else (many, threads)
+        return Case(part, task, repeat, name, *size, device, seconds, steps)
 
     return [
         case(part, task, repeat, name)

@@ -187,6 +187,9 @@ def test_peer_has_an_environment_of_its_own(
     (tmp_path / "echo" / "worker.py").write_text("raise ValueError('no')")
     with pytest.raises(RuntimeError, match="ValueError: no"):
         peers.peer("echo").run()
+    (tmp_path / "echo" / "worker.py").write_text("import a_missing_package")
+    with pytest.raises(experiment.Skipped, match="echo needs the package a_missing_package"):
+        peers.peer("echo").run()
     (tmp_path / "lost").mkdir()
     (tmp_path / "lost" / "requirements.txt").write_text(f"{tmp_path}/no_package.whl\n")
     for _ in range(2):
