@@ -81,12 +81,14 @@ def cases(options: Options) -> list[Case]:
 
     def case(part: str, task: str, repeat: int, name: str) -> Case:
         single = part == "single"
-        many = contestants.worlds("c" if name == "npg" else name, threads, options.device)
-        if options.worlds and name in ("native", "c", "warp", "npg"):
-            many = options.worlds
+        if single:
+            size = 1, 1
+        elif options.worlds and name in ("native", "c", "warp", "npg"):
+            size = options.worlds, threads
+        else:
+            size = contestants.worlds("c" if name == "npg" else name, threads, options.device), threads
         device = options.device if name == "warp" else "cpu"
         steps = int(options.apart) if part == "kept" else warm
-        size = (1, 1) if single else (many, threads)
         return Case(part, task, repeat, name, *size, device, seconds, steps)
 
     return [

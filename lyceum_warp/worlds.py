@@ -166,7 +166,7 @@ class Worlds:
             capture = Graphs(self.device, enabled=graphs, capture_engine=self.engine.capturable, nvtx=self._nvtx)
             self._programs[key] = Programs(
                 capture,
-                step=capture.sequence(self._phases_with_graphs(capture) if graphs else self.step_phases()),
+                step=capture.sequence(self._phases_of_a_graph() if graphs else self.step_phases()),
                 reset=capture.sequence(self.reset_phases(randomly=False)),
                 rand_reset=capture.sequence(self.reset_phases(randomly=True)),
                 read_state=capture.sequence(self.read_phases()),
@@ -188,34 +188,31 @@ class Worlds:
             *self._observe_phases(),
         ]
 
-    def _phases_with_graphs(self, graphs: Graphs) -> list[Phase]:
-        """The same with graphs: parts of a step are left out in a step in which they concern no world."""
-        if self._nvtx:
+    def _phases_of_a_graph(self) -> list[Phase]:
+        """The same where a step is one graph: parts of it are left out in a step in which they concern no world."""
+        if not self.engine.capturable or self._nvtx:
             return self.step_phases()
-        only_for = partial(self._only_for, graphs)
         restart = self._restart_phases(self.restarting, randomly=True)
         show = self._refresh_phases(self.restarting), self._observe_phases()
         if not (events := self._event_phases()):
-            return [*self._transition_phases(), only_for(self.restarting, restart, *show)]
+            return [*self._transition_phases(), self._only_for(self.restarting, restart, *show)]
         moved = self._moved_phases()
         return [
             *self._transition_phases(),
-            only_for(self.restarting, restart),
+            self._only_for(self.restarting, restart),
             *events,
-            *([only_for(self._moved, moved)] if moved else []),
-            *([only_for(self.restarting, show[0])] if show[0] else []),
+            *([self._only_for(self._moved, moved)] if moved else []),
+            *([self._only_for(self.restarting, show[0])] if show[0] else []),
             *show[1],
         ]
 
-    def _only_for(self, graphs: Graphs, mask: wp.array, *phases: list[Phase]) -> Phase:
+    def _only_for(self, mask: wp.array, *phases: list[Phase]) -> Phase:
         """Phases as one that is left out where the mask holds no world."""
         every = [phase for part in phases for phase in part]
-        # a graph of the whole step holds their launches, too; beside an engine's own calls they have own graphs
-        calls = [phase.run for phase in every] if self.engine.capturable else graphs.sequence(every)
 
         def run() -> None:
-            for call in calls:
-                call()
+            for phase in every:
+                phase.run()
 
         return Phase(every[0].name, partial(self.engine.run_for, mask, run), engine=True)
 

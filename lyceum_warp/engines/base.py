@@ -192,9 +192,9 @@ class Engine(abc.ABC):
         raise NotImplementedError(f"the {self.name} engine cannot settle single worlds")
 
     def run_for(self, mask: wp.array, run: Callable[[], None]) -> None:
-        """Run what concerns the masked worlds alone; an engine may leave it out where there are none.
+        """Run launches that concern the masked worlds alone; an engine may leave them out where there are none.
 
-        By default it always runs.
+        Only for an engine that is ``capturable``. By default they always run.
         """
         run()
 

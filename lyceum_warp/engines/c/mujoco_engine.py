@@ -1,7 +1,7 @@
 """The C engine: MuJoCo itself, many worlds on a pool of threads (mujoco.batch), float64 inside."""
 
 import copy
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import mujoco
@@ -257,10 +257,6 @@ class MujocoEngine(Engine):
                 launch_rows(widen_bool, mask, array, column)
             elif name not in READ_ONLY:
                 launch_rows(widen, mask, flat(array), column)
-
-    def run_for(self, mask: wp.array, run: Callable[[], None]) -> None:
-        if np.count_nonzero(self._on_host(mask)):  # in a fifth of the time of any()
-            run()
 
     def refresh(self, mask: wp.array) -> None:
         self._forward(mask, self.reset_stage, self._derived)
