@@ -54,6 +54,8 @@ class Setting:
     """Whether the worlds are at different steps of their episodes, so that some restart in every step."""
     npg: bool = False
     """Whether NPG samples: the policy's forward passes, the noise and the rollout buffer are part of the step."""
+    policy: Path | None = None
+    """A run, or the file of a policy, whose mean policy chose the actions; random actions by default."""
 
 
 def next_controls(env: lw.Env) -> torch.Tensor:
@@ -150,9 +152,17 @@ def seconds(env: lw.Env, function: Callable[[], None]) -> float:
 BLOCK = 10
 """Steps after which environment and bare engine change places."""
 
+FOLLOWED = 250
+"""Steps of a policy before anything is measured under its actions."""
+
 
 def compare(
-    env: lw.Env, blocks: int, act: Callable[[int], None], block: Callable[[], None], first: float
+    env: lw.Env,
+    blocks: int,
+    act: Callable[[int], None],
+    block: Callable[[], None],
+    first: float,
+    prepare: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
     """Time an environment and the bare engine on the same states; seconds are medians over the blocks.
 
@@ -162,12 +172,16 @@ def compare(
         act: Sets the actions of step t of a block.
         block: Makes the steps of a block, with those actions.
         first: Seconds until the environment's first step was done.
+        prepare: Chooses the actions of the next block, in steps that are taken back; off the clock.
     """
     bare = bare_engine(env)
     whole, alone, staged = [], [], []
     warm = max(2, env.horizon // 500)  # graphs are captured, and states are no longer the first ones
     for repetition in range(warm + blocks):
         start = env.get_state()
+        if prepare is not None:
+            prepare()
+            env.set_state(start)
         time_env = seconds(env, block)
         env.set_state(start)
         snapshots = []
@@ -239,10 +253,22 @@ def measure(setting: Setting) -> dict[str, Any]:
             env, setting.blocks, lambda t: npg.policy.sample(env.obs, npg.noise[t], out=env.action), npg.sample, first
         )
     actions = contestants.actions(env, seed=0)
+    policy = None if setting.policy is None else lw.load(setting.policy).to(env.obs.device)
 
     def block() -> None:
         for t in range(BLOCK):
             env.action.copy_(actions[t])
             env.step()
 
-    return compare(env, setting.blocks, lambda t: env.action.copy_(actions[t]), block, first)
+    @torch.no_grad()
+    def follow() -> None:
+        """Steps of the policy, whose actions become those of the block."""
+        for t in range(BLOCK):
+            actions[t].copy_(policy(env.obs))
+            env.step(actions[t])
+
+    if policy is not None:
+        for _ in range(FOLLOWED // BLOCK):  # into states of the policy's own
+            follow()
+    prepare = None if policy is None else follow
+    return compare(env, setting.blocks, lambda t: env.action.copy_(actions[t]), block, first, prepare)

@@ -11,6 +11,7 @@ sample is, and how each contestant makes it.
 import dataclasses
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import contestants
@@ -52,6 +53,8 @@ class Options(experiment.Options):
     """Number of worlds of our engines and of native C; by default 64 for each thread, and 16,384 on a GPU."""
     apart: bool = False
     """In the part kept, whether the worlds are at different steps of their episodes."""
+    policy: Path | None = None
+    """In the part kept, a run or a file whose mean policy chooses the actions, with one task; else they are random."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,6 +70,8 @@ class Case:
     seconds: float
     warm: int
     """Steps before the clock starts; in the part kept, 1 where the worlds are apart."""
+    policy: str = ""
+    """In the part kept, whose actions are stepped; random ones without it."""
 
 
 def cases(options: Options) -> list[Case]:
@@ -89,7 +94,8 @@ def cases(options: Options) -> list[Case]:
             size = contestants.worlds("c" if name == "npg" else name, threads, options.device), threads
         device = options.device if name == "warp" else "cpu"
         steps = int(options.apart) if part == "kept" else warm
-        return Case(part, task, repeat, name, *size, device, seconds, steps)
+        policy = str(options.policy) if options.policy and part == "kept" and name != "npg" else ""
+        return Case(part, task, repeat, name, *size, device, seconds, steps, policy)
 
     return [
         case(part, task, repeat, name)
@@ -115,7 +121,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
         with experiment.cores(case.threads):
             return kept.measure(kept.Setting(
                 case.task, case.worlds, engine, case.device, case.threads, max(5, int(30 * case.seconds)),
-                apart=bool(case.warm), npg=case.contestant == "npg",
+                apart=bool(case.warm), npg=case.contestant == "npg", policy=Path(case.policy) if case.policy else None,
             ))  # fmt: skip
     return contestants.measure(
         case.contestant, case.task, worlds=case.worlds, threads=case.threads, device=case.device, seed=case.repeat,
@@ -181,6 +187,7 @@ def _kept_line(row: Row) -> list[str]:
         case["task"]
         + (", sampling of NPG" if case["contestant"] == "npg" else "")
         + (", apart" if case["warm"] else "")
+        + (", of a policy" if case["policy"] else "")
     )
     step = case["worlds"] / found["env_steps_per_second"]
     return [

@@ -7,6 +7,9 @@ from typing import Any
 
 import pytest
 
+import lyceum_warp as lw
+from lyceum_warp.checkpoints import policy_content, serialized
+
 BENCH = Path(__file__).parents[2] / "bench"
 
 
@@ -49,6 +52,20 @@ def test_throughput_is_measured_once_and_tabulated(
 
     assert plot.main(plot.Options(("throughput",), tmp_path)) == 0
     assert len([*tmp_path.glob("throughput-*.svg")]) == 1
+
+
+def test_actions_of_a_policy_are_stepped_beside_the_bare_engine(
+    bench: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    env = lw.make("cartpole", nworld=2)
+    npg = lw.NPG(env, config=lw.NPGConfig(samples=64, mean_every=0))
+    policy, out = tmp_path / "policy.pt", tmp_path / "throughput.jsonl"
+    policy.write_bytes(serialized(policy_content(0, npg.policy, npg.value)))
+    words = f"--tasks cartpole --contestants c --threads 1 --parts kept --worlds 16 --policy {policy}".split()
+    assert run(bench, "throughput", out, *words) == 0
+    (row,) = lines(out)
+    assert row["case"]["policy"] == str(policy) and 0.1 < row["result"]["kept"] < 2.0
+    assert "| cartpole, of a policy | C | 16 |" in capsys.readouterr().out
 
 
 def test_scaling_is_measured_by_cores_and_worlds(
