@@ -484,8 +484,10 @@ def figure(rows: Sequence[Row]) -> Figure:
             points = []
             for name, group in same.items():
                 plan = statistics.median(row.result["plan_ms"] for row in group)
-                earned = f", return {statistics.fmean(row.result['return'] for row in group):.0f}"
-                points.append((name, plan, f"{plan:.3g} ms{earned if part == 'cartpole' else ''}"))
+                text = f"{plan:.3g} ms"
+                if part == "cartpole":
+                    text += f", return {statistics.fmean(row.result['return'] for row in group):.0f}"
+                points.append((name, plan, text))
             panels.append((task if samples is None else f"{task}, {samples} samples", "milliseconds of a plan", points))
     drawn = Figure(figsize=(10.0, 1.0 + 1.9 * ((len(panels) + 1) // 2)), layout="constrained")
     FigureCanvasAgg(drawn)
