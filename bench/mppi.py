@@ -484,7 +484,7 @@ def figure(rows: Sequence[Row]) -> Figure:
             points = []
             for name, group in same.items():
                 plan = statistics.median(row.result["plan_ms"] for row in group)
-                text = f"{plan:.3g} ms"
+                text = f"{plan:,.0f} ms" if plan >= 100.0 else f"{plan:.3g} ms"
                 if part == "cartpole":
                     text += f", return {statistics.fmean(row.result['return'] for row in group):.0f}"
                 points.append((name, plan, text))
