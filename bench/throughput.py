@@ -81,6 +81,10 @@ def cases(options: Options) -> list[Case]:
     parts = choose(options.parts, PARTS, what="part")
     threads = options.threads or cpu_cores()
     gpu = options.device.startswith("cuda")
+    if options.policy is not None and len(tasks) != 1:
+        raise ValueError(f"--policy {options.policy} belongs to one task: name it with --tasks")
+    if options.policy is not None and not options.policy.exists():
+        raise ValueError(f"there is no policy {options.policy}: give the folder of a run, or the file of a policy")
     repeats = options.repeats or (1 if options.short else 3)
     seconds, warm = (0.2, 20) if options.short else (options.seconds, 100)
 

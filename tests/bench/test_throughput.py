@@ -118,6 +118,8 @@ def test_more_threads_than_cores_are_skipped(
         ("--tasks hoper", "throughput: there is no task 'hoper': did you mean hopper?"),
         ("--contestants gym", "throughput: there is no contestant 'gym': there are native, c, warp, "),
         ("--parts one", "throughput: there is no part 'one': there are sampling, single, kept"),
+        ("--policy none.pt", "throughput: --policy none.pt belongs to one task: name it with --tasks"),
+        ("--policy none.pt --tasks hopper", "throughput: there is no policy none.pt: give the folder of a run"),
         ("--device cuda:7", "throughput: there is no GPU for --device cuda:7"),
     ],
 )

@@ -101,9 +101,10 @@ def test_lagged_fields_belong_to_the_new_state_after_a_reset(file: Path, engine:
 CLEARED = TASK.replace('lagged = ("sensordata",)', 'lagged = cleared = ("sensordata",)').replace("Filtered", "Cleared")
 
 
+@pytest.mark.parametrize("fields", [[], ["xpos"], ["qacc"]])  # others are computed at the beginning of an episode
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_cleared_fields_are_zero_when_an_episode_begins(task_file: TaskFile, engine: str) -> None:
-    env = lw.make(task_file("cleared.py", CLEARED), engine=engine, nworld=2)
+def test_cleared_fields_are_zero_when_an_episode_begins(task_file: TaskFile, engine: str, fields: list[str]) -> None:
+    env = lw.make(task_file("cleared.py", CLEARED), engine=engine, nworld=2, fields=fields)
     assert torch.equal(env.obs[:, :2], torch.tensor([[0.5, 0.0]] * 2))
     for _ in range(6):
         env.step(torch.ones(2, 1))

@@ -259,7 +259,8 @@ class MujocoEngine(Engine):
                 launch_rows(widen, mask, flat(array), column)
 
     def refresh(self, mask: wp.array) -> None:
-        self._forward(mask, self.reset_stage, self._derived)
+        computed = [field for field in self._derived if field.reset > Stage.NONE]  # the others are cleared
+        self._forward(mask, self.reset_stage, computed)
 
     def refresh_current(self, mask: wp.array) -> None:
         current = [field for field in self._derived if field.refresh > Stage.NONE]

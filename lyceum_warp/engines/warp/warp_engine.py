@@ -185,8 +185,8 @@ class WarpEngine(Engine):
         own.owner = source  # a view of this memory may outlive the engine
         return own
 
-    def _copy_snapshots(self, mask: wp.array) -> None:
-        for field in self.snapshots:
+    def _copy_snapshots(self, mask: wp.array, fields: Iterable[Field]) -> None:
+        for field in fields:
             launch_rows(copy_rows, mask, flat(self._own[field.name]), flat(self.arrays[field.name]))
 
     # physics
@@ -200,7 +200,7 @@ class WarpEngine(Engine):
                     substep.step(self.m, self.d)
                 else:
                     mjw.step(self.m, self.d)
-        self._copy_snapshots(self._everyone)
+        self._copy_snapshots(self._everyone, self.snapshots)
         self.refresh_current(self._everyone)
 
     def _forward(
@@ -307,7 +307,7 @@ class WarpEngine(Engine):
         """A forward pass of all worlds; those outside the mask stay as they are."""
         with self._histories_kept():
             self._forward(self._reset_parts, self.reset_stage)
-        self._copy_snapshots(mask)
+        self._copy_snapshots(mask, [field for field in self.snapshots if field.reset > Stage.NONE])
         if self._reset_parts is None:
             overflow.report_pool_overflow(self.d, mask)
 
