@@ -23,6 +23,7 @@ from rich.table import Table
 
 import lyceum_warp as lw
 from lyceum_warp.algos.networks import moved
+from lyceum_warp.cli.arguments import parameter
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +46,8 @@ class Options:
     """Engine."""
     integrator: str | None = None
     """Another integrator than the model's: euler, rk4, implicit or implicitfast."""
+    param: tuple[str, ...] = ()
+    """Parameters of the task, each as NAME=VALUE."""
     target: float | None = None
     """A mean return at which a run ends: that of the policy with its noise over 16 episodes of its own, off the clock.
     An iteration's episodes would not do: with short segments, the long ones among them end late."""
@@ -68,7 +71,7 @@ def run(options: Options, seed: int) -> list[dict[str, Any]]:
         nthread = 1 if options.device == "cpu" else None
     env = lw.make(
         options.task, nworld=options.nworld, seed=seed, device=options.device, engine=options.engine,
-        integrator=options.integrator, nthread=nthread,
+        integrator=options.integrator, nthread=nthread, **dict(map(parameter, options.param)),
     )  # fmt: skip
     npg = lw.NPG(env, config=options.config, seed=seed)
     if options.reward_scale != 1.0 or options.outlier is not None:

@@ -44,18 +44,34 @@ TASKS = (
 
 DEFAULT = "default"
 
+_NEAR = {"gamma": 0.99, "lam": 0.95, "value_epochs": 5}
+
+_NO_FORCES = {"param": ("include_cfrc_ext_in_observation=False", "contact_cost_weight=0")}
+"""Ant and humanoid as in the versions that Tianshou's figures are of, where contact forces were always 0."""
+
 SETTINGS: dict[str, dict[str, Any]] = {
     DEFAULT: {},
     "gamma 0.99": {"gamma": 0.99, "lam": 0.95},
     "gamma 0.999": {"gamma": 0.999},
     "5,000 samples": {"samples": 5000},
-    "5,000 samples, gamma 0.99": {"samples": 5000, "gamma": 0.99, "lam": 0.95, "value_epochs": 5},
-    "2,000 samples, gamma 0.99": {"samples": 2000, "gamma": 0.99, "lam": 0.95, "value_epochs": 5},
     "less noise": {"log_std": -1.0},
     "gamma 0.97, less noise": {"gamma": 0.97, "log_std": -1.0},
+    "5,000 samples, gamma 0.99": {"samples": 5000, **_NEAR},
+    "5,000 samples, gamma 0.99, less noise": {"samples": 5000, **_NEAR, "log_std": -1.0},
+    "2,000 samples, gamma 0.99": {"samples": 2000, **_NEAR},
+    "2,000 samples, gamma 0.99, less noise": {"samples": 2000, **_NEAR, "log_std": -1.0},
+    "2,000 samples, gamma 0.99, little noise": {"samples": 2000, **_NEAR, "log_std": -1.5},
+    "2,000 samples, gamma 0.99, no contact forces": {"samples": 2000, **_NEAR, **_NO_FORCES},
+    "2,000 samples, gamma 0.99, less noise, no contact forces": {
+        "samples": 2000, **_NEAR, "log_std": -1.0, **_NO_FORCES,
+    },
+    "2,000 samples, gamma 0.99, little noise, no contact forces": {
+        "samples": 2000, **_NEAR, "log_std": -1.5, **_NO_FORCES,
+    },
     "beginnings": {"samples": 5000, "rollout": "episodes", "min_log_std": -1.5, "delta": 0.05},
 }
-"""What differs from the default. "beginnings" samples the first 79 steps of an episode in each of 64 worlds."""
+"""What differs from the default, "param" in the task and the rest in the hyperparameters. "beginnings" samples the first
+79 steps of an episode in each of 64 worlds."""
 
 _LONG = (DEFAULT, "gamma 0.99", "less noise", "2,000 samples, gamma 0.99")
 _GAITS = (DEFAULT, "gamma 0.99", "5,000 samples", "5,000 samples, gamma 0.99")
@@ -77,6 +93,8 @@ class Options:
     """Tasks."""
     config: lw.NPGConfig = dataclasses.field(default_factory=lw.NPGConfig)
     """Hyperparameters."""
+    setting: str | None = None
+    """One of ``SETTINGS`` for all tasks; by default "default"."""
     search: bool = False
     """Whether to try the settings of ``TRIED``."""
     own: Path | None = None
@@ -95,14 +113,16 @@ class Options:
 
 def case(options: Options, task: str, setting: str) -> learning.Options:
     """The settings of a task's runs."""
-    config = dataclasses.replace(options.config, **SETTINGS[setting])
+    words = dict(SETTINGS[setting])
+    param = words.pop("param", ())
+    config = dataclasses.replace(options.config, **words)
     each = -(-(config.samples or 10_000) // options.nworld) * options.nworld
     iterations = -(-options.samples // each)
     # evaluations step, too: about twenty of them, the last one at the end
     every = max(1, iterations // 20)
     iterations = -(-iterations // every) * every
     config = dataclasses.replace(config, mean_every=every)
-    return learning.Options(task, config=config, iterations=iterations, nworld=options.nworld, processes=2)
+    return learning.Options(task, config=config, iterations=iterations, nworld=options.nworld, param=param, processes=2)
 
 
 def chosen(search: Path | None, tasks: tuple[str, ...]) -> dict[str, str]:
@@ -141,7 +161,11 @@ def run(options: Options, task: str, setting: str, seed: int) -> dict[str, Any]:
 
 
 def main(options: Options) -> None:
-    if options.search:
+    if options.setting is not None:
+        if options.setting not in SETTINGS:
+            raise SystemExit(f"setting must be one of {', '.join(map(repr, SETTINGS))}, not {options.setting!r}")
+        cases = [(task, options.setting) for task in options.tasks]
+    elif options.search:
         cases = [(task, setting) for task in options.tasks for setting in TRIED.get(task, tuple(SETTINGS))]
     else:
         cases = list(chosen(options.own, options.tasks).items())

@@ -36,6 +36,8 @@ class Peer:
     python: Path
     """Interpreter of the virtual environment."""
     worker: Path
+    ours: bool = False
+    """Whether it shares our environment."""
 
     def run(self, *, timeout: float = 600.0, **arguments: Any) -> dict[str, Any]:
         """Run the worker: it reads one JSON object, and the last line that it prints is one.
@@ -48,8 +50,9 @@ class Peer:
             experiment.Skipped: The worker misses a package.
             RuntimeError: The worker failed.
         """
-        # our own packages must not be found in the peer's environment
-        env = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME")}
+        # our own packages must not be found in an environment of the peer's own
+        hidden = () if self.ours else ("PYTHONPATH", "PYTHONHOME")
+        env = {name: value for name, value in os.environ.items() if name not in hidden}
         command = [str(self.python), str(self.worker)]
         done = subprocess.run(
             command, input=json.dumps(arguments), env=env, timeout=timeout, capture_output=True, text=True
@@ -81,7 +84,7 @@ def peer(name: str, worker: str | None = None) -> Peer:
 
 def peer_here(name: str, worker: str) -> Peer:
     """A peer that shares our environment, run in a process of its own."""
-    return Peer(name, Path(sys.executable), FOLDER / worker)
+    return Peer(name, Path(sys.executable), FOLDER / worker, ours=True)
 
 
 def _environment(name: str, requirements: Path) -> Path:
