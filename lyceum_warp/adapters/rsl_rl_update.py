@@ -45,11 +45,12 @@ class CapturedUpdate:
             for name, buffer in part.named_buffers(recurse=False)
         ]
         self.rate.fill_(float(self.ppo.learning_rate))
-        if self.cuda:
-            for group in self.ppo.optimizer.param_groups:
-                group["capturable"], group["lr"] = True, self.rate
-            for entry in self.ppo.optimizer.state.values():
-                entry["step"] = entry["step"].to(device=self.device, dtype=torch.float32)
+        for group in self.ppo.optimizer.param_groups:
+            # one kernel for all parameters; without it, a graph has several for each of them
+            group["fused"], group["foreach"] = True, False
+            group["capturable"], group["lr"] = self.cuda, self.rate
+        for entry in self.ppo.optimizer.state.values():
+            entry["step"] = entry["step"].to(device=self.device, dtype=torch.float32)
         self._warm = False
         self._graph: torch.cuda.CUDAGraph | None = None
 
@@ -162,6 +163,3 @@ class CapturedUpdate:
             lower, higher = (self.rate / 1.5).clamp_min(1e-5), (self.rate * 1.5).clamp_max(1e-2)
             raised = torch.where((kl < wanted / 2.0) & (kl > 0.0), higher, self.rate)
             self.rate.copy_(torch.where(kl > wanted * 2.0, lower, raised))
-        if not self.cuda:
-            for group in ppo.optimizer.param_groups:
-                group["lr"] = self.rate.item()
