@@ -258,7 +258,7 @@ def test_a_command_begins_with_the_policy_of_a_run(
     config = Run.open(out).config
     assert config["from"] == {"run": str(six), "which": "4", "iteration": 4}
     assert (config["task"], config["params"], config["nworld"]) == ("point_mass", {"success_distance": 0.5}, 2)
-    assert config["npg"] == Run.open(six).config["npg"]
+    assert config["npg"] == Run.open(six).config["npg"] | {"value_group": "policy"}
     state = Run.open(out).read()["state"]
     assert state["iteration"] == 1
     moved = mean_action(lw.load(out)) - mean_action(lw.load(six, which=4))
@@ -288,7 +288,7 @@ def test_flags_with_the_defaults_of_new_runs_replace_the_settings_of_the_other_r
     given = ["--gamma", "0.995", "--whiten", "--seed", "0", "--keep-every", "0", "--no-deterministic"]
     assert cli.main([*command, "--out", str(out), *given]) == 0
     config = Run.open(out).config
-    assert config["npg"] == npg | {"gamma": 0.995, "whiten": True}
+    assert config["npg"] == npg | {"gamma": 0.995, "whiten": True, "value_group": "policy"}
     assert (config["seed"], config["keep_every"], config["options"]) == (0, 0, {"horizon": 32})
     assert config["physics"] == {}
     capsys.readouterr()

@@ -10,6 +10,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.validate import finite_number, layer_sizes, whole_number
 
 Bootstrap = Literal["final", "before"]
+NormalizeWhen = Literal["step", "before", "after"]
 Optimizer = Literal["adam", "adamw", "sgd", "rmsprop"]
 Schedule = Literal["adaptive", "fixed"]
 StdType = Literal["scalar", "log"]
@@ -20,18 +21,19 @@ _WHOLE = {"num_steps_per_env": 1, "num_learning_epochs": 1, "num_mini_batches": 
 _REAL = {
     "gamma": (0.0, 1.0), "lam": (0.0, 1.0), "clip_param": (0.0, math.inf), "value_loss_coef": (0.0, math.inf),
     "entropy_coef": (0.0, math.inf), "learning_rate": (0.0, math.inf), "desired_kl": (0.0, math.inf),
-    "max_grad_norm": (0.0, math.inf), "init_std": (1e-6, 1e6),
+    "max_grad_norm": (0.0, math.inf), "init_std": (1e-6, 1e6), "final_entropy_coef": (0.0, math.inf),
 }  # fmt: skip
 """The smallest and the largest value of each number."""
 
-_CHOICES = {"bootstrap": Bootstrap, "optimizer": Optimizer, "schedule": Schedule, "std_type": StdType}
+_CHOICES = {"bootstrap": Bootstrap, "optimizer": Optimizer, "schedule": Schedule, "std_type": StdType,
+            "normalize_when": NormalizeWhen}  # fmt: skip
 """The values of each choice."""
 
 _COMPILE_MODES = ("default", "max-autotune-no-cudagraphs")
 """The modes of torch.compile that rsl_rl takes: those without CUDA graphs."""
 
 _FLAGS = ("use_clipped_value_loss", "normalize_advantage_per_mini_batch", "normalize", "random_start", "tf32",
-          "captured_update")  # fmt: skip
+          "batched_values", "captured_update")  # fmt: skip
 
 _ACTIVATIONS = {"leaky_relu": "lrelu", "silu": "swish"}
 """Activations that rsl_rl calls by another name."""
@@ -79,6 +81,11 @@ class RslRlConfig:
     """Whether to limit a value's change from its old one by clip_param."""
     entropy_coef: float = 0.01
     """Weight of the policy's entropy."""
+    final_entropy_coef: float | None = None
+    """Weight of the policy's entropy from the last iteration of entropy_decay on; by default it stays the same."""
+    entropy_decay: tuple[int, int] = (150, 200)
+    """Iterations from the first to the second of which the entropy's weight falls linearly, where final_entropy_coef
+    is given."""
     learning_rate: float = 1e-3
     """Learning rate, at first where it is adaptive."""
     schedule: Schedule = "adaptive"
@@ -109,10 +116,17 @@ class RslRlConfig:
     "policy"."""
     normalize: bool = True
     """Whether policy and value function normalise observations by their running mean and variance."""
+    normalize_when: NormalizeWhen | None = None
+    """When these statistics take in observations: "step" for those that each step leads to, "before" and "after" for
+    all of an iteration, before or after the update; by default as the installed rsl_rl does, which is "after" from
+    5.5 on and "step" in 5.4. rsl_rl's own runner does the latter."""
     random_start: bool = True
     """Whether the first episodes begin at random steps, so that time limits fall at all times."""
     tf32: bool = True
     """Whether matrix products on a GPU use TensorFloat-32."""
+    batched_values: bool = False
+    """Whether values and densities are computed once for all steps of an iteration, rather than in each step. They are
+    the same up to rounding, and sampling is faster on a GPU."""
     captured_update: bool = False
     """Whether an epoch of the update is one CUDA graph, in which nothing waits for the device. It computes the same up
     to rounding; without a GPU it has no advantage."""
@@ -129,17 +143,22 @@ class RslRlConfig:
             name: whole_number(name, getattr(self, name), low=low) for name, low in _WHOLE.items()
         }
         for name, (smallest, largest) in _REAL.items():
+            if name == "final_entropy_coef" and self.final_entropy_coef is None:
+                continue
             checked[name] = finite_number(name, getattr(self, name), low=smallest, high=largest)
         for name in ("hidden", "value_hidden"):
             checked[name] = tuple(layer_sizes(getattr(self, name), name))
             if not checked[name]:
                 raise ValueError(f"{name} must be the widths of at least one hidden layer, as in (512, 256, 128)")
+        checked["entropy_decay"] = _iterations("entropy_decay", self.entropy_decay)
         for name in ("activation", "value_activation"):
             check_activation(getattr(self, name), name)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         for name, choices in _CHOICES.items():
-            if (choice := getattr(self, name)) not in get_args(choices):
+            if (choice := getattr(self, name)) is None and name == "normalize_when":
+                continue
+            if choice not in get_args(choices):
                 raise ValueError(f"{name} must be {' or '.join(map(repr, get_args(choices)))}, not {choice!r}")
         for name in _FLAGS:
             if not isinstance(flag := getattr(self, name), bool):
@@ -153,6 +172,14 @@ class RslRlConfig:
             raise ValueError(f"captured_update needs the optimizer 'adam' or 'adamw', not {self.optimizer!r}")
         if self.captured_update and self.torch_compile_mode is not None:
             raise ValueError("captured_update and torch_compile_mode exclude each other: leave out one of them")
+
+    def entropy_weight(self, iteration: int) -> float:
+        """Weight of the policy's entropy in an iteration, of which the first one is 1."""
+        if self.final_entropy_coef is None:
+            return self.entropy_coef
+        first, last = self.entropy_decay
+        share = min(max((iteration - first) / (last - first), 0.0), 1.0)
+        return self.entropy_coef + share * (self.final_entropy_coef - self.entropy_coef)
 
     def group(self, env: Env) -> str:
         """The group of observations that the value function gets.
@@ -203,6 +230,22 @@ class RslRlConfig:
             "multi_gpu": None,
             "torch_compile_mode": self.torch_compile_mode,
         }  # fmt: skip
+
+
+def _iterations(name: str, value: Any) -> tuple[int, int]:
+    """Two numbers of iterations, the second of which is larger.
+
+    Raises:
+        ValueError: The value is something else.
+    """
+    try:
+        first, last = value
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be two numbers of iterations, as in (150, 200), not {value!r}") from None
+    pair = whole_number(name, first, low=0), whole_number(name, last, low=1)
+    if pair[0] >= pair[1]:
+        raise ValueError(f"{name} must end after it begins, not {value!r}")
+    return pair
 
 
 def _layers(hidden: tuple[int, ...], activation: str) -> dict[str, Any]:

@@ -7,7 +7,6 @@ import torch
 from lyceum_warp.adapters.adapted_env import environment_of
 from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl
 from lyceum_warp.adapters.rsl_rl_statistics import RECENT
-from lyceum_warp.adapters.step_results import episode_ends
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
@@ -124,11 +123,11 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         """
         env = self.env
         env.step(actions)
-        terminated, _ = episode_ends(env)
+        fault = (env.done_reason & FAULTS) != 0
         extras = {
-            "time_outs": env.done & ~terminated,
+            "time_outs": env.done & (fault | ~env.terminated),
             "final_obs": self._final_obs,
-            "log": self._log() | {"faults/worlds": ((env.done_reason & FAULTS) != 0).sum()},
+            "log": self._log() | {"faults/worlds": fault.sum()},
         }
         return self._obs.clone(), env.reward, env.done, extras
 

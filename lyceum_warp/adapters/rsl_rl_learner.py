@@ -21,8 +21,10 @@ from lyceum_warp.adapters.rsl_rl_networks import (
     copy_value,
     make_writable,
 )
+from lyceum_warp.adapters.rsl_rl_normalizer import freeze_normalizers, take_in
 from lyceum_warp.adapters.rsl_rl_random import OwnRandomNumbers
-from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl
+from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl, normalizes_while_sampling
+from lyceum_warp.adapters.rsl_rl_sampling import BatchedSampling
 from lyceum_warp.adapters.rsl_rl_statistics import RECENT, RslRlIteration
 from lyceum_warp.adapters.rsl_rl_update import CapturedUpdate
 from lyceum_warp.algos.distributed import Team
@@ -131,7 +133,11 @@ class RslRlLearner:
         self._captured = CapturedUpdate(self.ppo) if config.captured_update else None
         self._update = self._captured or self.ppo.update
 
-        self.rollout = Rollout(env, config.num_steps_per_env)
+        self._normalize_when = config.normalize_when or ("step" if normalizes_while_sampling() else "after")
+        self.rollout = Rollout(env, config.num_steps_per_env, groups=(group,) if config.batched_values else ())
+        self._batched: BatchedSampling | None = None
+        if config.batched_values:
+            self._batched = BatchedSampling(self.ppo, self.rollout, final=config.bootstrap == "final")
         self.count = config.num_steps_per_env * env.nworld
         self.iteration = self.samples = 0
         self._recent: collections.deque[float] = collections.deque(maxlen=RECENT)
@@ -147,9 +153,14 @@ class RslRlLearner:
         config, ppo, rollout = self.config, self.ppo, self.rollout
         timer = PhaseTimer(self.env.obs.device)
         with self._random, _precision(tf32=config.tf32 and self.env.obs.device.type == "cuda"):
+            ppo.train_mode()
+            freeze_normalizers(ppo)
             self._sample()
             timer.mark()
+            ppo.entropy_coef = config.entropy_weight(self.iteration + 1)
             losses = self._update()
+            if self._normalize_when == "after":
+                self._take_in(ppo.storage.observations)
         self._copy_networks()
         episodes = finished(rollout)
         numbers = [
@@ -201,10 +212,15 @@ class RslRlLearner:
 
     def _sample(self) -> None:
         """Fill rsl_rl's storage with steps of the current policy, and compute the advantages."""
-        ppo, env, rollout = self.ppo, self.env, self.rollout
-        ppo.train_mode()
+        ppo, env, rollout, when = self.ppo, self.env, self.rollout, self._normalize_when
         rollout.begin()
         with torch.inference_mode(), one_thread():
+            if self._batched is not None:
+                self._batched.sample(self._take_in_step if when == "step" else _nothing)
+                if when == "before":
+                    self._take_in(ppo.storage.observations)
+                self._batched.value()
+                return
             obs = self.worlds.get_observations()
             for _ in range(self.config.num_steps_per_env):
                 env.action.copy_(ppo.act(obs))
@@ -212,7 +228,19 @@ class RslRlLearner:
                 obs, reward, done, extras = self.worlds.step(env.action)
                 rollout.store_outputs()
                 ppo.process_env_step(obs, reward, done, extras)
+                if when == "step":
+                    self._take_in_step()
             ppo.compute_returns(obs)
+            if when == "before":
+                self._take_in(ppo.storage.observations)
+
+    def _take_in_step(self) -> None:
+        self._take_in(self.env.obs_groups)
+
+    def _take_in(self, obs: Mapping[str, torch.Tensor]) -> None:
+        """Take observations into the normalisers of both networks."""
+        for network in (self.ppo.actor, self.ppo.critic):
+            take_in(network, obs)
 
     def _copy_networks(self) -> None:
         copy_policy(self.ppo.get_policy(), self.policy)
@@ -282,6 +310,10 @@ class RslRlLearner:
         self._recent.clear()
         self._recent.extend(state["recent"])
         self.iteration, self.samples = state["iteration"], state["samples"]
+
+
+def _nothing() -> None:
+    pass
 
 
 @contextlib.contextmanager

@@ -6,8 +6,6 @@ from typing import Any
 import torch
 from torch import nn
 
-from lyceum_warp.adapters.rsl_rl_release import normalizes_while_sampling
-
 
 class CapturedUpdate:
     """Computes what ``PPO.update`` of rsl_rl computes, up to rounding and with fewer random numbers.
@@ -16,6 +14,8 @@ class CapturedUpdate:
     host. Here the learning rate stays on the device, and so do the losses, which one copy brings to the host at the end
     of the update. The mini-batches are the same in every epoch, as there, so that one shuffled copy of the samples
     serves all epochs, and an epoch can be captured. Without a GPU the same operations run one by one.
+
+    The caller takes observations into the normalisers.
 
     Args:
         ppo: rsl_rl's PPO with an ``MLPModel`` for each network and with Adam, in one process, without random network
@@ -30,6 +30,7 @@ class CapturedUpdate:
         self.count = ppo.num_mini_batches
         self.batch = storage.num_envs * storage.num_transitions_per_env // self.count
         self.rate = torch.zeros((), device=self.device)
+        self._entropy_coef = torch.zeros((), device=self.device)  # changes from one replay to the next
         self._sums = torch.zeros(3, device=self.device)
         self._samples: dict[str, torch.Tensor] = {}
         self._parameters = [p for group in ppo.optimizer.param_groups for p in group["params"] if p.requires_grad]
@@ -44,11 +45,12 @@ class CapturedUpdate:
             for name, buffer in part.named_buffers(recurse=False)
         ]
         self.rate.fill_(float(self.ppo.learning_rate))
-        if self.cuda:
-            for group in self.ppo.optimizer.param_groups:
-                group["capturable"], group["lr"] = True, self.rate
-            for entry in self.ppo.optimizer.state.values():
-                entry["step"] = entry["step"].to(device=self.device, dtype=torch.float32)
+        for group in self.ppo.optimizer.param_groups:
+            # one kernel for all parameters; without it, a graph has several for each of them
+            group["fused"], group["foreach"] = True, False
+            group["capturable"], group["lr"] = self.cuda, self.rate
+        for entry in self.ppo.optimizer.state.values():
+            entry["step"] = entry["step"].to(device=self.device, dtype=torch.float32)
         self._warm = False
         self._graph: torch.cuda.CUDAGraph | None = None
 
@@ -57,13 +59,10 @@ class CapturedUpdate:
         ppo = self.ppo
         self._put_back_buffers()
         self._shuffle()
+        self._entropy_coef.fill_(ppo.entropy_coef)
         self._sums.zero_()
         for _ in range(ppo.num_learning_epochs):
             self._run_epoch()
-        if not normalizes_while_sampling():
-            obs = ppo.storage.observations.flatten(0, 1)
-            ppo.actor.update_normalization(obs)
-            ppo.critic.update_normalization(obs)
         ppo.storage.clear()
         means = self._sums / (ppo.num_learning_epochs * self.count)
         value, surrogate, entropy, ppo.learning_rate = torch.cat([means, self.rate[None]]).tolist()
@@ -144,7 +143,7 @@ class CapturedUpdate:
             near = samples["value"] + (value - samples["value"]).clamp(-limit, limit)
             error = torch.max(error, (near - samples["return"]).square())
         value_loss, entropy = error.mean(), policy.entropy.mean()
-        loss = surrogate + ppo.value_loss_coef * value_loss - ppo.entropy_coef * entropy
+        loss = surrogate + ppo.value_loss_coef * value_loss - self._entropy_coef * entropy
 
         # not backward(), whose sums of gradients belong to the stream of the first call
         gradients = torch.autograd.grad(loss, self._parameters)
@@ -164,6 +163,3 @@ class CapturedUpdate:
             lower, higher = (self.rate / 1.5).clamp_min(1e-5), (self.rate * 1.5).clamp_max(1e-2)
             raised = torch.where((kl < wanted / 2.0) & (kl > 0.0), higher, self.rate)
             self.rate.copy_(torch.where(kl > wanted * 2.0, lower, raised))
-        if not self.cuda:
-            for group in ppo.optimizer.param_groups:
-                group["lr"] = self.rate.item()

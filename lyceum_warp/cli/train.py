@@ -264,6 +264,8 @@ def _fitted(algorithm: Algorithm, config: Any, content: PolicyContent, path: Pat
         if given != saved:  # the flags' defaults are those of the run
             flag = f"{algorithm.prefix}{field.name.replace('_', '-')}"
             raise ValueError(f"the networks in {path} have {field.name} {saved}, not {given}: leave out {flag}")
+    if fitted.value_group is None:  # the new run's own default would be that of its task
+        fitted = dataclasses.replace(fitted, value_group=content["value"]["shape"].get("group", "policy"))
     return fitted
 
 

@@ -23,11 +23,21 @@ from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
     ({"torch_compile_mode": "max-autotune"},
      "torch_compile_mode must be 'default' or 'max-autotune-no-cudagraphs', or None .* not 'max-autotune'"),
     ({"torch_compile_mode": 1}, "torch_compile_mode must be .* not 1"),
+    ({"normalize_when": "never"}, "normalize_when must be 'step' or 'before' or 'after', not 'never'"),
+    ({"final_entropy_coef": -1.0}, "final_entropy_coef must be a finite number of at least 0, not -1.0"),
+    ({"entropy_decay": 7}, r"entropy_decay must be two numbers of iterations, as in \(150, 200\), not 7"),
+    ({"entropy_decay": (5, 5)}, r"entropy_decay must end after it begins, not \(5, 5\)"),
     ({"value_group": 3}, "value_group must be a name, or None, not 3"),
 ])  # fmt: skip
 def test_values_that_are_not_valid_are_refused(words: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         RslRlConfig(**words)  # type: ignore[arg-type]
+
+
+def test_the_weight_of_the_entropy_falls_linearly() -> None:
+    config = RslRlConfig(entropy_coef=0.02, final_entropy_coef=0.01, entropy_decay=(10, 20))
+    assert [config.entropy_weight(it) for it in (1, 10, 15, 20, 99)] == pytest.approx([0.02, 0.02, 0.015, 0.01, 0.01])
+    assert RslRlConfig(entropy_coef=0.02).entropy_weight(500) == 0.02
 
 
 def test_the_value_function_gets_the_critics_group_where_there_is_one(shared_env: SharedEnv) -> None:

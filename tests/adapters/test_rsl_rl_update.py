@@ -1,5 +1,6 @@
 """The update of rsl_rl's PPO that can be captured, beside rsl_rl's own."""
 
+import copy
 from typing import Any
 
 import pytest
@@ -9,6 +10,7 @@ from metered_task import Metered
 import lyceum_warp as lw
 from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
 from lyceum_warp.adapters.rsl_rl_learner import RslRlLearner
+from lyceum_warp.adapters.rsl_rl_update import CapturedUpdate
 
 
 def learner(*, device: str = "cpu", **changes: Any) -> RslRlLearner:
@@ -48,6 +50,63 @@ def test_the_numbers_are_those_of_rsl_rls_own(changes: dict[str, Any]) -> None:
     for one, other in ((own.ppo.actor, captured.ppo.actor), (own.ppo.critic, captured.ppo.critic)):
         for name, weights in one.state_dict().items():
             torch.testing.assert_close(other.state_dict()[name], weights, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("changes", [
+    {}, {"desired_kl": 1e-4}, {"desired_kl": 1e3, "max_grad_norm": 0.01}, {"clip_param": 0.01, "entropy_coef": 0.3},
+    {"normalize_advantage_per_mini_batch": True, "use_clipped_value_loss": False, "std_type": "log"},
+    {"schedule": "fixed", "optimizer": "adamw", "num_mini_batches": 5, "num_learning_epochs": 3},
+])  # fmt: skip
+def test_the_parameters_are_those_of_rsl_rls_own_to_1e_5(
+    changes: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two updates from the same samples in the same order, in float64 so that rounding hides no difference."""
+    made = learner(**changes)
+    for _ in range(2):  # the normalisers' statistics are no longer those of new networks
+        next(made)
+    own = made.ppo
+    storage = own.storage
+    with torch.inference_mode(False):
+        for network in (own.actor, own.critic):
+            network.double()
+        for name, value in vars(storage).items():
+            if isinstance(value, torch.Tensor) and value.is_floating_point():
+                setattr(storage, name, value.clone().double())
+        storage.observations = storage.observations.double()
+        storage.distribution_params = tuple(part.clone().double() for part in storage.distribution_params)
+        own.actor.distribution.update(torch.zeros(1, 1, dtype=torch.float64))
+        for entry in own.optimizer.state.values():
+            for name in ("exp_avg", "exp_avg_sq"):
+                entry[name] = entry[name].double()
+        own.actor.distribution._distribution = None
+        other = copy.deepcopy(own)
+    samples = own.num_mini_batches * (96 // own.num_mini_batches)
+    order = torch.randperm(samples, generator=torch.Generator().manual_seed(0))
+    monkeypatch.setattr(torch, "randperm", lambda *a, **o: order)
+    captured, start = CapturedUpdate(other), [p.detach().clone() for p in own.actor.parameters()]
+    for _ in range(2):
+        losses = own.update(), captured()
+        assert losses[1] == pytest.approx(losses[0], rel=1e-5, abs=1e-6)  # sums are float32
+        assert other.learning_rate == pytest.approx(own.learning_rate, rel=1e-5)
+    for one, same in ((own.actor, other.actor), (own.critic, other.critic)):
+        for weights, found in zip(one.parameters(), same.parameters(), strict=True):
+            torch.testing.assert_close(found, weights, rtol=1e-5, atol=1e-6)
+    assert all((p - p0).abs().max() > 1e-5 for p, p0 in zip(own.actor.parameters(), start, strict=True))
+
+
+def test_the_weight_of_the_entropy_may_change_between_updates() -> None:
+    """A graph reads it on the device."""
+    weights, stds = [], []
+    for captured in (False, True):
+        for final in (0.0, 5.0):
+            made = learner(schedule="fixed", captured_update=captured, entropy_coef=0.0, final_entropy_coef=final,
+                           entropy_decay=(1, 3))  # fmt: skip
+            for _ in range(3):
+                stds.append(next(made).std_mean)
+                weights.append(made.ppo.entropy_coef)
+    assert weights == [0.0, 0.0, 0.0, 0.0, 2.5, 5.0] * 2
+    for without, raised in ((stds[:3], stds[3:6]), (stds[6:9], stds[9:])):
+        assert raised[0] == pytest.approx(without[0]) and raised[2] > without[2] + 0.02
 
 
 def test_the_numbers_are_those_of_rsl_rls_own_over_iterations() -> None:
