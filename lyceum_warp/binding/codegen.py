@@ -38,24 +38,24 @@ class Observations:
 
 
 @wp.func
-def observe_groups(s: World, p: Params, out: Observations, w: int, base: wp.uint32, rng: Row[wp.uint32]):
+def observe_group(group: int, s: World, p: Params, out: Observations, w: int, base: wp.uint32, rng: Row[wp.uint32]):
 {observe}
 
 
 @wp.func
-def all_finite(out: Observations, w: int) -> bool:
+def finite_group(group: int, out: Observations, w: int) -> bool:
     finite = bool(True)
 {finite}
     return finite
 
 
 @wp.func
-def copy_observations(source: Observations, target: Observations, w: int):
+def copy_observations(source: Observations, target: Observations, w: int, lane: int, lanes: int):
 {copy}
 
 
 @wp.func
-def finite_memory(s0: World, s1: World) -> bool:
+def finite_memory(s0: World, s1: World, lane: int, lanes: int) -> bool:
     finite = bool(True)
 {memory}
     return finite
@@ -113,19 +113,24 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
     for number, (group, function) in enumerate(groups.items()):
         scope[f"observe_{number}"] = function
         noisy = len(function.input_types) > len(FUNCTIONS["observe"].kinds)
+        observe.append(f"if group == {number}:")
         if noisy:  # a stream for each group, so that no group's draws depend on another's
-            observe.append(f"rng[0] = substream(base, {number})")
-        observe.append(f"observe_{number}(s, p, out.{group}[w]{', rng' if noisy else ''})")
+            observe.append(f"    rng[0] = substream(base, {number})")
+        observe.append(f"    observe_{number}(s, p, out.{group}[w]{', rng' if noisy else ''})")
     blocks = {
         "batch": batch,
         "rows": rows,
         "groups": [f"    {group}: type_group" for group in groups],
         "observe": [f"    {line}" for line in observe],
-        "finite": [f"    finite = finite and finite_row(out.{group}[w])" for group in groups],
-        "copy": [f"    copy_row(source.{group}[w], target.{group}[w])" for group in groups],
+        "finite": [
+            f"    if group == {number}:\n        finite = finite_row(out.{group}[w], 0, 1)"
+            for number, group in enumerate(groups)
+        ],
+        "copy": [f"    copy_row(source.{group}[w], target.{group}[w], lane, lanes)" for group in groups],
     }
     blocks["memory"], blocks["model"] = _memory_checks(source), _model_checks(source)
     scope["type_group"] = wp.array2d(dtype=float)
+    scope |= {"ngroups": len(groups), "has_memory": bool(blocks["memory"])}
     parts = [_BATCH.format(**{name: "\n".join(lines) for name, lines in blocks.items()})]
     parts += [_default(function) for function in FUNCTIONS.values() if function.default is not None]
     text = "\n".join(parts)
@@ -139,7 +144,10 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
 
 def _memory_checks(source: TaskSource) -> list[str]:
     """Lines that find memory that is not finite. What outlives episodes is put back; the rest ends with its episode."""
-    checks = {"memory": "finite_row(s1.memory)", "lasting_memory": "restored_row(s0.lasting_memory, s1.lasting_memory)"}
+    checks = {
+        "memory": "finite_row(s1.memory, lane, lanes)",
+        "lasting_memory": "restored_row(s0.lasting_memory, s1.lasting_memory, lane, lanes)",
+    }
     found = [check for name, check in checks.items() if name in source.world.vars]
     return [f"    if not {check}:\n        finite = False" for check in found]
 
