@@ -138,6 +138,7 @@ class Worlds:
         self._found.terminated, self._found.success = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
         self._found.fault = wp.zeros((self._parts, n), dtype=int)  # type: ignore[assignment]
         self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
+        self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)
         self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
         self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
         naction = self.action_space.size
@@ -319,6 +320,8 @@ class Worlds:
             self.after, self.params, self.action, self.ranges, self.scale, self.counters, self.safe_action,
             self._action_fault, self.engine.ctrl,
         ], self.device)  # fmt: skip
+        if (check_model := self.task.kernels.check_model) is not None:
+            launch_lanes(check_model, self.nworld, [self.after, self._action_fault], self.device)
 
     def _substep(self) -> None:
         args = [self.after, self.params]
@@ -423,8 +426,11 @@ class Worlds:
 
     def _observe(self, mask: wp.array) -> None:
         """Observe the masked worlds; the others were observed when they were judged."""
-        args = [mask, self.after, self.params, self.counters, self.final_obs, self.obs]
-        launch_worlds(self.task.kernels.observe_worlds, self.nworld, args, self.device)
+        kernels, finite = self.task.kernels, self._finite_obs
+        args = [mask, self.after, self.params, self.counters, finite, self.obs]
+        launch_parts(kernels.observe_worlds, len(self.obs_spaces), self.nworld, args, self.device)
+        args = [mask, finite, self.final_obs, self.obs]
+        launch_lanes(kernels.mend_observations, self.nworld, args, self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Observe and judge the states of the masked worlds, without a transition."""

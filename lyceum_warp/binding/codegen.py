@@ -62,7 +62,7 @@ def finite_memory(s0: World, s1: World, lane: int, lanes: int) -> bool:
 
 
 @wp.func
-def valid_model(s: World) -> bool:
+def valid_model(s: World, lane: int, lanes: int) -> bool:
     valid = bool(True)
 {model}
     return valid
@@ -130,7 +130,7 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
     }
     blocks["memory"], blocks["model"] = _memory_checks(source), _model_checks(source)
     scope["type_group"] = wp.array2d(dtype=float)
-    scope |= {"ngroups": len(groups), "has_memory": bool(blocks["memory"])}
+    scope |= {"has_memory": bool(blocks["memory"]), "checks_model": bool(blocks["model"])}
     parts = [_BATCH.format(**{name: "\n".join(lines) for name, lines in blocks.items()})]
     parts += [_default(function) for function in FUNCTIONS.values() if function.default is not None]
     text = "\n".join(parts)
@@ -163,7 +163,8 @@ def _model_checks(source: TaskSource) -> list[str]:
                 [f"s.{name}[i]"] if variable.type.dtype is wp.float32 else [f"s.{name}[i][{j}]" for j in range(size)]
             )
             bad = " or ".join(f"not ({element} >= 0.0)" for element in elements)
-            lines += [f"    for i in range(s.{name}.shape[0]):", f"        if {bad}:", "            valid = False"]
+            lines.append(f"    for i in range(lane, s.{name}.shape[0], lanes):")
+            lines += [f"        if {bad}:", "            valid = False"]
     return lines
 
 

@@ -180,9 +180,9 @@ def make_kernels(
     Args:
         generated: ``World`` and ``Params``, the structs of the task; ``Batch``, a struct of the task's fields for all
             worlds, and ``view``, the function from (batch, world) to ``World``; ``Observations``, a struct of the
-            groups of observations, with ``observe_group``, ``finite_group`` and ``copy_observations``, and their
-            number, ``ngroups``; ``finite_memory`` and ``valid_model``, which look for faults in what the task itself
-            wrote; ``has_memory``, whether it has any.
+            groups of observations, with ``observe_group``, ``finite_group`` and ``copy_observations``;
+            ``finite_memory`` and ``valid_model``, which look for faults in what the task itself wrote; ``has_memory``
+            and ``checks_model``, whether there is anything to look for.
         functions: The task's functions by name, with defaults for those that it does not have.
         written: Names of the functions that the task has. Without ``control`` a scale and an offset map actions to
             controls; without ``evaluate`` the evaluation is the reward; without ``advance`` memory stays as it is.
@@ -190,7 +190,7 @@ def make_kernels(
     """
     Batch, Params, Observations = generated.Batch, generated.Params, generated.Observations  # noqa: N806
     World = generated.World  # noqa: N806
-    view, observe_group, ngroups = generated.view, generated.observe_group, generated.ngroups
+    view, observe_group = generated.view, generated.observe_group
     finite_group, copy_observations = generated.finite_group, generated.copy_observations
     finite_memory, valid_model = generated.finite_memory, generated.valid_model
     control, reward, measure = functions["control"], functions["reward"], functions["measure"]
@@ -238,8 +238,6 @@ def make_kernels(
         fault_out[w] = fault
         for i in range(action_in.shape[1]):
             safe_action_out[w, i] = wp.where(fault == 0, action_in[w, i], 0.0)
-        if not valid_model(view(batch, w)):
-            fault_out[w] = fault | MODEL
         if wp.static(has_control):
             control(view(batch, w), safe_action_out[w], params[w % params.shape[0]], ctrl_out[w])
         else:
@@ -248,6 +246,13 @@ def make_kernels(
         for i in range(ctrl_out.shape[1]):
             ctrl_out[w, i] = wp.clamp(ctrl_out[w, i], range_in[i, 0], range_in[i, 1])
         counters.step[w] = counters.step[w] + 1
+
+    @kernel_if(generated.checks_model)
+    def check_model(batch: Batch, fault_inout: wp.array[int], lanes: int):
+        """Find faults of the model fields that the task writes; launched over (nworld, lanes)."""
+        w, lane = wp.tid()
+        if not valid_model(view(batch, w), lane, lanes):
+            fault_inout[w] = fault_inout[w] | MODEL
 
     @kernel_for("advance")
     def advance_memory(
@@ -473,21 +478,34 @@ def make_kernels(
         batch: Batch,
         params: wp.array[Params],
         counters: Counters,
-        good_in: Observations,
+        finite_out: wp.array2d[bool],
         obs_out: Observations,
     ):
-        """Observe the masked worlds; launched over (nworld,).
+        """Observe the masked worlds, and find the groups whose numbers are finite; launched over (groups, nworld)."""
+        group, w = wp.tid()
+        if mask_in[w]:
+            observe(group, view(batch, w), params[w % params.shape[0]], obs_out, w, counters)
+            finite_out[group, w] = finite_group(group, obs_out, w)
 
-        Where a number is not finite, which is a fault of the next step, the last good observations take its place.
+    @wp.kernel(module=module, enable_backward=False)
+    def mend_observations(
+        mask_in: wp.array[bool],
+        finite_in: wp.array2d[bool],
+        good_in: Observations,
+        obs_inout: Observations,
+        lanes: int,
+    ):
+        """Put the last good observations where a number is not finite; launched over (nworld, lanes).
+
+        Such a number is a fault of the next step.
         """
-        w = wp.tid()
+        w, lane = wp.tid()
         if mask_in[w]:
             finite = bool(True)
-            for group in range(ngroups):
-                observe(group, view(batch, w), params[w % params.shape[0]], obs_out, w, counters)
-                finite = finite and finite_group(group, obs_out, w)
+            for group in range(finite_in.shape[0]):
+                finite = finite and finite_in[group, w]
             if not finite:
-                copy_observations(good_in, obs_out, w, 0, 1)
+                copy_observations(good_in, obs_inout, w, lane, lanes)
 
     @kernel_for("control")
     def control_worlds(
@@ -550,6 +568,7 @@ def make_kernels(
         Batch=Batch,
         Observations=Observations,
         act=act,
+        check_model=check_model,
         substep_memory=substep_memory,
         advance_memory=advance_memory,
         check_memory=check_memory,
@@ -560,6 +579,7 @@ def make_kernels(
         reject_worlds=reject_worlds,
         run_events=run_events,
         observe_worlds=observe_worlds,
+        mend_observations=mend_observations,
         control_worlds=control_worlds,
         measure_worlds=measure_worlds,
         judge_rows=judge_rows,
