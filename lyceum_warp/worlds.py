@@ -409,16 +409,16 @@ class Worlds:
             wp.copy(self._before_event(name), array)
         launch_worlds(self.task.kernels.run_events, self.nworld, [
             self.restarting, self.after, self.params, self.counters, self._going_on, self._moved, self.changed,
+            self._stale,
         ], self.device)  # fmt: skip
         for name, array in (live | drawn).items():
-            self._mark_changes(self._before_event(name), array, self.changed if name in MEMORIES else self._moved)
-        masks = [self._moved, self.restarting, self.changed, self._stale]
-        wp.launch(steps.merge_masks, self.nworld, masks, device=self.device)
+            self._mark_changes(self._before_event(name), array, physics=name not in MEMORIES)
         self.engine.commit(self._moved, [name for name in live if name not in MEMORIES])
 
-    def _mark_changes(self, before: wp.array, after: wp.array, changed: wp.array) -> None:
-        """Mark the worlds that go on and in which a field changed."""
-        launch_lanes(steps.mark_changes, self.nworld, [self._going_on, flat(before), flat(after), changed], self.device)
+    def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
+        """Mark the worlds that go on and in which a field changed: it is physics, or the task's memory."""
+        args = [self._going_on, flat(before), flat(after), physics, self._moved, self.changed, self._stale]
+        launch_lanes(steps.mark_changes, self.nworld, args, self.device)
 
     def _before_event(self, name: str) -> wp.array:
         """Where the values of a field before an event are kept."""

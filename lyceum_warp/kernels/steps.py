@@ -144,28 +144,21 @@ def mark_changes(
     mask_in: wp.array[bool],
     before_in: wp.array2d[float],
     after_in: wp.array2d[float],
+    physics: bool,
+    moved_inout: wp.array[bool],
     changed_inout: wp.array[bool],
+    stale_inout: wp.array[bool],
     lanes: int,
 ):
-    """Mark the masked worlds whose rows differ; launched over (nworld, lanes)."""
+    """Mark the masked worlds whose rows differ, as moved only where they are physics; launched over (nworld, lanes)."""
     w, lane = wp.tid()
     if mask_in[w]:
         for i in range(lane, after_in.shape[1], lanes):
             if before_in[w, i] != after_in[w, i]:
+                if physics:
+                    moved_inout[w] = True
                 changed_inout[w] = True
-
-
-@wp.kernel(enable_backward=False)
-def merge_masks(
-    moved_in: wp.array[bool],
-    restarting_in: wp.array[bool],
-    changed_inout: wp.array[bool],
-    stale_out: wp.array[bool],
-):
-    """Find the worlds that an event changed at all, and with those that restart; launched over (nworld,)."""
-    w = wp.tid()
-    changed_inout[w] = changed_inout[w] or moved_in[w]
-    stale_out[w] = changed_inout[w] or restarting_in[w]
+                stale_inout[w] = True
 
 
 def make_kernels(
@@ -461,12 +454,14 @@ def make_kernels(
         mask_out: wp.array[bool],
         moved_out: wp.array[bool],
         changed_out: wp.array[bool],
+        stale_out: wp.array[bool],
     ):
         """Run the events of the worlds that do not restart, ``mask_out``; launched over (nworld,)."""
         w = wp.tid()
         mask_out[w] = not restarting_in[w]
         moved_out[w] = False
         changed_out[w] = False
+        stale_out[w] = restarting_in[w]
         if not restarting_in[w]:
             at = stream(counters.key[w], counters.episode[w], counters.step[w])
             counters.rng[w, 0] = substream(at, EVENT)
