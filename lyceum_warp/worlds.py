@@ -52,7 +52,7 @@ def own_bytes_per_world(task: BoundTask) -> int:
     state_size = state_space(task.model, snapshots, task.dynamics, own_parts(task)).size
     copies = sum(field.size for field in task.fields)
     observations = sum(sum(layout.values()) for layout in task.obs_layouts.values())
-    return 4 * copies + 8 * state_size + 8 * observations + 200
+    return 4 * copies + 8 * state_size + 8 * observations + 250
 
 
 def own_parts(task: BoundTask) -> dict[str, int]:
@@ -310,8 +310,8 @@ class Worlds:
 
     def keep_before(self) -> None:
         """Keep the current state as the one that a transition starts from."""
-        for name, copy in self._copies.items():
-            wp.copy(copy, getattr(self.after, name))
+        if (kernel := self.task.kernels.keep_before) is not None:
+            launch_lanes(kernel, self.nworld, [self.after, self.before], self.device)
 
     def act(self) -> None:
         """Keep the state that the step starts from, and turn actions into controls."""

@@ -15,9 +15,10 @@ import warp as wp
 
 from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.writes import written_fields
+from lyceum_warp.fields import is_data_field
 from lyceum_warp.kernels import random, steps
 from lyceum_warp.model_fields import NOT_NEGATIVE
-from lyceum_warp.task import FUNCTIONS, Row, Task, TaskFunction
+from lyceum_warp.task import FUNCTIONS, MEMORIES, Row, Task, TaskFunction
 
 _BATCH = """
 @wp.struct
@@ -30,6 +31,11 @@ def view(batch: Batch, w: int) -> World:
     s = World()
 {rows}
     return s
+
+
+@wp.func
+def copy_state(source: Batch, target: Batch, w: int, lane: int, lanes: int):
+{state}
 
 
 @wp.struct
@@ -100,13 +106,15 @@ def _module_name(task: type[Task]) -> str:
 def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[str, Any]:
     """The scope of the generated source after it has run: structs, functions around the task's, and defaults."""
     scope: dict[str, Any] = {"wp": wp, "Row": Row, "World": source.world, "Params": source.params}
-    batch, rows = [], []
+    batch, rows, state = [], [], []
     for name, variable in source.world.vars.items():
         kind = variable.type
         ndim, dtype = (kind.ndim + 1, kind.dtype) if hasattr(kind, "ndim") else (1, kind)
         scope[f"type_{name}"] = wp.array(dtype=dtype, ndim=ndim)
         batch.append(f"    {name}: type_{name}")
         rows.append(f"    s.{name} = batch.{name}[w]")
+        if name in MEMORIES or is_data_field(name):  # no step changes the model
+            state += _copy(name, ndim)
     scope |= {"substream": random.substream, "finite_row": steps.finite_row, "copy_row": steps.copy_row}
     scope["restored_row"] = steps.restored_row
     observe = []
@@ -120,6 +128,7 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
     blocks = {
         "batch": batch,
         "rows": rows,
+        "state": state or ["    pass"],
         "groups": [f"    {group}: type_group" for group in groups],
         "observe": [f"    {line}" for line in observe],
         "finite": [
@@ -130,7 +139,7 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
     }
     blocks["memory"], blocks["model"] = _memory_checks(source), _model_checks(source)
     scope["type_group"] = wp.array2d(dtype=float)
-    scope |= {"has_memory": bool(blocks["memory"]), "checks_model": bool(blocks["model"])}
+    scope |= {"has_memory": bool(blocks["memory"]), "checks_model": bool(blocks["model"]), "has_state": bool(state)}
     parts = [_BATCH.format(**{name: "\n".join(lines) for name, lines in blocks.items()})]
     parts += [_default(function) for function in FUNCTIONS.values() if function.default is not None]
     text = "\n".join(parts)
@@ -140,6 +149,17 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
     scope["__name__"] = f"lyceum_warp.generated.{source.name}"
     exec(compile(text, file, "exec"), scope)
     return scope
+
+
+def _copy(name: str, ndim: int) -> list[str]:
+    """Lines that copy a world's values of a field, (nworld, ...) with some number of axes; the lanes share a row."""
+    if ndim == 1:
+        return ["    if lane == 0:", f"        target.{name}[w] = source.{name}[w]"]
+    lines = [f"    for i1 in range(lane, source.{name}.shape[1], lanes):"]
+    for axis in range(2, ndim):
+        lines.append("    " * axis + f"for i{axis} in range(source.{name}.shape[{axis}]):")
+    place = ", ".join(["w", *(f"i{axis}" for axis in range(1, ndim))])
+    return [*lines, "    " * ndim + f"target.{name}[{place}] = source.{name}[{place}]"]
 
 
 def _memory_checks(source: TaskSource) -> list[str]:

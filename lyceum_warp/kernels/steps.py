@@ -172,10 +172,10 @@ def make_kernels(
 
     Args:
         generated: ``World`` and ``Params``, the structs of the task; ``Batch``, a struct of the task's fields for all
-            worlds, and ``view``, the function from (batch, world) to ``World``; ``Observations``, a struct of the
-            groups of observations, with ``observe_group``, ``finite_group`` and ``copy_observations``;
-            ``finite_memory`` and ``valid_model``, which look for faults in what the task itself wrote; ``has_memory``
-            and ``checks_model``, whether there is anything to look for.
+            worlds, ``view``, the function from (batch, world) to ``World``, and ``copy_state``, which copies what steps
+            change; ``Observations``, a struct of the groups of observations, with ``observe_group``, ``finite_group``
+            and ``copy_observations``; ``finite_memory`` and ``valid_model``, which look for faults in what the task
+            itself wrote; ``has_state``, ``has_memory`` and ``checks_model``, whether these have anything to do.
         functions: The task's functions by name, with defaults for those that it does not have.
         written: Names of the functions that the task has. Without ``control`` a scale and an offset map actions to
             controls; without ``evaluate`` the evaluation is the reward; without ``advance`` memory stays as it is.
@@ -186,6 +186,7 @@ def make_kernels(
     view, observe_group = generated.view, generated.observe_group
     finite_group, copy_observations = generated.finite_group, generated.copy_observations
     finite_memory, valid_model = generated.finite_memory, generated.valid_model
+    copy_state = generated.copy_state
     control, reward, measure = functions["control"], functions["reward"], functions["measure"]
     evaluate, terminated, success = functions["evaluate"], functions["terminated"], functions["success"]
     initialize, randomize, startup = functions["initialize"], functions["randomize"], functions["startup"]
@@ -206,6 +207,12 @@ def make_kernels(
         """Write a group of observations; its noise is a function of the counters alone."""
         base = substream(stream(counters.key[w], counters.episode[w], counters.step[w]), OBSERVE)
         observe_group(group, s, p, out, w, base, counters.rng[group * counters.step.shape[0] + w])
+
+    @kernel_if(generated.has_state)
+    def keep_before(after: Batch, before_out: Batch, lanes: int):
+        """Copy the fields that a step changes; launched over (nworld, lanes)."""
+        w, lane = wp.tid()
+        copy_state(after, before_out, w, lane, lanes)
 
     @wp.kernel(module=module, enable_backward=False)
     def act(
@@ -562,6 +569,7 @@ def make_kernels(
     return SimpleNamespace(
         Batch=Batch,
         Observations=Observations,
+        keep_before=keep_before,
         act=act,
         check_model=check_model,
         substep_memory=substep_memory,
