@@ -55,9 +55,10 @@ def launch_worlds(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: w
     wp.launch(kernel, nworld, args, device=device, block_dim=WORLDS_A_BLOCK if wp.get_device(device).is_cuda else 1)
 
 
-def launch_parts(kernel: wp.Kernel, parts: int, nworld: int, args: Sequence[Any], device: wp.Device) -> None:
+def launch_parts(kernel: wp.Kernel, parts: int, nworld: int, args: Sequence[Any], device: wp.Device | None) -> None:
     """Launch a kernel of a task with a thread for each part of the work on each world, (parts, nworld)."""
-    wp.launch(kernel, (parts, nworld), args, device=device, block_dim=WORLDS_A_BLOCK if device.is_cuda else 1)
+    block = WORLDS_A_BLOCK if wp.get_device(device).is_cuda else 1
+    wp.launch(kernel, (parts, nworld), args, device=device, block_dim=block)
 
 
 def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device) -> None:
