@@ -27,7 +27,7 @@ from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.fields import Stage
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
-from lyceum_warp.kernels import random, state, steps
+from lyceum_warp.kernels import random, rows, state, steps
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.spaces import Space, action_space, control_ranges, control_scale, state_space
 from lyceum_warp.task import MEMORIES
@@ -418,7 +418,7 @@ class Worlds:
     def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
         """Mark the worlds that go on and in which a field changed: it is physics, or the task's memory."""
         args = [self._going_on, flat(before), flat(after), physics, self._moved, self.changed, self._stale]
-        launch_lanes(steps.mark_changes, self.nworld, args, self.device)
+        launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _before_event(self, name: str) -> wp.array:
         """Where the values of a field before an event are kept."""
@@ -430,7 +430,7 @@ class Worlds:
         args = [mask, self.after, self.params, self.counters, finite, self.obs]
         launch_parts(kernels.observe_worlds, len(self.obs_spaces), self.nworld, args, self.device)
         args = [mask, finite, self.final_obs, self.obs]
-        launch_lanes(kernels.mend_observations, self.nworld, args, self.device)
+        launch_lanes(kernels.replace_observations, self.nworld, args, self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Observe and judge the states of the masked worlds, without a transition."""

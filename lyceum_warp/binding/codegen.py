@@ -17,6 +17,7 @@ from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.writes import written_fields
 from lyceum_warp.fields import is_data_field
 from lyceum_warp.kernels import random, steps
+from lyceum_warp.kernels import rows as kernel_rows
 from lyceum_warp.model_fields import NOT_NEGATIVE
 from lyceum_warp.task import FUNCTIONS, MEMORIES, Row, Task, TaskFunction
 
@@ -115,8 +116,8 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
         rows.append(f"    s.{name} = batch.{name}[w]")
         if name in MEMORIES or is_data_field(name):  # no step changes the model
             state += _copy(name, ndim)
-    scope |= {"substream": random.substream, "finite_row": steps.finite_row, "copy_row": steps.copy_row}
-    scope["restored_row"] = steps.restored_row
+    scope |= {"substream": random.substream, "finite_row": kernel_rows.finite_row, "copy_row": kernel_rows.copy_row}
+    scope["restored_row"] = kernel_rows.restored_row
     observe = []
     for number, (group, function) in enumerate(groups.items()):
         scope[f"observe_{number}"] = function

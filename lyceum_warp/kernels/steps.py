@@ -9,6 +9,7 @@ import warp as wp
 from lyceum_warp.done import Done
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.random import stream, substream
+from lyceum_warp.kernels.rows import copy_row
 
 TERMINATED = wp.constant(int(Done.TERMINATED))
 TRUNCATED = wp.constant(int(Done.TRUNCATED))
@@ -85,41 +86,6 @@ OUTCOMES = {
 """The fields of Outcome with one number a world, and their types."""
 
 
-@wp.func
-def finite_row(row: wp.array[float], lane: int, lanes: int) -> bool:
-    """Whether every number of a lane, which has one place of a row in ``lanes``, is finite."""
-    for i in range(lane, row.shape[0], lanes):  # noqa: SIM110 (Warp has no all())
-        if not wp.isfinite(row[i]):
-            return False
-    return True
-
-
-@wp.func
-def restored_row(before: wp.array[float], after: wp.array[float], lane: int, lanes: int) -> bool:
-    """Put back a lane's numbers that are not finite any more; returns whether there are none."""
-    finite = bool(True)
-    for i in range(lane, after.shape[0], lanes):
-        if not wp.isfinite(after[i]):
-            finite = False
-            after[i] = wp.where(wp.isfinite(before[i]), before[i], 0.0)
-    return finite
-
-
-@wp.func
-def copy_row(source: wp.array[float], target: wp.array[float], lane: int, lanes: int):
-    """Copy a lane's numbers of a row."""
-    for i in range(lane, source.shape[0], lanes):
-        target[i] = source[i]
-
-
-@wp.func
-def count_faults(fault: int, count_inout: wp.array[int]):
-    """Count each kind of fault, at the place of its bit in Done."""
-    for bit in range(count_inout.shape[0]):
-        if ((fault >> bit) & 1) != 0:
-            wp.atomic_add(count_inout, bit, 1)
-
-
 @wp.kernel(enable_backward=False)
 def hold_success(
     mask_in: wp.array[bool],
@@ -137,28 +103,6 @@ def hold_success(
         if transition:
             count_inout[w, 0] = wp.where(success_inout[w], wp.min(count_inout[w, 0] + 1.0, float(needed)), 0.0)
         success_inout[w] = success_inout[w] and count_inout[w, 0] >= float(needed)
-
-
-@wp.kernel(enable_backward=False)
-def mark_changes(
-    mask_in: wp.array[bool],
-    before_in: wp.array2d[float],
-    after_in: wp.array2d[float],
-    physics: bool,
-    moved_inout: wp.array[bool],
-    changed_inout: wp.array[bool],
-    stale_inout: wp.array[bool],
-    lanes: int,
-):
-    """Mark the masked worlds whose rows differ, as moved only where they are physics; launched over (nworld, lanes)."""
-    w, lane = wp.tid()
-    if mask_in[w]:
-        for i in range(lane, after_in.shape[1], lanes):
-            if before_in[w, i] != after_in[w, i]:
-                if physics:
-                    moved_inout[w] = True
-                changed_inout[w] = True
-                stale_inout[w] = True
 
 
 def make_kernels(
@@ -316,9 +260,8 @@ def make_kernels(
                     found_out.eval[w] = evaluate(s1, p)
             elif part == GAIN:
                 if transition:
-                    gain = reward(view(before, w), action_in[w], s1, p)
-                    found_out.reward[w] = gain
-                    if not wp.isfinite(gain):
+                    found_out.reward[w] = reward(view(before, w), action_in[w], s1, p)
+                    if not wp.isfinite(found_out.reward[w]):
                         found = REWARD
             elif part == METRICS:
                 if wp.static(has_measure):
@@ -338,7 +281,7 @@ def make_kernels(
         mask_in: wp.array[bool],
         before: Batch,
         params: wp.array[Params],
-        found_in: Findings,
+        found: Findings,
         step_in: wp.array[int],
         horizon: int,
         transition: bool,
@@ -365,8 +308,8 @@ def make_kernels(
         if not mask_in[w]:
             return
         fault = fault_inout[w] | action_fault_in[w]
-        for part in range(found_in.fault.shape[0]):
-            fault = fault | found_in.fault[part, w]
+        for part in range(found.fault.shape[0]):
+            fault = fault | found.fault[part, w]
         if fault == 0:
             copy_observations(final_obs_inout, obs_out, w, lane, lanes)
         else:
@@ -383,21 +326,21 @@ def make_kernels(
         fault_inout[w] = fault
         gain = float(0.0)
         if fault == 0 and transition:
-            gain = found_in.reward[w]
+            gain = found.reward[w]
         out.reward[w] = gain
         if wp.static(has_evaluate):
             if fault == 0:
-                out.eval[w] = found_in.eval[w]
+                out.eval[w] = found.eval[w]
             elif transition:
-                last = evaluate(view(before, w), params[w % params.shape[0]])
-                if not faults.is_out_of_range(last):  # else keep the evaluation of an earlier state
-                    out.eval[w] = last
+                found.eval[w] = evaluate(view(before, w), params[w % params.shape[0]])
+                if not faults.is_out_of_range(found.eval[w]):  # else keep the evaluation of an earlier state
+                    out.eval[w] = found.eval[w]
         else:
             out.eval[w] = gain
         reason = fault
-        if fault == 0 and found_in.terminated[w]:
+        if fault == 0 and found.terminated[w]:
             reason = TERMINATED
-        out.success[w] = fault == 0 and found_in.success[w]
+        out.success[w] = fault == 0 and found.success[w]
         if horizon > 0 and step_in[w] >= horizon:
             reason = reason | TRUNCATED
         if keep_reason:
@@ -410,7 +353,7 @@ def make_kernels(
             # without automatic resets a world steps on after its end, but not after a fault
             restart_out[w] = wp.where(keep_reason, fault != 0, reason != 0)
             if fault != 0:
-                count_faults(fault, fault_count_inout)
+                faults.count_faults(fault, fault_count_inout)
 
     @wp.kernel(module=module, enable_backward=False)
     def restart(
@@ -490,7 +433,7 @@ def make_kernels(
             finite_out[group, w] = finite_group(group, obs_out, w)
 
     @wp.kernel(module=module, enable_backward=False)
-    def mend_observations(
+    def replace_observations(
         mask_in: wp.array[bool],
         finite_in: wp.array2d[bool],
         good_in: Observations,
@@ -582,7 +525,7 @@ def make_kernels(
         reject_worlds=reject_worlds,
         run_events=run_events,
         observe_worlds=observe_worlds,
-        mend_observations=mend_observations,
+        replace_observations=replace_observations,
         control_worlds=control_worlds,
         measure_worlds=measure_worlds,
         judge_rows=judge_rows,
