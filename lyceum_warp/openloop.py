@@ -232,5 +232,5 @@ class OpenLoop:
         worlds, n, device = self.worlds, self.env.nworld, self.env.device
         self.env.engine.find_faults(worlds.everyone)
         wp.launch(planning.merge_faults, n, [self.env.engine.fault, self._fault], device=device)
-        args = [worlds.everyone, batch, worlds.params, worlds.counters, self._finite, self._obs]
-        launch_parts(self.env.task.kernels.observe_worlds, len(worlds.obs_spaces), n, args, device)
+        args = [worlds.everyone, batch, worlds.params, worlds.counters, self._obs, self._finite, self._obs, 1]
+        launch_parts(self.env.task.kernels.observe_worlds, 1, n, args, device)

@@ -139,6 +139,7 @@ class Worlds:
         self._found.fault = wp.zeros((self._parts, n), dtype=int)  # type: ignore[assignment]
         self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
         self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)
+        self._observing = len(self.obs_spaces) if self.device.is_cuda else 1  # threads that observe a world
         self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
         self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
         naction = self.action_space.size
@@ -426,11 +427,12 @@ class Worlds:
 
     def _observe(self, mask: wp.array) -> None:
         """Observe the masked worlds; the others were observed when they were judged."""
-        kernels, finite = self.task.kernels, self._finite_obs
-        args = [mask, self.after, self.params, self.counters, finite, self.obs]
-        launch_parts(kernels.observe_worlds, len(self.obs_spaces), self.nworld, args, self.device)
-        args = [mask, finite, self.final_obs, self.obs]
-        launch_lanes(kernels.replace_observations, self.nworld, args, self.device)
+        kernels, finite, parts = self.task.kernels, self._finite_obs, self._observing
+        args = [mask, self.after, self.params, self.counters, self.final_obs, finite, self.obs, parts]
+        launch_parts(kernels.observe_worlds, parts, self.nworld, args, self.device)
+        if parts > 1:
+            args = [mask, finite, self.final_obs, self.obs]
+            launch_lanes(kernels.replace_observations, self.nworld, args, self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Observe and judge the states of the masked worlds, without a transition."""

@@ -437,8 +437,8 @@ class BoundTask:
             rows = self.kernels.Observations()
             for group, size in sizes.items():
                 setattr(rows, group, wp.full((1, size + _SPARE), unwritten, dtype=float, device=device))
-            args = [mask, batch, params, counters, finite, rows]
-            launch_parts(self.kernels.observe_worlds, len(sizes), 1, args, device)
+            args = [mask, batch, params, counters, rows, finite, rows, 1]
+            launch_parts(self.kernels.observe_worlds, 1, 1, args, device)
             found = {group: getattr(rows, group).numpy()[0] for group in sizes}
             for group, row in found.items():
                 written[group] |= _is_written(row, unwritten)

@@ -423,14 +423,24 @@ def make_kernels(
         batch: Batch,
         params: wp.array[Params],
         counters: Counters,
+        good_in: Observations,
         finite_out: wp.array2d[bool],
         obs_out: Observations,
+        parts: int,
     ):
-        """Observe the masked worlds, and find the groups whose numbers are finite; launched over (groups, nworld)."""
-        group, w = wp.tid()
+        """Observe the masked worlds, and find the groups whose numbers are finite; launched over (parts, nworld).
+
+        With one part for all groups it replaces what is not finite as well; else ``replace_observations`` must follow.
+        """
+        part, w = wp.tid()
         if mask_in[w]:
-            observe(group, view(batch, w), params[w % params.shape[0]], obs_out, w, counters)
-            finite_out[group, w] = finite_group(group, obs_out, w)
+            finite = bool(True)
+            for group in range(part, finite_out.shape[0], parts):
+                observe(group, view(batch, w), params[w % params.shape[0]], obs_out, w, counters)
+                finite_out[group, w] = finite_group(group, obs_out, w)
+                finite = finite and finite_out[group, w]
+            if parts == 1 and not finite:
+                copy_observations(good_in, obs_out, w, 0, 1)
 
     @wp.kernel(module=module, enable_backward=False)
     def replace_observations(
