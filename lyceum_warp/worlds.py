@@ -132,11 +132,12 @@ class Worlds:
         """Their sums over the episode of that step."""
         self.outcome.metrics = self.metrics  # type: ignore[assignment]
         self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
-        self._parts = int(steps.OBSERVE_FIRST) + len(self.obs_spaces)
+        parts = int(steps.OBSERVE_FIRST) + len(self.obs_spaces)
+        self._judging = parts if self.device.is_cuda else 1  # threads that judge a world
         self._found = steps.Findings()
         self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)
         self._found.terminated, self._found.success = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
-        self._found.fault = wp.zeros((self._parts, n), dtype=int)  # type: ignore[assignment]
+        self._found.fault = wp.zeros((parts, n), dtype=int)  # type: ignore[assignment]
         self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
         self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)
         self._observing = len(self.obs_spaces) if self.device.is_cuda else 1  # threads that observe a world
@@ -348,9 +349,9 @@ class Worlds:
         kernels = self.task.kernels
         if kernels.check_memory is not None:
             launch_lanes(kernels.check_memory, self.nworld, [mask, self.before, self.after, fault], self.device)
-        launch_parts(kernels.judge, self._parts, self.nworld, [
+        launch_parts(kernels.judge, self._judging, self.nworld, [
             mask, self.before, self.after, self.params, self.safe_action, self.counters, transition, fault,
-            action_fault, self._found, self.metrics, self.final_obs,
+            action_fault, self._found, self.metrics, self.final_obs, self._judging,
         ], self.device)  # fmt: skip
         launch_lanes(kernels.conclude, self.nworld, [
             mask, self.before, self.params, self._found, self.counters.step, self.horizon, transition, keep_reason,

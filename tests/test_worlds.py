@@ -39,11 +39,13 @@ def test_phases_run_by_hand_have_the_numbers_of_a_step(engine: str) -> None:
     assert torch.equal(env.get_state(), by_hand.get_state())
 
 
-def outcomes_with_faults(engine: str, *, observing: int = 1) -> tuple[list[torch.Tensor], dict[str, int]]:
+def outcomes_with_faults(
+    engine: str, *, judging: int = 1, observing: int = 1
+) -> tuple[list[torch.Tensor], dict[str, int]]:
     """What steps of a task with every feature leave, with events and faults of each kind, and the counts of faults."""
     env = lw.make(Full, nworld=4, engine=engine, seed=2)
     own, kept = env.worlds, []
-    own._observing = observing
+    own._judging, own._observing = judging, observing
     for i in range(25):
         env.action.fill_(0.1 * (i % 10))
         if i == 5:
@@ -76,7 +78,7 @@ def test_rows_that_lanes_share_have_the_numbers_of_one_lane(engine: str, monkeyp
     one, counts = outcomes_with_faults(engine)
     assert counts == {"action": 1, "nan": 1, "model": 1}
     monkeypatch.setattr(worlds, "launch_lanes", launch_three)
-    three, same_counts = outcomes_with_faults(engine, observing=2)
+    three, same_counts = outcomes_with_faults(engine, judging=5, observing=2)
     assert counts == same_counts
     assert all(torch.equal(a, b) for a, b in zip(one, three, strict=True))
 

@@ -239,42 +239,44 @@ def make_kernels(
         found_out: Findings,
         metrics_out: wp.array2d[float],
         obs_out: Observations,
+        threads: int,
     ):
-        """Judge a transition, or a state alone, in the masked worlds; launched over (parts, nworld).
+        """Judge a transition, or a state alone, in the masked worlds; launched over (threads, nworld).
 
-        The parts do not depend on each other and are threads of their own, because one after the other they take
-        several times as long on a GPU, which has places for far more threads than there are worlds. A world that has
-        a fault already is not judged.
+        The parts do not depend on each other. On a GPU each has a thread of its own, because one after the other they
+        take several times as long, and there are places for far more threads than worlds. A world that has a fault
+        already is not judged.
         """
-        part, w = wp.tid()
+        first, w = wp.tid()
         if not mask_in[w]:
             return
-        found = int(0)
-        if (fault_in[w] | action_fault_in[w]) == 0:
-            p = params[w % params.shape[0]]
-            s1 = view(after, w)
-            if part == ENDS:
-                found_out.terminated[w] = terminated(s1, p)
-                found_out.success[w] = success(s1, p)
-                if wp.static(has_evaluate):
-                    found_out.eval[w] = evaluate(s1, p)
-            elif part == GAIN:
-                if transition:
-                    found_out.reward[w] = reward(view(before, w), action_in[w], s1, p)
-                    if not wp.isfinite(found_out.reward[w]):
-                        found = REWARD
-            elif part == METRICS:
-                if wp.static(has_measure):
-                    for i in range(metrics_out.shape[1]):
-                        metrics_out[w, i] = 0.0
+        for part in range(first, found_out.fault.shape[0], threads):
+            found = int(0)
+            if (fault_in[w] | action_fault_in[w]) == 0:
+                p = params[w % params.shape[0]]
+                s1 = view(after, w)
+                if part == ENDS:
+                    found_out.terminated[w] = terminated(s1, p)
+                    found_out.success[w] = success(s1, p)
+                    if wp.static(has_evaluate):
+                        found_out.eval[w] = evaluate(s1, p)
+                elif part == GAIN:
                     if transition:
-                        measure(view(before, w), action_in[w], s1, p, metrics_out[w])
-            else:
-                group = part - OBSERVE_FIRST
-                observe(group, s1, p, obs_out, w, counters)
-                if not finite_group(group, obs_out, w):
-                    found = OBSERVATION
-        found_out.fault[part, w] = found
+                        found_out.reward[w] = reward(view(before, w), action_in[w], s1, p)
+                        if not wp.isfinite(found_out.reward[w]):
+                            found = REWARD
+                elif part == METRICS:
+                    if wp.static(has_measure):
+                        for i in range(metrics_out.shape[1]):
+                            metrics_out[w, i] = 0.0
+                        if transition:
+                            measure(view(before, w), action_in[w], s1, p, metrics_out[w])
+                else:
+                    group = part - OBSERVE_FIRST
+                    observe(group, s1, p, obs_out, w, counters)
+                    if not finite_group(group, obs_out, w):
+                        found = OBSERVATION
+            found_out.fault[part, w] = found
 
     @wp.kernel(module=module, enable_backward=False)
     def conclude(
