@@ -55,6 +55,21 @@ def launch_worlds(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: w
     wp.launch(kernel, nworld, args, device=device, block_dim=WORLDS_A_BLOCK if wp.get_device(device).is_cuda else 1)
 
 
+def launch_parts(kernel: wp.Kernel, parts: int, nworld: int, args: Sequence[Any], device: wp.Device | None) -> None:
+    """Launch a kernel of a task with a thread for each part of the work on each world, (parts, nworld)."""
+    block = WORLDS_A_BLOCK if wp.get_device(device).is_cuda else 1
+    wp.launch(kernel, (parts, nworld), args, device=device, block_dim=block)
+
+
+def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device) -> None:
+    """Launch a kernel over (nworld, lanes), whose last argument is the number of threads that share a world's rows.
+
+    It is 1 on the CPU and a warp on a GPU, whose threads read and write neighbouring places of a row together.
+    """
+    lanes = 32 if device.is_cuda else 1
+    wp.launch(kernel, (nworld, lanes), [*args, lanes], device=device)
+
+
 def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.array) -> None:
     """Launch one of the copying kernels of ``kernels.state`` over the masked rows of the target, (nworld, n)."""
     if target.size == 0:

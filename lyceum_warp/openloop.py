@@ -6,7 +6,7 @@ from functools import partial
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import flat, launch_rows, launch_worlds, shared_rows, torch_view, with_memory
+from lyceum_warp.arrays import flat, launch_parts, launch_rows, launch_worlds, shared_rows, torch_view, with_memory
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
@@ -85,6 +85,7 @@ class OpenLoop:
             self._terminated = wp.zeros(rows, dtype=bool)
             self._fault = wp.zeros(n, dtype=int)
             self._obs = task.kernels.Observations()
+            self._finite = wp.zeros((len(env.obs_spaces), n), dtype=bool)
             for group, space in env.obs_spaces.items():
                 setattr(self._obs, group, wp.zeros((n, space.size), dtype=float))
             self._no_memory = wp.zeros((rows + n, 0), dtype=float)
@@ -231,5 +232,5 @@ class OpenLoop:
         worlds, n, device = self.worlds, self.env.nworld, self.env.device
         self.env.engine.find_faults(worlds.everyone)
         wp.launch(planning.merge_faults, n, [self.env.engine.fault, self._fault], device=device)
-        args = [worlds.everyone, batch, worlds.params, worlds.counters, self._obs, self._obs]
-        launch_worlds(self.env.task.kernels.observe_worlds, n, args, device)
+        args = [worlds.everyone, batch, worlds.params, worlds.counters, self._obs, self._finite, self._obs, 1]
+        launch_parts(self.env.task.kernels.observe_worlds, 1, n, args, device)

@@ -12,13 +12,22 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import flat, launch_rows, launch_worlds, shared_rows, torch_view, with_memory
+from lyceum_warp.arrays import (
+    flat,
+    launch_lanes,
+    launch_parts,
+    launch_rows,
+    launch_worlds,
+    shared_rows,
+    torch_view,
+    with_memory,
+)
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.fields import Stage
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
-from lyceum_warp.kernels import random, state, steps
+from lyceum_warp.kernels import random, rows, state, steps
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.spaces import Space, action_space, control_ranges, control_scale, state_space
 from lyceum_warp.task import MEMORIES
@@ -43,7 +52,7 @@ def own_bytes_per_world(task: BoundTask) -> int:
     state_size = state_space(task.model, snapshots, task.dynamics, own_parts(task)).size
     copies = sum(field.size for field in task.fields)
     observations = sum(sum(layout.values()) for layout in task.obs_layouts.values())
-    return 4 * copies + 8 * state_size + 8 * observations + 200
+    return 4 * copies + 8 * state_size + 8 * observations + 250
 
 
 def own_parts(task: BoundTask) -> dict[str, int]:
@@ -123,7 +132,15 @@ class Worlds:
         """Their sums over the episode of that step."""
         self.outcome.metrics = self.metrics  # type: ignore[assignment]
         self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
+        parts = int(steps.OBSERVE_FIRST) + len(self.obs_spaces)
+        self._judging = parts if self.device.is_cuda else 1  # threads that judge a world
+        self._found = steps.Findings()
+        self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)
+        self._found.terminated, self._found.success = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
+        self._found.fault = wp.zeros((parts, n), dtype=int)  # type: ignore[assignment]
         self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
+        self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)
+        self._observing = len(self.obs_spaces) if self.device.is_cuda else 1  # threads that observe a world
         self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
         self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
         naction = self.action_space.size
@@ -138,13 +155,13 @@ class Worlds:
         self.counters = steps.Counters()
         self.counters.step, self.counters.episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
         self.counters.key = wp.zeros(n, dtype=wp.uint32)
-        self.counters.rng = wp.zeros((n, 1), dtype=wp.uint32)  # type: ignore[assignment]
+        self.counters.rng = wp.zeros((len(self.obs_spaces) * n, 1), dtype=wp.uint32)  # type: ignore[assignment]
         self._seed = wp.zeros(1, dtype=int)
         self._action_fault, self._no_fault, self._judged = (wp.zeros(n, dtype=int) for _ in range(3))
         self.fault_count = wp.zeros(int(FAULTS).bit_length(), dtype=int)
         self.everyone, self.mask = wp.full(n, True, dtype=bool), wp.zeros(n, dtype=bool)
         self.restarting, self._drawing = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
-        self._going_on, self._moved, self.changed = (wp.zeros(n, dtype=bool) for _ in range(3))
+        self._going_on, self._moved, self.changed, self._stale = (wp.zeros(n, dtype=bool) for _ in range(4))
         self.changed_view = torch_view(self.changed)
         """The worlds that the events of the last step changed, (nworld,) bool."""
         self.state = wp.zeros((n, self.state_space.size), dtype=wp.float64)
@@ -264,10 +281,8 @@ class Worlds:
 
     def _observe_phases(self) -> list[Phase]:
         """Observations of the worlds that changed since they were judged."""
-        phases = [Phase("observe", partial(self._observe, self.restarting))]
-        if self.task.kernels.run_events is not None:
-            phases.append(Phase("event observe", partial(self._observe, self.changed)))
-        return phases
+        changed = self.restarting if self.task.kernels.run_events is None else self._stale
+        return [Phase("observe", partial(self._observe, changed))]
 
     def _refresh_phases(self, mask: wp.array) -> list[Phase]:
         if self.engine.reset_stage == Stage.NONE:  # no field follows from the state
@@ -297,8 +312,8 @@ class Worlds:
 
     def keep_before(self) -> None:
         """Keep the current state as the one that a transition starts from."""
-        for name, copy in self._copies.items():
-            wp.copy(copy, getattr(self.after, name))
+        if (kernel := self.task.kernels.keep_before) is not None:
+            launch_lanes(kernel, self.nworld, [self.after, self.before], self.device)
 
     def act(self) -> None:
         """Keep the state that the step starts from, and turn actions into controls."""
@@ -307,6 +322,8 @@ class Worlds:
             self.after, self.params, self.action, self.ranges, self.scale, self.counters, self.safe_action,
             self._action_fault, self.engine.ctrl,
         ], self.device)  # fmt: skip
+        if (check_model := self.task.kernels.check_model) is not None:
+            launch_lanes(check_model, self.nworld, [self.after, self._action_fault], self.device)
 
     def _substep(self) -> None:
         args = [self.after, self.params]
@@ -318,7 +335,6 @@ class Worlds:
         self.advance_memory()
         keep_reason = not self.autoreset
         self._judge(self.everyone, self.engine.fault, self._action_fault, transition=True, keep_reason=keep_reason)
-        wp.launch(steps.count_faults, self.nworld, [self.engine.fault, self.fault_count], device=self.device)
 
     def advance_memory(self) -> None:
         """Advance task memory by one step."""
@@ -330,10 +346,17 @@ class Worlds:
         self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, keep_reason: bool = False
     ) -> None:
         """Reward, metrics, evaluation, ends and observations of the masked worlds; see ``kernels.steps``."""
-        launch_worlds(self.task.kernels.judge, self.nworld, [
-            mask, self.before, self.after, self.params, self.safe_action, self.counters, self.horizon, transition,
-            keep_reason, fault, action_fault, self.outcome, self.metric_sums, self.obs, self.final_obs,
-            self.restarting,
+        kernels = self.task.kernels
+        if kernels.check_memory is not None:
+            launch_lanes(kernels.check_memory, self.nworld, [mask, self.before, self.after, fault], self.device)
+        launch_parts(kernels.judge, self._judging, self.nworld, [
+            mask, self.before, self.after, self.params, self.safe_action, self.counters, transition, fault,
+            action_fault, self._found, self.metrics, self.final_obs, self._judging,
+        ], self.device)  # fmt: skip
+        launch_lanes(kernels.conclude, self.nworld, [
+            mask, self.before, self.params, self._found, self.counters.step, self.horizon, transition, keep_reason,
+            fault, action_fault, self.outcome, self.metric_sums, self.obs, self.final_obs, self.restarting,
+            self.fault_count,
         ], self.device)  # fmt: skip
         self._hold_success(mask, transition=transition)
 
@@ -388,16 +411,16 @@ class Worlds:
             wp.copy(self._before_event(name), array)
         launch_worlds(self.task.kernels.run_events, self.nworld, [
             self.restarting, self.after, self.params, self.counters, self._going_on, self._moved, self.changed,
+            self._stale,
         ], self.device)  # fmt: skip
         for name, array in (live | drawn).items():
-            self._mark_changes(self._before_event(name), array, self.changed if name in MEMORIES else self._moved)
-        wp.launch(steps.merge_masks, self.nworld, [self._moved, self.changed], device=self.device)
+            self._mark_changes(self._before_event(name), array, physics=name not in MEMORIES)
         self.engine.commit(self._moved, [name for name in live if name not in MEMORIES])
 
-    def _mark_changes(self, before: wp.array, after: wp.array, changed: wp.array) -> None:
-        """Mark the worlds that go on and in which a field changed."""
-        args = [self._going_on, flat(before), flat(after), changed]
-        wp.launch(steps.mark_changes, self.nworld, args, device=self.device)
+    def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
+        """Mark the worlds that go on and in which a field changed: it is physics, or the task's memory."""
+        args = [self._going_on, flat(before), flat(after), physics, self._moved, self.changed, self._stale]
+        launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _before_event(self, name: str) -> wp.array:
         """Where the values of a field before an event are kept."""
@@ -405,8 +428,12 @@ class Worlds:
 
     def _observe(self, mask: wp.array) -> None:
         """Observe the masked worlds; the others were observed when they were judged."""
-        args = [mask, self.after, self.params, self.counters, self.final_obs, self.obs]
-        launch_worlds(self.task.kernels.observe_worlds, self.nworld, args, self.device)
+        kernels, finite, parts = self.task.kernels, self._finite_obs, self._observing
+        args = [mask, self.after, self.params, self.counters, self.final_obs, finite, self.obs, parts]
+        launch_parts(kernels.observe_worlds, parts, self.nworld, args, self.device)
+        if parts > 1:
+            args = [mask, finite, self.final_obs, self.obs]
+            launch_lanes(kernels.replace_observations, self.nworld, args, self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Observe and judge the states of the masked worlds, without a transition."""

@@ -7,9 +7,11 @@ import pytest
 import torch
 import warp as wp
 from conftest import SharedEnv
+from full_task import Full
 from metered_task import Metered
 
 import lyceum_warp as lw
+from lyceum_warp import worlds
 from lyceum_warp.kernels import steps
 from lyceum_warp.tasks.point_mass import PointMass
 
@@ -35,6 +37,50 @@ def test_phases_run_by_hand_have_the_numbers_of_a_step(engine: str) -> None:
         for name in steps.OUTCOMES:
             assert torch.equal(getattr(env, name), getattr(by_hand, name)), f"{name} at step {i}"
     assert torch.equal(env.get_state(), by_hand.get_state())
+
+
+def outcomes_with_faults(
+    engine: str, *, judging: int = 1, observing: int = 1
+) -> tuple[list[torch.Tensor], dict[str, int]]:
+    """What steps of a task with every feature leave, with events and faults of each kind, and the counts of faults."""
+    env = lw.make(Full, nworld=4, engine=engine, seed=2)
+    own, kept = env.worlds, []
+    own._judging, own._observing = judging, observing
+    for i in range(25):
+        env.action.fill_(0.1 * (i % 10))
+        if i == 5:
+            env.action[1, 0] = torch.nan
+        for step, part, bad in (
+            (8, "lasting_memory", torch.nan),
+            (12, "memory", torch.nan),
+            (16, "geom_friction", -1.0),
+        ):
+            if i == step:
+                state = env.get_state()
+                env.state_space.split(state)[part][2, -1] = bad
+                env.set_state(state, check=False)
+        env.step()
+        groups = [*own.obs_groups.values(), *own.final_obs_groups.values()]
+        metrics = [wp.to_torch(own.metrics), wp.to_torch(own.episode_metrics)]
+        outcome = [own.buffers[name] for name in steps.OUTCOMES]
+        kept += [array.clone() for array in (*groups, *metrics, *outcome, own.changed_view, env.get_state())]
+    assert own.changed_view.any(), "no event changed a world"
+    return kept, {kind: count for kind, count in env.fault_counts.items() if count}
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_rows_that_lanes_share_have_the_numbers_of_one_lane(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a GPU a warp shares a world's rows, and groups have threads of their own; here these run in turn."""
+
+    def launch_three(kernel: wp.Kernel, nworld: int, args: list[Any], device: wp.Device) -> None:
+        wp.launch(kernel, (nworld, 3), [*args, 3], device=device)
+
+    one, counts = outcomes_with_faults(engine)
+    assert counts == {"action": 1, "nan": 1, "model": 1}
+    monkeypatch.setattr(worlds, "launch_lanes", launch_three)
+    three, same_counts = outcomes_with_faults(engine, judging=5, observing=2)
+    assert counts == same_counts
+    assert all(torch.equal(a, b) for a, b in zip(one, three, strict=True))
 
 
 def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.Env, lw.Env]:

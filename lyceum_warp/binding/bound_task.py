@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from lyceum_warp.arrays import launch_worlds
+from lyceum_warp.arrays import launch_parts, launch_worlds
 from lyceum_warp.binding import models
 from lyceum_warp.binding.codegen import kernels_of
 from lyceum_warp.binding.functions import TaskSource
@@ -430,13 +430,15 @@ class BoundTask:
     def _check_observations(self, batch: Any, params: wp.array, counters: Any) -> None:
         device = params.device
         mask = wp.full(1, True, dtype=bool, device=device)
+        finite = wp.zeros((len(self.obs_layouts), 1), dtype=bool, device=device)
         sizes = {group: sum(layout.values()) for group, layout in self.obs_layouts.items()}
         written = {group: np.zeros(size + _SPARE, dtype=bool) for group, size in sizes.items()}
         for unwritten in (math.nan, _UNWRITTEN):
             rows = self.kernels.Observations()
             for group, size in sizes.items():
                 setattr(rows, group, wp.full((1, size + _SPARE), unwritten, dtype=float, device=device))
-            launch_worlds(self.kernels.observe_worlds, 1, [mask, batch, params, counters, rows, rows], device)
+            args = [mask, batch, params, counters, rows, finite, rows, 1]
+            launch_parts(self.kernels.observe_worlds, 1, 1, args, device)
             found = {group: getattr(rows, group).numpy()[0] for group in sizes}
             for group, row in found.items():
                 written[group] |= _is_written(row, unwritten)

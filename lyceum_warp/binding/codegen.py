@@ -15,9 +15,11 @@ import warp as wp
 
 from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.writes import written_fields
+from lyceum_warp.fields import is_data_field
 from lyceum_warp.kernels import random, steps
+from lyceum_warp.kernels import rows as kernel_rows
 from lyceum_warp.model_fields import NOT_NEGATIVE
-from lyceum_warp.task import FUNCTIONS, Row, Task, TaskFunction
+from lyceum_warp.task import FUNCTIONS, MEMORIES, Row, Task, TaskFunction
 
 _BATCH = """
 @wp.struct
@@ -32,37 +34,42 @@ def view(batch: Batch, w: int) -> World:
     return s
 
 
+@wp.func
+def copy_state(source: Batch, target: Batch, w: int, lane: int, lanes: int):
+{state}
+
+
 @wp.struct
 class Observations:
 {groups}
 
 
 @wp.func
-def observe_groups(s: World, p: Params, out: Observations, w: int, base: wp.uint32, rng: Row[wp.uint32]):
+def observe_group(group: int, s: World, p: Params, out: Observations, w: int, base: wp.uint32, rng: Row[wp.uint32]):
 {observe}
 
 
 @wp.func
-def all_finite(out: Observations, w: int) -> bool:
+def finite_group(group: int, out: Observations, w: int) -> bool:
     finite = bool(True)
 {finite}
     return finite
 
 
 @wp.func
-def copy_observations(source: Observations, target: Observations, w: int):
+def copy_observations(source: Observations, target: Observations, w: int, lane: int, lanes: int):
 {copy}
 
 
 @wp.func
-def finite_memory(s0: World, s1: World) -> bool:
+def finite_memory(s0: World, s1: World, lane: int, lanes: int) -> bool:
     finite = bool(True)
 {memory}
     return finite
 
 
 @wp.func
-def valid_model(s: World) -> bool:
+def valid_model(s: World, lane: int, lanes: int) -> bool:
     valid = bool(True)
 {model}
     return valid
@@ -100,32 +107,40 @@ def _module_name(task: type[Task]) -> str:
 def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[str, Any]:
     """The scope of the generated source after it has run: structs, functions around the task's, and defaults."""
     scope: dict[str, Any] = {"wp": wp, "Row": Row, "World": source.world, "Params": source.params}
-    batch, rows = [], []
+    batch, rows, state = [], [], []
     for name, variable in source.world.vars.items():
         kind = variable.type
         ndim, dtype = (kind.ndim + 1, kind.dtype) if hasattr(kind, "ndim") else (1, kind)
         scope[f"type_{name}"] = wp.array(dtype=dtype, ndim=ndim)
         batch.append(f"    {name}: type_{name}")
         rows.append(f"    s.{name} = batch.{name}[w]")
-    scope |= {"substream": random.substream, "finite_row": steps.finite_row, "copy_row": steps.copy_row}
-    scope["restored_row"] = steps.restored_row
+        if name in MEMORIES or is_data_field(name):  # no step changes the model
+            state += _copy(name, ndim)
+    scope |= {"substream": random.substream, "finite_row": kernel_rows.finite_row, "copy_row": kernel_rows.copy_row}
+    scope["restored_row"] = kernel_rows.restored_row
     observe = []
     for number, (group, function) in enumerate(groups.items()):
         scope[f"observe_{number}"] = function
         noisy = len(function.input_types) > len(FUNCTIONS["observe"].kinds)
+        observe.append(f"if group == {number}:")
         if noisy:  # a stream for each group, so that no group's draws depend on another's
-            observe.append(f"rng[0] = substream(base, {number})")
-        observe.append(f"observe_{number}(s, p, out.{group}[w]{', rng' if noisy else ''})")
+            observe.append(f"    rng[0] = substream(base, {number})")
+        observe.append(f"    observe_{number}(s, p, out.{group}[w]{', rng' if noisy else ''})")
     blocks = {
         "batch": batch,
         "rows": rows,
+        "state": state or ["    pass"],
         "groups": [f"    {group}: type_group" for group in groups],
         "observe": [f"    {line}" for line in observe],
-        "finite": [f"    finite = finite and finite_row(out.{group}[w])" for group in groups],
-        "copy": [f"    copy_row(source.{group}[w], target.{group}[w])" for group in groups],
+        "finite": [
+            f"    if group == {number}:\n        finite = finite_row(out.{group}[w], 0, 1)"
+            for number, group in enumerate(groups)
+        ],
+        "copy": [f"    copy_row(source.{group}[w], target.{group}[w], lane, lanes)" for group in groups],
     }
     blocks["memory"], blocks["model"] = _memory_checks(source), _model_checks(source)
     scope["type_group"] = wp.array2d(dtype=float)
+    scope |= {"has_memory": bool(blocks["memory"]), "checks_model": bool(blocks["model"]), "has_state": bool(state)}
     parts = [_BATCH.format(**{name: "\n".join(lines) for name, lines in blocks.items()})]
     parts += [_default(function) for function in FUNCTIONS.values() if function.default is not None]
     text = "\n".join(parts)
@@ -137,9 +152,23 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
     return scope
 
 
+def _copy(name: str, ndim: int) -> list[str]:
+    """Lines that copy a world's values of a field, (nworld, ...) with some number of axes; the lanes share a row."""
+    if ndim == 1:
+        return ["    if lane == 0:", f"        target.{name}[w] = source.{name}[w]"]
+    lines = [f"    for i1 in range(lane, source.{name}.shape[1], lanes):"]
+    for axis in range(2, ndim):
+        lines.append("    " * axis + f"for i{axis} in range(source.{name}.shape[{axis}]):")
+    place = ", ".join(["w", *(f"i{axis}" for axis in range(1, ndim))])
+    return [*lines, "    " * ndim + f"target.{name}[{place}] = source.{name}[{place}]"]
+
+
 def _memory_checks(source: TaskSource) -> list[str]:
     """Lines that find memory that is not finite. What outlives episodes is put back; the rest ends with its episode."""
-    checks = {"memory": "finite_row(s1.memory)", "lasting_memory": "restored_row(s0.lasting_memory, s1.lasting_memory)"}
+    checks = {
+        "memory": "finite_row(s1.memory, lane, lanes)",
+        "lasting_memory": "restored_row(s0.lasting_memory, s1.lasting_memory, lane, lanes)",
+    }
     found = [check for name, check in checks.items() if name in source.world.vars]
     return [f"    if not {check}:\n        finite = False" for check in found]
 
@@ -155,7 +184,8 @@ def _model_checks(source: TaskSource) -> list[str]:
                 [f"s.{name}[i]"] if variable.type.dtype is wp.float32 else [f"s.{name}[i][{j}]" for j in range(size)]
             )
             bad = " or ".join(f"not ({element} >= 0.0)" for element in elements)
-            lines += [f"    for i in range(s.{name}.shape[0]):", f"        if {bad}:", "            valid = False"]
+            lines.append(f"    for i in range(lane, s.{name}.shape[0], lanes):")
+            lines += [f"        if {bad}:", "            valid = False"]
     return lines
 
 

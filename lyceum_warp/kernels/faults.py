@@ -17,6 +17,14 @@ def is_out_of_range(x: float) -> bool:
     return not (wp.abs(x) < MAX_MAGNITUDE)
 
 
+@wp.func
+def count_faults(fault: int, count_inout: wp.array[int]):
+    """Count each kind of fault, at the place of its bit in Done."""
+    for bit in range(count_inout.shape[0]):
+        if ((fault >> bit) & 1) != 0:
+            wp.atomic_add(count_inout, bit, 1)
+
+
 @wp.kernel(enable_backward=False)
 def faults_of_rows(
     mask_in: wp.array[bool],

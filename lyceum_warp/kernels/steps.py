@@ -9,6 +9,7 @@ import warp as wp
 from lyceum_warp.done import Done
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.random import stream, substream
+from lyceum_warp.kernels.rows import copy_row
 
 TERMINATED = wp.constant(int(Done.TERMINATED))
 TRUNCATED = wp.constant(int(Done.TRUNCATED))
@@ -24,6 +25,12 @@ EVENT = wp.constant(-2)
 STARTUP = wp.constant(-1)
 """Stands in for the number of an episode."""
 
+# the parts of a judgement; the groups of observations follow
+ENDS = wp.constant(0)
+GAIN = wp.constant(1)
+METRICS = wp.constant(2)
+OBSERVE_FIRST = wp.constant(3)
+
 
 @wp.struct
 class Counters:
@@ -36,7 +43,8 @@ class Counters:
     episode: wp.array[int]
     """Number of the episode."""
     rng: wp.array2d[wp.uint32]
-    """The random stream that a task's function draws from, (nworld, 1); every kernel starts it again."""
+    """The random stream that a task's function draws from, (groups of observations * nworld, 1), a row for each
+    thread that draws; every kernel starts it again."""
 
 
 @wp.struct
@@ -54,6 +62,18 @@ class Outcome:
     episode_metrics: wp.array2d[float]
 
 
+@wp.struct
+class Findings:
+    """What the parts of a judgement find before it is known whether a world has a fault; every array is (nworld,)."""
+
+    reward: wp.array[float]
+    eval: wp.array[float]
+    terminated: wp.array[bool]
+    success: wp.array[bool]
+    fault: wp.array2d[int]
+    """Faults found by each part, (parts, nworld)."""
+
+
 OUTCOMES = {
     "reward": wp.float32,
     "eval": wp.float32,
@@ -64,44 +84,6 @@ OUTCOMES = {
     "done_reason": wp.int32,
 }
 """The fields of Outcome with one number a world, and their types."""
-
-
-@wp.func
-def finite_row(row: wp.array[float]) -> bool:
-    """Whether every number is finite."""
-    for i in range(row.shape[0]):  # noqa: SIM110 (Warp has no all())
-        if not wp.isfinite(row[i]):
-            return False
-    return True
-
-
-@wp.func
-def restored_row(before: wp.array[float], after: wp.array[float]) -> bool:
-    """Put back the numbers that are not finite any more; returns whether there are none."""
-    finite = bool(True)
-    for i in range(after.shape[0]):
-        if not wp.isfinite(after[i]):
-            finite = False
-            after[i] = wp.where(wp.isfinite(before[i]), before[i], 0.0)
-    return finite
-
-
-@wp.func
-def copy_row(source: wp.array[float], target: wp.array[float]):
-    """Copy a row."""
-    for i in range(source.shape[0]):
-        target[i] = source[i]
-
-
-@wp.kernel(enable_backward=False)
-def count_faults(fault_in: wp.array[int], count_out: wp.array[int]):
-    """Count each kind of fault, at the place of its bit in Done; launched over (nworld,)."""
-    w = wp.tid()
-    fault = fault_in[w]
-    if fault != 0:
-        for bit in range(count_out.shape[0]):
-            if ((fault >> bit) & 1) != 0:
-                wp.atomic_add(count_out, bit, 1)
 
 
 @wp.kernel(enable_backward=False)
@@ -123,25 +105,6 @@ def hold_success(
         success_inout[w] = success_inout[w] and count_inout[w, 0] >= float(needed)
 
 
-@wp.kernel(enable_backward=False)
-def mark_changes(
-    mask_in: wp.array[bool], before_in: wp.array2d[float], after_in: wp.array2d[float], changed_inout: wp.array[bool]
-):
-    """Mark the masked worlds whose rows differ; launched over (nworld,)."""
-    w = wp.tid()
-    if mask_in[w] and not changed_inout[w]:
-        for i in range(after_in.shape[1]):
-            if before_in[w, i] != after_in[w, i]:
-                changed_inout[w] = True
-
-
-@wp.kernel(enable_backward=False)
-def merge_masks(mask_in: wp.array[bool], mask_inout: wp.array[bool]):
-    """Add the worlds of one mask to another; launched over (nworld,)."""
-    w = wp.tid()
-    mask_inout[w] = mask_inout[w] or mask_in[w]
-
-
 def make_kernels(
     generated: SimpleNamespace,
     functions: Mapping[str, wp.Function],
@@ -153,9 +116,10 @@ def make_kernels(
 
     Args:
         generated: ``World`` and ``Params``, the structs of the task; ``Batch``, a struct of the task's fields for all
-            worlds, and ``view``, the function from (batch, world) to ``World``; ``Observations``, a struct of the
-            groups of observations, with ``observe_groups``, ``all_finite`` and ``copy_observations``;
-            ``finite_memory`` and ``valid_model``, which look for faults in what the task itself wrote.
+            worlds, ``view``, the function from (batch, world) to ``World``, and ``copy_state``, which copies what steps
+            change; ``Observations``, a struct of the groups of observations, with ``observe_group``, ``finite_group``
+            and ``copy_observations``; ``finite_memory`` and ``valid_model``, which look for faults in what the task
+            itself wrote; ``has_state``, ``has_memory`` and ``checks_model``, whether these have anything to do.
         functions: The task's functions by name, with defaults for those that it does not have.
         written: Names of the functions that the task has. Without ``control`` a scale and an offset map actions to
             controls; without ``evaluate`` the evaluation is the reward; without ``advance`` memory stays as it is.
@@ -163,9 +127,10 @@ def make_kernels(
     """
     Batch, Params, Observations = generated.Batch, generated.Params, generated.Observations  # noqa: N806
     World = generated.World  # noqa: N806
-    view, observe_groups = generated.view, generated.observe_groups
-    all_finite, copy_observations = generated.all_finite, generated.copy_observations
+    view, observe_group = generated.view, generated.observe_group
+    finite_group, copy_observations = generated.finite_group, generated.copy_observations
     finite_memory, valid_model = generated.finite_memory, generated.valid_model
+    copy_state = generated.copy_state
     control, reward, measure = functions["control"], functions["reward"], functions["measure"]
     evaluate, terminated, success = functions["evaluate"], functions["terminated"], functions["success"]
     initialize, randomize, startup = functions["initialize"], functions["randomize"], functions["startup"]
@@ -173,17 +138,25 @@ def make_kernels(
     advance, substep = functions["advance"], functions["substep"]
     has_control, has_evaluate, has_measure = (name in written for name in ("control", "evaluate", "measure"))
 
+    def kernel_if(needed: bool) -> Callable[[Any], Any]:
+        """Decorator: a kernel, or None for tasks that do not need it."""
+        return wp.kernel(module=module, enable_backward=False) if needed else lambda body: None
+
     def kernel_for(function: str) -> Callable[[Any], Any]:
         """Decorator: a kernel for tasks that have a function, and None for the others."""
-        if function in written:
-            return wp.kernel(module=module, enable_backward=False)
-        return lambda body: None
+        return kernel_if(function in written)
 
     @wp.func
-    def observe(s: World, p: Params, out: Observations, w: int, counters: Counters):
-        """Write every group of observations; their noise is a function of the counters alone."""
+    def observe(group: int, s: World, p: Params, out: Observations, w: int, counters: Counters):
+        """Write a group of observations; its noise is a function of the counters alone."""
         base = substream(stream(counters.key[w], counters.episode[w], counters.step[w]), OBSERVE)
-        observe_groups(s, p, out, w, base, counters.rng[w])
+        observe_group(group, s, p, out, w, base, counters.rng[group * counters.step.shape[0] + w])
+
+    @kernel_if(generated.has_state)
+    def keep_before(after: Batch, before_out: Batch, lanes: int):
+        """Copy the fields that a step changes; launched over (nworld, lanes)."""
+        w, lane = wp.tid()
+        copy_state(after, before_out, w, lane, lanes)
 
     @wp.kernel(module=module, enable_backward=False)
     def act(
@@ -209,8 +182,6 @@ def make_kernels(
         fault_out[w] = fault
         for i in range(action_in.shape[1]):
             safe_action_out[w, i] = wp.where(fault == 0, action_in[w, i], 0.0)
-        if not valid_model(view(batch, w)):
-            fault_out[w] = fault | MODEL
         if wp.static(has_control):
             control(view(batch, w), safe_action_out[w], params[w % params.shape[0]], ctrl_out[w])
         else:
@@ -219,6 +190,13 @@ def make_kernels(
         for i in range(ctrl_out.shape[1]):
             ctrl_out[w, i] = wp.clamp(ctrl_out[w, i], range_in[i, 0], range_in[i, 1])
         counters.step[w] = counters.step[w] + 1
+
+    @kernel_if(generated.checks_model)
+    def check_model(batch: Batch, fault_inout: wp.array[int], lanes: int):
+        """Find faults of the model fields that the task writes; launched over (nworld, lanes)."""
+        w, lane = wp.tid()
+        if not valid_model(view(batch, w), lane, lanes):
+            fault_inout[w] = fault_inout[w] | MODEL
 
     @kernel_for("advance")
     def advance_memory(
@@ -240,6 +218,13 @@ def make_kernels(
         w = wp.tid()
         substep(view(batch, w), params[w % params.shape[0]])
 
+    @kernel_if(generated.has_memory)
+    def check_memory(mask_in: wp.array[bool], before: Batch, after: Batch, fault_inout: wp.array[int], lanes: int):
+        """Find faults of the task's memory in the masked worlds; launched over (nworld, lanes)."""
+        w, lane = wp.tid()
+        if mask_in[w] and not finite_memory(view(before, w), view(after, w), lane, lanes):
+            fault_inout[w] = fault_inout[w] | NAN
+
     @wp.kernel(module=module, enable_backward=False)
     def judge(
         mask_in: wp.array[bool],
@@ -248,6 +233,58 @@ def make_kernels(
         params: wp.array[Params],
         action_in: wp.array2d[float],
         counters: Counters,
+        transition: bool,
+        fault_in: wp.array[int],
+        action_fault_in: wp.array[int],
+        found_out: Findings,
+        metrics_out: wp.array2d[float],
+        obs_out: Observations,
+        threads: int,
+    ):
+        """Judge a transition, or a state alone, in the masked worlds; launched over (threads, nworld).
+
+        The parts do not depend on each other. On a GPU each has a thread of its own, because one after the other they
+        take several times as long, and there are places for far more threads than worlds. A world that has a fault
+        already is not judged.
+        """
+        first, w = wp.tid()
+        if not mask_in[w]:
+            return
+        for part in range(first, found_out.fault.shape[0], threads):
+            found = int(0)
+            if (fault_in[w] | action_fault_in[w]) == 0:
+                p = params[w % params.shape[0]]
+                s1 = view(after, w)
+                if part == ENDS:
+                    found_out.terminated[w] = terminated(s1, p)
+                    found_out.success[w] = success(s1, p)
+                    if wp.static(has_evaluate):
+                        found_out.eval[w] = evaluate(s1, p)
+                elif part == GAIN:
+                    if transition:
+                        found_out.reward[w] = reward(view(before, w), action_in[w], s1, p)
+                        if not wp.isfinite(found_out.reward[w]):
+                            found = REWARD
+                elif part == METRICS:
+                    if wp.static(has_measure):
+                        for i in range(metrics_out.shape[1]):
+                            metrics_out[w, i] = 0.0
+                        if transition:
+                            measure(view(before, w), action_in[w], s1, p, metrics_out[w])
+                else:
+                    group = part - OBSERVE_FIRST
+                    observe(group, s1, p, obs_out, w, counters)
+                    if not finite_group(group, obs_out, w):
+                        found = OBSERVATION
+            found_out.fault[part, w] = found
+
+    @wp.kernel(module=module, enable_backward=False)
+    def conclude(
+        mask_in: wp.array[bool],
+        before: Batch,
+        params: wp.array[Params],
+        found: Findings,
+        step_in: wp.array[int],
         horizon: int,
         transition: bool,
         keep_reason: bool,
@@ -256,67 +293,57 @@ def make_kernels(
         out: Outcome,
         metric_sum_inout: wp.array2d[float],
         obs_out: Observations,
-        final_obs_out: Observations,
+        final_obs_inout: Observations,
         restart_out: wp.array[bool],
+        fault_count_inout: wp.array[int],
+        lanes: int,
     ):
-        """Judge a transition, or a state alone, in the masked worlds; launched over (nworld,).
+        """Put together what ``judge`` found in the masked worlds; launched over (nworld, lanes).
 
-        Writes the reward, the metrics, the evaluation, termination, success and the observations.
+        Writes the reward, the metrics and their sums, the evaluation, the ends, success and the observations. The
+        lanes of a world share its rows.
 
         A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and the last good
         observations. It counts as terminated, so that no learner takes it for a time limit.
         """
-        w = wp.tid()
+        w, lane = wp.tid()
         if not mask_in[w]:
             return
-        p = params[w % params.shape[0]]
-        s0 = view(before, w)
-        s1 = view(after, w)
         fault = fault_inout[w] | action_fault_in[w]
-        if not finite_memory(s0, s1):
-            fault = fault | NAN
-        gain = float(0.0)
+        for part in range(found.fault.shape[0]):
+            fault = fault | found.fault[part, w]
         if fault == 0:
-            if transition:
-                gain = reward(s0, action_in[w], s1, p)
-                if not wp.isfinite(gain):
-                    fault = REWARD
-            observe(s1, p, final_obs_out, w, counters)
-            if not all_finite(final_obs_out, w):
-                fault = fault | OBSERVATION
-        if fault == 0:
-            copy_observations(final_obs_out, obs_out, w)
+            copy_observations(final_obs_inout, obs_out, w, lane, lanes)
         else:
-            gain = 0.0
-            copy_observations(obs_out, final_obs_out, w)
-        fault_inout[w] = fault
-        if wp.static(has_evaluate):
-            if fault == 0:
-                out.eval[w] = evaluate(s1, p)
-            elif transition:
-                last = evaluate(s0, p)
-                if not faults.is_out_of_range(last):  # else keep the evaluation of an earlier state
-                    out.eval[w] = last
-        else:
-            out.eval[w] = gain
-        out.reward[w] = gain
+            copy_observations(obs_out, final_obs_inout, w, lane, lanes)
         if wp.static(has_measure):
-            for i in range(out.metrics.shape[1]):
-                out.metrics[w, i] = 0.0
-            if fault == 0 and transition:
-                measure(s0, action_in[w], s1, p, out.metrics[w])
-            for i in range(out.metrics.shape[1]):
+            for i in range(lane, out.metrics.shape[1], lanes):
+                if fault != 0 or not transition:
+                    out.metrics[w, i] = 0.0
                 if wp.isfinite(out.metrics[w, i]):  # the sum belongs to the state, which is finite
                     metric_sum_inout[w, i] = metric_sum_inout[w, i] + out.metrics[w, i]
                 out.episode_metrics[w, i] = metric_sum_inout[w, i]
-        reason = fault
-        if fault == 0:
-            if terminated(s1, p):
-                reason = reason | TERMINATED
-            out.success[w] = success(s1, p)
+        if lane > 0:
+            return
+        fault_inout[w] = fault
+        gain = float(0.0)
+        if fault == 0 and transition:
+            gain = found.reward[w]
+        out.reward[w] = gain
+        if wp.static(has_evaluate):
+            if fault == 0:
+                out.eval[w] = found.eval[w]
+            elif transition:
+                found.eval[w] = evaluate(view(before, w), params[w % params.shape[0]])
+                if not faults.is_out_of_range(found.eval[w]):  # else keep the evaluation of an earlier state
+                    out.eval[w] = found.eval[w]
         else:
-            out.success[w] = False
-        if horizon > 0 and counters.step[w] >= horizon:
+            out.eval[w] = gain
+        reason = fault
+        if fault == 0 and found.terminated[w]:
+            reason = TERMINATED
+        out.success[w] = fault == 0 and found.success[w]
+        if horizon > 0 and step_in[w] >= horizon:
             reason = reason | TRUNCATED
         if keep_reason:
             reason = reason | out.done_reason[w]
@@ -327,6 +354,8 @@ def make_kernels(
         if transition:
             # without automatic resets a world steps on after its end, but not after a fault
             restart_out[w] = wp.where(keep_reason, fault != 0, reason != 0)
+            if fault != 0:
+                faults.count_faults(fault, fault_count_inout)
 
     @wp.kernel(module=module, enable_backward=False)
     def restart(
@@ -377,12 +406,14 @@ def make_kernels(
         mask_out: wp.array[bool],
         moved_out: wp.array[bool],
         changed_out: wp.array[bool],
+        stale_out: wp.array[bool],
     ):
         """Run the events of the worlds that do not restart, ``mask_out``; launched over (nworld,)."""
         w = wp.tid()
         mask_out[w] = not restarting_in[w]
         moved_out[w] = False
         changed_out[w] = False
+        stale_out[w] = restarting_in[w]
         if not restarting_in[w]:
             at = stream(counters.key[w], counters.episode[w], counters.step[w])
             counters.rng[w, 0] = substream(at, EVENT)
@@ -395,17 +426,43 @@ def make_kernels(
         params: wp.array[Params],
         counters: Counters,
         good_in: Observations,
+        finite_out: wp.array2d[bool],
         obs_out: Observations,
+        parts: int,
     ):
-        """Observe the masked worlds; launched over (nworld,).
+        """Observe the masked worlds, and find the groups whose numbers are finite; launched over (parts, nworld).
 
-        Where a number is not finite, which is a fault of the next step, the last good observations take its place.
+        With one part for all groups it replaces what is not finite as well; else ``replace_observations`` must follow.
         """
-        w = wp.tid()
+        part, w = wp.tid()
         if mask_in[w]:
-            observe(view(batch, w), params[w % params.shape[0]], obs_out, w, counters)
-            if not all_finite(obs_out, w):
-                copy_observations(good_in, obs_out, w)
+            finite = bool(True)
+            for group in range(part, finite_out.shape[0], parts):
+                observe(group, view(batch, w), params[w % params.shape[0]], obs_out, w, counters)
+                finite_out[group, w] = finite_group(group, obs_out, w)
+                finite = finite and finite_out[group, w]
+            if parts == 1 and not finite:
+                copy_observations(good_in, obs_out, w, 0, 1)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def replace_observations(
+        mask_in: wp.array[bool],
+        finite_in: wp.array2d[bool],
+        good_in: Observations,
+        obs_inout: Observations,
+        lanes: int,
+    ):
+        """Put the last good observations where a number is not finite; launched over (nworld, lanes).
+
+        Such a number is a fault of the next step.
+        """
+        w, lane = wp.tid()
+        if mask_in[w]:
+            finite = bool(True)
+            for group in range(finite_in.shape[0]):
+                finite = finite and finite_in[group, w]
+            if not finite:
+                copy_observations(good_in, obs_inout, w, lane, lanes)
 
     @kernel_for("control")
     def control_worlds(
@@ -459,23 +516,28 @@ def make_kernels(
         p = params[w % params.shape[0]]
         for t in range(action_in.shape[0] // n):
             row = t * n + w
-            copy_row(memory_inout[row], memory_inout[row + n])
-            copy_row(lasting_memory_inout[row], lasting_memory_inout[row + n])
+            copy_row(memory_inout[row], memory_inout[row + n], 0, 1)
+            copy_row(lasting_memory_inout[row], lasting_memory_inout[row + n], 0, 1)
             counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], counters.step[w] + t + 1)
             advance(view(before, row), action_in[row], view(after, row), p, counters.rng[w])
 
     return SimpleNamespace(
         Batch=Batch,
         Observations=Observations,
+        keep_before=keep_before,
         act=act,
+        check_model=check_model,
         substep_memory=substep_memory,
         advance_memory=advance_memory,
+        check_memory=check_memory,
         judge=judge,
+        conclude=conclude,
         start_worlds=start_worlds,
         restart=restart,
         reject_worlds=reject_worlds,
         run_events=run_events,
         observe_worlds=observe_worlds,
+        replace_observations=replace_observations,
         control_worlds=control_worlds,
         measure_worlds=measure_worlds,
         judge_rows=judge_rows,

@@ -8,6 +8,9 @@ substep before, and heights of feet of the step before. Only the forces on the f
 beginning, as for every task, and 0 when an episode begins. Feet are spheres on a plane: one touches it where its centre
 is within its radius.
 A reward that is not finite is a fault; mjlab counts such a term as 0.
+
+Loops over legs are written range(int(4)), which Warp does not unroll: on a GPU, where a thread has a whole world, the
+kernels otherwise have three times as many instructions, each of which is fetched for one use.
 """
 
 import math
@@ -158,7 +161,7 @@ def heading(s: World) -> float:
 def foot(s: World, p: Params, leg: int) -> tuple[wp.vec3, wp.vec3]:
     """Position and velocity of a foot in the world, from the joints alone, so that no forward pass is needed."""
     x, v = wp.vec3(s.site_pos[p.feet + leg]), wp.vec3(0.0)
-    for k in range(3):
+    for k in range(int(3)):
         j = 3 * leg + 2 - k  # calf, thigh, hip
         axis = s.jnt_axis[p.joints + j]
         turn = lw.quat_from_axis_angle(axis, s.qpos[7 + j])
@@ -200,7 +203,7 @@ def force(s: World, p: Params, leg: int) -> wp.vec3:
 
 @wp.func
 def substep(s: World, p: Params):
-    for leg in range(4):
+    for leg in range(int(4)):
         x, _ = foot(s, p, leg)
         touching = touches(x, s, p)
         s.memory[CONTACT_TIME + leg] = wp.where(touching, s.memory[CONTACT_TIME + leg] + p.substep_dt, 0.0)
@@ -238,8 +241,8 @@ def amount(c: wp.vec3) -> float:  # of a command
 
 
 @wp.func
-def active(s: World, p: Params) -> float:  # 1 where the command is to move
-    return wp.where(amount(command(s, p)) > p.least_command, 1.0, 0.0)
+def active(c: wp.vec3, p: Params) -> float:  # 1 where the command is to move
+    return wp.where(amount(c) > p.least_command, 1.0, 0.0)
 
 
 @wp.func
@@ -306,7 +309,7 @@ def observe(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):
 @wp.func
 def observe_critic(s: World, p: Params, obs: Row[float]):
     k = put_robot(s, p, obs, 0.0)
-    for leg in range(4):
+    for leg in range(int(4)):
         x, _ = foot(s, p, leg)
         obs[k + leg] = height(x)
         obs[k + 4 + leg] = s.memory[AIR_TIME + leg]
@@ -316,19 +319,17 @@ def observe_critic(s: World, p: Params, obs: Row[float]):
             obs[k + 12 + 3 * leg + i] = wp.sign(f[i]) * wp.log(1.0 + wp.abs(f[i]))
 
 
-# the terms of the reward; the command is that of the state in which the action was chosen
+# the terms of the reward; the command c is that of the state in which the action was chosen
 
 
 @wp.func
-def track_linear_velocity(s0: World, s1: World, p: Params) -> float:
-    c, v = command(s0, p), linear_velocity(s1)
-    return wp.exp(-wp.length_sq(wp.vec3(c[0], c[1], 0.0) - v) / p.linear_velocity_variance)
+def track_linear_velocity(c: wp.vec3, s1: World, p: Params) -> float:
+    return wp.exp(-wp.length_sq(wp.vec3(c[0], c[1], 0.0) - linear_velocity(s1)) / p.linear_velocity_variance)
 
 
 @wp.func
-def track_angular_velocity(s0: World, s1: World, p: Params) -> float:
-    c, w = command(s0, p), angular_velocity(s1)
-    return wp.exp(-wp.length_sq(wp.vec3(0.0, 0.0, c[2]) - w) / p.angular_velocity_variance)
+def track_angular_velocity(c: wp.vec3, s1: World, p: Params) -> float:
+    return wp.exp(-wp.length_sq(wp.vec3(0.0, 0.0, c[2]) - angular_velocity(s1)) / p.angular_velocity_variance)
 
 
 @wp.func
@@ -338,9 +339,9 @@ def upright(s1: World, p: Params) -> float:
 
 
 @wp.func
-def pose(s0: World, s1: World, p: Params) -> float:
+def pose(c: wp.vec3, s1: World, p: Params) -> float:
     std = p.walking_pose_std
-    if amount(command(s0, p)) < p.least_command:
+    if amount(c) < p.least_command:
         std = p.standing_pose_std
     total = float(0.0)
     for j in range(12):
@@ -369,63 +370,57 @@ def action_rate_l2(s0: World, action: Row[float]) -> float:
 
 
 @wp.func
-def foot_clearance(s0: World, s1: World, p: Params) -> float:
-    total = float(0.0)
-    for leg in range(4):
+def foot_clearance_and_slip(c: wp.vec3, s1: World, p: Params) -> wp.vec2:
+    """Both terms, which follow from the same positions and velocities of the feet."""
+    clearance, slip = float(0.0), float(0.0)
+    for leg in range(int(4)):
         x, v = foot(s1, p, leg)
-        total += wp.abs(height(x) - p.foot_height) * speed(v)
-    return total * active(s0, p)
+        clearance += wp.abs(height(x) - p.foot_height) * speed(v)
+        if touches(x, s1, p):
+            slip += speed(v) * speed(v)
+    return wp.vec2(clearance * active(c, p), slip * active(c, p))
 
 
 @wp.func
-def foot_swing_height(s0: World, s1: World, p: Params) -> float:
+def foot_swing_height(c: wp.vec3, s0: World, s1: World, p: Params) -> float:
     total = float(0.0)
-    for leg in range(4):
+    for leg in range(int(4)):
         if landed(s1.memory[CONTACT_TIME + leg], p):
             error = s0.lasting_memory[PEAK_HEIGHT + leg] / p.foot_height - 1.0
             total += error * error
-    return total * active(s0, p)
+    return total * active(c, p)
 
 
 @wp.func
-def foot_slip(s0: World, s1: World, p: Params) -> float:
+def soft_landing(c: wp.vec3, s1: World, p: Params) -> float:
     total = float(0.0)
-    for leg in range(4):
-        x, v = foot(s1, p, leg)
-        if touches(x, s1, p):
-            total += speed(v) * speed(v)
-    return total * active(s0, p)
-
-
-@wp.func
-def soft_landing(s0: World, s1: World, p: Params) -> float:
-    total = float(0.0)
-    for leg in range(4):
+    for leg in range(int(4)):
         # the force is that of the last substep's beginning, at which the contact was younger
         if landed(s1.memory[CONTACT_TIME + leg] - p.substep_dt, p):
             total += wp.length(force(s1, p, leg))
-    return total * active(s0, p)
+    return total * active(c, p)
 
 
 @wp.func
-def terms(s0: World, action: Row[float], s1: World, p: Params) -> lw.vec10:
+def terms(c: wp.vec3, s0: World, action: Row[float], s1: World, p: Params) -> lw.vec10:
+    feet = foot_clearance_and_slip(c, s1, p)
     return p.dt * lw.vec10(
-        p.track_linear_velocity * track_linear_velocity(s0, s1, p),
-        p.track_angular_velocity * track_angular_velocity(s0, s1, p),
+        p.track_linear_velocity * track_linear_velocity(c, s1, p),
+        p.track_angular_velocity * track_angular_velocity(c, s1, p),
         p.upright * upright(s1, p),
-        p.pose * pose(s0, s1, p),
+        p.pose * pose(c, s1, p),
         p.dof_pos_limits * dof_pos_limits(s1, p),
         p.action_rate_l2 * action_rate_l2(s0, action),
-        p.foot_clearance * foot_clearance(s0, s1, p),
-        p.foot_swing_height * foot_swing_height(s0, s1, p),
-        p.foot_slip * foot_slip(s0, s1, p),
-        p.soft_landing * soft_landing(s0, s1, p),
+        p.foot_clearance * feet[0],
+        p.foot_swing_height * foot_swing_height(c, s0, s1, p),
+        p.foot_slip * feet[1],
+        p.soft_landing * soft_landing(c, s1, p),
     )
 
 
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    return wp.dot(terms(s0, action, s1, p), lw.vec10(1.0))
+    return wp.dot(terms(command(s0, p), s0, action, s1, p), lw.vec10(1.0))
 
 
 @wp.func
@@ -437,7 +432,7 @@ def velocity_error(c: wp.vec3, s: World) -> float:
 @wp.func
 def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):
     c = command(s0, p)
-    k = lw.put(metrics, 0, terms(s0, action, s1, p))
+    k = lw.put(metrics, 0, terms(c, s0, action, s1, p))
     k = lw.put(metrics, k, velocity_error(c, s1))
     lw.put(metrics, k, wp.abs(c[2] - angular_velocity(s1)[2]))
 
@@ -462,7 +457,7 @@ def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uin
     s1.memory[COMMAND_TIMER] = s0.memory[COMMAND_TIMER] - p.dt
     s1.memory[PUSH_TIMER] = s0.memory[PUSH_TIMER] - p.dt
     s1.lasting_memory[ENV_STEPS] = s0.lasting_memory[ENV_STEPS] + 1.0
-    for leg in range(4):
+    for leg in range(int(4)):
         peak = s0.lasting_memory[PEAK_HEIGHT + leg]
         x, _ = foot(s1, p, leg)
         if landed(s1.memory[CONTACT_TIME + leg], p):

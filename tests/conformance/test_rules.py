@@ -96,7 +96,7 @@ def in_every_world(method: Function) -> Function:
 
 
 def unmarked(method: Function) -> Function:
-    return lambda self, before, after, changed: None
+    return lambda self, before, after, *, physics: None
 
 
 def once_a_step(method: Function) -> Function:

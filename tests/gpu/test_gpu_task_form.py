@@ -31,8 +31,9 @@ def test_worlds_on_a_gpu_have_the_numbers_of_the_c_engine() -> None:
     assert not any(gpu.fault_counts.values())
 
 
-def test_a_step_with_every_feature_waits_for_nothing() -> None:
-    env = lw.make(Full, nworld=64, device="cuda")
+@pytest.mark.parametrize("task", [Full, "go1_velocity"], ids=["full", "go1_velocity"])
+def test_a_step_with_every_feature_waits_for_nothing(task: type[lw.Task] | str) -> None:
+    env = lw.make(task, nworld=64, device="cuda")
     for _ in range(5):
         env.step()
     with nothing_waits():

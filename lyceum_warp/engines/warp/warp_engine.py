@@ -98,9 +98,9 @@ class WarpEngine(Engine):
             self.arrays[varied.name] = self._alias_model(varied)
         self._constants = self._model_constants()
         self._static = StaticGeoms(model, self.dynamics, device)
-        # the model's own initial state follows qpos0 and the poses of mocap bodies, which may differ between worlds
+        # the initial state that MuJoCo Warp knows follows model fields, which may differ between worlds
         self._start: wp.array | None = None
-        if initial is not None or self.dynamics:
+        if initial is not None or self.dynamics.keys() & {"qpos0", "body_pos", "body_quat"}:
             self._start = wp.array(self.initial, dtype=float, device=device)
         self._reset = [field.name for field in self.fields.values() if field.reset > Stage.NONE]
         current = [field.name for field in self.fields.values() if field.refresh > Stage.NONE]

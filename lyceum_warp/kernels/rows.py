@@ -1,0 +1,52 @@
+"""Rows that the threads of a world share: thread ``lane`` of ``lanes`` has every place i with i % lanes == lane."""
+
+import warp as wp
+
+
+@wp.func
+def finite_row(row: wp.array[float], lane: int, lanes: int) -> bool:
+    """Whether every number of a lane, which has one place of a row in ``lanes``, is finite."""
+    for i in range(lane, row.shape[0], lanes):  # noqa: SIM110 (Warp has no all())
+        if not wp.isfinite(row[i]):
+            return False
+    return True
+
+
+@wp.func
+def restored_row(before: wp.array[float], after: wp.array[float], lane: int, lanes: int) -> bool:
+    """Put back a lane's numbers that are not finite any more; returns whether there are none."""
+    finite = bool(True)
+    for i in range(lane, after.shape[0], lanes):
+        if not wp.isfinite(after[i]):
+            finite = False
+            after[i] = wp.where(wp.isfinite(before[i]), before[i], 0.0)
+    return finite
+
+
+@wp.func
+def copy_row(source: wp.array[float], target: wp.array[float], lane: int, lanes: int):
+    """Copy a lane's numbers of a row."""
+    for i in range(lane, source.shape[0], lanes):
+        target[i] = source[i]
+
+
+@wp.kernel(enable_backward=False)
+def mark_changes(
+    mask_in: wp.array[bool],
+    before_in: wp.array2d[float],
+    after_in: wp.array2d[float],
+    physics: bool,
+    moved_inout: wp.array[bool],
+    changed_inout: wp.array[bool],
+    stale_inout: wp.array[bool],
+    lanes: int,
+):
+    """Mark the masked worlds whose rows differ, as moved only where they are physics; launched over (nworld, lanes)."""
+    w, lane = wp.tid()
+    if mask_in[w]:
+        for i in range(lane, after_in.shape[1], lanes):
+            if before_in[w, i] != after_in[w, i]:
+                if physics:
+                    moved_inout[w] = True
+                changed_inout[w] = True
+                stale_inout[w] = True
