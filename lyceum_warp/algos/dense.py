@@ -1,0 +1,235 @@
+"""Fully connected networks on the CPU, with derivatives that are written out.
+
+With some hundred units in a layer, modules and autograd cost more than the arithmetic. Here a pass is one product of
+matrices a layer, into buffers that are allocated once. Other networks, and other devices, take the way of torch.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from lyceum_warp.algos.networks import Normalizer
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.value import ValueFunction
+
+
+def _tanh_(x: torch.Tensor) -> None:
+    array = x.numpy()
+    np.tanh(array, out=array)  # several times as fast as torch's on some processors
+
+
+_ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[torch.Tensor], Any], Callable[..., Any]]] = {
+    nn.Tanh: (_tanh_, lambda y, out: torch.mul(y, y, out=out).neg_().add_(1.0)),
+    nn.ReLU: (torch.relu_, lambda y, out: torch.sign(y, out=out)),
+    nn.ELU: (nn.functional.elu_, lambda y, out: torch.clamp(y, max=0.0, out=out).add_(1.0)),
+}
+"""Activations in place, and their derivatives from their results, of those modules of ``mlp`` that have such."""
+
+
+class DensePasses:
+    """Outputs y of a network, and products with J = d y / d parameters. A result is valid until the next call.
+
+    Args:
+        parameters: Weight and bias of each layer, in the order of the layers.
+        activation: What follows each layer but the last one; a key of ``_ACTIVATIONS``.
+    """
+
+    def __init__(self, parameters: Iterable[torch.Tensor], activation: type[nn.Module]) -> None:
+        self.parameters = [parameter.detach() for parameter in parameters]
+        self.weights, self.biases = self.parameters[::2], self.parameters[1::2]
+        self.activation = activation
+        self._activate, self._slope = _ACTIVATIONS[activation]
+        self._rows = 0
+        self._buffers: list[list[torch.Tensor]] = []
+        self._allocate(0)
+
+    @staticmethod
+    def of(network: nn.Module, last: "DensePasses | None" = None) -> "DensePasses | None":
+        """Passes through a network; None if it is not one of ``mlp`` on the CPU, or its activation is not known here.
+
+        Args:
+            network: The network.
+            last: What an earlier call returned; it is returned once more where it still has the network's parameters.
+        """
+        if type(network) is not nn.Sequential or len(network) % 2 == 0:
+            return None
+        layers, activations = list(network)[::2], list(network)[1::2]
+        kind = type(activations[0]) if activations else nn.Tanh
+        parameters = (
+            [tensor for layer in layers for tensor in (layer.weight, layer.bias)]
+            if all(type(layer) is nn.Linear for layer in layers)
+            else []
+        )
+        own = list(network.parameters())
+        if (
+            kind not in _ACTIVATIONS
+            or len(parameters) != len(own)  # as where a layer occurs twice
+            or any(a is not b or a.device.type != "cpu" or a.dtype != torch.float32 for a, b in zip(parameters, own))
+            or any(type(module) is not kind or getattr(module, "alpha", 1.0) != 1.0 for module in activations)
+            or any(map(_hooked, network.modules()))
+        ):
+            return None
+        if last is not None and last.activation is kind and _places(last.parameters) == _places(own):
+            return last
+        return DensePasses(own, kind)
+
+    def _allocate(self, rows: int) -> None:
+        """Buffers of a number of rows: results, slopes and derivatives of each layer."""
+        widths = [len(bias) for bias in self.biases]
+        self._buffers = [[torch.empty(rows, n) for n in widths] for _ in range(3)]
+
+    def _resize(self, rows: int) -> None:
+        """Use the first rows of the buffers."""
+        if rows > len(self._buffers[0][0]):
+            self._allocate(rows)
+        self._rows = rows
+        self.results, self.slopes, self.derivatives = [[b[:rows] for b in kind] for kind in self._buffers]
+
+    def __call__(self, x: torch.Tensor) -> torch.Tensor:
+        """Outputs, (rows, outputs), from inputs, (rows, inputs), which must stay as they are for later products."""
+        if len(x) != self._rows:
+            self._resize(len(x))
+        self._inputs, self._sloped = [x, *self.results[:-1]], False
+        last = len(self.weights) - 1
+        for i, (weight, bias, result) in enumerate(zip(self.weights, self.biases, self.results, strict=True)):
+            torch.addmm(bias, self._inputs[i], weight.t(), out=result)
+            if i < last:
+                self._activate(result)
+        return self.results[-1]
+
+    def _find_slopes(self) -> None:
+        if not self._sloped:
+            for result, slope in zip(self.results[:-1], self.slopes, strict=False):
+                self._slope(result, out=slope)
+            self._sloped = True
+
+    def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
+        """J v, (rows, outputs), at the last inputs.
+
+        Args:
+            parts: v, in tensors of the parameters' shapes.
+        """
+        self._find_slopes()
+        last = len(self.weights) - 1
+        for i, derivative in enumerate(self.derivatives):
+            torch.addmm(parts[2 * i + 1], self._inputs[i], parts[2 * i].t(), out=derivative)
+            if i:
+                derivative.addmm_(self.derivatives[i - 1], self.weights[i].t())
+            if i < last:
+                derivative.mul_(self.slopes[i])
+        return self.derivatives[-1]
+
+    def pull(self, u: torch.Tensor, out: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
+        """J^T u at the last inputs.
+
+        Args:
+            u: Derivatives by the outputs, (rows, outputs).
+            out: Where to write it: tensors of the parameters' shapes.
+        """
+        self._find_slopes()
+        for i in reversed(range(len(self.weights))):
+            x, weight = self._inputs[i], self.weights[i]
+            if x.shape[1] < u.shape[1]:  # the product with the longer rows is the faster one
+                out[2 * i].copy_((x.t() @ u).t())
+            else:
+                torch.mm(u.t(), x, out=out[2 * i])
+            torch.sum(u, 0, out=out[2 * i + 1])
+            if i:
+                u = torch.mm(u, weight, out=self.derivatives[i - 1]).mul_(self.slopes[i - 1])
+        return out
+
+
+class DensePolicy:
+    """A ``GaussianPolicy`` with a network of ``mlp``, on the CPU.
+
+    Args:
+        policy: The policy.
+        passes: Passes through its network.
+    """
+
+    def __init__(self, policy: GaussianPolicy, passes: DensePasses) -> None:
+        self.policy, self.passes = policy, passes
+        self._x = torch.empty(0, policy.nobs)
+        self._pulled = [torch.empty_like(parameter) for parameter in passes.parameters]
+
+    @staticmethod
+    def of(policy: GaussianPolicy, last: "DensePolicy | None" = None) -> "DensePolicy | None":
+        """The same policy; None if a part of it is of another kind, or some of its network is not learned.
+
+        Args:
+            policy: The policy.
+            last: What an earlier call returned; it is returned once more where it still has the policy's parameters.
+        """
+        plain = type(policy) is GaussianPolicy and type(policy.normalizer) in (Normalizer, nn.Identity)
+        if not plain or _hooked(policy) or _hooked(policy.normalizer):
+            return None
+        if not all(parameter.requires_grad for parameter in policy.network.parameters()):
+            return None
+        passes = DensePasses.of(policy.network, last and last.passes)
+        if passes is None or (last is not None and last.policy is policy and last.passes is passes):
+            return last if passes else None
+        return DensePolicy(policy, passes)
+
+    def __call__(self, obs: torch.Tensor) -> torch.Tensor:
+        """Mean actions, (rows, nact), from observations, (rows, nobs)."""
+        normalizer = self.policy.normalizer
+        if not isinstance(normalizer, Normalizer):
+            return self.passes(obs)
+        if len(obs) > len(self._x):
+            self._x = torch.empty_like(obs)
+        x = self._x[: len(obs)]
+        torch.sub(obs, normalizer.shift, out=x).mul_(normalizer.scale)
+        return self.passes(x.clamp_(-normalizer.limit, normalizer.limit))
+
+    def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
+        """Draw actions, as ``GaussianPolicy.sample``."""
+        return torch.addcmul(self(obs), noise, self.policy.log_std.detach().exp(), out=out)
+
+    def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
+        """J v for the network's parameters, at the last observations (``DensePasses.push``)."""
+        return self.passes.push(parts)
+
+    def pull(self, u: torch.Tensor) -> list[torch.Tensor]:
+        """J^T u for the network's parameters, at the last observations, in tensors of their shapes."""
+        self.passes.pull(u, self._pulled)
+        return list(self._pulled)
+
+
+class DenseValue:
+    """Predictions of a ``ValueFunction`` with a network of ``mlp``, on the CPU.
+
+    Args:
+        value: The value function.
+        passes: Passes through its network.
+    """
+
+    def __init__(self, value: ValueFunction, passes: DensePasses) -> None:
+        self.value, self.passes = value, passes
+
+    @staticmethod
+    def of(value: ValueFunction, last: "DenseValue | None" = None) -> "DenseValue | None":
+        """The same value function; None if a part of it is of another kind. ``last`` as for a ``DensePolicy``."""
+        if type(value) is not ValueFunction or _hooked(value):
+            return None
+        passes = DensePasses.of(value.network, last and last.passes)
+        if passes is None or (last is not None and last.value is value and last.passes is passes):
+            return last if passes else None
+        return DenseValue(value, passes)
+
+    def __call__(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+        """Predicted returns, (...,), from observations, (..., nobs), and steps since the reset, (...,)."""
+        features = self.value.features(obs, step)
+        output = self.passes(features.reshape(-1, features.shape[-1])).view(features.shape[:-1])
+        return output * self.value.scale.float() + self.value.shift.float()
+
+
+def _hooked(module: nn.Module) -> bool:
+    """Whether more than ``forward`` runs when a module is called."""
+    return any(getattr(module, f"_forward{kind}_hooks") for kind in ("", "_pre"))
+
+
+def _places(tensors: Iterable[torch.Tensor]) -> list[int]:
+    return [tensor.data_ptr() for tensor in tensors]
