@@ -56,25 +56,23 @@ class DensePasses:
         """
         if type(network) is not nn.Sequential or len(network) % 2 == 0:
             return None
-        layers, activations = list(network)[::2], list(network)[1::2]
+        layers: list[Any] = list(network)[::2]
+        activations = list(network)[1::2]
         kind = type(activations[0]) if activations else nn.Tanh
-        parameters = (
-            [tensor for layer in layers for tensor in (layer.weight, layer.bias)]
-            if all(type(layer) is nn.Linear for layer in layers)
-            else []
-        )
-        own = list(network.parameters())
+        linear = all(type(layer) is nn.Linear and layer.bias is not None for layer in layers)
+        parameters = [p for layer in layers for p in (layer.weight, layer.bias)] if linear else []
+        # a layer may occur twice, or its weight may be computed from another parameter
+        if [id(p) for p in network.parameters()] != [id(p) for p in parameters] or kind not in _ACTIVATIONS:
+            return None
         if (
-            kind not in _ACTIVATIONS
-            or len(parameters) != len(own)  # as where a layer occurs twice
-            or any(a is not b or a.device.type != "cpu" or a.dtype != torch.float32 for a, b in zip(parameters, own))
+            any(p.device.type != "cpu" or p.dtype != torch.float32 for p in parameters)
             or any(type(module) is not kind or getattr(module, "alpha", 1.0) != 1.0 for module in activations)
             or any(map(_hooked, network.modules()))
         ):
             return None
-        if last is not None and last.activation is kind and _places(last.parameters) == _places(own):
+        if last is not None and last.activation is kind and _places(last.parameters) == _places(parameters):
             return last
-        return DensePasses(own, kind)
+        return DensePasses(parameters, kind)
 
     def _allocate(self, rows: int) -> None:
         """Buffers of a number of rows: results, slopes and derivatives of each layer."""
@@ -168,10 +166,11 @@ class DensePolicy:
             return None
         if not all(parameter.requires_grad for parameter in policy.network.parameters()):
             return None
-        passes = DensePasses.of(policy.network, last and last.passes)
-        if passes is None or (last is not None and last.policy is policy and last.passes is passes):
-            return last if passes else None
-        return DensePolicy(policy, passes)
+        passes = DensePasses.of(policy.network, last.passes if last else None)
+        if passes is None:
+            return None
+        kept = last is not None and last.policy is policy and last.passes is passes
+        return last if kept else DensePolicy(policy, passes)
 
     def __call__(self, obs: torch.Tensor) -> torch.Tensor:
         """Mean actions, (rows, nact), from observations, (rows, nobs)."""
@@ -214,10 +213,11 @@ class DenseValue:
         """The same value function; None if a part of it is of another kind. ``last`` as for a ``DensePolicy``."""
         if type(value) is not ValueFunction or _hooked(value):
             return None
-        passes = DensePasses.of(value.network, last and last.passes)
-        if passes is None or (last is not None and last.value is value and last.passes is passes):
-            return last if passes else None
-        return DenseValue(value, passes)
+        passes = DensePasses.of(value.network, last.passes if last else None)
+        if passes is None:
+            return None
+        kept = last is not None and last.value is value and last.passes is passes
+        return last if kept else DenseValue(value, passes)
 
     def __call__(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Predicted returns, (...,), from observations, (..., nobs), and steps since the reset, (...,)."""

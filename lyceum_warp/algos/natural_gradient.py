@@ -70,12 +70,9 @@ class FisherProduct:
         if weight is not None:
             self.precision = weight.unsqueeze(-1) * self.precision
         self.damping, self.team = damping, team or Team()
-        self.jacobian: DensePolicy | AutogradJacobian
-        if dense is None:
-            self.jacobian = AutogradJacobian(policy(obs), [p for p in self.parameters if p is not policy.log_std])
-        else:
-            dense(obs)
-            self.jacobian = dense
+        self.mean = (dense or policy)(obs)
+        network = [p for p in self.parameters if p is not policy.log_std]
+        self.jacobian = dense or AutogradJacobian(self.mean, network)
 
     def __call__(self, vector: torch.Tensor) -> torch.Tensor:
         """(F + damping) vector, both (parameters,)."""

@@ -158,7 +158,7 @@ def test_the_fisher_information_takes_other_samples_each_time(env: lw.Env) -> No
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, fisher_fraction=1 / 16), seed=0)
     next(npg)
     obs = npg.rollout.obs.flatten(0, 1)
-    means = [npg.fisher(obs).mean for _ in range(2)]
+    means = [npg.fisher(obs).mean.clone() for _ in range(2)]
     assert means[0].shape == (20, 2) and not torch.equal(*means)
     # of 16 worlds, a stride of 16 would take the same one every time
     every = npg.policy(obs).detach()
