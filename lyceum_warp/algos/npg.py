@@ -7,6 +7,7 @@ step of a fixed length in the metric of the Fisher information.
 
 import copy
 import dataclasses
+import functools
 import logging
 import math
 from collections.abc import Iterator
@@ -35,7 +36,7 @@ from lyceum_warp.algos.npg_statistics import (
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.policy_check import check_policy
 from lyceum_warp.algos.rollout_buffer import Rollout
-from lyceum_warp.algos.timing import PhaseTimer, one_thread
+from lyceum_warp.algos.timing import PhaseTimer, beside, one_thread
 from lyceum_warp.algos.value import BOUND, ValueFunction
 from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.docstrings import document_attributes
@@ -217,15 +218,17 @@ class NPG:
 
         # 5. Natural gradient x = F^-1 g, and the step x sqrt(delta / (g.x)), so that step.F.step = delta.
         fisher = self.fisher(obs)
-        direction = conjugate_gradient(fisher, gradient, config.cg_iterations)
-        step = direction * torch.sqrt(config.delta / (gradient @ direction + 1e-20))
-        finite, fraction, kl = self.move(step, obs, old_mean)
-        timer.mark()
 
-        # 6. The value function, on the returns of these samples. Its statistics change just before, so that the fit
-        # corrects what they do to its predictions.
+        # 6. The value function, on the returns of these samples; on two CPU threads it is fitted at the same time. Its
+        # statistics change just before, so that the fit corrects what they do to its predictions.
         self.value.observe(value_obs, team)
-        fitted = self.fit(value_obs, rollout.step.flatten(), target.flatten(), self.generator)
+        fit = functools.partial(self.fit, value_obs, rollout.step.flatten(), target.flatten(), self.generator)
+        with beside(fit, allowed=self._reads_numbers) as fit_result:
+            direction = conjugate_gradient(fisher, gradient, config.cg_iterations)
+            step = direction * torch.sqrt(config.delta / (gradient @ direction + 1e-20))
+            finite, fraction, kl = self.move(step, obs, old_mean)
+            timer.mark()
+            fitted = fit_result()
 
         # One copy brings the numbers of all processes to the host.
         update = UpdateNumbers(
