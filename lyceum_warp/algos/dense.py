@@ -5,7 +5,7 @@ matrices a layer, into buffers that are allocated once. Other networks, and othe
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -15,18 +15,25 @@ from lyceum_warp.algos.networks import Normalizer
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
 
-
-def _tanh_(x: torch.Tensor) -> None:
-    array = x.numpy()
-    np.tanh(array, out=array)  # several times as fast as torch's on some processors
+_Array: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]
 
 
-_ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[torch.Tensor], Any], Callable[..., Any]]] = {
-    nn.Tanh: (_tanh_, lambda y, out: torch.mul(y, y, out=out).neg_().add_(1.0)),
-    nn.ReLU: (torch.relu_, lambda y, out: torch.sign(y, out=out)),
-    nn.ELU: (nn.functional.elu_, lambda y, out: torch.clamp(y, max=0.0, out=out).add_(1.0)),
+def _elu_(x: _Array) -> None:
+    np.copyto(x, np.expm1(x), where=x < 0.0)
+
+
+# numpy's tanh is several times as fast as torch's on some processors
+_ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[..., Any]]] = {
+    nn.Tanh: (lambda x: np.tanh(x, out=x), lambda y, out: torch.mul(y, y, out=out).neg_().add_(1.0)),
+    nn.ReLU: (lambda x: np.maximum(x, 0.0, out=x), lambda y, out: torch.sign(y, out=out)),
+    nn.ELU: (_elu_, lambda y, out: torch.clamp(y, max=0.0, out=out).add_(1.0)),
 }
 """Activations in place, and their derivatives from their results, of those modules of ``mlp`` that have such."""
+
+
+_FEW = 2**18
+"""Rows times the weights of the largest layer, up to which numpy computes results. Between two steps of the worlds,
+when caches hold other things, it begins a call several times as fast; it divides larger products among threads."""
 
 
 class DensePasses:
@@ -42,6 +49,7 @@ class DensePasses:
         self.weights, self.biases = self.parameters[::2], self.parameters[1::2]
         self.activation = activation
         self._activate, self._slope = _ACTIVATIONS[activation]
+        self._parameter_arrays = [(w.numpy().T, b.numpy()) for w, b in zip(self.weights, self.biases, strict=True)]
         self._rows = 0
         self._buffers: list[list[torch.Tensor]] = []
         self._allocate(0)
@@ -83,8 +91,9 @@ class DensePasses:
         """Use the first rows of the buffers."""
         if rows > len(self._buffers[0][0]):
             self._allocate(rows)
-        self._rows = rows
+        self._rows, self._few = rows, rows * max(weight.numel() for weight in self.weights) <= _FEW
         self.results, self.slopes, self.derivatives = [[b[:rows] for b in kind] for kind in self._buffers]
+        self._arrays = [result.numpy() for result in self.results]
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         """Outputs, (rows, outputs), from inputs, (rows, inputs), which must stay as they are for later products."""
@@ -92,10 +101,16 @@ class DensePasses:
             self._resize(len(x))
         self._inputs, self._sloped = [x, *self.results[:-1]], False
         last = len(self.weights) - 1
-        for i, (weight, bias, result) in enumerate(zip(self.weights, self.biases, self.results, strict=True)):
-            torch.addmm(bias, self._inputs[i], weight.t(), out=result)
+        array = x.numpy()
+        for i, (result, (weights, biases)) in enumerate(zip(self._arrays, self._parameter_arrays, strict=True)):
+            if self._few:
+                np.matmul(array, weights, out=result)
+                np.add(result, biases, out=result)
+            else:
+                torch.addmm(self.biases[i], self._inputs[i], self.weights[i].t(), out=self.results[i])
             if i < last:
                 self._activate(result)
+            array = result
         return self.results[-1]
 
     def _find_slopes(self) -> None:
@@ -150,6 +165,8 @@ class DensePolicy:
 
     def __init__(self, policy: GaussianPolicy, passes: DensePasses) -> None:
         self.policy, self.passes = policy, passes
+        self.others = _others(policy)
+        self._log_std, *self._statistics = [tensor.numpy() for tensor in self.others]
         self._x = torch.empty(0, policy.nobs)
         self._pulled = [torch.empty_like(parameter) for parameter in passes.parameters]
 
@@ -170,6 +187,7 @@ class DensePolicy:
         if passes is None:
             return None
         kept = last is not None and last.policy is policy and last.passes is passes
+        kept = kept and last is not None and _places(last.others) == _places(_others(policy))
         return last if kept else DensePolicy(policy, passes)
 
     def __call__(self, obs: torch.Tensor) -> torch.Tensor:
@@ -180,12 +198,18 @@ class DensePolicy:
         if len(obs) > len(self._x):
             self._x = torch.empty_like(obs)
         x = self._x[: len(obs)]
-        torch.sub(obs, normalizer.shift, out=x).mul_(normalizer.scale)
-        return self.passes(x.clamp_(-normalizer.limit, normalizer.limit))
+        array, (shift, scale) = x.numpy(), self._statistics
+        np.subtract(obs.numpy(), shift, out=array)
+        np.multiply(array, scale, out=array)
+        np.clip(array, -normalizer.limit, normalizer.limit, out=array)
+        return self.passes(x)
 
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
         """Draw actions, as ``GaussianPolicy.sample``."""
-        return torch.addcmul(self(obs), noise, self.policy.log_std.detach().exp(), out=out)
+        action = out.numpy()
+        np.multiply(noise.numpy(), np.exp(self._log_std), out=action)
+        np.add(action, self(obs).numpy(), out=action)
+        return out
 
     def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
         """J v for the network's parameters, at the last observations (``DensePasses.push``)."""
@@ -229,6 +253,15 @@ class DenseValue:
 def _hooked(module: nn.Module) -> bool:
     """Whether more than ``forward`` runs when a module is called."""
     return any(getattr(module, f"_forward{kind}_hooks") for kind in ("", "_pre"))
+
+
+def _others(policy: GaussianPolicy) -> list[torch.Tensor]:
+    """The tensors of a policy that are not its network's."""
+    normalizer = policy.normalizer
+    return [
+        policy.log_std.detach(),
+        *([normalizer.shift, normalizer.scale] if isinstance(normalizer, Normalizer) else []),
+    ]
 
 
 def _places(tensors: Iterable[torch.Tensor]) -> list[int]:
