@@ -70,8 +70,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     },
     "beginnings": {"samples": 5000, "rollout": "episodes", "min_log_std": -1.5, "delta": 0.05},
 }
-"""What differs from the default, "param" in the task and the rest in the hyperparameters. "beginnings" samples the first
-79 steps of an episode in each of 64 worlds."""
+"""What differs from the default, "param" in the task and the rest in the hyperparameters. "beginnings" samples the
+first 79 steps of an episode in each of 64 worlds."""
 
 _LONG = (DEFAULT, "gamma 0.99", "less noise", "2,000 samples, gamma 0.99")
 _GAITS = (DEFAULT, "gamma 0.99", "5,000 samples", "5,000 samples, gamma 0.99")

@@ -4,9 +4,10 @@
 an environment: NPG uses ``Env``, and MPPI also uses ``OpenLoop``, to whose phases it adds its own.
 
 NPG's parts: ``npg_config`` (hyperparameters), ``rollout_buffer`` (samples), ``natural_gradient`` (Fisher information
-and conjugate gradient), ``policy``, ``value`` and ``networks`` (the functions that are learned), ``value_fit``
-(regression on returns), ``evaluation`` (the mean policy in whole episodes), ``npg_statistics`` (the numbers of an
-iteration), ``distributed`` (several processes) and ``timing`` (seconds of its phases).
+and conjugate gradient), ``policy``, ``value`` and ``networks`` (the functions that are learned), ``dense`` (the same on
+the CPU, with derivatives written out), ``value_fit`` (regression on returns), ``evaluation`` (the mean policy in whole
+episodes), ``npg_statistics`` (the numbers of an iteration), ``distributed`` (several processes) and ``timing`` (seconds
+of its phases).
 
 MPPI's parts: ``mppi_config`` (settings), ``mppi_arguments`` (the arguments of ``lw.MPPI``, sorted into settings,
 options and parameters) and ``planner_state`` (the state to plan from).

@@ -1,19 +1,47 @@
-"""The natural gradient's linear system: products with the Fisher information, and conjugate gradient."""
+"""The vanilla gradient, and the natural gradient's linear system: the Fisher information, and conjugate gradient."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 
+from lyceum_warp.algos.dense import DensePolicy
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.policy import GaussianPolicy
+
+
+def score_gradient(
+    policy: GaussianPolicy,
+    obs: torch.Tensor,
+    action: torch.Tensor,
+    weight: torch.Tensor,
+    *,
+    dense: DensePolicy | None = None,
+) -> torch.Tensor:
+    """Gradient of sum(weight * log pi(action | obs)) by the policy's parameters that are learned, (parameters,).
+
+    Args:
+        policy: The policy.
+        obs: Observations, (samples, nobs).
+        action: Actions, (samples, nact).
+        weight: Weights, (samples,).
+        dense: The same policy with derivatives that are written out, where it has such.
+    """
+    parameters = [p for p in policy.parameters() if p.requires_grad]
+    if dense is None:
+        return flatten(torch.autograd.grad((policy.log_prob(obs, action) * weight).sum(), parameters))
+    precision = torch.exp(-policy.log_std.detach())
+    z, weight = (action - dense(obs)) * precision, weight.unsqueeze(-1)
+    gradients = dense.pull(z * precision * weight)
+    if (at := _place(policy.log_std, parameters)) is not None:
+        gradients.insert(at, ((z.square() - 1.0) * weight).sum(0))
+    return flatten(gradients)
 
 
 class FisherProduct:
     """Products with the Fisher information of a Gaussian policy, averaged over observations.
 
     For N(mean(s; theta), diag(sigma^2)) it is E[J^T diag(1 / sigma^2) J] for the parameters of the mean, with
-    J = d mean / d theta, and 2 for each log sigma. J v is the derivative of the linear map u -> J^T u, so both
-    factors are backward passes through graphs that are built once.
+    J = d mean / d theta, and 2 for each log sigma.
 
     Args:
         policy: The policy.
@@ -22,6 +50,7 @@ class FisherProduct:
         count: Number of observations of all processes; by default those in ``obs``.
         weight: Weights of the observations, (samples,): 1, or 0 for one that another process brings.
         team: The processes.
+        dense: The same policy with derivatives that are written out, where it has such.
     """
 
     def __init__(
@@ -33,17 +62,17 @@ class FisherProduct:
         count: int | None = None,
         weight: torch.Tensor | None = None,
         team: Team | None = None,
+        dense: DensePolicy | None = None,
     ) -> None:
         self.parameters = [p for p in policy.parameters() if p.requires_grad]
-        self.log_std_at = next((i for i, p in enumerate(self.parameters) if p is policy.log_std), None)
-        self.network = [p for p in self.parameters if p is not policy.log_std]
+        self.log_std_at = _place(policy.log_std, self.parameters)
         self.precision = torch.exp(-2 * policy.log_std.detach()) / (count or len(obs))
         if weight is not None:
             self.precision = weight.unsqueeze(-1) * self.precision
         self.damping, self.team = damping, team or Team()
-        self.mean = policy(obs)
-        self.probe = torch.zeros_like(self.mean, requires_grad=True)
-        self.pulled = torch.autograd.grad(self.mean, self.network, self.probe, create_graph=True)
+        self.mean = (dense or policy)(obs)
+        network = [p for p in self.parameters if p is not policy.log_std]
+        self.jacobian = dense or AutogradJacobian(self.mean, network)
 
     def __call__(self, vector: torch.Tensor) -> torch.Tensor:
         """(F + damping) vector, both (parameters,)."""
@@ -52,11 +81,35 @@ class FisherProduct:
             for part, p in zip(vector.split([p.numel() for p in self.parameters]), self.parameters, strict=True)
         ]
         log_std_part = vector if self.log_std_at is None else parts.pop(self.log_std_at)
-        (pushed,) = torch.autograd.grad(self.pulled, self.probe, parts, retain_graph=True)
-        pulled = list(torch.autograd.grad(self.mean, self.network, pushed * self.precision, retain_graph=True))
+        pulled = self.jacobian.pull(self.jacobian.push(parts) * self.precision)
         if self.log_std_at is not None:  # not a sum over samples: each process contributes an equal part
             pulled.insert(self.log_std_at, 2.0 / self.team.size * log_std_part)
         return self.team.sum(flatten(pulled)) + self.damping * vector
+
+
+class AutogradJacobian:
+    """Products with J = d mean / d parameters, of any network.
+
+    J v is the derivative of the linear map u -> J^T u, so both products are backward passes through graphs that are
+    built once.
+
+    Args:
+        mean: The network's results, (samples, nact).
+        parameters: Its parameters that are learned.
+    """
+
+    def __init__(self, mean: torch.Tensor, parameters: Sequence[torch.Tensor]) -> None:
+        self.mean, self.parameters = mean, parameters
+        self.probe = torch.zeros_like(mean, requires_grad=True)
+        self.pulled = torch.autograd.grad(mean, parameters, self.probe, create_graph=True)
+
+    def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
+        """J v, (samples, nact), from v in tensors of the parameters' shapes."""
+        return torch.autograd.grad(self.pulled, self.probe, parts, retain_graph=True)[0]
+
+    def pull(self, u: torch.Tensor) -> list[torch.Tensor]:
+        """J^T u, in tensors of the parameters' shapes, from u, (samples, nact)."""
+        return list(torch.autograd.grad(self.mean, self.parameters, u, retain_graph=True))
 
 
 def conjugate_gradient(
@@ -85,3 +138,7 @@ def conjugate_gradient(
 def flatten(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
     """The numbers of several tensors as one vector."""
     return torch.cat([tensor.reshape(-1) for tensor in tensors])
+
+
+def _place(tensor: torch.Tensor, tensors: Iterable[torch.Tensor]) -> int | None:
+    return next((i for i, other in enumerate(tensors) if other is tensor), None)

@@ -7,6 +7,7 @@ step of a fixed length in the metric of the Fisher information.
 
 import copy
 import dataclasses
+import functools
 import logging
 import math
 from collections.abc import Iterator
@@ -15,10 +16,11 @@ from typing import Any
 import torch
 import warp as wp
 
+from lyceum_warp.algos.dense import DensePolicy, DenseValue
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
 from lyceum_warp.algos.learner import fitted_config
-from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, flatten
+from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, score_gradient
 from lyceum_warp.algos.networks import Normalizer
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
 from lyceum_warp.algos.npg_statistics import (
@@ -34,7 +36,7 @@ from lyceum_warp.algos.npg_statistics import (
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.policy_check import check_policy
 from lyceum_warp.algos.rollout_buffer import Rollout
-from lyceum_warp.algos.timing import PhaseTimer, one_thread
+from lyceum_warp.algos.timing import PhaseTimer, beside, one_thread
 from lyceum_warp.algos.value import BOUND, ValueFunction
 from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.docstrings import document_attributes
@@ -151,6 +153,9 @@ class NPG:
         self.policy.to(device)
         self.value.to(device)
 
+        # decisions of one process on the CPU wait for no device and for no other process
+        self._reads_numbers = device.type == "cpu" and team.size == 1
+
         # samples, and whether an iteration begins new episodes or continues those of the last one
         samples = enough_samples(config, nworld)
         steps = -(-samples // nworld)
@@ -176,6 +181,9 @@ class NPG:
         self._evaluate_mean = MeanPolicyEvaluation(env, config.mean_episodes, team)
         # a seed of its own: the same numbers should not make both the weights and the noise
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
+
+        self._dense_policy: DensePolicy | None = None
+        self._dense_value: DenseValue | None = None
 
         self.iteration = self.samples = self._skipping = 0
         self.rollout.restart()
@@ -204,22 +212,23 @@ class NPG:
 
         # 4. Vanilla gradient of E[log pi(a|s) A(s, a)].
         action = rollout.action.flatten(0, 1)
-        parameters = [p for p in self.policy.parameters() if p.requires_grad]
-        objective = (self.policy.log_prob(obs, action) * advantage.flatten()).sum() / self.count
-        gradient = team.sum(flatten(torch.autograd.grad(objective, parameters)))
+        weight = advantage.flatten() / self.count
+        gradient = team.sum(score_gradient(self.policy, obs, action, weight, dense=self.dense_policy()))
         timer.mark()
 
         # 5. Natural gradient x = F^-1 g, and the step x sqrt(delta / (g.x)), so that step.F.step = delta.
         fisher = self.fisher(obs)
-        direction = conjugate_gradient(fisher, gradient, config.cg_iterations)
-        step = direction * torch.sqrt(config.delta / (gradient @ direction + 1e-20))
-        finite, fraction, kl = self.move(step, obs, old_mean)
-        timer.mark()
 
-        # 6. The value function, on the returns of these samples. Its statistics change just before, so that the fit
-        # corrects what they do to its predictions.
+        # 6. The value function, on the returns of these samples; on two CPU threads it is fitted at the same time. Its
+        # statistics change just before, so that the fit corrects what they do to its predictions.
         self.value.observe(value_obs, team)
-        fitted = self.fit(value_obs, rollout.step.flatten(), target.flatten(), self.generator)
+        fit = functools.partial(self.fit, value_obs, rollout.step.flatten(), target.flatten(), self.generator)
+        with beside(fit, allowed=self._reads_numbers) as fit_result:
+            direction = conjugate_gradient(fisher, gradient, config.cg_iterations)
+            step = direction * torch.sqrt(config.delta / (gradient @ direction + 1e-20))
+            finite, fraction, kl = self.move(step, obs, old_mean)
+            timer.mark()
+            fitted = fit_result()
 
         # One copy brings the numbers of all processes to the host.
         update = UpdateNumbers(
@@ -274,7 +283,12 @@ class NPG:
         """Fill the rollout buffer with steps of the current policy under new noise."""
         with one_thread():
             self.noise.normal_(generator=self.generator)
-            self.rollout.collect(self.policy, self.noise[:, self._own])
+            self.rollout.collect(self.dense_policy() or self.policy, self.noise[:, self._own])
+
+    def dense_policy(self) -> DensePolicy | None:
+        """The policy with passes that are written out, where it has such, as the default one has on the CPU."""
+        self._dense_policy = DensePolicy.of(self.policy, self._dense_policy)
+        return self._dense_policy
 
     @torch.no_grad()
     def advantages(self) -> tuple[torch.Tensor, torch.Tensor, ValueSums, torch.Tensor]:
@@ -321,7 +335,8 @@ class NPG:
             obs: Observations, (..., nobs).
             step: Steps since the reset, (...,).
         """
-        value = self.value(obs, step)
+        self._dense_value = DenseValue.of(self.value, self._dense_value)
+        value = (self._dense_value or self.value)(obs, step)
         return torch.where(value.isfinite(), value, self.value.shift.float())
 
     @torch.no_grad()
@@ -337,7 +352,8 @@ class NPG:
         Returns:
             The mean actions before, (samples, nact).
         """
-        old_mean, normalizer = self.policy(obs), self.policy.normalizer
+        mean, normalizer = self.dense_policy() or self.policy, self.policy.normalizer
+        old_mean = mean(obs).clone()
         if isinstance(normalizer, Normalizer):
             before = normalizer.shift.clone(), normalizer.scale.clone()
             self.policy.observe(obs, self.team)
@@ -345,9 +361,11 @@ class NPG:
             limit, part = _DRIFT * 0.5 * self.config.delta, torch.ones_like(after[0][0])
             for _ in range(_SHORTER):
                 normalizer.interpolate(before, after, part)
-                square = (old_mean - self.policy(obs)).square()
+                square = (old_mean - mean(obs)).square()
                 kl = 0.5 * (square * torch.exp(-2 * self.policy.log_std)).sum(-1).mean()
                 kl = self.team.sum(kl) / self.team.size
+                if self._reads_numbers and kl <= limit:  # as all further rounds would find
+                    break
                 part = torch.where(kl <= limit, part, part * (limit / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5))
             normalizer.interpolate(before, after, part)
         return old_mean
@@ -367,8 +385,9 @@ class NPG:
                 places, own = self.team.locate(subset, self.env.nworld)
                 obs, weight = obs[places], own.float()
         return FisherProduct(
-            self.policy, obs, self.config.damping, count=self._fisher_count, weight=weight, team=self.team
-        )
+            self.policy, obs, self.config.damping, count=self._fisher_count, weight=weight, team=self.team,
+            dense=self.dense_policy(),
+        )  # fmt: skip
 
     @torch.no_grad()
     def move(
@@ -397,6 +416,7 @@ class NPG:
         steps = [part.view_as(p) for part, p in zip(step.split([p.numel() for p in parameters]), old, strict=True)]
         old_log_std = self.policy.log_std.clone()
         lowest = old_log_std.clamp_max(self.config.min_log_std)
+        mean = self.dense_policy() or self.policy
 
         def divergence(fraction: torch.Tensor) -> torch.Tensor:
             for parameter, before, part in zip(parameters, old, steps, strict=True):
@@ -405,7 +425,7 @@ class NPG:
                     moved = torch.maximum(moved, lowest)
                 parameter.copy_(torch.where(fraction > 0.0, moved, before))
             log_std = self.policy.log_std
-            square = (old_mean - self.policy(obs)).square() + torch.exp(2 * old_log_std)
+            square = (old_mean - mean(obs)).square() + torch.exp(2 * old_log_std)
             kl = (log_std - old_log_std + 0.5 * square * torch.exp(-2 * log_std) - 0.5).sum(-1).mean()
             return self.team.sum(kl) / self.team.size
 
@@ -413,11 +433,14 @@ class NPG:
         fraction = finite.float()
         for _ in range(_SHORTER):
             kl = divergence(fraction)
+            if self._reads_numbers and kl <= limit:  # as all further rounds would find
+                break
             factor = (wanted / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5)
             fraction = torch.where(kl <= limit, fraction, fraction * factor)
-        kl = divergence(fraction)
-        fraction = torch.where(kl <= limit, fraction, 0.0)
-        kl = divergence(fraction)
+        else:
+            kl = divergence(fraction)
+            fraction = torch.where(kl <= limit, fraction, 0.0)
+            kl = divergence(fraction)
         self.team.copy_leader(self.policy.parameters())
         return finite & kl.isfinite(), fraction, kl
 

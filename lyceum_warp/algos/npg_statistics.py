@@ -43,7 +43,7 @@ class Iteration(LearnerIteration):
     time_solve: float
     """Seconds of conjugate gradient and of the step."""
     time_value: float
-    """Seconds of fitting the value function."""
+    """Seconds of fitting the value function; on two CPU threads only those after ``time_solve``, which it overlaps."""
 
 
 class UpdateNumbers(NamedTuple):

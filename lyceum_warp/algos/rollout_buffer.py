@@ -6,6 +6,7 @@ from collections.abc import Collection
 import torch
 import warp as wp
 
+from lyceum_warp.algos.dense import DensePolicy
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.arrays import torch_view
@@ -114,7 +115,7 @@ class Rollout:
         return into[-1].stored
 
     @torch.no_grad()
-    def collect(self, policy: GaussianPolicy, noise: torch.Tensor) -> None:
+    def collect(self, policy: GaussianPolicy | DensePolicy, noise: torch.Tensor) -> None:
         """Run the policy for ``steps`` steps from the worlds' current states.
 
         Args:

@@ -1,9 +1,11 @@
 """Regression of a value function on returns."""
 
+import math
 from typing import Any
 
 import torch
 
+from lyceum_warp.algos.dense import DensePasses, DenseValue
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.timing import one_thread
 from lyceum_warp.algos.value import BOUND, ValueFunction
@@ -14,7 +16,7 @@ class ValueFit:
 
     The mini-batches are the same for any number of processes: each process takes the samples of its own worlds, and
     the gradients are summed. On CUDA the step of a mini-batch is one graph, captured once and replayed, in place of
-    some 40 launches.
+    some 40 launches; on the CPU its derivatives are written out, where the network is one of ``mlp``.
 
     Args:
         value: The value function.
@@ -64,15 +66,21 @@ class ValueFit:
             target = target.float().unsqueeze(-1)
         with one_thread():
             self._keep_if_finite()
+            dense = DenseValue.of(self.value)
+            steps = None if dense is None else DenseSteps(self, dense.passes)
             for _ in range(self.epochs):
                 order = torch.randperm(self.samples, generator=generator, device=features.device)
                 if self.cuda and self.team.captures:
                     self.captured = self.captured or CapturedStep(self, features, target)
                     self.captured(features, target, order)
-                    continue
-                for part in order.split(self.batch):
-                    places, weight = self._own(part)
-                    self.learn(features[places], target[places], weight)
+                elif steps is not None:
+                    steps(features, target, order)
+                else:
+                    for part in order.split(self.batch):
+                        places, weight = self._own(part)
+                        self.learn(features[places], target[places], weight)
+            if steps is not None:
+                steps.store()
             self.team.copy_leader(self.parameters)
             finite = self._keep_if_finite()
             self._restore()
@@ -127,6 +135,79 @@ class ValueFit:
         for group in self.optimizer.param_groups:
             group["capturable"] = self.cuda
         self.captured = None  # its graph holds the addresses of the old moments
+
+
+class DenseSteps:
+    """The mini-batch steps of one call of a ``ValueFit`` on the CPU, with derivatives and Adam written out.
+
+    Parameters and moments are vectors of their own, which ``store`` copies into the value function and the optimizer.
+
+    Args:
+        fit: The fit.
+        passes: Passes through the value function's network.
+    """
+
+    def __init__(self, fit: ValueFit, passes: DensePasses) -> None:
+        self.fit, self.team = fit, fit.team
+        state = [fit.optimizer.state.get(p) or {} for p in fit.parameters]
+        first, second = (
+            [s.get(name, torch.zeros_like(p)) for s, p in zip(state, fit.parameters, strict=True)]
+            for name in ("exp_avg", "exp_avg_sq")
+        )
+        self.count = int(state[0].get("step", 0))
+        self.parameters, self.first, self.second = (
+            torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
+            for tensors in (passes.parameters, first, second)
+        )
+        self.gradient, self.root = fit.gradient, torch.empty_like(self.parameters)
+        self.passes = DensePasses(self._shaped(self.parameters), passes.activation)
+        self.gradients = self._shaped(self.gradient)
+
+    def _shaped(self, flat: torch.Tensor) -> list[torch.Tensor]:
+        """Views of a vector, of the parameters' shapes."""
+        sizes = [p.numel() for p in self.fit.parameters]
+        return [part.view_as(p) for part, p in zip(flat.split(sizes), self.fit.parameters, strict=True)]
+
+    def __call__(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
+        """Run an epoch.
+
+        Args:
+            features: The network's inputs, (samples, features).
+            target: Scaled returns, (samples, 1).
+            order: A permutation of all processes' samples.
+        """
+        places, own = self.team.locate(order, self.fit.nworld)
+        sizes = [len(part) for part in order.split(self.fit.batch)]
+        counts = [int(part.sum()) for part in own.split(self.fit.batch)]
+        features, target = features[places[own]], target[places[own]]
+        for x, y, size in zip(features.split(counts), target.split(counts), sizes, strict=True):
+            self.learn(x, y, 1.0 / size)
+
+    def learn(self, features: torch.Tensor, target: torch.Tensor, weight: float) -> None:
+        """One step of Adam on a weighted sum of squared errors."""
+        error = self.passes(features).sub_(target)
+        self.passes.pull(error.mul_(2.0 * weight), self.gradients)
+        self.team.sum(self.gradient)
+        group = self.fit.optimizer.param_groups[0]
+        decay, slow = group["betas"]
+        self.count += 1
+        self.first.lerp_(self.gradient, 1.0 - decay)
+        self.second.mul_(slow).addcmul_(self.gradient, self.gradient, value=1.0 - slow)
+        # both corrections of the moments' start from 0 are in the factor of the step
+        unbias = math.sqrt(1.0 - slow**self.count)
+        torch.sqrt(self.second, out=self.root).add_(group["eps"] * unbias)
+        factor = group["lr"] * unbias / (1.0 - decay**self.count)
+        self.parameters.addcdiv_(self.first, self.root, value=-factor)
+
+    @torch.no_grad()
+    def store(self) -> None:
+        """Copy parameters and moments into the value function and the optimizer."""
+        shaped = zip(*map(self._shaped, (self.parameters, self.first, self.second)), strict=True)
+        for parameter, (new, first, second) in zip(self.fit.parameters, shaped, strict=True):
+            parameter.copy_(new)
+            self.fit.optimizer.state[parameter] = {
+                "step": torch.tensor(float(self.count)), "exp_avg": first, "exp_avg_sq": second,
+            }  # fmt: skip
 
 
 class CapturedStep:

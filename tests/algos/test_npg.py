@@ -14,6 +14,7 @@ from conftest import TaskFile
 from full_task import Full
 
 import lyceum_warp as lw
+from lyceum_warp.algos.dense import DensePolicy, DenseValue
 
 SMALL = lw.NPGConfig(samples=320, hidden=(8, 8), value_hidden=(16,), mean_every=2, mean_episodes=2)
 
@@ -158,7 +159,7 @@ def test_the_fisher_information_takes_other_samples_each_time(env: lw.Env) -> No
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, fisher_fraction=1 / 16), seed=0)
     next(npg)
     obs = npg.rollout.obs.flatten(0, 1)
-    means = [npg.fisher(obs).mean for _ in range(2)]
+    means = [npg.fisher(obs).mean.clone() for _ in range(2)]
     assert means[0].shape == (20, 2) and not torch.equal(*means)
     # of 16 worlds, a stride of 16 would take the same one every time
     every = npg.policy(obs).detach()
@@ -465,3 +466,28 @@ def test_gpu_a_resumed_run_continues() -> None:
     assert again.kl == pytest.approx(first.kl, rel=1e-2)
     assert again.value_error == pytest.approx(first.value_error, rel=1e-2)
     assert again.gradient_norm == pytest.approx(first.gradient_norm, rel=1e-2)
+
+
+@pytest.mark.parametrize("kl_limit", [1.0, 1.5])  # with 1.0 many steps are shortened
+def test_written_out_and_parallel_iterations_equal_plain_ones(kl_limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plain ones take autograd and all rounds of the line search, and fit the value function after the step."""
+    threads, learned = torch.get_num_threads(), []
+    torch.set_num_threads(2)
+    try:
+        for plain in (False, True):
+            env = lw.make("hopper", nworld=8, seed=0, nthread=1)
+            npg = lw.NPG(env, config=lw.NPGConfig(samples=800, mean_every=0, kl_limit=kl_limit), seed=0)
+            if plain:
+                monkeypatch.setattr(DensePolicy, "of", lambda *args: None)
+                monkeypatch.setattr(DenseValue, "of", lambda *args: None)
+                npg._reads_numbers = False
+            assert (npg.dense_policy() is None) == plain
+            it = next(npg)
+            numbers = torch.nn.utils.parameters_to_vector
+            learned.append((it.kl, it.step_fraction, numbers(npg.policy.parameters()), numbers(npg.value.parameters())))
+    finally:
+        torch.set_num_threads(threads)
+    (kl, fraction, *networks), (other_kl, other_fraction, *others) = learned
+    assert kl == pytest.approx(other_kl, rel=1e-3) and fraction == pytest.approx(other_fraction, rel=1e-3)
+    for network, other in zip(networks, others, strict=True):
+        torch.testing.assert_close(network, other, rtol=1e-3, atol=1e-5)

@@ -1,9 +1,12 @@
 """The regression of value functions, with and without a captured step."""
 
+from typing import Any
+
 import pytest
 import torch
 
 import lyceum_warp as lw
+from lyceum_warp.algos.dense import DenseValue
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.value_fit import CapturedStep, ValueFit
 
@@ -26,6 +29,43 @@ def test_the_step_that_is_captured_learns_the_same_as_plain_mini_batches() -> No
                     one_step.learn()
         fits.append(torch.cat([p.detach().flatten() for p in fit.parameters]))
     torch.testing.assert_close(*fits)
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu", "elu"])
+def test_written_out_steps_learn_the_same_as_autograd(activation: Any) -> None:
+    """In two calls: the second continues with the moments of the first."""
+    generator = torch.Generator().manual_seed(2)
+    data = [torch.randn(50, 6, generator=generator) for _ in range(2)]  # the last mini-batch is smaller
+    fits = []
+    for written_out in (False, True):
+        init = torch.Generator().manual_seed(0)
+        value = lw.ValueFunction(5, (16, 8), activation=activation, scale=1.0, generator=init)
+        fit = ValueFit(value, 50, 5, rate=1e-2, epochs=2, batch=16, team=Team())
+        generator = torch.Generator().manual_seed(1)
+        for obs, target in ((part[:, :5], part[:, 5]) for part in data):
+            if written_out:
+                assert fit(obs, torch.zeros(50), target, generator)
+                continue
+            for _ in range(fit.epochs):
+                for places in torch.randperm(50, generator=generator).split(16):
+                    fit.learn(obs[places], target[places, None], 1.0 / len(places))
+        fits.append(fit)
+    plain, dense = fits
+    for parameter, other in zip(plain.parameters, dense.parameters, strict=True):
+        torch.testing.assert_close(parameter, other)
+        moments, others = plain.optimizer.state[parameter], dense.optimizer.state[other]
+        assert list(moments) == list(others) and moments["step"].dtype == others["step"].dtype
+        for name in moments:
+            torch.testing.assert_close(moments[name], others[name], rtol=1e-4, atol=1e-6)
+
+
+def test_a_network_of_its_own_is_fitted_by_autograd() -> None:
+    value = lw.ValueFunction(5, (8,), activation="gelu", scale=1.0)
+    assert DenseValue.of(value) is None
+    fit = ValueFit(value, 50, 5, rate=1e-2, epochs=20, batch=16, team=Team())
+    obs, target = torch.randn(50, 5), torch.ones(50)
+    assert fit(obs, torch.zeros(50), target, torch.Generator().manual_seed(0))
+    assert (value(obs, torch.zeros(50)) - 1.0).abs().mean() < 0.5
 
 
 @pytest.mark.gpu

@@ -1,0 +1,91 @@
+"""NPG's samples from Gymnasium's vector environments, in place of ours."""
+
+import contextlib
+import functools
+import time
+
+import gymnasium
+import torch
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+
+import lyceum_warp as lw
+from lyceum_warp.algos.dense import DensePolicy
+from lyceum_warp.algos.distributed import Team
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.rollout_buffer import Rollout
+
+TASKS = {"swimmer": "Swimmer-v5", "hopper": "Hopper-v5", "walker2d": "Walker2d-v5"}
+"""Our tasks, with Gymnasium's names."""
+
+
+class GymnasiumRollout(Rollout):
+    """Fills NPG's buffer from a vector environment of Gymnasium, as ``Rollout`` does from ours.
+
+    A world that ends begins its next episode within the same step, and the first episodes are as much shortened as
+    those of our environment were.
+    """
+
+    def __init__(self, env: lw.Env, steps: int, envs: VectorEnv, seed: int, *, segments: bool) -> None:
+        super().__init__(env, steps, first_only=not segments)
+        self.envs = envs
+        self.now, _ = envs.reset(seed=1000 * seed)
+        self.elapsed = torch.zeros(env.nworld)
+        if segments:
+            self.elapsed.copy_(env.episode_step)
+            # the time limit is the outermost wrapper, in processes of their own, too
+            envs.set_attr("_elapsed_steps", env.episode_step.tolist())
+            self.running_return.masked_fill_(self.elapsed > 0, torch.nan)
+
+    def restart(self) -> None:
+        self.now, _ = self.envs.reset()
+        self.elapsed.zero_()
+        self.running_return.zero_()
+
+    def stagger(self, generator: torch.Generator, team: Team | None = None) -> None:
+        raise NotImplementedError("the first episodes take their lengths from our environment's")
+
+    @torch.no_grad()
+    def collect(self, policy: GaussianPolicy | DensePolicy, noise: torch.Tensor) -> None:
+        for t in range(self.steps):
+            self.obs[t].copy_(torch.from_numpy(self.now))
+            self.step[t] = self.elapsed
+            policy.sample(self.obs[t], noise[t], out=self.action[t])
+            self.now, reward, terminated, truncated, info = self.envs.step(self.action[t].numpy())
+            done = terminated | truncated
+            self.final_obs[t].copy_(torch.from_numpy(self.now))
+            for world in done.nonzero()[0]:
+                self.final_obs[t, world].copy_(torch.from_numpy(info["final_obs"][world]))
+            self.reward[t].copy_(torch.from_numpy(reward))
+            self.terminated[t].copy_(torch.from_numpy(terminated))
+            self.done[t].copy_(torch.from_numpy(done))
+            self.elapsed += 1.0
+            self.running_return += self.reward[t]
+            self.episode_return[t] = self.running_return
+            self.episode_length[t] = self.elapsed
+            self.running_return.masked_fill_(self.done[t], torch.nan if self._first_only else 0.0)
+            self.elapsed.masked_fill_(self.done[t], 0.0)
+
+
+def vector(task: str, nworld: int, mode: str) -> VectorEnv:
+    """Gymnasium's vector environment, without the checks that are for writers of environments."""
+    made = [functools.partial(gymnasium.make, TASKS[task], disable_env_checker=True)] * nworld
+    if mode == "sync":
+        return SyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP)
+    # Gymnasium's own way on Linux; new interpreters would import all of this program, once for each world
+    return AsyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP, context="fork")
+
+
+def rates(task: str, nworld: int, steps: int) -> dict[str, float]:
+    """Environment steps per second of both vector modes on these cores, with random actions."""
+    found = {}
+    for mode in ("sync", "async"):
+        with contextlib.closing(vector(task, nworld, mode)) as envs:
+            envs.reset(seed=0)
+            envs.action_space.seed(0)
+            actions = [envs.action_space.sample() for _ in range(steps)]
+            envs.step(actions[0])
+            start = time.perf_counter()
+            for action in actions:
+                envs.step(action)
+            found[mode] = steps * nworld / (time.perf_counter() - start)
+    return found

@@ -1,0 +1,268 @@
+"""Fully connected networks on the CPU, with derivatives that are written out.
+
+With some hundred units in a layer, modules and autograd cost more than the arithmetic. Here a pass is one product of
+matrices a layer, into buffers that are allocated once. Other networks, and other devices, take the way of torch.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from torch import nn
+
+from lyceum_warp.algos.networks import Normalizer
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.value import ValueFunction
+
+_Array: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]
+
+
+def _elu_(x: _Array) -> None:
+    np.copyto(x, np.expm1(x), where=x < 0.0)
+
+
+# numpy's tanh is several times as fast as torch's on some processors
+_ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[..., Any]]] = {
+    nn.Tanh: (lambda x: np.tanh(x, out=x), lambda y, out: torch.mul(y, y, out=out).neg_().add_(1.0)),
+    nn.ReLU: (lambda x: np.maximum(x, 0.0, out=x), lambda y, out: torch.sign(y, out=out)),
+    nn.ELU: (_elu_, lambda y, out: torch.clamp(y, max=0.0, out=out).add_(1.0)),
+}
+"""Activations in place, and their derivatives from their results, of those modules of ``mlp`` that have such."""
+
+
+_FEW = 2**18
+"""Rows times the weights of the largest layer, up to which numpy computes results. Between two steps of the worlds,
+when caches hold other things, it begins a call several times as fast; it divides larger products among threads."""
+
+
+class DensePasses:
+    """Outputs y of a network, and products with J = d y / d parameters. A result is valid until the next call.
+
+    Args:
+        parameters: Weight and bias of each layer, in the order of the layers.
+        activation: What follows each layer but the last one; a key of ``_ACTIVATIONS``.
+    """
+
+    def __init__(self, parameters: Iterable[torch.Tensor], activation: type[nn.Module]) -> None:
+        self.parameters = [parameter.detach() for parameter in parameters]
+        self.weights, self.biases = self.parameters[::2], self.parameters[1::2]
+        self.activation = activation
+        self._activate, self._slope = _ACTIVATIONS[activation]
+        self._parameter_arrays = [(w.numpy().T, b.numpy()) for w, b in zip(self.weights, self.biases, strict=True)]
+        self._rows = 0
+        self._buffers: list[list[torch.Tensor]] = []
+        self._allocate(0)
+
+    @staticmethod
+    def of(network: nn.Module, last: "DensePasses | None" = None) -> "DensePasses | None":
+        """Passes through a network; None if it is not one of ``mlp`` on the CPU, or its activation is not known here.
+
+        Args:
+            network: The network.
+            last: What an earlier call returned; it is returned once more where it still has the network's parameters.
+        """
+        if type(network) is not nn.Sequential or len(network) % 2 == 0:
+            return None
+        layers: list[Any] = list(network)[::2]
+        activations = list(network)[1::2]
+        kind = type(activations[0]) if activations else nn.Tanh
+        linear = all(type(layer) is nn.Linear and layer.bias is not None for layer in layers)
+        parameters = [p for layer in layers for p in (layer.weight, layer.bias)] if linear else []
+        # a layer may occur twice, or its weight may be computed from another parameter
+        if [id(p) for p in network.parameters()] != [id(p) for p in parameters] or kind not in _ACTIVATIONS:
+            return None
+        if (
+            any(p.device.type != "cpu" or p.dtype != torch.float32 for p in parameters)
+            or any(type(module) is not kind or getattr(module, "alpha", 1.0) != 1.0 for module in activations)
+            or any(map(_hooked, network.modules()))
+        ):
+            return None
+        if last is not None and last.activation is kind and _places(last.parameters) == _places(parameters):
+            return last
+        return DensePasses(parameters, kind)
+
+    def _allocate(self, rows: int) -> None:
+        """Buffers of a number of rows: results, slopes and derivatives of each layer."""
+        widths = [len(bias) for bias in self.biases]
+        self._buffers = [[torch.empty(rows, n) for n in widths] for _ in range(3)]
+
+    def _resize(self, rows: int) -> None:
+        """Use the first rows of the buffers."""
+        if rows > len(self._buffers[0][0]):
+            self._allocate(rows)
+        self._rows, self._few = rows, rows * max(weight.numel() for weight in self.weights) <= _FEW
+        self.results, self.slopes, self.derivatives = [[b[:rows] for b in kind] for kind in self._buffers]
+        self._arrays = [result.numpy() for result in self.results]
+
+    def __call__(self, x: torch.Tensor) -> torch.Tensor:
+        """Outputs, (rows, outputs), from inputs, (rows, inputs), which must stay as they are for later products."""
+        if len(x) != self._rows:
+            self._resize(len(x))
+        self._inputs, self._sloped = [x, *self.results[:-1]], False
+        last = len(self.weights) - 1
+        array = x.numpy()
+        for i, (result, (weights, biases)) in enumerate(zip(self._arrays, self._parameter_arrays, strict=True)):
+            if self._few:
+                np.matmul(array, weights, out=result)
+                np.add(result, biases, out=result)
+            else:
+                torch.addmm(self.biases[i], self._inputs[i], self.weights[i].t(), out=self.results[i])
+            if i < last:
+                self._activate(result)
+            array = result
+        return self.results[-1]
+
+    def _find_slopes(self) -> None:
+        if not self._sloped:
+            for result, slope in zip(self.results[:-1], self.slopes, strict=False):
+                self._slope(result, out=slope)
+            self._sloped = True
+
+    def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
+        """J v, (rows, outputs), at the last inputs.
+
+        Args:
+            parts: v, in tensors of the parameters' shapes.
+        """
+        self._find_slopes()
+        last = len(self.weights) - 1
+        for i, derivative in enumerate(self.derivatives):
+            torch.addmm(parts[2 * i + 1], self._inputs[i], parts[2 * i].t(), out=derivative)
+            if i:
+                derivative.addmm_(self.derivatives[i - 1], self.weights[i].t())
+            if i < last:
+                derivative.mul_(self.slopes[i])
+        return self.derivatives[-1]
+
+    def pull(self, u: torch.Tensor, out: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
+        """J^T u at the last inputs.
+
+        Args:
+            u: Derivatives by the outputs, (rows, outputs).
+            out: Where to write it: tensors of the parameters' shapes.
+        """
+        self._find_slopes()
+        for i in reversed(range(len(self.weights))):
+            x, weight = self._inputs[i], self.weights[i]
+            if x.shape[1] < u.shape[1]:  # the product with the longer rows is the faster one
+                out[2 * i].copy_((x.t() @ u).t())
+            else:
+                torch.mm(u.t(), x, out=out[2 * i])
+            torch.sum(u, 0, out=out[2 * i + 1])
+            if i:
+                u = torch.mm(u, weight, out=self.derivatives[i - 1]).mul_(self.slopes[i - 1])
+        return out
+
+
+class DensePolicy:
+    """A ``GaussianPolicy`` with a network of ``mlp``, on the CPU.
+
+    Args:
+        policy: The policy.
+        passes: Passes through its network.
+    """
+
+    def __init__(self, policy: GaussianPolicy, passes: DensePasses) -> None:
+        self.policy, self.passes = policy, passes
+        self.others = _others(policy)
+        self._log_std, *self._statistics = [tensor.numpy() for tensor in self.others]
+        self._x = torch.empty(0, policy.nobs)
+        self._pulled = [torch.empty_like(parameter) for parameter in passes.parameters]
+
+    @staticmethod
+    def of(policy: GaussianPolicy, last: "DensePolicy | None" = None) -> "DensePolicy | None":
+        """The same policy; None if a part of it is of another kind, or some of its network is not learned.
+
+        Args:
+            policy: The policy.
+            last: What an earlier call returned; it is returned once more where it still has the policy's parameters.
+        """
+        plain = type(policy) is GaussianPolicy and type(policy.normalizer) in (Normalizer, nn.Identity)
+        if not plain or _hooked(policy) or _hooked(policy.normalizer):
+            return None
+        if not all(parameter.requires_grad for parameter in policy.network.parameters()):
+            return None
+        passes = DensePasses.of(policy.network, last.passes if last else None)
+        if passes is None:
+            return None
+        kept = last is not None and last.policy is policy and last.passes is passes
+        kept = kept and last is not None and _places(last.others) == _places(_others(policy))
+        return last if kept else DensePolicy(policy, passes)
+
+    def __call__(self, obs: torch.Tensor) -> torch.Tensor:
+        """Mean actions, (rows, nact), from observations, (rows, nobs)."""
+        normalizer = self.policy.normalizer
+        if not isinstance(normalizer, Normalizer):
+            return self.passes(obs)
+        if len(obs) > len(self._x):
+            self._x = torch.empty_like(obs)
+        x = self._x[: len(obs)]
+        array, (shift, scale) = x.numpy(), self._statistics
+        np.subtract(obs.numpy(), shift, out=array)
+        np.multiply(array, scale, out=array)
+        np.clip(array, -normalizer.limit, normalizer.limit, out=array)
+        return self.passes(x)
+
+    def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
+        """Draw actions, as ``GaussianPolicy.sample``."""
+        action = out.numpy()
+        np.multiply(noise.numpy(), np.exp(self._log_std), out=action)
+        np.add(action, self(obs).numpy(), out=action)
+        return out
+
+    def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
+        """J v for the network's parameters, at the last observations (``DensePasses.push``)."""
+        return self.passes.push(parts)
+
+    def pull(self, u: torch.Tensor) -> list[torch.Tensor]:
+        """J^T u for the network's parameters, at the last observations, in tensors of their shapes."""
+        self.passes.pull(u, self._pulled)
+        return list(self._pulled)
+
+
+class DenseValue:
+    """Predictions of a ``ValueFunction`` with a network of ``mlp``, on the CPU.
+
+    Args:
+        value: The value function.
+        passes: Passes through its network.
+    """
+
+    def __init__(self, value: ValueFunction, passes: DensePasses) -> None:
+        self.value, self.passes = value, passes
+
+    @staticmethod
+    def of(value: ValueFunction, last: "DenseValue | None" = None) -> "DenseValue | None":
+        """The same value function; None if a part of it is of another kind. ``last`` as for a ``DensePolicy``."""
+        if type(value) is not ValueFunction or _hooked(value):
+            return None
+        passes = DensePasses.of(value.network, last.passes if last else None)
+        if passes is None:
+            return None
+        kept = last is not None and last.value is value and last.passes is passes
+        return last if kept else DenseValue(value, passes)
+
+    def __call__(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+        """Predicted returns, (...,), from observations, (..., nobs), and steps since the reset, (...,)."""
+        features = self.value.features(obs, step)
+        output = self.passes(features.reshape(-1, features.shape[-1])).view(features.shape[:-1])
+        return output * self.value.scale.float() + self.value.shift.float()
+
+
+def _hooked(module: nn.Module) -> bool:
+    """Whether more than ``forward`` runs when a module is called."""
+    return any(getattr(module, f"_forward{kind}_hooks") for kind in ("", "_pre"))
+
+
+def _others(policy: GaussianPolicy) -> list[torch.Tensor]:
+    """The tensors of a policy that are not its network's."""
+    normalizer = policy.normalizer
+    return [
+        policy.log_std.detach(),
+        *([normalizer.shift, normalizer.scale] if isinstance(normalizer, Normalizer) else []),
+    ]
+
+
+def _places(tensors: Iterable[torch.Tensor]) -> list[int]:
+    return [tensor.data_ptr() for tensor in tensors]
