@@ -63,10 +63,16 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "2,000 samples, gamma 0.99, little noise": {"samples": 2000, **_NEAR, "log_std": -1.5},
     "2,000 samples, gamma 0.99, no contact forces": {"samples": 2000, **_NEAR, **_NO_FORCES},
     "2,000 samples, gamma 0.99, less noise, no contact forces": {
-        "samples": 2000, **_NEAR, "log_std": -1.0, **_NO_FORCES,
+        "samples": 2000,
+        **_NEAR,
+        "log_std": -1.0,
+        **_NO_FORCES,
     },
     "2,000 samples, gamma 0.99, little noise, no contact forces": {
-        "samples": 2000, **_NEAR, "log_std": -1.5, **_NO_FORCES,
+        "samples": 2000,
+        **_NEAR,
+        "log_std": -1.5,
+        **_NO_FORCES,
     },
     "beginnings": {"samples": 5000, "rollout": "episodes", "min_log_std": -1.5, "delta": 0.05},
 }
