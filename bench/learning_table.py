@@ -60,6 +60,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "5,000 samples, gamma 0.99, less noise": {"samples": 5000, **_NEAR, "log_std": -1.0},
     "2,000 samples, gamma 0.99": {"samples": 2000, **_NEAR},
     "2,000 samples, gamma 0.99, less noise": {"samples": 2000, **_NEAR, "log_std": -1.0},
+    "1,000 samples, gamma 0.99, less noise": {"samples": 1000, **_NEAR, "log_std": -1.0},
     "2,000 samples, gamma 0.99, little noise": {"samples": 2000, **_NEAR, "log_std": -1.5},
     "2,000 samples, gamma 0.99, no contact forces": {"samples": 2000, **_NEAR, **_NO_FORCES},
     "2,000 samples, gamma 0.99, less noise, no contact forces": {
