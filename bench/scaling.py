@@ -16,6 +16,7 @@ import contestants
 import experiment
 from contestants import LABELS
 from experiment import Experiment, Row, Table, choose, median_and_range
+from matplotlib.ticker import LogLocator
 from throughput import COLORS, TASKS
 
 from lyceum_warp.machine import cpu_cores
@@ -175,6 +176,8 @@ def figure(rows: Sequence[Row]) -> Any:
             one = middle(found["native"][1])
             axes.plot(ends, [one * n for n in ends], color="#aaa", linewidth=0.8, linestyle="--", label="in proportion")
         axes.set_xscale("log", base=2)
+        if size == "worlds":
+            axes.xaxis.set_major_locator(LogLocator(base=8, numticks=10))
         axes.set_yscale("log")
         axes.xaxis.set_major_formatter("{x:,.0f}")
         axes.set_xlabel("cores" if size == "threads" else "worlds")

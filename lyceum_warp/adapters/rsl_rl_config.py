@@ -4,6 +4,8 @@ import dataclasses
 import math
 from typing import Any, Literal, get_args
 
+import torch
+
 from lyceum_warp.algos.networks import Activation, check_activation
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
@@ -33,7 +35,10 @@ _COMPILE_MODES = ("default", "max-autotune-no-cudagraphs")
 """The modes of torch.compile that rsl_rl takes: those without CUDA graphs."""
 
 _FLAGS = ("use_clipped_value_loss", "normalize_advantage_per_mini_batch", "normalize", "random_start", "tf32",
-          "batched_values", "captured_update")  # fmt: skip
+          "batched_values")  # fmt: skip
+
+_CAPTURED_OPTIMIZERS = ("adam", "adamw")
+"""Optimizers whose steps can be captured."""
 
 _ACTIVATIONS = {"leaky_relu": "lrelu", "silu": "swish"}
 """Activations that rsl_rl calls by another name."""
@@ -116,20 +121,20 @@ class RslRlConfig:
     "policy"."""
     normalize: bool = True
     """Whether policy and value function normalise observations by their running mean and variance."""
-    normalize_when: NormalizeWhen | None = None
-    """When these statistics take in observations: "step" for those that each step leads to, "before" and "after" for
-    all of an iteration, before or after the update; by default as the installed rsl_rl does, which is "after" from
-    5.5 on and "step" in 5.4. rsl_rl's own runner does the latter."""
+    normalize_when: NormalizeWhen = "step"
+    """When these statistics take in observations: "step" for those that each step leads to, as rsl_rl 5.4 does,
+    "before" and "after" for all of an iteration, before or after the update. rsl_rl's own runner does what the
+    installed rsl_rl does, which is "after" from 5.5 on."""
     random_start: bool = True
     """Whether the first episodes begin at random steps, so that time limits fall at all times."""
     tf32: bool = True
     """Whether matrix products on a GPU use TensorFloat-32."""
-    batched_values: bool = False
+    batched_values: bool = True
     """Whether values and densities are computed once for all steps of an iteration, rather than in each step. They are
     the same up to rounding, and sampling is faster on a GPU."""
-    captured_update: bool = False
+    captured_update: bool | None = None
     """Whether an epoch of the update is one CUDA graph, in which nothing waits for the device. It computes the same up
-    to rounding; without a GPU it has no advantage."""
+    to rounding. By default it is on a GPU, where the optimizer is "adam" or "adamw" and nothing is compiled."""
     torch_compile_mode: str | None = None
     """Mode of torch.compile for the networks, "default" or "max-autotune-no-cudagraphs"; by default they are not
     compiled."""
@@ -156,9 +161,7 @@ class RslRlConfig:
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         for name, choices in _CHOICES.items():
-            if (choice := getattr(self, name)) is None and name == "normalize_when":
-                continue
-            if choice not in get_args(choices):
+            if (choice := getattr(self, name)) not in get_args(choices):
                 raise ValueError(f"{name} must be {' or '.join(map(repr, get_args(choices)))}, not {choice!r}")
         for name in _FLAGS:
             if not isinstance(flag := getattr(self, name), bool):
@@ -168,10 +171,18 @@ class RslRlConfig:
         if (mode := self.torch_compile_mode) is not None and mode not in _COMPILE_MODES:
             modes = " or ".join(map(repr, _COMPILE_MODES))
             raise ValueError(f"torch_compile_mode must be {modes}, or None for no compilation, not {mode!r}")
-        if self.captured_update and self.optimizer not in ("adam", "adamw"):
+        if self.captured_update is not None and not isinstance(self.captured_update, bool):
+            raise ValueError(f"captured_update must be True, False or None, not {self.captured_update!r}")
+        if self.captured_update and self.optimizer not in _CAPTURED_OPTIMIZERS:
             raise ValueError(f"captured_update needs the optimizer 'adam' or 'adamw', not {self.optimizer!r}")
         if self.captured_update and self.torch_compile_mode is not None:
             raise ValueError("captured_update and torch_compile_mode exclude each other: leave out one of them")
+
+    def captures(self, device: torch.device) -> bool:
+        """Whether an epoch of the update on this device is one CUDA graph."""
+        if self.captured_update is not None:
+            return self.captured_update
+        return device.type == "cuda" and self.optimizer in _CAPTURED_OPTIMIZERS and self.torch_compile_mode is None
 
     def entropy_weight(self, iteration: int) -> float:
         """Weight of the policy's entropy in an iteration, of which the first one is 1."""

@@ -23,7 +23,7 @@ from lyceum_warp.adapters.rsl_rl_networks import (
 )
 from lyceum_warp.adapters.rsl_rl_normalizer import freeze_normalizers, take_in
 from lyceum_warp.adapters.rsl_rl_random import OwnRandomNumbers
-from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl, normalizes_while_sampling
+from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl
 from lyceum_warp.adapters.rsl_rl_sampling import BatchedSampling
 from lyceum_warp.adapters.rsl_rl_statistics import RECENT, RslRlIteration
 from lyceum_warp.adapters.rsl_rl_update import CapturedUpdate
@@ -130,10 +130,9 @@ class RslRlLearner:
         if policy is not None:
             begin_with(self.ppo.actor, self.ppo.critic, policy, value)
         self._copy_networks()
-        self._captured = CapturedUpdate(self.ppo) if config.captured_update else None
+        self._captured = CapturedUpdate(self.ppo) if config.captures(device) else None
         self._update = self._captured or self.ppo.update
 
-        self._normalize_when = config.normalize_when or ("step" if normalizes_while_sampling() else "after")
         self.rollout = Rollout(env, config.num_steps_per_env, groups=(group,) if config.batched_values else ())
         self._batched: BatchedSampling | None = None
         if config.batched_values:
@@ -159,7 +158,7 @@ class RslRlLearner:
             timer.mark()
             ppo.entropy_coef = config.entropy_weight(self.iteration + 1)
             losses = self._update()
-            if self._normalize_when == "after":
+            if config.normalize_when == "after":
                 self._take_in(ppo.storage.observations)
         self._copy_networks()
         episodes = finished(rollout)
@@ -212,7 +211,7 @@ class RslRlLearner:
 
     def _sample(self) -> None:
         """Fill rsl_rl's storage with steps of the current policy, and compute the advantages."""
-        ppo, env, rollout, when = self.ppo, self.env, self.rollout, self._normalize_when
+        ppo, env, rollout, when = self.ppo, self.env, self.rollout, self.config.normalize_when
         rollout.begin()
         with torch.inference_mode(), one_thread():
             if self._batched is not None:

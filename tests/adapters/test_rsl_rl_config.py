@@ -1,8 +1,10 @@
 """Hyperparameters of rsl_rl's PPO."""
 
 import inspect
+from typing import Any
 
 import pytest
+import torch
 from conftest import SharedEnv
 from metered_task import Metered
 from rsl_rl.algorithms import PPO
@@ -27,6 +29,7 @@ from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
     ({"final_entropy_coef": -1.0}, "final_entropy_coef must be a finite number of at least 0, not -1.0"),
     ({"entropy_decay": 7}, r"entropy_decay must be two numbers of iterations, as in \(150, 200\), not 7"),
     ({"entropy_decay": (5, 5)}, r"entropy_decay must end after it begins, not \(5, 5\)"),
+    ({"captured_update": "yes"}, "captured_update must be True, False or None, not 'yes'"),
     ({"value_group": 3}, "value_group must be a name, or None, not 3"),
 ])  # fmt: skip
 def test_values_that_are_not_valid_are_refused(words: dict[str, object], message: str) -> None:
@@ -38,6 +41,19 @@ def test_the_weight_of_the_entropy_falls_linearly() -> None:
     config = RslRlConfig(entropy_coef=0.02, final_entropy_coef=0.01, entropy_decay=(10, 20))
     assert [config.entropy_weight(it) for it in (1, 10, 15, 20, 99)] == pytest.approx([0.02, 0.02, 0.015, 0.01, 0.01])
     assert RslRlConfig(entropy_coef=0.02).entropy_weight(500) == 0.02
+
+
+@pytest.mark.parametrize("words, on_gpu, on_cpu", [
+    ({}, True, False),
+    ({"optimizer": "adamw"}, True, False),
+    ({"optimizer": "sgd"}, False, False),
+    ({"torch_compile_mode": "default"}, False, False),
+    ({"captured_update": False}, False, False),
+    ({"captured_update": True}, True, True),
+])  # fmt: skip
+def test_the_update_is_captured_on_a_gpu_where_it_can_be(words: dict[str, Any], on_gpu: bool, on_cpu: bool) -> None:
+    config = RslRlConfig(**words)
+    assert (config.captures(torch.device("cuda:1")), config.captures(torch.device("cpu"))) == (on_gpu, on_cpu)
 
 
 def test_the_value_function_gets_the_critics_group_where_there_is_one(shared_env: SharedEnv) -> None:

@@ -124,7 +124,7 @@ def test_statistics_of_a_step_serve_the_next_one() -> None:
 @pytest.mark.gpu
 @pytest.mark.parametrize("bootstrap", ["final", "before"])
 def test_gpu_what_is_stored_is_the_same(bootstrap: str) -> None:
-    made = learner(device="cuda:0", batched_values=True, bootstrap=bootstrap)
+    made = learner(device="cuda:0", batched_values=True, bootstrap=bootstrap, normalize_when="after")
     for _ in range(3):
         next(made)
     ppo, storage = made.ppo, made.ppo.storage

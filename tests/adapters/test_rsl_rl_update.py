@@ -21,8 +21,8 @@ def learner(*, device: str = "cpu", **changes: Any) -> RslRlLearner:
 
 def check_equal_over_iterations(device: str, close: dict[str, float]) -> None:
     """Compare the update with rsl_rl's own, which draws actions that it does not need: here, it does not."""
-    changes = {"device": device, "schedule": "fixed", "learning_rate": 3e-4, "tf32": False}
-    own, captured = learner(**changes), learner(captured_update=True, **changes)
+    changes = {"device": device, "schedule": "fixed", "learning_rate": 3e-4, "tf32": False, "normalize_when": "after"}
+    own, captured = learner(captured_update=False, **changes), learner(captured_update=True, **changes)
     policy = own.ppo.actor.distribution
     sample = policy.sample
     policy.sample = lambda: policy.mean.detach() if torch.is_grad_enabled() else sample()
