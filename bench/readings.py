@@ -74,7 +74,7 @@ def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uin
 
 @wp.func
 def mjlabs_terms(s0: World, action: Row[float], s1: World, p: Params) -> lw.vec10:
-    seen = past(s1)
+    seen, c = past(s1), go1.command(s0, p)
     clearance, swing, landing = float(0.0), float(0.0), float(0.0)
     for leg in range(4):
         position, _ = go1.foot(s0, p, leg)
@@ -84,24 +84,24 @@ def mjlabs_terms(s0: World, action: Row[float], s1: World, p: Params) -> lw.vec1
             error = s0.lasting_memory[PAST_PEAK + leg] / p.foot_height - 1.0
             swing += error * error
             landing += wp.length(go1.force(s1, p, leg))
-    active = go1.active(s0, p)
+    active, feet = go1.active(c, p), go1.foot_clearance_and_slip(c, seen, p)
     return p.dt * lw.vec10(
-        p.track_linear_velocity * go1.track_linear_velocity(s0, seen, p),
-        p.track_angular_velocity * go1.track_angular_velocity(s0, seen, p),
+        p.track_linear_velocity * go1.track_linear_velocity(c, seen, p),
+        p.track_angular_velocity * go1.track_angular_velocity(c, seen, p),
         p.upright * go1.upright(seen, p),
-        p.pose * go1.pose(s0, s1, p),
+        p.pose * go1.pose(c, s1, p),
         p.dof_pos_limits * go1.dof_pos_limits(s1, p),
         p.action_rate_l2 * go1.action_rate_l2(s0, action),
         p.foot_clearance * clearance * active,
         p.foot_swing_height * swing * active,
-        p.foot_slip * go1.foot_slip(s0, seen, p),
+        p.foot_slip * feet[1],
         p.soft_landing * landing * active,
     )
 
 
 @wp.func
 def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):
-    k = lw.put(metrics, 0, go1.terms(s0, action, s1, p))
+    k = lw.put(metrics, 0, go1.terms(go1.command(s0, p), s0, action, s1, p))
     lw.put(metrics, k, mjlabs_terms(s0, action, s1, p))
 
 
