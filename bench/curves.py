@@ -14,6 +14,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+LABELS = {
+    "return_mean": "return", "return_recent": "return, last 100 episodes", "mean_return": "return of the mean policy",
+}  # fmt: skip
+
 COLORS = ("#c8502d", "#3d6fa5", "#5a8f4e", "#8a6bb1")
 
 
@@ -27,8 +31,9 @@ class Options:
     """The picture (PNG)."""
     x: Literal["samples", "seconds"] = "samples"
     """What the returns are drawn against."""
-    y: Literal["return_mean", "mean_return"] = "return_mean"
-    """Return of the stochastic policy in training, or of the mean policy in episodes of its own."""
+    y: Literal["return_mean", "return_recent", "mean_return"] = "return_mean"
+    """Return of the stochastic policy in training, in an iteration or in the last 100 episodes (time_to_reward.py), or of
+    the mean policy in episodes of its own."""
     title: str = ""
     """What stands above it."""
 
@@ -57,12 +62,12 @@ def main(options: Options) -> None:
         axes.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
         axes.plot(x, mean, color=color, label=label or Path(path).stem)
     axes.set_xlabel(options.x)
-    axes.set_ylabel("return" if options.y == "return_mean" else "return of the mean policy")
+    axes.set_ylabel(LABELS[options.y])
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(color="#e4e7eb")
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, loc="upper left")
+    axes.legend(frameon=False, loc="best")
     axes.set_title(options.title, loc="left")
     options.out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(options.out, dpi=130)
