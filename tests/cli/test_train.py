@@ -392,13 +392,13 @@ def test_a_terminated_run_continues(trained: Path, tmp_path: Path) -> None:
     assert_continues(out, rest, trained)
 
 
-@pytest.mark.parametrize("moment", ["step", "log_prob", "state_dict", "write", "save_state"])
+@pytest.mark.parametrize("moment", ["step", "move", "state_dict", "write", "save_state"])
 def test_an_interrupted_run_continues(
     moment: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Within this process: while it samples, learns, or writes. The tests of plan interrupt a command from outside."""
     out = tmp_path / "run"
-    owner: Any = {"step": lw.Env, "log_prob": lw.GaussianPolicy, "state_dict": lw.NPG}.get(moment, Run)
+    owner: Any = {"step": lw.Env, "move": lw.NPG, "state_dict": lw.NPG}.get(moment, Run)
     original, calls = getattr(owner, moment), []
 
     def interrupting(*args: Any, **words: Any) -> Any:
@@ -410,7 +410,7 @@ def test_an_interrupted_run_continues(
         return result
 
     monkeypatch.setattr(owner, moment, interrupting)
-    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "100000", "--save-every", "1"]
+    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "2000", "--save-every", "1"]
     assert interrupted(argv) == 130
     monkeypatch.undo()
     assert_continues(out, capsys.readouterr().out, trained)
