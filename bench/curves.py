@@ -32,8 +32,8 @@ class Options:
     x: Literal["samples", "seconds"] = "samples"
     """What the returns are drawn against."""
     y: Literal["return_mean", "return_recent", "mean_return"] = "return_mean"
-    """Return of the stochastic policy in training, in an iteration or in the last 100 episodes (time_to_reward.py), or of
-    the mean policy in episodes of its own."""
+    """Return of the stochastic policy in training, in an iteration or in the last 100 episodes (time_to_reward.py), or
+    of the mean policy in episodes of its own."""
     title: str = ""
     """What stands above it."""
 

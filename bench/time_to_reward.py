@@ -1,7 +1,7 @@
 """Seconds until rsl_rl's PPO, through the adapter, or NPG first reaches given mean rewards.
 
 python bench/time_to_reward.py go1_velocity --device cuda --nworld 4096 --targets 20 40 50 60 70 75 80 \\
-    --seeds 42 43 44 --out bench/results/ppo-go1_velocity-default-h200.csv
+    --seeds 42 43 44 --out bench/results/ppo-go1_velocity-h200.csv
 python bench/time_to_reward.py go1_velocity --algorithm npg --npg.gamma 0.99 --npg.lam 0.95 ...
 
 The mean reward is the mean return of the last 100 episodes that ended, as rsl_rl prints it, but without the worlds'

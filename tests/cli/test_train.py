@@ -366,8 +366,8 @@ def test_the_default_number_of_worlds_depends_on_the_device() -> None:
 def assert_continues(out: Path, output: str, trained: Path) -> None:
     """A run that was interrupted after its third iteration has lost nothing, and prints how to continue it."""
     done = Run.open(out).read()["iteration"]
-    assert f"after {done} of 100000 iterations" in output
-    assert f"lyceum-warp train --resume {out} --iterations 100000" in output
+    assert f"after {done} of 2000 iterations" in output
+    assert f"lyceum-warp train --resume {out} --iterations 2000" in output
     rows = metrics(out)
     assert [int(row["iteration"]) for row in rows] == list(range(1, done + 1))
     assert rows[:3] == metrics(trained)[: min(3, done)]  # of short iterations, the last few may be lost
@@ -379,7 +379,7 @@ def test_a_terminated_run_continues(trained: Path, tmp_path: Path) -> None:
     if os.name == "nt":
         pytest.skip("signals are POSIX's")
     out = tmp_path / "run"
-    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "100000"]
+    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "2000"]
     program = f"import sys; from lyceum_warp.cli import main; sys.exit(main({argv!r}))"
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
