@@ -42,7 +42,7 @@ class GymnasiumRollout(Rollout):
         self.running_return.zero_()
 
     def stagger(self, generator: torch.Generator, team: Team | None = None) -> None:
-        raise NotImplementedError("the first episodes take their lengths from our environment's")
+        raise NotImplementedError("the clocks of Gymnasium's environments are set once, to those of our environment")
 
     @torch.no_grad()
     def collect(self, policy: GaussianPolicy | DensePolicy, noise: torch.Tensor) -> None:

@@ -133,11 +133,13 @@ def case(options: Options, task: str, setting: str) -> learning.Options:
 
 
 def chosen(search: Path | None, tasks: tuple[str, ...]) -> dict[str, str]:
-    """The setting of each task: the best one of a search, or the default."""
+    """The setting of each task: the best one of a search that leaves the task as it is, or the default."""
     if search is None:
         return dict.fromkeys(tasks, DEFAULT)
     found: dict[str, dict[str, list[float]]] = {}
     for r in read(search):
+        if "param" in SETTINGS[r["setting"]]:
+            continue
         found.setdefault(r["task"], {}).setdefault(r["setting"], []).append(r["final"])
     if missing := [task for task in tasks if task not in found]:
         raise SystemExit(f"{search} has no run of {', '.join(missing)}: search again with these tasks")

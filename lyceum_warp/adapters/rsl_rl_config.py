@@ -99,8 +99,8 @@ class RslRlConfig:
     """"adaptive" divides the learning rate by 1.5 after a mini-batch whose KL divergence is more than twice desired_kl,
     and multiplies it by 1.5 where it is less than half, between 1e-5 and 1e-2."""
     desired_kl: float = 0.02
-    """The KL divergence that the adaptive learning rate aims at. go1_velocity learns faster so than with 0.01
-    (bench/README.md)."""
+    """The KL divergence that the adaptive learning rate aims at. On go1_velocity PPO learns faster with 0.02 than
+    with mjlab's 0.01 (bench/README.md)."""
     max_grad_norm: float = 1.0
     """Largest Euclidean length of a gradient, of the policy's and of the value function's."""
     optimizer: Optimizer = "adam"
@@ -133,8 +133,9 @@ class RslRlConfig:
     tf32: bool = True
     """Whether matrix products on a GPU use TensorFloat-32."""
     batched_values: bool = True
-    """Whether values and densities are computed once for all steps of an iteration, rather than in each step. They are
-    the same up to rounding, and sampling is faster on a GPU."""
+    """Whether values and densities are computed once for all steps of an iteration, rather than in each step, which is
+    faster on a GPU. They are the same up to rounding, except that values are normalised by the statistics at the end of
+    the sampling where ``normalize_when`` is "step" or "before"."""
     captured_update: bool | None = None
     """Whether an epoch of the update is one CUDA graph, in which nothing waits for the device. It computes the same up
     to rounding. By default it is on a GPU, where the optimizer is "adam" or "adamw" and nothing is compiled."""

@@ -7,7 +7,7 @@ import torch
 from lyceum_warp.adapters.adapted_env import environment_of
 from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl
 from lyceum_warp.adapters.rsl_rl_statistics import RECENT
-from lyceum_warp.done import FAULTS
+from lyceum_warp.adapters.step_results import episode_ends, faulty
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 from lyceum_warp.validate import described
@@ -123,9 +123,10 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         """
         env = self.env
         env.step(actions)
-        fault = (env.done_reason & FAULTS) != 0
+        fault = faulty(env)
+        terminated, _ = episode_ends(env, fault)
         extras = {
-            "time_outs": env.done & (fault | ~env.terminated),
+            "time_outs": env.done & ~terminated,
             "final_obs": self._final_obs,
             "log": self._log() | {"faults/worlds": fault.sum()},
         }

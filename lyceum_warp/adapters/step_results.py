@@ -87,12 +87,21 @@ class Infos:
         return infos
 
 
-def episode_ends(env: Env) -> tuple[torch.Tensor, torch.Tensor]:
+def faulty(env: Env) -> torch.Tensor:
+    """The worlds that had a fault in the last step, (nworld,) bool."""
+    return (env.done_reason & FAULTS) != 0
+
+
+def episode_ends(env: Env, fault: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
     """Whether the last step terminated episodes, and whether it truncated them, each (nworld,) bool.
 
     A fault truncates: the task did not end the episode, so that learners bootstrap with the last good observation.
+
+    Args:
+        env: The environment.
+        fault: What ``faulty`` returned, where the caller has it already.
     """
-    fault = (env.done_reason & FAULTS) != 0
+    fault = faulty(env) if fault is None else fault
     return env.terminated & ~fault, env.truncated | fault
 
 

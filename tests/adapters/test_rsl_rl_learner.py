@@ -209,7 +209,8 @@ def test_networks_that_rsl_rl_lacks_are_refused(shared_env: SharedEnv) -> None:
 @pytest.mark.parametrize("bootstrap", ["final", "before"])
 def test_gpu_sampling_does_not_wait_for_the_device(bootstrap: Bootstrap) -> None:
     env = lw.make(Metered, nworld=64, horizon=10, device="cuda:0")
-    made = learner(env, RslRlConfig(**{**vars(SMALL), "bootstrap": bootstrap}))
+    changes = {"bootstrap": bootstrap, "batched_values": False, "normalize_when": "after"}
+    made = learner(env, RslRlConfig(**vars(SMALL) | changes))
     for _ in range(2):
         next(made)
     torch.cuda.set_sync_debug_mode("error")
