@@ -10,6 +10,8 @@ and substeps. (hydrax has no release on the package index, where its name is tha
 
 The Python planners (``python_mppi.py``) are a careful one with a message a plan, and the simple one that the paper
 measured, with a message a step. All planners control the same plant. Contestants take turns in blocks of episodes.
+With --jobs several blocks run at a time, each in a process with cores of its own: successes stay the same, while times
+are those of cores whose neighbours work.
 """
 
 import dataclasses
@@ -515,7 +517,7 @@ def figure(rows: Sequence[Row]) -> Figure:
 EXPERIMENT = experiment.Experiment(
     name="mppi", summary="MPPI in episodes and in planning time, beside Python, bare engines and judo",
     cases=cases, estimate=estimate, measure=measure, tables=tables, figure=figure, options=Options,
-    packages=("gymnasium-robotics",),
+    packages=("gymnasium-robotics",), parallel=True,
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -5,18 +5,20 @@
 Both sides run the same class with the same settings, the same number of worlds and the same seeds; only the buffer of
 samples is filled by other environments. Gymnasium's have the faster one of its two vector modes on these cores,
 measured before the clock starts. Beside them learn PPO of stable-baselines3 and TRPO of sb3-contrib with the settings
-that RL Baselines3 Zoo tuned for these tasks, and, with --device cuda, our NPG and rsl_rl's PPO on the same worlds of a
-GPU.
+that RL Baselines3 Zoo tuned for these tasks, for a quarter of an hour each, and, with --device cuda, our NPG and
+rsl_rl's PPO on the same worlds of a GPU.
 
 The policies of all contestants are judged by the same judge: the mean action, in single environments of Gymnasium,
 from the same initial states. The clock stands still meanwhile, and starts once kernels are compiled and environments
-exist. Every case is a process of its own on cores of its own.
+exist. Every case is a process of its own on cores of its own; those of stable-baselines3 use one core, as a second
+makes them slower. Runs on a GPU have it one after the other, and their policies are judged once they have left it.
 """
 
 import contextlib
 import copy
 import dataclasses
 import fcntl
+import math
 import os
 import statistics
 import sys
@@ -58,14 +60,14 @@ CONTESTANTS = {
     "npg_gpu": "NPG, our environments on a GPU",
     "ppo_rsl_rl": "PPO, rsl_rl, our environments on a GPU",
 }
-ON_CPU, ON_GPU = tuple(CONTESTANTS)[:4], tuple(CONTESTANTS)[4:]
+ON_CPU, ON_GPU, YARDSTICKS = tuple(CONTESTANTS)[:4], tuple(CONTESTANTS)[4:], ("ppo_sb3", "trpo_sb3")
 
 COLORS = dict(zip(CONTESTANTS, ("#c8502d", "#3d6fa5", "#5a8f4e", "#8a6bb1", "#d99a2b", "#58a6a6"), strict=True))
 
 GPU_WORLDS = {"npg_gpu": 2048, "ppo_rsl_rl": 4096}
 
-SECONDS = {"npg": 90.0, "npg_gymnasium": 200.0, "ppo_sb3": 1400.0, "trpo_sb3": 350.0}
-"""Rough time of a case of a million samples on two cores, the judge included."""
+SECONDS = {"npg": 90.0, "npg_gymnasium": 200.0, "ppo_sb3": 1700.0, "trpo_sb3": 350.0}
+"""Rough time of a case of a million samples on its cores, the judge included."""
 
 EVERY_100K = tuple(range(100_000, 1_000_001, 100_000))
 """Samples at which the curves are compared."""
@@ -107,7 +109,9 @@ class Options(experiment.Options):
     """Samples of a run on the CPU."""
     nworld: int = 64
     """Worlds of NPG on the CPU, ours and Gymnasium's."""
-    gpu_seconds: float = 60.0
+    yardstick_seconds: float = 900.0
+    """Seconds of learning after which PPO and TRPO on the CPU end, if they have not had all samples before."""
+    gpu_seconds: float = 30.0
     """Seconds of learning on a GPU."""
     judgements: int = 20
     """How often a run's policy is judged after the start."""
@@ -128,7 +132,7 @@ class Case:
     samples: int | None
     """Samples after which it ends."""
     limit: float | None
-    """Seconds of learning after which it ends."""
+    """Seconds of learning after which it ends, if it has not ended before."""
     judgements: int
     episodes: int
     short: bool
@@ -141,15 +145,16 @@ def cases(options: Options) -> list[Case]:
     for name in contestants:
         if name in ON_GPU and not cuda:
             raise ValueError(f"{name} needs a GPU: give --device cuda")
+    limits = dict.fromkeys(YARDSTICKS, options.yardstick_seconds)
+    limits |= dict.fromkeys(ON_GPU, 3.0 if short else options.gpu_seconds)
     if options.judgements < 2:
         raise ValueError(f"judgements must be at least 2, not {options.judgements}")
     return [
         Case(
-            task, name, seed, options.threads or 1,
-            GPU_WORLDS[name] if name in ON_GPU else None if name.endswith("sb3") else 8 if short else options.nworld,
+            task, name, seed, 1 if name in YARDSTICKS else options.threads or 1,
+            GPU_WORLDS[name] if name in ON_GPU else None if name in YARDSTICKS else 8 if short else options.nworld,
             None if name in ON_GPU else 1000 if short else options.samples,
-            (3.0 if short else options.gpu_seconds) if name in ON_GPU else None,
-            2 if short else options.judgements, 2 if short else options.episodes, short,
+            limits.get(name), 2 if short else options.judgements, 2 if short else options.episodes, short,
         )
         for group in (ON_CPU, ON_GPU)
         for seed in options.seeds or (range(2) if short else range(5))
@@ -159,11 +164,10 @@ def cases(options: Options) -> list[Case]:
 
 
 def estimate(case: Case) -> float:
-    judge = 0.1 * case.judgements * case.episodes
-    if case.limit is not None:
-        return case.limit + judge + 20.0
-    assert case.samples is not None
-    return SECONDS[case.contestant] * case.samples / 1e6 + 10.0
+    judge, limit = 0.1 * case.judgements * case.episodes + 10.0, case.limit or math.inf
+    if case.samples is None:
+        return limit + judge + 10.0
+    return min(SECONDS[case.contestant] * case.samples / 1e6 + 10.0, limit + judge)
 
 
 # the judge, and the points of a curve
@@ -198,8 +202,7 @@ class Curve:
 
     def __init__(self, case: Case) -> None:
         self.case, self.judge = case, Judge(case.task, case.episodes)
-        self.points: list[tuple[int, float, float, float | None]] = []
-        """Samples; seconds of learning; return of the mean policy; mean return of the training episodes that ended."""
+        self._points: list[tuple[int, float, float | Act, float | None]] = []
         self.returns: list[float] = []
         """Returns of the episodes that ended since the last point, of the policy with its noise."""
         self._began, self._waited = 0.0, 0.0
@@ -215,34 +218,42 @@ class Curve:
     def ended(self, samples: int) -> bool:
         """Whether the run has reached its end."""
         case = self.case
-        return samples >= (case.samples or sys.maxsize) or self.seconds() >= (case.limit or float("inf"))
+        return samples >= (case.samples or math.inf) or self.seconds() >= (case.limit or math.inf)
 
     def due(self, samples: int) -> bool:
         """Whether the policy is to be judged now: at even distances, and at the end."""
-        case, done = self.case, len(self.points)
-        passed = samples / case.samples if case.samples else self.seconds() / (case.limit or 1.0)
+        case, done = self.case, len(self._points)
+        passed = max(samples / (case.samples or math.inf), self.seconds() / (case.limit or math.inf))
         return self.ended(samples) or passed >= done / case.judgements
 
     def add(self, samples: int, act: Act) -> None:
-        """Judge a policy."""
+        """Judge a policy, or keep it until the run has left the GPU; then it must not change with further learning."""
         seconds = self.seconds()
         before = time.perf_counter()
         noisy = statistics.fmean(self.returns) if self.returns else None
-        self.points.append((samples, round(seconds, 4), round(self.judge(act), 3), noisy))
+        judged = act if self.case.contestant in ON_GPU else self.judge(act)
+        self._points.append((samples, round(seconds, 4), judged, noisy))
         self.returns = []
         self._waited += time.perf_counter() - before
+
+    def points(self) -> list[tuple[int, float, float, float | None]]:
+        """Samples; seconds of learning; return of the mean policy; mean return of the training episodes that ended."""
+        return [
+            (samples, seconds, round(self.judge(found) if callable(found) else found, 3), noisy)
+            for samples, seconds, found, noisy in self._points
+        ]
 
 
 # NPG, on our environments and on Gymnasium's
 
 
 def mean_action(policy: torch.nn.Module) -> Act:
-    """A policy as the judge calls it."""
-    device = next(policy.parameters()).device
+    """A policy as it is now, and as the judge calls it."""
+    now = copy.deepcopy(policy).cpu()
 
     @torch.no_grad()
     def act(obs: np.ndarray) -> np.ndarray:
-        return policy(torch.as_tensor(obs, dtype=torch.float32, device=device)).cpu().numpy()
+        return now(torch.as_tensor(obs, dtype=torch.float32)).numpy()
 
     return act
 
@@ -332,7 +343,7 @@ def stable_baselines3(case: Case, options: Options, curve: Curve) -> dict[str, A
 
         def _on_step(self) -> bool:
             curve.returns += [info["episode"]["r"] for info in self.locals["infos"] if "episode" in info]
-            return True
+            return curve.seconds() < (case.limit or math.inf)
 
         def _on_rollout_start(self) -> None:
             if self.num_timesteps and curve.due(self.num_timesteps):
@@ -348,8 +359,7 @@ def stable_baselines3(case: Case, options: Options, curve: Curve) -> dict[str, A
     assert case.samples is not None
     curve.start(act)
     model.learn(case.samples, callback=Watch())
-    if curve.points[-1][0] < model.num_timesteps:
-        curve.add(model.num_timesteps, act)
+    curve.add(model.num_timesteps, act)
     return {}
 
 
@@ -371,9 +381,10 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     curve = Curve(case)
     with alone("gpu") if case.contestant in ON_GPU else contextlib.nullcontext():
         more = RUN[case.contestant](case, options, curve)
-    samples, seconds, mean, noisy = curve.points[-1]
+    points = curve.points()
+    samples, seconds, mean, noisy = points[-1]
     return {"samples": samples, "seconds": seconds, "mean_return": mean, "noisy_return": noisy, **more,
-            "curve": curve.points}  # fmt: skip
+            "curve": points}  # fmt: skip
 
 
 # tables and figure
