@@ -145,7 +145,10 @@ def planner(case: Case, threads: int, timestep: float) -> lw.MPPI | Slowed:
     engine: dict[str, Any] = {"engine": ENGINES[case.contestant], "device": case.device}
     if case.contestant == C:
         engine["nthread"] = threads
-    plan = lw.MPPI(case.task, samples=case.samples, horizon=case.horizon, seed=case.seed, **engine)
+    try:
+        plan = lw.MPPI(case.task, samples=case.samples, horizon=case.horizon, seed=case.seed, **engine)
+    except ValueError as error:  # its worlds do not fit into the memory
+        raise Skipped(f"{case.task}, {case.samples} samples of {case.horizon} steps: {error}") from error
     return Slowed(plan, case.slow * timestep) if case.slow else plan
 
 
