@@ -120,11 +120,13 @@ class Case:
 def cases(options: Options) -> list[Case]:
     """Plans, then episodes, then cartpole; contestants that are compared follow one another."""
     short, cuda = options.short, options.device.startswith("cuda")
-    threads = options.threads or len(os.sched_getaffinity(0))
+    threads = options.threads or len(os.sched_getaffinity(0)) // max(options.jobs, 1)
     parts = choose(options.parts, ("plans", "episodes", "cartpole"), what="part")
     tasks = choose(options.tasks, TASKS, ("reach",) if short else (), what="task")
     usual = ("mppi", *(("mppi_warp",) if cuda else ()), *PYTHON, *(() if short else PEERS))
     contestants = choose(options.contestants, CONTESTANTS, usual, what="contestant")
+    if options.jobs > 1 and (parts != ("episodes",) or "mppi_warp" in contestants):
+        raise ValueError("plans, cartpole and a GPU are timed alone, so that jobs must be 1: or give --parts episodes")
     # a part without a contestant that has its tasks would be measured for nothing
     simulated = [name for name in contestants if name not in PEERS]
     planning = [name for name in contestants if name not in PYTHON]
@@ -402,24 +404,34 @@ def tables(rows: Sequence[Row]) -> list[Table]:
     return [make(found) for make, part in made if (found := grouped(rows, part))]
 
 
+def episodes_of(rows: Sequence[Row]) -> dict[int, dict[int, list[Any]]]:
+    """Episodes (seed, success, return, seconds) by set and seed."""
+    sets: dict[int, dict[int, list[Any]]] = {}
+    for row in rows:
+        sets.setdefault(row.case["repeat"], {}).update({episode[0]: episode for episode in row.result["each"]})
+    return sets
+
+
 def episode_table(found: dict[tuple[str, int | None], dict[str, list[Row]]]) -> Table:
     lines = []
     for (task, _), same in found.items():
         for name, group in same.items():
-            each = [episode for row in group for episode in row.result["each"]]
+            sets = episodes_of(group)
+            each = [episode for same_set in sets.values() for episode in same_set.values()]
             good = sum(int(episode[1]) for episode in each)
             low, high = wilson(good, len(each))
-            sets: dict[int, list[list[Any]]] = {}
-            for row in group:
-                sets.setdefault(row.case["repeat"], []).extend(row.result["each"])
-            shares = ", ".join(f"{statistics.fmean(int(e[1]) for e in sets[i]):.0%}" for i in sorted(sets))
+            shares = ", ".join(f"{statistics.fmean(int(e[1]) for e in sets[i].values()):.0%}" for i in sorted(sets))
+            times = []
+            for i, ours in episodes_of(same.get("mppi", ())).items():
+                if seeds := ours.keys() & sets.get(i, {}).keys():
+                    times.append(sum(sets[i][seed][3] for seed in seeds) / sum(ours[seed][3] for seed in seeds))
             lines.append([
                 task, CONTESTANTS[name], f"{good} of {len(each)}", f"{low:.0%} to {high:.0%}", shares,
                 f"{statistics.fmean(episode[3] for episode in each):.3g}",
-                median_and_range(ratios(group, same.get("mppi", ()), "seconds")),
+                median_and_range(times),
             ])  # fmt: skip
     title = ("Episodes: success with its 95 % interval (Wilson), in each set of seeds, and mean seconds of an episode; "
-             "the last column is the median over the blocks of episodes (smallest to largest).")  # fmt: skip
+             "the last column compares the same seeds, median over the sets (smallest to largest).")  # fmt: skip
     header = ["task", "planner", "successes", "interval", "sets", "seconds", "seconds by ours"]
     return Table(title, header, lines)
 

@@ -1,6 +1,6 @@
 """NPG's learning curves on our environments, and of the same NPG fed by Gymnasium's vector environments (figure 2).
 
-    lyceum-warp bench npg --threads 2 --jobs 30
+    lyceum-warp bench npg --threads 2 --jobs 16
 
 Both sides run the same class with the same settings, the same number of worlds and the same seeds; only the buffer of
 samples is filled by other environments. Gymnasium's have the faster one of its two vector modes on these cores,
@@ -236,6 +236,11 @@ class Curve:
         self.returns = []
         self._waited += time.perf_counter() - before
 
+    def finish(self, samples: int, act: Act) -> None:
+        """Judge the last policy, if that has not been done: the time may have passed after it."""
+        if self._points[-1][0] < samples:
+            self.add(samples, act)
+
     def points(self) -> list[tuple[int, float, float, float | None]]:
         """Samples; seconds of learning; return of the mean policy; mean return of the training episodes that ended."""
         return [
@@ -313,6 +318,7 @@ def iterate(learner: Any, curve: Curve, update: Callable[[Any], float]) -> dict[
         curve.returns += rollout.episode_return[ended].tolist()
         if curve.due(learner.samples):
             curve.add(learner.samples, mean_action(learner.policy))
+    curve.finish(learner.samples, mean_action(learner.policy))
     return {"sampling_seconds": sampling, "update_seconds": updates}
 
 
@@ -346,20 +352,18 @@ def stable_baselines3(case: Case, options: Options, curve: Curve) -> dict[str, A
             return curve.seconds() < (case.limit or math.inf)
 
         def _on_rollout_start(self) -> None:
-            if self.num_timesteps and curve.due(self.num_timesteps):
+            if self.num_timesteps and curve.due(self.num_timesteps) and not curve.ended(self.num_timesteps):
                 curve.add(self.num_timesteps, act)
 
     def act(obs: np.ndarray) -> np.ndarray:
         return model.predict(envs.normalize_obs(obs), deterministic=True)[0]
 
-    # networks and mini-batches are so small that a second thread makes these learners slower
-    torch.set_num_threads(1)
     agent(n_steps=64, batch_size=64)[0].learn(1)  # torch's first calls take longer
     model, envs = agent(**({"n_steps": 256, "batch_size": 64} if case.short else {}))
     assert case.samples is not None
     curve.start(act)
     model.learn(case.samples, callback=Watch())
-    curve.add(model.num_timesteps, act)
+    curve.finish(model.num_timesteps, act)
     return {}
 
 
@@ -379,7 +383,8 @@ def alone(name: str) -> Iterator[None]:
 def measure(case: Case, options: Options) -> dict[str, Any]:
     torch.set_num_threads(case.threads)
     curve = Curve(case)
-    with alone("gpu") if case.contestant in ON_GPU else contextlib.nullcontext():
+    on_gpu = case.contestant in ON_GPU
+    with experiment.cores(case.threads), alone("gpu") if on_gpu else contextlib.nullcontext():
         more = RUN[case.contestant](case, options, curve)
     points = curve.points()
     samples, seconds, mean, noisy = points[-1]

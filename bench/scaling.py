@@ -8,6 +8,7 @@ engine on all cores. contestants.py says what a sample is.
 """
 
 import dataclasses
+import statistics
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -123,14 +124,10 @@ def by_size(rows: Sequence[Row], part: str, size: str) -> dict[str, dict[str, di
     return found
 
 
-def middle(values: Sequence[float]) -> float:
-    return sorted(values)[len(values) // 2]
-
-
 def saturation(sizes: dict[int, list[float]]) -> int:
     """The fewest worlds whose rate is near the highest one."""
-    highest = max(map(middle, sizes.values()))
-    return next(many for many, values in sizes.items() if middle(values) >= SATURATED * highest)
+    highest = max(map(statistics.median, sizes.values()))
+    return next(many for many, values in sizes.items() if statistics.median(values) >= SATURATED * highest)
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
@@ -154,8 +151,9 @@ def _cell(sizes: dict[int, list[float]], many: int, part: str) -> str:
     if many not in sizes:
         return ""
     text = median_and_range(sizes[many], ",.0f")
-    ratio = f"; {middle(sizes[many]) / middle(sizes[1]):.1f}" if part == "cores" and many != 1 and 1 in sizes else ""
-    return text + ratio
+    if part != "cores" or many == 1 or 1 not in sizes:
+        return text
+    return f"{text}; {statistics.median(sizes[many]) / statistics.median(sizes[1]):.1f}"
 
 
 def figure(rows: Sequence[Row]) -> Any:
@@ -167,13 +165,13 @@ def figure(rows: Sequence[Row]) -> Any:
     for axes, (size, groups) in zip(panels, drawn, strict=True):
         task, found = next(iter(groups.items()))
         for name, sizes in found.items():
-            middles = [middle(values) for values in sizes.values()]
+            middles = [statistics.median(values) for values in sizes.values()]
             low, high = [min(values) for values in sizes.values()], [max(values) for values in sizes.values()]
             axes.fill_between(list(sizes), low, high, color=COLORS[name], alpha=0.2, linewidth=0)
             axes.plot(list(sizes), middles, color=COLORS[name], marker=".", label=LABELS[name])
         if size == "threads" and "native" in found and 1 in found["native"]:
             ends = [1, max(found["native"])]
-            one = middle(found["native"][1])
+            one = statistics.median(found["native"][1])
             axes.plot(ends, [one * n for n in ends], color="#aaa", linewidth=0.8, linestyle="--", label="in proportion")
         axes.set_xscale("log", base=2)
         if size == "worlds":

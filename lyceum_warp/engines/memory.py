@@ -11,6 +11,10 @@ _KEPT_FREE = 0.1
 """The share of the free memory that is left for everything else."""
 
 
+class NotEnoughMemoryError(ValueError):
+    """A number of worlds does not fit into the free memory of a device."""
+
+
 def most_worlds(bytes_per_world: float, device: wp.Device) -> int | None:
     """The largest number of worlds that fits into the free memory of a device, or None where that is not known."""
     free = free_memory(device)
@@ -28,7 +32,7 @@ def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: 
         held: Bytes of the batch that are allocated already.
 
     Raises:
-        ValueError: The batch does not fit; the message names the largest number of worlds that does.
+        NotEnoughMemoryError: The batch does not fit; the message names the largest number of worlds that does.
     """
     free = free_memory(device)
     if free is not None and nworld > _most(bytes_per_world, free + held):
@@ -40,7 +44,7 @@ def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: 
         return
     worlds = f"{nworld} worlds of {model}" if model else f"{nworld} worlds"
     hint = f"use nworld={most} at most" if most else "not even one world fits"
-    raise ValueError(
+    raise NotEnoughMemoryError(
         f"{worlds} need about {nworld * bytes_per_world / 1e9:.3g} GB ({bytes_per_world / 1e3:.3g} kB each), and "
         f"{device.alias} has {(free + held) / 1e9:.3g} GB free: {hint}"
     )

@@ -116,7 +116,10 @@ def test_judos_worker_has_our_reward(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         (["--parts", "episode"], "there is no part 'episode': did you mean episodes?"),
         (["--contestants", "hydrax"], "there is no contestant 'hydrax'"),
-        (["--jobs", "2"], "the cases of mppi compete for the cores, so that jobs must be 1"),
+        (
+            ["--jobs", "2"],
+            "plans, cartpole and a GPU are timed alone, so that jobs must be 1: or give --parts episodes",
+        ),
         (["--block", "0"], "block and repeats must be at least 1"),
     ],
 )
