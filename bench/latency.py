@@ -249,7 +249,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
     title = (
         "Planning time of MPPI, and control in real time: plans that took at most one step of the world, age of the "
         "applied actions in steps, and steps of the world that began late. A planner marked with × was slowed down on "
-        "purpose, to as many steps. A planner whose first plan takes more than 5 s makes no other."
+        "purpose, to as many steps. A time above 5 s is that of a single plan, on the C engine the planner's first."
     )
     return [Table(title, header, [cells(row) for row in rows])] if rows else []
 

@@ -10,8 +10,8 @@ and substeps. (hydrax has no release on the package index, where its name is tha
 
 The Python planners (``python_mppi.py``) are a careful one with a message a plan, and the simple one that the paper
 measured, with a message a step. All planners control the same plant. Contestants take turns in blocks of episodes.
-With --jobs several blocks run at a time, each in a process with cores of its own: successes stay the same, while times
-are those of cores whose neighbours work.
+With --parts episodes --jobs N, N blocks run at a time, each in a process with cores of its own: successes stay the
+same, while times are those of cores whose neighbours work.
 """
 
 import dataclasses

@@ -136,6 +136,14 @@ def test_plan_that_takes_too_long_is_measured_once(latency: ModuleType, monkeypa
     assert found["plans"] == 1 and found["median_ms"] >= 20.0 and "met" not in found
 
 
+def test_planner_that_does_not_fit_into_memory_is_skipped(latency: ModuleType) -> None:
+    from experiment import Skipped
+
+    case = latency.Case("point_mass", "c", "cpu", 1, 10**9, 4, 0.0, 0.3, 0, 0)
+    with pytest.raises(Skipped, match="point_mass, 1000000000 samples of 4 steps: .* GB free"):
+        latency.planner(case, 1, 0.02)
+
+
 def test_planner_of_the_warp_engine_is_measured(latency: ModuleType) -> None:
     case = latency.Case("point_mass", "warp", "cpu", 1, 4, 4, 0.0, 0.3, 0, 0)
     found = latency.measure(case, options(latency, *SMALL))

@@ -100,6 +100,30 @@ def test_ppo_of_stable_baselines3_yields_a_curve(npg: ModuleType) -> None:
     assert result["samples"] == 512 and [point[0] for point in result["curve"]] == [0, 256, 512]
 
 
+def test_a_yardstick_ends_when_its_time_is_over(npg: ModuleType) -> None:
+    pytest.importorskip("stable_baselines3")
+    limited = dataclasses.replace(case(npg, "ppo_sb3"), samples=1_000_000, limit=1e-3)
+    result = npg.measure(limited, npg.Options(short=True))
+    assert result["samples"] < 256 and [point[0] for point in result["curve"]] == [0, result["samples"]]
+
+
+def test_a_gpu_is_free_while_its_policies_are_judged(npg: ModuleType) -> None:
+    policy = lw.GaussianPolicy(8, 2)
+    curve = npg.Curve(dataclasses.replace(case(npg, "npg"), contestant="npg_gpu"))
+    judge, judged = curve.judge, []
+    curve.judge = lambda act: judged.append(act) or judge(act)
+    curve.start(npg.mean_action(policy))
+    expected = judge(npg.mean_action(policy))
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.add_(0.3)
+    curve.finish(100, npg.mean_action(policy))
+    assert not judged  # while it learns
+    first, last = curve.points()
+    assert len(judged) == 2 and (first[0], last[0]) == (0, 100)
+    assert first[2] == pytest.approx(expected, abs=1e-3) and first[2] != last[2]
+
+
 def test_a_missing_peer_is_skipped_with_one_line(npg: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     import experiment
 
