@@ -78,7 +78,7 @@ class BareC:
         self.rows = engine.batch.state
         self.batch = Batch(engine.batch.model, env.nworld, engine.nthread)
         self.stage = engine.stage
-        self.staged = Batch(engine.batch.model, env.nworld, engine.nthread, engine.batch.persistent)
+        self.staged = Batch(engine.batch.model, env.nworld, engine.nthread)
 
     def snapshot(self) -> tuple[np.ndarray, np.ndarray]:
         """States and controls of the environment's next step."""
@@ -91,9 +91,7 @@ class BareC:
         self.batch.step(nstep=self.env.task.frame_skip)
 
     def load_staged(self, snapshot: tuple[np.ndarray, np.ndarray]) -> None:
-        """Make ready for a step that goes on from the stage which the last one computed."""
         self.staged.state[:], self.staged.ctrl[:] = snapshot
-        self.staged.forward(stage=self.stage)
 
     def step_staged(self) -> None:
         """A step that computes the stage which the task needs."""

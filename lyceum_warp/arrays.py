@@ -1,6 +1,8 @@
-"""Host code for Warp arrays: views under another shape or in torch, and launches over masked rows."""
+"""Host code for Warp arrays: views under another shape or in torch, and launches over worlds and their rows."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
@@ -50,24 +52,59 @@ def torch_view(array: wp.array) -> torch.Tensor:
     return wp.to_torch(array, requires_grad=False)
 
 
+_PART: ContextVar[tuple[int, int]] = ContextVar("_PART", default=(0, 1))
+"""Which part of the worlds the functions below launch for, and of how many."""
+
+
+@contextlib.contextmanager
+def part_of_worlds(part: int, parts: int) -> Iterator[None]:
+    """Let the functions below launch their kernels for one part of the worlds, or of the rows that stand for them.
+
+    Args:
+        part: Which part, from 0 on.
+        parts: Number of parts, of about equal size.
+    """
+    token = _PART.set((part, parts))
+    try:
+        yield
+    finally:
+        _PART.reset(token)
+
+
+def _launch(kernel: wp.Kernel, dim: Sequence[int], axis: int, args: Sequence[Any], device: Any, **options: Any) -> None:
+    """Launch a kernel for the part of the worlds that is asked for; ``axis`` of ``dim`` counts them.
+
+    The kernel's last argument is the first world of the part.
+    """
+    part, parts = _PART.get()
+    first, end = (dim[axis] * k // parts for k in (part, part + 1))
+    if end > first:
+        size = (*dim[:axis], end - first, *dim[axis + 1 :])
+        wp.launch(kernel, size, [*args, first], device=device, **options)
+
+
+def _block(device: wp.Device | None) -> int:
+    return WORLDS_A_BLOCK if wp.get_device(device).is_cuda else 1
+
+
 def launch_worlds(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device | None) -> None:
-    """Launch a kernel of a task with a thread for each world."""
-    wp.launch(kernel, nworld, args, device=device, block_dim=WORLDS_A_BLOCK if wp.get_device(device).is_cuda else 1)
+    """Launch a kernel with a thread for each world; its last argument is the first world."""
+    _launch(kernel, (nworld,), 0, args, device, block_dim=_block(device))
 
 
 def launch_parts(kernel: wp.Kernel, parts: int, nworld: int, args: Sequence[Any], device: wp.Device | None) -> None:
-    """Launch a kernel of a task with a thread for each part of the work on each world, (parts, nworld)."""
-    block = WORLDS_A_BLOCK if wp.get_device(device).is_cuda else 1
-    wp.launch(kernel, (parts, nworld), args, device=device, block_dim=block)
+    """Launch a kernel with a thread for each part of the work on each world, (parts, nworld)."""
+    _launch(kernel, (parts, nworld), 1, args, device, block_dim=_block(device))
 
 
 def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device) -> None:
-    """Launch a kernel over (nworld, lanes), whose last argument is the number of threads that share a world's rows.
+    """Launch a kernel over (nworld, lanes), whose last arguments are the number of lanes and the first world.
 
-    It is 1 on the CPU and a warp on a GPU, whose threads read and write neighbouring places of a row together.
+    The lanes are threads that share a world's rows: 1 on the CPU and a warp on a GPU, whose threads read and write
+    neighbouring places of a row together.
     """
     lanes = 32 if device.is_cuda else 1
-    wp.launch(kernel, (nworld, lanes), [*args, lanes], device=device)
+    _launch(kernel, (nworld, lanes), 0, [*args, lanes], device)
 
 
 def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.array) -> None:
@@ -75,4 +112,4 @@ def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.
     if target.size == 0:
         return
     lanes = min(32, target.shape[1]) if wp.get_device(target.device).is_cuda else 1
-    wp.launch(kernel, (target.shape[0], lanes), [mask, source, target, lanes], device=target.device)
+    _launch(kernel, (target.shape[0], lanes), 0, [mask, source, target, lanes], target.device)

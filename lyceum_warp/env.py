@@ -574,7 +574,7 @@ class Env:
     @property
     def fault_counts(self) -> dict[str, int]:
         """How often each kind of fault has happened since construction; waits for the device."""
-        counts = self.worlds.fault_count.numpy()
+        counts = self.worlds.fault_count.numpy().sum(axis=0)
         return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from functools import partial
+from typing import Any
 
 import torch
 import warp as wp
@@ -140,7 +141,9 @@ class OpenLoop:
         return (
             Phase("start", self._start),
             Phase("physics", physics, engine=True),
-            Phase("judge", self._judge_rows),
+            Phase("advance", self._advance_memory),
+            Phase("judge", self._judge_rows, by_world=True),
+            Phase("end", self._end_of_horizon),
         )
 
     def _step_by_step(self) -> tuple[Phase, ...]:
@@ -193,24 +196,36 @@ class OpenLoop:
             args = [row, columns[name].start, states]
             wp.launch(planning.overwrite, (states.shape[0], row.shape[1]), args, device=self.env.device)
 
-    def _judge_rows(self) -> None:
-        """Judge the transitions of the whole horizon."""
-        worlds, kernels, device, n = self.worlds, self.env.task.kernels, self.env.device, self.env.nworld
+    def _transitions(self) -> list[Any]:
+        """The first arguments of kernels for the transitions of the whole horizon."""
         actions = self._actions.reshape((-1, self._actions.shape[2]))
-        transition = [self._before, self._after, worlds.params, actions]
+        return [self._before, self._after, self.worlds.params, actions]
+
+    def _advance_memory(self) -> None:
+        """Advance the task's memory along the horizon."""
+        n, kernels = self.env.nworld, self.env.task.kernels
         if kernels.advance_rows is not None:
+            rows = (self.horizon + 1) * n
             memories = [
-                self._memories[name].reshape((len(actions) + n, -1)) if name in self._memories else self._no_memory
+                self._memories[name].reshape((rows, -1)) if name in self._memories else self._no_memory
                 for name in MEMORIES
             ]
-            args = [*transition, worlds.counters, *memories]
-            launch_worlds(kernels.advance_rows, n, args, device)
+            args = [*self._transitions(), self.worlds.counters, *memories]
+            launch_worlds(kernels.advance_rows, n, args, self.env.device)
         else:  # they stay as they are at the start
             for buffer in self._memories.values():
                 for t in range(self.horizon):
                     wp.copy(buffer[t + 1], buffer[0])
-        launch_worlds(kernels.judge_rows, len(actions), [*transition, self._reward, self._terminated], device)
-        wp.launch(planning.add_steps, n, [self.horizon, worlds.counters.step], device=device)
+
+    def _judge_rows(self) -> None:
+        """Judge the transitions of the whole horizon, each of which stands alone."""
+        rows, args = self.horizon * self.env.nworld, [*self._transitions(), self._reward, self._terminated]
+        launch_worlds(self.env.task.kernels.judge_rows, rows, args, self.env.device)
+
+    def _end_of_horizon(self) -> None:
+        wp.launch(
+            planning.add_steps, self.env.nworld, [self.horizon, self.worlds.counters.step], device=self.env.device
+        )
         self._end(self._last)
 
     def _act(self, t: int) -> None:

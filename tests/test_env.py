@@ -14,7 +14,6 @@ import pytest
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.worlds import Worlds
 
 PACKAGE = Path(lw.__file__).parent
 
@@ -43,7 +42,7 @@ def test_a_step_reaches_the_c_engine_through_two_functions() -> None:
     env = lw.make("hopper", nworld=2)
     env.engine.batch = spy = Spy(env.engine.batch)  # type: ignore[attr-defined]
     env.step()
-    assert spy.stacks == [[("env.py", "step"), ("engines/c/mujoco_engine.py", "step")]]
+    assert spy.stacks == [[("env.py", "step"), ("engines/c/mujoco_engine.py", "_advance")]]
 
 
 def test_an_uncaptured_step_reaches_mujoco_warp_through_two_functions(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,9 +59,12 @@ def test_an_uncaptured_step_reaches_mujoco_warp_through_two_functions(monkeypatc
 
 
 def test_the_phases_of_a_step_are_one_list_in_order() -> None:
-    names = {task: [p.name for p in Worlds.step_phases(lw.make(task).worlds)] for task in ("hopper", "reach")}
-    assert names["reach"] == ["act", "physics", "judge", "restart", "refresh", "observe"]
-    assert names["hopper"] == ["act", "physics", "judge", "restart", "observe"]  # it reads the state alone
+    def names(task: str, engine: str) -> list[str]:
+        return [phase.name for phase in lw.make(task, engine=engine).worlds.step_phases()]
+
+    assert names("reach", "warp") == ["act", "physics", "judge", "restart", "refresh", "observe"]
+    assert names("hopper", "warp") == ["act", "physics", "judge", "restart", "observe"]  # it reads the state alone
+    assert names("hopper", "mujoco") == ["act", "inputs", "physics", "fields", "judge", "restart", "observe"]
 
 
 def test_a_field_that_is_not_kept_is_refused_with_the_way_to_get_it() -> None:

@@ -507,7 +507,7 @@ def test_worlds_that_reset_and_bad_horizons_are_refused(shared_env: SharedEnv) -
 
 
 def test_a_rollout_is_a_list_of_phases() -> None:
-    """One entry for the whole horizon of a task whose actions are controls, else three for each step."""
+    """One call of the engine for the whole horizon of a task whose actions are controls, else one for each step."""
     names = [[phase.name for phase in rollouts(task, 2, engine="mujoco").phases] for task in (Forgetful, Servo)]
-    assert names[0] == ["start", "physics", "judge"]
-    assert names[1] == ["start", "reset", "restore", *["act", "physics", "judge"] * 2, "end"]
+    assert names[0] == ["start", "physics", "advance", "judge", "end"]
+    assert names[1] == ["start", "reset", "restore", *["act", "inputs", "physics", "fields", "judge"] * 2, "end"]

@@ -1,5 +1,6 @@
 """Worlds: the phases of a step, a reset and a restored state, and what they leave in the arrays."""
 
+import threading
 from typing import Any
 
 import numpy as np
@@ -73,7 +74,7 @@ def test_rows_that_lanes_share_have_the_numbers_of_one_lane(engine: str, monkeyp
     """On a GPU a warp shares a world's rows, and groups have threads of their own; here these run in turn."""
 
     def launch_three(kernel: wp.Kernel, nworld: int, args: list[Any], device: wp.Device) -> None:
-        wp.launch(kernel, (nworld, 3), [*args, 3], device=device)
+        wp.launch(kernel, (nworld, 3), [*args, 3, 0], device=device)
 
     one, counts = outcomes_with_faults(engine)
     assert counts == {"action": 1, "nan": 1, "model": 1}
@@ -81,6 +82,33 @@ def test_rows_that_lanes_share_have_the_numbers_of_one_lane(engine: str, monkeyp
     three, same_counts = outcomes_with_faults(engine, judging=5, observing=2)
     assert counts == same_counts
     assert all(torch.equal(a, b) for a, b in zip(one, three, strict=True))
+
+
+def test_parts_of_the_worlds_have_the_numbers_of_all_worlds_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three threads replay the launches around the C engine for a part of the four worlds each."""
+    together, counts = outcomes_with_faults("mujoco")
+    monkeypatch.setattr(worlds, "NANOSECONDS_A_THREAD", 1)
+    monkeypatch.setattr(worlds, "cpu_cores", lambda: 3)
+    before = threading.active_count()
+    apart, same_counts = outcomes_with_faults("mujoco")
+    assert threading.active_count() == before + 2
+    assert counts == same_counts
+    assert all(torch.equal(a, b) for a, b in zip(together, apart, strict=True))
+
+
+def test_threads_share_a_step_only_where_it_is_long_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worlds, "cpu_cores", lambda: 8)
+
+    def threads(nworld: int, **options: Any) -> int:
+        env = lw.make("hopper", nworld=nworld, **options)
+        before = threading.active_count()
+        for _ in range(3):
+            env.step()
+        return threading.active_count() - before + 1
+
+    assert threads(64) == threads(4096, nthread=1) == threads(4096, graphs=False) == 1
+    assert threads(4096, engine="mujoco") == 8
+    assert threads(4096, nthread=3) == 3
 
 
 def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.Env, lw.Env]:
@@ -190,7 +218,7 @@ def test_a_step_with_graphs_is_one_call_between_calls_into_a_native_engine(engin
     env = lw.make("reach", engine=engine)
     assert len(env.worlds.step) == calls
     env.worlds.configure(horizon=env.horizon, autoreset=True, graphs=False)
-    assert len(env.worlds.step) == len(env.worlds.step_phases()) == 6
+    assert len(env.worlds.step) == len(env.worlds.step_phases()) == (8 if engine == "mujoco" else 6)
 
 
 def test_configure_returns_to_earlier_programs_without_making_them_again() -> None:

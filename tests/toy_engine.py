@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from lyceum_warp.arrays import flat, launch_rows
+from lyceum_warp.arrays import flat, launch_rows, launch_worlds
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
 from lyceum_warp.kernels import faults, state
@@ -119,7 +119,8 @@ class ToyEngine(Engine):
 
     def find_faults(self, mask: wp.array) -> None:
         nphysics = 1 + self.model.nq + self.model.nv + self.model.na
-        wp.launch(faults.faults_of_rows, self.nworld, [mask, self._rows, nphysics, self._warning, self.fault])
+        args = [mask, self._rows, nphysics, self._warning, self.fault]
+        launch_worlds(faults.faults_of_rows, self.nworld, args, self.device)
 
     def reset(self, mask: wp.array) -> None:
         launch_rows(state.fill_rows64, mask, self._initial, self._rows)

@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Callable, Collection, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -11,6 +12,7 @@ import warp as wp
 from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.fields import Field, Stage, describe
+from lyceum_warp.graphs.capture import Phase
 from lyceum_warp.kernels.state import narrow, widen
 from lyceum_warp.model_fields import ModelField, check_simple
 
@@ -42,6 +44,11 @@ class Engine(abc.ABC):
 
     name: str
     """The engine's name, as in ``make(engine=...)``."""
+    nthread: int = 1
+    """Threads that may have a part of the worlds each in launches around a step; 0 for one on every core.
+
+    An engine with several of them launches through ``lyceum_warp.arrays`` wherever it makes launches for all worlds.
+    """
     capturable: bool
     """Whether every method is made of Warp launches, so that a whole step can be captured as one graph.
 
@@ -153,6 +160,10 @@ class Engine(abc.ABC):
 
         The arrays of all fields that are ``written`` are taken over first.
         """
+
+    def step_phases(self, nstep: int) -> list[Phase]:
+        """``step`` as phases. An engine that is not ``capturable`` can have its copies of fields in graphs this way."""
+        return [Phase("physics", partial(self.step, nstep), engine=True)]
 
     @abc.abstractmethod
     def find_faults(self, mask: wp.array) -> None:

@@ -3,14 +3,21 @@
 Code with launches lists them as phases, in order. ``Graphs.sequence`` turns the list into calls: phases that
 follow one another and are made of Warp launches become one graph, captured once and replayed. On an engine whose own
 calls are launches a whole step is one graph; on others the engine's calls stay between the graphs.
+
+Warp runs a launch on the CPU in one thread. Beside an engine that steps on all cores, phases that treat every world
+apart become several graphs, each for a part of the worlds, and threads replay them side by side.
 """
 
 import dataclasses
 import weakref
 from collections.abc import Callable, Iterable
+from functools import partial
 
 import torch
 import warp as wp
+
+from lyceum_warp.arrays import part_of_worlds
+from lyceum_warp.graphs.workers import Workers
 
 Calls = tuple[Callable[[], None], ...]
 """The result of ``Graphs.sequence``: functions to call in order."""
@@ -30,6 +37,9 @@ class Phase:
     """Takes no arguments."""
     engine: bool = False
     """True for an engine call, which consists of Warp launches on some engines only."""
+    by_world: bool = False
+    """Whether all that happens are launches through ``arrays.launch_worlds`` and its relatives, in which no world
+    depends on another one, so that several threads may have a part of the worlds each."""
 
 
 class Graphs:
@@ -40,12 +50,15 @@ class Graphs:
         enabled: False calls every phase directly.
         capture_engine: Whether calls into the engine are made of launches.
         nvtx: Whether to mark each phase as a range for NVIDIA's profilers.
+        workers: Threads that replay the graphs of phases with ``by_world``; by default the caller's alone.
     """
 
     def __init__(
-        self, device: wp.Device, *, enabled: bool = True, capture_engine: bool = True, nvtx: bool = False
-    ) -> None:
+        self, device: wp.Device, *, enabled: bool = True, capture_engine: bool = True, nvtx: bool = False,
+        workers: Workers | None = None,
+    ) -> None:  # fmt: skip
         self.device, self.enabled, self.capture_engine, self.nvtx = device, enabled, capture_engine, nvtx
+        self._workers = workers
         self._graphs: weakref.WeakSet[_Graph] = weakref.WeakSet()
 
     def sequence(self, phases: Iterable[Phase]) -> Calls:
@@ -60,6 +73,8 @@ class Graphs:
 
         for phase in phases:
             if self._is_captured(phase):
+                if together and self._workers is not None and together[0].by_world != phase.by_world:
+                    close()
                 together.append(phase)
                 if self.nvtx:
                     close()
@@ -78,38 +93,50 @@ class Graphs:
         return self.enabled and (self.capture_engine or not phase.engine)
 
     def _captured(self, *phases: Phase) -> Callable[[], object]:
-        graph = _Graph(self.device, [phase.run for phase in phases])
+        functions = [phase.run for phase in phases]
+        graph = _Graph(self.device, functions, self._workers if phases[0].by_world else None)
         self._graphs.add(graph)
         return _Range(phases[0].name, graph) if self.nvtx else graph
 
 
 class _Graph:
-    """Functions made of launches as one graph.
+    """Functions made of launches as one graph, or as one for each thread.
 
     The first call runs them directly, which loads every module that they need; the second captures and replays; all
     further calls replay.
     """
 
-    def __init__(self, device: wp.Device, functions: list[Callable[[], object]]) -> None:
-        self._device, self._functions = device, functions
+    def __init__(
+        self, device: wp.Device, functions: list[Callable[[], object]], workers: Workers | None = None
+    ) -> None:
+        self._device, self._functions, self._workers = device, functions, workers
         self.forget()
 
     def forget(self) -> None:
-        self._graph: wp.Graph | None = None
+        self._replay: Callable[[], object] | None = None
         self._loaded = False
 
     def __call__(self) -> None:
-        if self._graph is None:
+        if self._replay is None:
             if not self._loaded:
                 self._loaded = True
                 self._run()
                 return
             if self._device.is_cuda:  # a capture may clear memory that earlier launches still work in
                 wp.synchronize_device(self._device)
-            with wp.ScopedCapture(device=self._device) as capture:
-                self._run()
-            self._graph = capture.graph
-        wp.capture_launch(self._graph)
+            self._replay = self._capture()
+        self._replay()
+
+    def _capture(self) -> Callable[[], object]:
+        if self._workers is None:
+            return self._capture_part(0, 1)
+        parts = self._workers.nthread
+        return partial(self._workers.run, [self._capture_part(k, parts) for k in range(parts)])
+
+    def _capture_part(self, part: int, parts: int) -> Callable[[], object]:
+        with part_of_worlds(part, parts), wp.ScopedCapture(device=self._device) as capture:
+            self._run()
+        return partial(wp.capture_launch, capture.graph)
 
     def _run(self) -> None:
         for function in self._functions:

@@ -19,10 +19,10 @@ def is_out_of_range(x: float) -> bool:
 
 @wp.func
 def count_faults(fault: int, count_inout: wp.array[int]):
-    """Count each kind of fault, at the place of its bit in Done."""
+    """Count each kind of fault of a world, at the place of its bit in Done."""
     for bit in range(count_inout.shape[0]):
         if ((fault >> bit) & 1) != 0:
-            wp.atomic_add(count_inout, bit, 1)
+            count_inout[bit] = count_inout[bit] + 1
 
 
 @wp.kernel(enable_backward=False)
@@ -32,6 +32,7 @@ def faults_of_rows(
     nphysics: int,
     warning_inout: wp.array3d[int],
     fault_out: wp.array[int],
+    first: int,
 ):
     """Find faults of the C engine in the masked worlds; launched over (nworld,).
 
@@ -40,7 +41,7 @@ def faults_of_rows(
     The kinds are mjtWarning's: 0 inertia, 1 contacts full, 2 constraints full, 3 to 5 bad qpos, qvel, qacc,
     6 bad control. A counter is cleared when it is read.
     """
-    w = wp.tid()
+    w = first + wp.tid()
     if not mask_in[w]:
         return
     fault = int(0)

@@ -40,9 +40,11 @@ def mark_changes(
     changed_inout: wp.array[bool],
     stale_inout: wp.array[bool],
     lanes: int,
+    first: int,
 ):
     """Mark the masked worlds whose rows differ, as moved only where they are physics; launched over (nworld, lanes)."""
-    w, lane = wp.tid()
+    k, lane = wp.tid()
+    w = first + k
     if mask_in[w]:
         for i in range(lane, after_in.shape[1], lanes):
             if before_in[w, i] != after_in[w, i]:

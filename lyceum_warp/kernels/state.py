@@ -9,45 +9,60 @@ import warp as wp
 
 
 @wp.kernel(enable_backward=False)
-def widen(mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[wp.float64], lanes: int):
+def widen(
+    mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[wp.float64], lanes: int, first: int
+):
     """Copy the masked rows of float32 into float64; launched over (nworld, lanes)."""
-    w, lane = wp.tid()
+    k, lane = wp.tid()
+    w = first + k
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):
             target_out[w, i] = wp.float64(source_in[w, i])
 
 
 @wp.kernel(enable_backward=False)
-def narrow(mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[float], lanes: int):
+def narrow(
+    mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[float], lanes: int, first: int
+):
     """Round the masked rows of float64 to float32; launched over (nworld, lanes)."""
-    w, lane = wp.tid()
+    k, lane = wp.tid()
+    w = first + k
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):
             target_out[w, i] = float(source_in[w, i])
 
 
 @wp.kernel(enable_backward=False)
-def widen_bool(mask_in: wp.array[bool], source_in: wp.array2d[bool], target_out: wp.array2d[wp.float64], lanes: int):
+def widen_bool(
+    mask_in: wp.array[bool], source_in: wp.array2d[bool], target_out: wp.array2d[wp.float64], lanes: int, first: int
+):
     """Write the masked rows of truth values as 0 and 1; launched over (nworld, lanes)."""
-    w, lane = wp.tid()
+    k, lane = wp.tid()
+    w = first + k
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):
             target_out[w, i] = wp.where(source_in[w, i], wp.float64(1.0), wp.float64(0.0))
 
 
 @wp.kernel(enable_backward=False)
-def narrow_bool(mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[bool], lanes: int):
+def narrow_bool(
+    mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[bool], lanes: int, first: int
+):
     """Read what ``widen_bool`` writes, in the masked rows; launched over (nworld, lanes)."""
-    w, lane = wp.tid()
+    k, lane = wp.tid()
+    w = first + k
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):
             target_out[w, i] = source_in[w, i] != wp.float64(0.0)
 
 
 @wp.kernel(enable_backward=False)
-def copy_rows(mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[float], lanes: int):
+def copy_rows(
+    mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[float], lanes: int, first: int
+):
     """Copy the masked rows of float32; launched over (nworld, lanes)."""
-    w, lane = wp.tid()
+    k, lane = wp.tid()
+    w = first + k
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):
             target_out[w, i] = source_in[w, i]
@@ -73,10 +88,15 @@ def zero_columns(column_in: wp.array[int], target_out: wp.array2d[float]):
 
 @wp.kernel(enable_backward=False)
 def copy_rows64(
-    mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[wp.float64], lanes: int
+    mask_in: wp.array[bool],
+    source_in: wp.array2d[wp.float64],
+    target_out: wp.array2d[wp.float64],
+    lanes: int,
+    first: int,
 ):
     """Copy the masked rows of float64; launched over (nworld, lanes)."""
-    w, lane = wp.tid()
+    k, lane = wp.tid()
+    w = first + k
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):
             target_out[w, i] = source_in[w, i]
@@ -84,19 +104,23 @@ def copy_rows64(
 
 @wp.kernel(enable_backward=False)
 def fill_rows64(
-    mask_in: wp.array[bool], source_in: wp.array[wp.float64], target_out: wp.array2d[wp.float64], lanes: int
+    mask_in: wp.array[bool], source_in: wp.array[wp.float64], target_out: wp.array2d[wp.float64], lanes: int, first: int
 ):
     """Copy one row of float64 into the masked rows; launched over (nworld, lanes)."""
-    w, lane = wp.tid()
+    k, lane = wp.tid()
+    w = first + k
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):
             target_out[w, i] = source_in[i]
 
 
 @wp.kernel(enable_backward=False)
-def fill_rows(mask_in: wp.array[bool], source_in: wp.array[float], target_out: wp.array2d[float], lanes: int):
+def fill_rows(
+    mask_in: wp.array[bool], source_in: wp.array[float], target_out: wp.array2d[float], lanes: int, first: int
+):
     """Copy one row of float32 into the masked rows; launched over (nworld, lanes)."""
-    w, lane = wp.tid()
+    k, lane = wp.tid()
+    w = first + k
     if mask_in[w]:
         for i in range(lane, target_out.shape[1], lanes):
             target_out[w, i] = source_in[i]

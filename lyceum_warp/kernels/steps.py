@@ -93,12 +93,13 @@ def hold_success(
     needed: int,
     count_inout: wp.array2d[float],
     success_inout: wp.array[bool],
+    first: int,
 ):
     """Let a success count only after ``needed`` steps in a row, in the masked worlds; launched over (nworld,).
 
     A transition goes on with the count, (nworld, 1), up to ``needed``, or clears it; a state alone keeps it.
     """
-    w = wp.tid()
+    w = first + wp.tid()
     if mask_in[w]:
         if transition:
             count_inout[w, 0] = wp.where(success_inout[w], wp.min(count_inout[w, 0] + 1.0, float(needed)), 0.0)
@@ -153,9 +154,10 @@ def make_kernels(
         observe_group(group, s, p, out, w, base, counters.rng[group * counters.step.shape[0] + w])
 
     @kernel_if(generated.has_state)
-    def keep_before(after: Batch, before_out: Batch, lanes: int):
+    def keep_before(after: Batch, before_out: Batch, lanes: int, first: int):
         """Copy the fields that a step changes; launched over (nworld, lanes)."""
-        w, lane = wp.tid()
+        k, lane = wp.tid()
+        w = first + k
         copy_state(after, before_out, w, lane, lanes)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -169,12 +171,13 @@ def make_kernels(
         safe_action_out: wp.array2d[float],
         fault_out: wp.array[int],
         ctrl_out: wp.array2d[float],
+        first: int,
     ):
         """Map actions to controls, clipped to their ranges; launched over (nworld,).
 
         An action that is not finite counts as zero.
         """
-        w = wp.tid()
+        w = first + wp.tid()
         fault = int(0)
         for i in range(action_in.shape[1]):
             if not wp.isfinite(action_in[w, i]):
@@ -192,9 +195,10 @@ def make_kernels(
         counters.step[w] = counters.step[w] + 1
 
     @kernel_if(generated.checks_model)
-    def check_model(batch: Batch, fault_inout: wp.array[int], lanes: int):
+    def check_model(batch: Batch, fault_inout: wp.array[int], lanes: int, first: int):
         """Find faults of the model fields that the task writes; launched over (nworld, lanes)."""
-        w, lane = wp.tid()
+        k, lane = wp.tid()
+        w = first + k
         if not valid_model(view(batch, w), lane, lanes):
             fault_inout[w] = fault_inout[w] | MODEL
 
@@ -205,23 +209,27 @@ def make_kernels(
         params: wp.array[Params],
         action_in: wp.array2d[float],
         counters: Counters,
+        first: int,
     ):
         """Advance the task's memory by one step; launched over (nworld,)."""
-        w = wp.tid()
+        w = first + wp.tid()
         counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], counters.step[w])
         p = params[w % params.shape[0]]
         advance(view(before, w), action_in[w], view(after, w), p, counters.rng[w])
 
     @kernel_for("substep")
-    def substep_memory(batch: Batch, params: wp.array[Params]):
+    def substep_memory(batch: Batch, params: wp.array[Params], first: int):
         """Advance the task's memory by one substep; launched over (nworld,)."""
-        w = wp.tid()
+        w = first + wp.tid()
         substep(view(batch, w), params[w % params.shape[0]])
 
     @kernel_if(generated.has_memory)
-    def check_memory(mask_in: wp.array[bool], before: Batch, after: Batch, fault_inout: wp.array[int], lanes: int):
+    def check_memory(
+        mask_in: wp.array[bool], before: Batch, after: Batch, fault_inout: wp.array[int], lanes: int, first: int
+    ):
         """Find faults of the task's memory in the masked worlds; launched over (nworld, lanes)."""
-        w, lane = wp.tid()
+        k, lane = wp.tid()
+        w = first + k
         if mask_in[w] and not finite_memory(view(before, w), view(after, w), lane, lanes):
             fault_inout[w] = fault_inout[w] | NAN
 
@@ -240,6 +248,7 @@ def make_kernels(
         metrics_out: wp.array2d[float],
         obs_out: Observations,
         threads: int,
+        first: int,
     ):
         """Judge a transition, or a state alone, in the masked worlds; launched over (threads, nworld).
 
@@ -247,10 +256,11 @@ def make_kernels(
         take several times as long, and there are places for far more threads than worlds. A world that has a fault
         already is not judged.
         """
-        first, w = wp.tid()
+        start, k = wp.tid()
+        w = first + k
         if not mask_in[w]:
             return
-        for part in range(first, found_out.fault.shape[0], threads):
+        for part in range(start, found_out.fault.shape[0], threads):
             found = int(0)
             if (fault_in[w] | action_fault_in[w]) == 0:
                 p = params[w % params.shape[0]]
@@ -295,8 +305,9 @@ def make_kernels(
         obs_out: Observations,
         final_obs_inout: Observations,
         restart_out: wp.array[bool],
-        fault_count_inout: wp.array[int],
+        fault_count_inout: wp.array2d[int],
         lanes: int,
+        first: int,
     ):
         """Put together what ``judge`` found in the masked worlds; launched over (nworld, lanes).
 
@@ -306,7 +317,8 @@ def make_kernels(
         A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and the last good
         observations. It counts as terminated, so that no learner takes it for a time limit.
         """
-        w, lane = wp.tid()
+        k, lane = wp.tid()
+        w = first + k
         if not mask_in[w]:
             return
         fault = fault_inout[w] | action_fault_in[w]
@@ -355,7 +367,7 @@ def make_kernels(
             # without automatic resets a world steps on after its end, but not after a fault
             restart_out[w] = wp.where(keep_reason, fault != 0, reason != 0)
             if fault != 0:
-                faults.count_faults(fault, fault_count_inout)
+                faults.count_faults(fault, fault_count_inout[w])
 
     @wp.kernel(module=module, enable_backward=False)
     def restart(
@@ -365,12 +377,13 @@ def make_kernels(
         batch: Batch,
         params: wp.array[Params],
         counters: Counters,
+        first: int,
     ):
         """Begin an episode in the masked worlds, or draw its initial state again; launched over (nworld,).
 
         The engine has already put them into the fixed initial state. A further draw goes on in the stream of the last.
         """
-        w = wp.tid()
+        w = first + wp.tid()
         if not mask_in[w]:
             return
         if not again:
@@ -384,15 +397,17 @@ def make_kernels(
             randomize(s, p, counters.rng[w])
 
     @kernel_for("reject")
-    def reject_worlds(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], again_out: wp.array[bool]):
+    def reject_worlds(
+        mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], again_out: wp.array[bool], first: int
+    ):
         """Find the masked worlds whose initial state must be drawn again; launched over (nworld,)."""
-        w = wp.tid()
+        w = first + wp.tid()
         again_out[w] = mask_in[w] and reject(view(batch, w), params[w % params.shape[0]])
 
     @kernel_for("startup")
-    def start_worlds(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], counters: Counters):
+    def start_worlds(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], counters: Counters, first: int):
         """Draw the model fields of the masked worlds once; launched over (nworld,)."""
-        w = wp.tid()
+        w = first + wp.tid()
         if mask_in[w]:
             counters.rng[w, 0] = stream(counters.key[w], STARTUP, 0)
             startup(view(batch, w), params[w % params.shape[0]], counters.rng[w])
@@ -407,9 +422,10 @@ def make_kernels(
         moved_out: wp.array[bool],
         changed_out: wp.array[bool],
         stale_out: wp.array[bool],
+        first: int,
     ):
         """Run the events of the worlds that do not restart, ``mask_out``; launched over (nworld,)."""
-        w = wp.tid()
+        w = first + wp.tid()
         mask_out[w] = not restarting_in[w]
         moved_out[w] = False
         changed_out[w] = False
@@ -429,15 +445,17 @@ def make_kernels(
         finite_out: wp.array2d[bool],
         obs_out: Observations,
         parts: int,
+        first: int,
     ):
         """Observe the masked worlds, and find the groups whose numbers are finite; launched over (parts, nworld).
 
         With one part for all groups it replaces what is not finite as well; else ``replace_observations`` must follow.
         """
-        part, w = wp.tid()
+        start, k = wp.tid()
+        w = first + k
         if mask_in[w]:
             finite = bool(True)
-            for group in range(part, finite_out.shape[0], parts):
+            for group in range(start, finite_out.shape[0], parts):
                 observe(group, view(batch, w), params[w % params.shape[0]], obs_out, w, counters)
                 finite_out[group, w] = finite_group(group, obs_out, w)
                 finite = finite and finite_out[group, w]
@@ -451,12 +469,14 @@ def make_kernels(
         good_in: Observations,
         obs_inout: Observations,
         lanes: int,
+        first: int,
     ):
         """Put the last good observations where a number is not finite; launched over (nworld, lanes).
 
         Such a number is a fault of the next step.
         """
-        w, lane = wp.tid()
+        k, lane = wp.tid()
+        w = first + k
         if mask_in[w]:
             finite = bool(True)
             for group in range(finite_in.shape[0]):
@@ -466,18 +486,18 @@ def make_kernels(
 
     @kernel_for("control")
     def control_worlds(
-        batch: Batch, params: wp.array[Params], action_in: wp.array2d[float], ctrl_out: wp.array2d[float]
+        batch: Batch, params: wp.array[Params], action_in: wp.array2d[float], ctrl_out: wp.array2d[float], first: int
     ):
         """Turn actions into controls and inputs, and nothing else; launched over (nworld,)."""
-        w = wp.tid()
+        w = first + wp.tid()
         control(view(batch, w), action_in[w], params[w % params.shape[0]], ctrl_out[w])
 
     @kernel_for("measure")
     def measure_worlds(
-        batch: Batch, params: wp.array[Params], action_in: wp.array2d[float], metrics_out: wp.array2d[float]
+        batch: Batch, params: wp.array[Params], action_in: wp.array2d[float], metrics_out: wp.array2d[float], first: int
     ):
         """Measure transitions from states to themselves; launched over (nworld,)."""
-        w = wp.tid()
+        w = first + wp.tid()
         s = view(batch, w)
         measure(s, action_in[w], s, params[w % params.shape[0]], metrics_out[w])
 
@@ -492,9 +512,10 @@ def make_kernels(
         action_in: wp.array2d[float],
         reward_out: wp.array[float],
         terminated_out: wp.array[bool],
+        first: int,
     ):
         """Compute reward and termination of a rollout's transitions; launched over (steps * nworld,)."""
-        row = wp.tid()
+        row = first + wp.tid()
         p = params[row % params.shape[0]]
         s1 = view(after, row)
         reward_out[row] = reward(view(before, row), action_in[row], s1, p)
@@ -509,9 +530,10 @@ def make_kernels(
         counters: Counters,
         memory_inout: wp.array2d[float],
         lasting_memory_inout: wp.array2d[float],
+        first: int,
     ):
         """Advance the task's memory along a rollout; launched over (nworld,), one thread for all steps of a world."""
-        w = wp.tid()
+        w = first + wp.tid()
         n = counters.step.shape[0]
         p = params[w % params.shape[0]]
         for t in range(action_in.shape[0] // n):

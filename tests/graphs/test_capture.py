@@ -1,8 +1,14 @@
 """Phases become graphs: the same numbers, the same order, captured where they are made of launches."""
 
+from functools import partial
+from typing import Any
+
+import pytest
 import warp as wp
 
+from lyceum_warp.arrays import launch_worlds
 from lyceum_warp.graphs.capture import Graphs, Phase
+from lyceum_warp.graphs.workers import Workers
 
 
 @wp.kernel(enable_backward=False)
@@ -51,6 +57,38 @@ def test_engine_calls_stay_between_graphs_where_they_are_not_made_of_launches() 
     assert calls[1] is phases[2].run
     assert [digits.after(calls) for _ in range(4)] == [1234] * 4
     assert digits.calls == 2 * 3 + 4
+
+
+@wp.kernel(enable_backward=False)
+def follow(digit: int, number_inout: wp.array[int], first: int):
+    w = first + wp.tid()
+    number_inout[w] = 10 * number_inout[w] + digit
+
+
+def test_threads_have_a_part_of_the_worlds_each_in_phases_that_allow_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    digits, sizes = wp.zeros(5, dtype=int, device="cpu"), []
+    launch = wp.launch
+
+    def phase(digit: int, *, by_world: bool) -> Phase:
+        run = partial(launch_worlds, follow, 5, [digit, digits], wp.get_device("cpu"))
+        return Phase(str(digit), run, by_world=by_world)
+
+    def noted(kernel: wp.Kernel, dim: tuple[int, ...], *args: Any, **options: Any) -> None:
+        sizes.append(dim[0])
+        launch(kernel, dim, *args, **options)
+
+    monkeypatch.setattr(wp, "launch", noted)
+    made = Graphs(wp.get_device("cpu"), workers=Workers(2))
+    shared = [True, True, False, True]
+    calls = made.sequence([phase(i + 1, by_world=by_world) for i, by_world in enumerate(shared)])
+    assert len(calls) == 3
+    for _ in range(4):
+        digits.zero_()
+        for call in calls:
+            call()
+        assert digits.numpy().tolist() == [1234] * 5
+    # the first calls launch for all worlds, the second ones capture two parts where they may, and the others replay
+    assert sizes == [5, 5, 5, 5, 2, 2, 3, 3, 5, 2, 3]
 
 
 def test_without_graphs_every_phase_is_called_directly() -> None:

@@ -41,7 +41,7 @@ step()
 
 
 def launch(mask: wp.array, row: wp.array, rows: wp.array) -> None:
-    wp.launch(fill_rows64, (3, 1), [mask, row, rows, 1], device="cpu")
+    wp.launch(fill_rows64, (3, 1), [mask, row, rows, 1, 0], device="cpu")
 
 
 @pytest.fixture

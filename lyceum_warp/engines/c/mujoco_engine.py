@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Collection, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -9,13 +10,14 @@ import numpy as np
 import warp as wp
 from mujoco.batch import Batch
 
-from lyceum_warp.arrays import flat, launch_rows
+from lyceum_warp.arrays import flat, launch_rows, launch_worlds
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.batch_faults import ErrorsAsWarnings
 from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
 from lyceum_warp.engines.c.world_models import WorldModels
 from lyceum_warp.engines.c.world_models import bytes_per_world as model_bytes_per_world
 from lyceum_warp.fields import READ_ONLY, STATE_FIELDS, Field, Stage, early_sensor_columns, state_columns
+from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_rows64, fill_rows64, narrow, narrow_bool, widen, widen_bool
 from lyceum_warp.model_fields import ModelField
@@ -24,9 +26,6 @@ from lyceum_warp.validate import whole_number
 
 _BATCH_BYTES = 150
 """Bytes that ``Batch`` keeps for each world beside its state: warnings, a status, the message of an error."""
-
-_MJDATA_BYTES = 165_000
-"""An MjData without its buffer and arena, most of it statistics of the solver (measured with MuJoCo 4.0)."""
 
 _Pairs = list[tuple[np.ndarray, np.ndarray]]
 
@@ -75,12 +74,15 @@ class MujocoEngine(Engine):
         """The model as the batch runs it."""
         # a world with a fault must be reported, not silently reset in the middle of a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self.batch = Batch(self.native_model, nworld, self.nthread, _is_persistent(self.fields.values()))
+        # Not persistent: that would let a step go on from the stages computed after the last one, but an MjData for
+        # every world does not fit into the caches, and the six tasks that need such stages were slower by 4 to 33 %
+        # (128 and 1,024 worlds on two cores)
+        self.batch = Batch(self.native_model, nworld, self.nthread)
         self._errors_as_warnings = ErrorsAsWarnings(self.batch)
         self._rows = self._alias(self.batch.state)
         self._warning: wp.array = wp.array(self.batch.warning, dtype=int, device=device, copy=False)
         self._initial = self._rounded_initial()
-        self._columns: dict[str, wp.array] = {}
+        self._sources: dict[str, wp.array] = {}
         self._copies: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         for field in self.fields.values():
             self._bind(field)
@@ -88,12 +90,16 @@ class MujocoEngine(Engine):
         kept = list(self.fields.values())
         self._state_fields = [field for field in kept if field.name in STATE_FIELDS]
         self._derived = [field for field in kept if field.name not in STATE_FIELDS]
-        # pairs of arrays, because every step goes through them, and looking fields up would take as long as a copy
-        self._lagged = self._pairs(field for field in kept if field.lagged)
-        self._unlagged = self._pairs(field for field in kept if not field.lagged and field.name != "ctrl")
-        self._changing = self._lagged + self._unlagged
+        lagged = [field for field in kept if field.lagged]
+        changing = [field for field in kept if field.name != "ctrl"]
+        # where the two kinds of fields belong to different states, lagged ones are copied between two calls
+        self._staged = bool(lagged) and self.stage > Stage.NONE
+        self._between = self._pairs(lagged) if self._staged else []
+        self._shown = [field for field in changing if not (self._staged and field.lagged)]
         self._early_columns = np.isin(np.arange(model.nsensordata), early_sensor_columns(model))
-        self._written = self._pairs(field for field in kept if field.written)
+        self._written = [field for field in kept if field.written]
+        self._graphs = Graphs(device, capture_engine=False)
+        self._steps: dict[int, Calls] = {}
         self._rollouts: dict[Any, NativeRollout | None] = {}
         self._masks: dict[int, tuple[wp.array, np.ndarray]] = {}
         self._values: dict[str, np.ndarray] = {}
@@ -131,9 +137,9 @@ class MujocoEngine(Engine):
         self.arrays[field.name] = array
         if field.name in STATE_FIELDS:
             source = self.batch.state[:, state_columns(self.model, field.name)]
-            self._columns[field.name] = self._alias(source)
         else:
-            source = self.batch.bind(field.name)
+            source = self.batch.bind(field.name).reshape(self.nworld, -1)
+        self._sources[field.name] = self._alias(source)
         target = array.numpy()
         self._copies[field.name] = target, source.reshape(target.shape)
 
@@ -146,27 +152,40 @@ class MujocoEngine(Engine):
         if dynamics:
             total += model_bytes_per_world(model, dynamics)
         total += 8 * sum(field.size for field in fields if field.name not in STATE_FIELDS)
-        if _is_persistent(fields):
-            # of an arena only the pages that contacts and constraints touch: about half as much as the buffer
-            total += _MJDATA_BYTES + 3 * mujoco.MjData(model).nbuffer // 2
         return total
 
     # physics
 
     def step(self, nstep: int) -> None:
-        for given, rows in self._written:
-            rows[...] = given
-        if self._lagged and self.stage > Stage.NONE:  # the two kinds of fields belong to different states
+        if nstep not in self._steps:
+            self._steps[nstep] = self._graphs.sequence(self.step_phases(nstep))
+        for call in self._steps[nstep]:
+            call()
+
+    def step_phases(self, nstep: int) -> list[Phase]:
+        return [
+            Phase("inputs", self._take_inputs, by_world=True),
+            Phase("physics", partial(self._advance, nstep), engine=True),
+            Phase("fields", self._show_fields, by_world=True),
+        ]
+
+    def _take_inputs(self) -> None:
+        for field in self._written:
+            launch_rows(widen, self._everyone, flat(self.arrays[field.name]), self._sources[field.name])
+
+    def _advance(self, nstep: int) -> None:
+        if self._staged:
             with self._errors_as_warnings:
                 self.batch.step(nstep=nstep)
-            _copy_all(self._lagged)
+            _copy_all(self._between)
             with self._errors_as_warnings:
                 self.batch.forward(stage=self.stage)
-            _copy_all(self._unlagged)
-            return
-        with self._errors_as_warnings:
-            self.batch.step(nstep=nstep, stage=self.stage)
-        _copy_all(self._changing)
+        else:
+            with self._errors_as_warnings:
+                self.batch.step(nstep=nstep, stage=self.stage)
+
+    def _show_fields(self) -> None:
+        self._read(self._shown, self._everyone)
 
     def _pairs(self, fields: Iterable[Field]) -> _Pairs:
         """The float32 arrays of fields, each with the engine's float64 array."""
@@ -234,28 +253,29 @@ class MujocoEngine(Engine):
     def find_faults(self, mask: wp.array) -> None:
         nphysics = 1 + self.model.nq + self.model.nv + self.model.na
         args = [mask, self._rows, nphysics, self._warning, self.fault]
-        wp.launch(faults.faults_of_rows, self.nworld, args, device=self.device)
+        launch_worlds(faults.faults_of_rows, self.nworld, args, self.device)
 
     def reset(self, mask: wp.array) -> None:
         launch_rows(fill_rows64, mask, self._initial, self._rows)
-        self._read_state_fields(mask)
+        self._read(self._state_fields, mask)
 
-    def _read_state_fields(self, mask: wp.array) -> None:
-        for name, column in self._columns.items():
-            array = self.arrays[name]
+    def _read(self, fields: Iterable[Field], mask: wp.array) -> None:
+        """Round the engine's values of fields into their arrays, in the masked worlds, by launches."""
+        for field in fields:
+            array, source = self.arrays[field.name], self._sources[field.name]
             if array.dtype is wp.bool:
-                launch_rows(narrow_bool, mask, column, array)
+                launch_rows(narrow_bool, mask, source, array)
             else:
-                launch_rows(narrow, mask, column, flat(array))
+                launch_rows(narrow, mask, source, flat(array))
 
     def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
-        for name, column in self._columns.items():
-            if names is not None and name not in names:
+        for field in self._state_fields:
+            if names is not None and field.name not in names:
                 continue
-            array = self.arrays[name]
+            array, column = self.arrays[field.name], self._sources[field.name]
             if array.dtype is wp.bool:
                 launch_rows(widen_bool, mask, array, column)
-            elif name not in READ_ONLY:
+            elif field.name not in READ_ONLY:
                 launch_rows(widen, mask, flat(array), column)
 
     def refresh(self, mask: wp.array) -> None:
@@ -265,7 +285,7 @@ class MujocoEngine(Engine):
     def refresh_current(self, mask: wp.array) -> None:
         current = [field for field in self._derived if field.refresh > Stage.NONE]
         self._forward(mask, self.stage, current, early=True)
-        self._read_state_fields(mask)
+        self._read(self._state_fields, mask)
 
     def _forward(self, mask: wp.array, stage: Stage, fields: list[Field], *, early: bool = False) -> None:
         chosen = self._on_host(mask)
@@ -288,8 +308,3 @@ def _copy_all(pairs: _Pairs) -> None:
     with np.errstate(over="ignore"):  # a world with a fault may hold numbers beyond float32
         for target, source in pairs:
             target[...] = source  # for a few worlds in half the time of np.copyto
-
-
-def _is_persistent(fields: Iterable[Field]) -> bool:
-    """Whether the batch keeps an MjData for each world, so that a step reuses the stages computed after the last."""
-    return any(field.refresh > Stage.NONE for field in fields)

@@ -1,0 +1,62 @@
+"""Threads that replay parts of a graph: all parts, side by side, with the errors of any, and no thread that stays."""
+
+import gc
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+
+from lyceum_warp.graphs.workers import Workers
+
+
+def own_threads() -> set[threading.Thread]:
+    return {thread for thread in threading.enumerate() if thread.name == "lyceum_warp"}
+
+
+def test_calls_run_side_by_side_on_the_threads() -> None:
+    together, names = threading.Barrier(3), []
+
+    def call() -> None:
+        together.wait(10)  # ends only where three threads come together
+        names.append(threading.current_thread().name)
+
+    workers = Workers(3)
+    for _ in range(3):
+        workers.run([call] * 3)
+    assert sorted(names) == 3 * [threading.current_thread().name] + 6 * ["lyceum_warp"]
+
+
+def test_the_first_call_starts_the_threads_and_the_last_reference_ends_them() -> None:
+    before = own_threads()
+    workers = Workers(3)
+    assert own_threads() == before
+    workers.run([int, int])
+    assert len(own_threads() - before) == 2
+    del workers
+    gc.collect()
+    end = time.monotonic() + 10
+    while own_threads() - before and time.monotonic() < end:
+        time.sleep(0.01)
+    assert own_threads() == before
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_an_error_of_any_call_is_raised_once_all_have_ended(place: int) -> None:
+    ended = []
+
+    def late() -> None:
+        time.sleep(0.05)
+        ended.append(True)
+
+    def wrong() -> None:
+        raise ZeroDivisionError
+
+    calls: list[Callable[[], object]] = [late, late]
+    calls.insert(place, wrong)
+    workers = Workers(3)
+    with pytest.raises(ZeroDivisionError):
+        workers.run(calls)
+    assert ended == [True, True]
+    workers.run([late] * 3)
+    assert len(ended) == 5
