@@ -22,13 +22,18 @@ def _elu_(x: _Array) -> None:
     np.copyto(x, np.expm1(x), where=x < 0.0)
 
 
+_tanh_slope, _relu_slope, _elu_slope = (
+    getattr(torch.ops.aten, f"{name}_backward").grad_input for name in ("tanh", "threshold", "elu")
+)
+
 # numpy's tanh is several times as fast as torch's on some processors
-_ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[..., Any]]] = {
-    nn.Tanh: (lambda x: np.tanh(x, out=x), lambda y, out: torch.mul(y, y, out=out).neg_().add_(1.0)),
-    nn.ReLU: (lambda x: np.maximum(x, 0.0, out=x), lambda y, out: torch.sign(y, out=out)),
-    nn.ELU: (_elu_, lambda y, out: torch.clamp(y, max=0.0, out=out).add_(1.0)),
+_ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[[torch.Tensor, torch.Tensor], Any]]] = {
+    nn.Tanh: (lambda x: np.tanh(x, out=x), lambda d, y: _tanh_slope(d, y, grad_input=d)),
+    nn.ReLU: (lambda x: np.maximum(x, 0.0, out=x), lambda d, y: _relu_slope(d, y, 0.0, grad_input=d)),
+    nn.ELU: (_elu_, lambda d, y: _elu_slope(d, 1.0, 1.0, 1.0, True, y, grad_input=d)),
 }
-"""Activations in place, and their derivatives from their results, of those modules of ``mlp`` that have such."""
+"""Activations in place, and products in place with their slopes, which follow from their results, of those modules of
+``mlp`` that have such. A product is one pass over memory."""
 
 
 _FEW = 2**18
@@ -48,7 +53,7 @@ class DensePasses:
         self.parameters = [parameter.detach() for parameter in parameters]
         self.weights, self.biases = self.parameters[::2], self.parameters[1::2]
         self.activation = activation
-        self._activate, self._slope = _ACTIVATIONS[activation]
+        self._activate, self._times_slope = _ACTIVATIONS[activation]
         self._parameter_arrays = [(w.numpy().T, b.numpy()) for w, b in zip(self.weights, self.biases, strict=True)]
         self._rows = 0
         self._buffers: list[list[torch.Tensor]] = []
@@ -83,23 +88,23 @@ class DensePasses:
         return DensePasses(parameters, kind)
 
     def _allocate(self, rows: int) -> None:
-        """Buffers of a number of rows: results, slopes and derivatives of each layer."""
+        """Buffers of a number of rows: results and derivatives of each layer."""
         widths = [len(bias) for bias in self.biases]
-        self._buffers = [[torch.empty(rows, n) for n in widths] for _ in range(3)]
+        self._buffers = [[torch.empty(rows, n) for n in widths] for _ in range(2)]
 
     def _resize(self, rows: int) -> None:
         """Use the first rows of the buffers."""
         if rows > len(self._buffers[0][0]):
             self._allocate(rows)
         self._rows, self._few = rows, rows * max(weight.numel() for weight in self.weights) <= _FEW
-        self.results, self.slopes, self.derivatives = [[b[:rows] for b in kind] for kind in self._buffers]
+        self.results, self.derivatives = [[b[:rows] for b in kind] for kind in self._buffers]
         self._arrays = [result.numpy() for result in self.results]
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         """Outputs, (rows, outputs), from inputs, (rows, inputs), which must stay as they are for later products."""
         if len(x) != self._rows:
             self._resize(len(x))
-        self._inputs, self._sloped = [x, *self.results[:-1]], False
+        self._inputs = [x, *self.results[:-1]]
         last = len(self.weights) - 1
         array = x.numpy()
         for i, (result, (weights, biases)) in enumerate(zip(self._arrays, self._parameter_arrays, strict=True)):
@@ -113,26 +118,19 @@ class DensePasses:
             array = result
         return self.results[-1]
 
-    def _find_slopes(self) -> None:
-        if not self._sloped:
-            for result, slope in zip(self.results[:-1], self.slopes, strict=False):
-                self._slope(result, out=slope)
-            self._sloped = True
-
     def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
         """J v, (rows, outputs), at the last inputs.
 
         Args:
             parts: v, in tensors of the parameters' shapes.
         """
-        self._find_slopes()
         last = len(self.weights) - 1
         for i, derivative in enumerate(self.derivatives):
             torch.addmm(parts[2 * i + 1], self._inputs[i], parts[2 * i].t(), out=derivative)
             if i:
                 derivative.addmm_(self.derivatives[i - 1], self.weights[i].t())
             if i < last:
-                derivative.mul_(self.slopes[i])
+                self._times_slope(derivative, self.results[i])
         return self.derivatives[-1]
 
     def pull(self, u: torch.Tensor, out: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
@@ -142,7 +140,6 @@ class DensePasses:
             u: Derivatives by the outputs, (rows, outputs).
             out: Where to write it: tensors of the parameters' shapes.
         """
-        self._find_slopes()
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
             if x.shape[1] < u.shape[1]:  # the product with the longer rows is the faster one
@@ -151,7 +148,8 @@ class DensePasses:
                 torch.mm(u.t(), x, out=out[2 * i])
             torch.sum(u, 0, out=out[2 * i + 1])
             if i:
-                u = torch.mm(u, weight, out=self.derivatives[i - 1]).mul_(self.slopes[i - 1])
+                u = torch.mm(u, weight, out=self.derivatives[i - 1])
+                self._times_slope(u, x)
         return out
 
 
