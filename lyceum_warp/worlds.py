@@ -35,7 +35,7 @@ from lyceum_warp.spaces import Space, action_space, control_ranges, control_scal
 from lyceum_warp.task import MEMORIES
 from lyceum_warp.validate import check_tensor
 
-NANOSECONDS_A_THREAD = 200_000
+NANOSECONDS_A_THREAD = 500_000
 """How much work pays off waking one more thread, of which each call costs some 20 microseconds."""
 
 

@@ -16,7 +16,15 @@ from lyceum_warp.engines.c.batch_faults import ErrorsAsWarnings
 from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
 from lyceum_warp.engines.c.world_models import WorldModels
 from lyceum_warp.engines.c.world_models import bytes_per_world as model_bytes_per_world
-from lyceum_warp.fields import READ_ONLY, STATE_FIELDS, Field, Stage, early_sensor_columns, state_columns
+from lyceum_warp.fields import (
+    DERIVED_FIELDS,
+    READ_ONLY,
+    STATE_FIELDS,
+    Field,
+    Stage,
+    early_sensor_columns,
+    state_columns,
+)
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_rows64, fill_rows64, narrow, narrow_bool, widen, widen_bool
@@ -90,12 +98,11 @@ class MujocoEngine(Engine):
         kept = list(self.fields.values())
         self._state_fields = [field for field in kept if field.name in STATE_FIELDS]
         self._derived = [field for field in kept if field.name not in STATE_FIELDS]
-        lagged = [field for field in kept if field.lagged]
-        changing = [field for field in kept if field.name != "ctrl"]
-        # where the two kinds of fields belong to different states, lagged ones are copied between two calls
-        self._staged = bool(lagged) and self.stage > Stage.NONE
-        self._between = self._pairs(lagged) if self._staged else []
-        self._shown = [field for field in changing if not (self._staged and field.lagged)]
+        # lagged fields belong to another state than those of the stage, and are copied before that is computed
+        staged = self.stage > Stage.NONE
+        self._before_stage = self._pairs(field for field in kept if field.lagged and staged)
+        self._shown = [field for field in kept if field.name != "ctrl" and not (field.lagged and staged)]
+        self._disabled, self._step_flags, self._stage_flags = self._disabled_flags()
         self._early_columns = np.isin(np.arange(model.nsensordata), early_sensor_columns(model))
         self._written = [field for field in kept if field.written]
         self._graphs = Graphs(device, capture_engine=False)
@@ -117,6 +124,19 @@ class MujocoEngine(Engine):
         if len(self._masks) < _MOST_MASKS:
             self._masks[id(mask)] = mask, view
         return view
+
+    def _disabled_flags(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Each world's disabled parts of the physics, live, and what they are in a step and in the stage after it.
+
+        Positions do not depend on contacts, whose search takes most of their stage. The arrays have no elements where
+        a field of the stage may depend on them.
+        """
+        computed = [field for field in self._derived if field.refresh > Stage.NONE]
+        if not all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in computed) or not computed:
+            none = np.zeros(0, dtype=int)
+            return none, none, none
+        live = self.batch.expand("opt.disableflags")
+        return live, live.copy(), live | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
 
     def _alias(self, rows: np.ndarray) -> wp.array:
         return wp.array(rows, dtype=wp.float64, device=self.device, copy=False)
@@ -174,15 +194,17 @@ class MujocoEngine(Engine):
             launch_rows(widen, self._everyone, flat(self.arrays[field.name]), self._sources[field.name])
 
     def _advance(self, nstep: int) -> None:
-        if self._staged:
-            with self._errors_as_warnings:
-                self.batch.step(nstep=nstep)
-            _copy_all(self._between)
+        with self._errors_as_warnings:
+            self.batch.step(nstep=nstep)
+        if self.stage == Stage.NONE:
+            return
+        _copy_all(self._before_stage)
+        self._disabled[...] = self._stage_flags
+        try:
             with self._errors_as_warnings:
                 self.batch.forward(stage=self.stage)
-        else:
-            with self._errors_as_warnings:
-                self.batch.step(nstep=nstep, stage=self.stage)
+        finally:
+            self._disabled[...] = self._step_flags
 
     def _show_fields(self) -> None:
         self._read(self._shown, self._everyone)
