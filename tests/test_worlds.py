@@ -13,6 +13,7 @@ from metered_task import Metered
 
 import lyceum_warp as lw
 from lyceum_warp import worlds
+from lyceum_warp.graphs.workers import Workers
 from lyceum_warp.kernels import steps
 from lyceum_warp.tasks.point_mass import PointMass
 
@@ -89,9 +90,10 @@ def test_parts_of_the_worlds_have_the_numbers_of_all_worlds_together(monkeypatch
     together, counts = outcomes_with_faults("mujoco")
     monkeypatch.setattr(worlds, "NANOSECONDS_A_THREAD", 1)
     monkeypatch.setattr(worlds, "cpu_cores", lambda: 3)
-    before = threading.active_count()
+    started: list[Workers] = []
+    monkeypatch.setattr(Workers, "_start", lambda self, start=Workers._start: (started.append(self), start(self)))
     apart, same_counts = outcomes_with_faults("mujoco")
-    assert threading.active_count() == before + 2
+    assert [workers.nthread for workers in started] == [3]
     assert counts == same_counts
     assert all(torch.equal(a, b) for a, b in zip(together, apart, strict=True))
 
@@ -101,14 +103,14 @@ def test_threads_share_a_step_only_where_it_is_long_enough(monkeypatch: pytest.M
 
     def threads(nworld: int, **options: Any) -> int:
         env = lw.make("hopper", nworld=nworld, **options)
-        before = threading.active_count()
+        before = set(threading.enumerate())
         for _ in range(3):
             env.step()
-        return threading.active_count() - before + 1
+        return len(set(threading.enumerate()) - before) + 1
 
-    assert threads(64) == threads(4096, nthread=1) == threads(4096, graphs=False) == 1
-    assert threads(4096, engine="mujoco") == 8
-    assert threads(4096, nthread=3) == 3
+    assert threads(64) == threads(8192, nthread=1) == threads(8192, graphs=False) == 1
+    assert threads(8192, engine="mujoco") == 8
+    assert threads(8192, nthread=3) == 3
 
 
 def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.Env, lw.Env]:

@@ -318,3 +318,26 @@ def test_fields_take_the_parts_that_compute_them() -> None:
     for name in ("jointlimitpos", "jointlimitvel"):
         assert parts(model_of(f'<{name} joint="knee"/>'), ["sensordata"]) is None
         assert parts(model_of(f'<{name} joint="knee"/>'), ["xpos"]) == (mjw.kinematics,)
+
+
+def test_fields_of_a_stage_and_those_of_the_last_substep_do_not_mix_where_worlds_share_an_mjdata() -> None:
+    """Fields that the stage after a step does not compute are another world's in the MjData that computes it."""
+    model, device = model_of(SENSORS["mixed"]), wp.get_device("cpu")
+    for lagged, current in ((), ("xpos",)), (("cvel",), ("xpos",)), (("cvel", "xpos"), ("sensordata",)):
+        fields = [describe(model, name, lagged=name in lagged) for name in (*lagged, *current, "qacc", "qvel")]
+        engines = [MujocoEngine(model, nworld, device, fields, nthread=1) for nworld in (4, 1, 1, 1, 1)]
+        for engine in engines:
+            engine.reset(everyone(engine))
+        together, apart = engines[0], engines[1:]
+        for w, engine in enumerate(apart):
+            for made, row in ((together, w), (engine, 0)):
+                made.arrays["qvel"].numpy()[row] = 0.4 * (w + 1)
+        for engine in engines:
+            engine.commit(everyone(engine))
+            engine.refresh(everyone(engine))
+            for nstep in (2, 3, 1):
+                engine.step(nstep)
+        for field in fields:
+            rows = np.concatenate([engine.arrays[field.name].numpy() for engine in apart])
+            np.testing.assert_array_equal(together.arrays[field.name].numpy(), rows, err_msg=f"{field.name} {lagged}")
+            assert len(np.unique(rows.reshape(4, -1), axis=0)) == 4, field.name

@@ -35,8 +35,6 @@ from lyceum_warp.validate import whole_number
 _BATCH_BYTES = 150
 """Bytes that ``Batch`` keeps for each world beside its state: warnings, a status, the message of an error."""
 
-_Pairs = list[tuple[np.ndarray, np.ndarray]]
-
 _MOST_MASKS = 16
 """Masks whose views are kept; an environment has fewer."""
 
@@ -98,13 +96,21 @@ class MujocoEngine(Engine):
         kept = list(self.fields.values())
         self._state_fields = [field for field in kept if field.name in STATE_FIELDS]
         self._derived = [field for field in kept if field.name not in STATE_FIELDS]
-        # lagged fields belong to another state than those of the stage, and are copied before that is computed
-        staged = self.stage > Stage.NONE
-        self._before_stage = self._pairs(field for field in kept if field.lagged and staged)
-        self._shown = [field for field in kept if field.name != "ctrl" and not (field.lagged and staged)]
-        self._disabled, self._step_flags, self._stage_flags = self._disabled_flags()
+        computed = [field for field in self._derived if field.refresh > Stage.NONE]
+        only_positions = all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in computed)
+        self._apart = bool(computed) and (only_positions or any(field.lagged for field in kept))
+        """Whether the stage after a step is a call of its own, in an MjData that another world may have had before."""
+        self._before_stage = [field for field in self._derived if field not in computed or field.snapshot]
+        self._mixed = [field for field in computed if field.snapshot]
+        early = self._state_fields + [field for field in computed if not field.snapshot]
+        self._shown = [field for field in (early if self._apart else kept) if field.name != "ctrl"]
+        # positions do not depend on contacts, whose search takes most of their stage
+        without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if only_positions else 0
+        self._disabled = self.batch.expand("opt.disableflags") if self._apart and without else np.zeros(0, dtype=int)
+        self._step_flags, self._stage_flags = self._disabled.copy(), self._disabled | without
         self._early_columns = np.isin(np.arange(model.nsensordata), early_sensor_columns(model))
         self._written = [field for field in kept if field.written]
+        self._every = np.full(nworld, True)
         self._graphs = Graphs(device, capture_engine=False)
         self._steps: dict[int, Calls] = {}
         self._rollouts: dict[Any, NativeRollout | None] = {}
@@ -124,19 +130,6 @@ class MujocoEngine(Engine):
         if len(self._masks) < _MOST_MASKS:
             self._masks[id(mask)] = mask, view
         return view
-
-    def _disabled_flags(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Each world's disabled parts of the physics, live, and what they are in a step and in the stage after it.
-
-        Positions do not depend on contacts, whose search takes most of their stage. The arrays have no elements where
-        a field of the stage may depend on them.
-        """
-        computed = [field for field in self._derived if field.refresh > Stage.NONE]
-        if not all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in computed) or not computed:
-            none = np.zeros(0, dtype=int)
-            return none, none, none
-        live = self.batch.expand("opt.disableflags")
-        return live, live.copy(), live | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
 
     def _alias(self, rows: np.ndarray) -> wp.array:
         return wp.array(rows, dtype=wp.float64, device=self.device, copy=False)
@@ -178,11 +171,16 @@ class MujocoEngine(Engine):
 
     def step(self, nstep: int) -> None:
         if nstep not in self._steps:
-            self._steps[nstep] = self._graphs.sequence(self.step_phases(nstep))
+            self._steps[nstep] = self._graphs.sequence(self._own_phases(nstep))
         for call in self._steps[nstep]:
             call()
 
     def step_phases(self, nstep: int) -> list[Phase]:
+        # a derived engine may have a step of its own around this one
+        own = type(self).step is MujocoEngine.step
+        return self._own_phases(nstep) if own else super().step_phases(nstep)
+
+    def _own_phases(self, nstep: int) -> list[Phase]:
         return [
             Phase("inputs", self._take_inputs, by_world=True),
             Phase("physics", partial(self._advance, nstep), engine=True),
@@ -195,23 +193,20 @@ class MujocoEngine(Engine):
 
     def _advance(self, nstep: int) -> None:
         with self._errors_as_warnings:
-            self.batch.step(nstep=nstep)
-        if self.stage == Stage.NONE:
+            self.batch.step(nstep=nstep, stage=Stage.NONE if self._apart else self.stage)
+        if not self._apart:
             return
-        _copy_all(self._before_stage)
+        self._copy(self._before_stage, self._every)
         self._disabled[...] = self._stage_flags
         try:
             with self._errors_as_warnings:
                 self.batch.forward(stage=self.stage)
         finally:
             self._disabled[...] = self._step_flags
+        self._copy(self._mixed, self._every, early=True)
 
     def _show_fields(self) -> None:
         self._read(self._shown, self._everyone)
-
-    def _pairs(self, fields: Iterable[Field]) -> _Pairs:
-        """The float32 arrays of fields, each with the engine's float64 array."""
-        return [self._copies[field.name] for field in fields]
 
     def _copy(self, fields: list[Field], mask: np.ndarray, *, early: bool = False) -> None:
         """Copy fields of the masked worlds from the engine's float64 arrays into their float32 arrays.
@@ -241,7 +236,7 @@ class MujocoEngine(Engine):
         native(state, controls, buffers)
         self.batch.state[:] = native.batch.state
         self.batch.warning += native.batch.warning
-        _copy_all(self._pairs(self._state_fields))
+        self._copy(self._state_fields, self._every)
         if self.dynamics:
             self._read_columns(state, self._everyone, self.dynamics.values(), self.state_size - self._dynamics_size)
             self.apply_model(self._everyone)
@@ -323,10 +318,3 @@ class MujocoEngine(Engine):
 
     def _set_integration(self, state_in: wp.array, mask: wp.array) -> None:
         launch_rows(copy_rows64, mask, state_in, self._rows)
-
-
-def _copy_all(pairs: _Pairs) -> None:
-    """Copy float64 arrays into float32 arrays, given in pairs of target and source."""
-    with np.errstate(over="ignore"):  # a world with a fault may hold numbers beyond float32
-        for target, source in pairs:
-            target[...] = source  # for a few worlds in half the time of np.copyto
