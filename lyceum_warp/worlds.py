@@ -35,9 +35,6 @@ from lyceum_warp.spaces import Space, action_space, control_ranges, control_scal
 from lyceum_warp.task import MEMORIES
 from lyceum_warp.validate import check_tensor
 
-NANOSECONDS_A_THREAD = 500_000
-"""How much work pays off waking one more thread, of which each call costs some 20 microseconds."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Programs:
@@ -58,15 +55,6 @@ def own_bytes_per_world(task: BoundTask) -> int:
     copies = sum(field.size for field in task.fields)
     observations = sum(sum(layout.values()) for layout in task.obs_layouts.values())
     return 4 * copies + 8 * state_size + 8 * observations + 300
-
-
-def nanoseconds_per_world(task: BoundTask) -> int:
-    """Roughly the time that a CPU core takes for one world's part of a step outside the physics.
-
-    Fitted to cartpole (16 numbers), hopper and humanoid (800) on a core of 3 GHz.
-    """
-    observations = sum(sum(layout.values()) for layout in task.obs_layouts.values())
-    return 800 + 3 * (sum(field.size for field in task.fields) + observations)
 
 
 def own_parts(task: BoundTask) -> dict[str, int]:
@@ -211,11 +199,10 @@ class Worlds:
         self.step = self.programs.step
 
     def _make_workers(self) -> Workers | None:
-        """Threads for the launches around the engine's calls, or None where one is enough."""
+        """Threads for the launches around the engine's calls, or None where the caller's is the only one."""
         if not self.device.is_cpu or self.engine.capturable:
             return None
-        pay_off = self.nworld * nanoseconds_per_world(self.task) // NANOSECONDS_A_THREAD
-        nthread = min(self.engine.nthread or cpu_cores(), pay_off)
+        nthread = self.engine.nthread or cpu_cores()
         return Workers(nthread) if nthread > 1 else None
 
     # phases

@@ -1,6 +1,5 @@
 """Worlds: the phases of a step, a reset and a restored state, and what they leave in the arrays."""
 
-import threading
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from metered_task import Metered
 
 import lyceum_warp as lw
 from lyceum_warp import worlds
+from lyceum_warp.graphs import capture
 from lyceum_warp.graphs.workers import Workers
 from lyceum_warp.kernels import steps
 from lyceum_warp.tasks.point_mass import PointMass
@@ -88,29 +88,32 @@ def test_rows_that_lanes_share_have_the_numbers_of_one_lane(engine: str, monkeyp
 def test_parts_of_the_worlds_have_the_numbers_of_all_worlds_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three threads replay the launches around the C engine for a part of the four worlds each."""
     together, counts = outcomes_with_faults("mujoco")
-    monkeypatch.setattr(worlds, "NANOSECONDS_A_THREAD", 1)
+    monkeypatch.setattr(capture, "SECONDS_A_THREAD", 1e-9)
     monkeypatch.setattr(worlds, "cpu_cores", lambda: 3)
-    started: list[Workers] = []
-    monkeypatch.setattr(Workers, "_start", lambda self, start=Workers._start: (started.append(self), start(self)))
+    shared, run = [], Workers.run
+    monkeypatch.setattr(Workers, "run", lambda self, calls: (shared.append(len(calls)), run(self, calls)))
     apart, same_counts = outcomes_with_faults("mujoco")
-    assert [workers.nthread for workers in started] == [3]
+    assert len(shared) > 20 and set(shared) == {3}
     assert counts == same_counts
     assert all(torch.equal(a, b) for a, b in zip(together, apart, strict=True))
 
 
-def test_threads_share_a_step_only_where_it_is_long_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worlds, "cpu_cores", lambda: 8)
-
-    def threads(nworld: int, **options: Any) -> int:
-        env = lw.make("hopper", nworld=nworld, **options)
-        before = set(threading.enumerate())
-        for _ in range(3):
-            env.step()
-        return len(set(threading.enumerate()) - before) + 1
-
-    assert threads(64) == threads(8192, nthread=1) == threads(8192, graphs=False) == 1
-    assert threads(8192, engine="mujoco") == 8
-    assert threads(8192, nthread=3) == 3
+@pytest.mark.parametrize(
+    ("seconds", "options", "parts"),
+    [(1e-9, {}, 3), (1e-9, {"nthread": 2}, 2), (1e-9, {"nthread": 1}, 0), (1e-9, {"graphs": False}, 0), (9.0, {}, 0)],
+)
+def test_threads_share_a_step_only_where_it_is_long_enough(
+    seconds: float, options: dict[str, Any], parts: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worlds, "cpu_cores", lambda: 3)
+    monkeypatch.setattr(capture, "SECONDS_A_THREAD", seconds)
+    shared: list[int] = []
+    run = Workers.run
+    monkeypatch.setattr(Workers, "run", lambda self, calls: (shared.append(len(calls)), run(self, calls)))
+    env = lw.make("hopper", nworld=6, engine="mujoco", **options)
+    for _ in range(3):
+        env.step()
+    assert set(shared) == ({parts} if parts else set())
 
 
 def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.Env, lw.Env]:

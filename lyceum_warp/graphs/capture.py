@@ -9,6 +9,7 @@ apart become several graphs, each for a part of the worlds, and threads replay t
 """
 
 import dataclasses
+import time
 import weakref
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -99,8 +100,12 @@ class Graphs:
         return _Range(phases[0].name, graph) if self.nvtx else graph
 
 
+SECONDS_A_THREAD = 5e-4
+"""How much work pays off one more thread; to wake it takes some 20 microseconds."""
+
+
 class _Graph:
-    """Functions made of launches as one graph, or as one for each thread.
+    """Functions made of launches as one graph, or as one for each thread where they take long.
 
     The first call runs them directly, which loads every module that they need; the second captures and replays; all
     further calls replay.
@@ -124,14 +129,15 @@ class _Graph:
                 return
             if self._device.is_cuda:  # a capture may clear memory that earlier launches still work in
                 wp.synchronize_device(self._device)
-            self._replay = self._capture()
+            self._replay = self._capture_part(0, 1)
+            start = time.perf_counter()
+            self._replay()
+            if self._workers is not None:
+                parts = min(self._workers.nthread, int((time.perf_counter() - start) / SECONDS_A_THREAD))
+                if parts > 1:
+                    self._replay = partial(self._workers.run, [self._capture_part(k, parts) for k in range(parts)])
+            return
         self._replay()
-
-    def _capture(self) -> Callable[[], object]:
-        if self._workers is None:
-            return self._capture_part(0, 1)
-        parts = self._workers.nthread
-        return partial(self._workers.run, [self._capture_part(k, parts) for k in range(parts)])
 
     def _capture_part(self, part: int, parts: int) -> Callable[[], object]:
         with part_of_worlds(part, parts), wp.ScopedCapture(device=self._device) as capture:

@@ -10,28 +10,31 @@ _Outbox = queue.SimpleQueue[BaseException | None]
 
 
 class Workers:
-    """Threads of one owner; they end when it is collected. They start with the first call, on its cores.
+    """Threads of one owner; they end when it is collected. They start where calls need them, on the caller's cores.
 
     Args:
-        nthread: Number of threads that work, the caller's among them.
+        nthread: The most threads that work, the caller's among them.
     """
 
     def __init__(self, nthread: int) -> None:
         self.nthread = nthread
         self._inbox: _Inbox = queue.SimpleQueue()
-        self._started = False
+        self._threads: list[threading.Thread] = []
+        weakref.finalize(self, _stop, self._inbox, self._threads)
 
     def run(self, calls: Sequence[Callable[[], object]]) -> None:
         """Call functions that release Python's lock while they work, and wait until all have returned.
 
         Args:
-            calls: The functions; the caller's thread takes the first one.
+            calls: The functions, one for each thread at most; the caller's takes the first one.
 
         Raises:
             BaseException: That of a function, once all of them have ended.
         """
-        if not self._started:
-            self._start()
+        while len(self._threads) < min(len(calls), self.nthread) - 1:
+            thread = threading.Thread(target=_work, args=(self._inbox,), name="lyceum_warp", daemon=True)
+            thread.start()
+            self._threads.append(thread)
         outbox: _Outbox = queue.SimpleQueue()
         for call in calls[1:]:
             self._inbox.put((call, outbox))
@@ -43,12 +46,6 @@ class Workers:
                 failed = outbox.get() or failed
         if failed is not None:
             raise failed
-
-    def _start(self) -> None:
-        self._started = True
-        for _ in range(self.nthread - 1):
-            threading.Thread(target=_work, args=(self._inbox,), name="lyceum_warp", daemon=True).start()
-        weakref.finalize(self, _stop, self._inbox, self.nthread - 1)
 
 
 def _work(inbox: _Inbox) -> None:
@@ -63,6 +60,6 @@ def _work(inbox: _Inbox) -> None:
         del given, call, outbox, error  # a waiting thread must keep nothing alive
 
 
-def _stop(inbox: _Inbox, number: int) -> None:
-    for _ in range(number):
+def _stop(inbox: _Inbox, threads: list[threading.Thread]) -> None:
+    for _ in threads:
         inbox.put(None)

@@ -27,11 +27,12 @@ def test_calls_run_side_by_side_on_the_threads() -> None:
     assert sorted(names) == 3 * [threading.current_thread().name] + 6 * ["lyceum_warp"]
 
 
-def test_the_first_call_starts_the_threads_and_the_last_reference_ends_them() -> None:
+def test_calls_start_the_threads_that_they_need_and_the_last_reference_ends_them() -> None:
     before = own_threads()
     workers = Workers(3)
     assert own_threads() == before
-    workers.run([int, int])
+    for calls in (1, 2, 3, 2):
+        workers.run([int] * calls)
     assert len(own_threads() - before) == 2
     del workers
     gc.collect()
