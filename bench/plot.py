@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import experiment
+import matplotlib
 import tyro
 
 
@@ -36,7 +37,9 @@ def main(options: Options) -> int:
             figure = draw(rows)
             for ending in ("png", "svg"):
                 out = options.results / f"{name}-{machine}.{ending}"
-                figure.savefig(out, dpi=130)
+                # names of elements that do not change with each drawing, and no date: equal figures are equal files
+                with matplotlib.rc_context({"svg.hashsalt": name}):
+                    figure.savefig(out, dpi=130, metadata={"Date": None} if ending == "svg" else None)
                 print(out)
     return 0
 
