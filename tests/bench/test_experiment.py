@@ -151,6 +151,9 @@ def test_figures_and_tables_come_from_results_alone(
     toy.main("--out", tmp_path / "toy.jsonl")
     toy.measured.clear()
     assert plot.main(plot.Options(("toy",), tmp_path)) == 0
+    drawn = {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.*")}
+    assert plot.main(plot.Options(("toy",), tmp_path)) == 0
+    assert drawn == {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.*")}
     assert sorted(path.suffix for path in tmp_path.glob("toy-*-cores.*")) == [".png", ".svg"]
     document = tmp_path / "README.md"
     document.write_text("# Before\n\n<!-- table toy -->\nold\n<!-- end -->\n\nAfter\n")
