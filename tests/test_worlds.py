@@ -111,7 +111,7 @@ def test_threads_share_a_step_only_where_it_is_long_enough(
     run = Workers.run
     monkeypatch.setattr(Workers, "run", lambda self, calls: (shared.append(len(calls)), run(self, calls)))
     env = lw.make("hopper", nworld=6, engine="mujoco", **options)
-    for _ in range(3):
+    for _ in range(capture.TIMED + 2):
         env.step()
     assert set(shared) == ({parts} if parts else set())
 

@@ -352,7 +352,8 @@ def test_a_step_runs_the_same_python_for_any_number_of_worlds() -> None:
         envs.reset(seed=0)
         action: Any = np.zeros((num_envs, 3), dtype=np.float32)
         action = torch.from_numpy(action) if options.get("torch") else action
-        envs.step(action)
+        for _ in range(2):  # the second step captures graphs
+            envs.step(action)
         count = 0
 
         def counted(frame: Any, event: str, argument: Any) -> None:
