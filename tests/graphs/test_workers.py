@@ -28,9 +28,9 @@ def test_calls_run_side_by_side_on_the_threads() -> None:
 
 
 def test_calls_start_the_threads_that_they_need_and_the_last_reference_ends_them() -> None:
-    before = own_threads()
+    before = own_threads()  # those of other tests' engines, which may end meanwhile
     workers = Workers(3)
-    assert own_threads() == before
+    assert not own_threads() - before
     for calls in (1, 2, 3, 2):
         workers.run([int] * calls)
     assert len(own_threads() - before) == 2
@@ -39,7 +39,7 @@ def test_calls_start_the_threads_that_they_need_and_the_last_reference_ends_them
     end = time.monotonic() + 10
     while own_threads() - before and time.monotonic() < end:
         time.sleep(0.01)
-    assert own_threads() == before
+    assert not own_threads() - before
 
 
 @pytest.mark.parametrize("place", [0, 1])
