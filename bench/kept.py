@@ -6,8 +6,7 @@ machine. The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco
 controls and number of substeps. ``kept`` is bare time by environment time; ``added`` is the difference. ``refresh`` is
 the time for fields that ``mj_step`` leaves behind, as a share of the step. On the Warp engine it counts those of the
 new state where the task reads positions, and a forward pass of the restarted worlds where it reads forces; what the
-next step takes over is counted, too. On the C engine it is what ``Batch.step`` itself takes longer if it computes the
-stage that the task needs.
+next step takes over is counted, too. On the C engine it counts those of the new state.
 
 Beside the package's tasks there is ``quadruped``, dm_control's, which reads sensors; dm_control must be installed.
 The experiment throughput prints these numbers.
@@ -17,6 +16,7 @@ import dataclasses
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,6 @@ import lyceum_warp as lw
 from lyceum_warp.arrays import launch_worlds
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
-from lyceum_warp.fields import Stage
 
 FILES = {"quadruped": Path(__file__).with_name("quadruped.py")}
 """Tasks of this folder."""
@@ -77,8 +76,6 @@ class BareC:
         assert isinstance(engine, MujocoEngine)
         self.rows = engine.batch.state
         self.batch = Batch(engine.batch.model, env.nworld, engine.nthread)
-        self.stage = engine.stage
-        self.staged = Batch(engine.batch.model, env.nworld, engine.nthread)
 
     def snapshot(self) -> tuple[np.ndarray, np.ndarray]:
         """States and controls of the environment's next step."""
@@ -89,13 +86,6 @@ class BareC:
 
     def step(self) -> None:
         self.batch.step(nstep=self.env.task.frame_skip)
-
-    def load_staged(self, snapshot: tuple[np.ndarray, np.ndarray]) -> None:
-        self.staged.state[:], self.staged.ctrl[:] = snapshot
-
-    def step_staged(self) -> None:
-        """A step that computes the stage which the task needs."""
-        self.staged.step(nstep=self.env.task.frame_skip, stage=self.stage)
 
 
 class BareWarp:
@@ -140,7 +130,7 @@ def synchronize(env: lw.Env) -> None:
         wp.synchronize_device(env.device)
 
 
-def seconds(env: lw.Env, function: Callable[[], None]) -> float:
+def seconds(env: lw.Env, function: Callable[[], object]) -> float:
     start = time.perf_counter()
     function()
     synchronize(env)
@@ -173,7 +163,7 @@ def compare(
         prepare: Chooses the actions of the next block, in steps that are taken back; off the clock.
     """
     bare = bare_engine(env)
-    whole, alone, staged = [], [], []
+    whole, alone = [], []
     warm = max(2, env.horizon // 500)  # graphs are captured, and states are no longer the first ones
     for repetition in range(warm + blocks):
         start = env.get_state()
@@ -187,45 +177,44 @@ def compare(
             act(t)
             snapshots.append(bare.snapshot())
             env.step()
-        time_bare = time_staged = 0.0
+        time_bare = 0.0
         for snapshot in snapshots:
             bare.load(snapshot)
             time_bare += seconds(env, bare.step)
-            if isinstance(bare, BareC) and bare.stage > Stage.NONE:
-                bare.load_staged(snapshot)
-                time_staged += seconds(env, bare.step_staged)
         if repetition >= warm:
-            staged.append((time_staged or time_bare) / BLOCK)
             whole.append(time_env / BLOCK)
             alone.append(time_bare / BLOCK)
     kept = statistics.median(b / a for a, b in zip(whole, alone, strict=True))
     step, step_alone = statistics.median(whole), statistics.median(alone)
     added = statistics.median(a - b for a, b in zip(whole, alone, strict=True)) * 1e6
     rate = env.nworld / step
-    longer = statistics.median(c - b for b, c in zip(alone, staged, strict=True))
-    refresh = refresh_seconds(env) if isinstance(env.engine, WarpEngine) else longer
     return {
         "env_steps_per_second": rate,
         "bare_steps_per_second": env.nworld / step_alone,
         "kept": kept,
         "added_microseconds": added,
-        "refresh": refresh / step,
+        "refresh": refresh_seconds(env) / step,
         "bytes_per_world": env.bytes_per_world,
         "first_step_seconds": first,  # with a cold cache, mostly compilation
     }
 
 
 def refresh_seconds(env: lw.Env) -> float:
-    """Seconds of a step's refreshes alone, for the worlds that restarted in the last step."""
+    """Seconds of a step's refreshes alone; on the Warp engine for the worlds that restarted in the last step, too."""
     engine = env.engine
-    assert isinstance(engine, WarpEngine)
-    if engine.stage == engine.reset_stage == Stage.NONE:
+    if isinstance(engine, MujocoEngine):
+        refresh: Callable[[], object] = engine.compute_stage
+        stages = (engine.stage,)
+    else:
+        assert isinstance(engine, WarpEngine)
+        stages = (engine.stage, engine.reset_stage)
+        with wp.ScopedDevice(env.device), wp.ScopedCapture() as capture:
+            engine.refresh_current(env.worlds.everyone)
+            engine.refresh(env.worlds.restarting)
+        refresh = partial(wp.capture_launch, capture.graph)
+    if not any(stages):
         return 0.0
-    with wp.ScopedDevice(env.device), wp.ScopedCapture() as capture:
-        engine.refresh_current(env.worlds.everyone)
-        engine.refresh(env.worlds.restarting)
-    times = [seconds(env, lambda: wp.capture_launch(capture.graph)) for _ in range(30)]
-    return statistics.median(times)
+    return statistics.median(seconds(env, refresh) for _ in range(30))
 
 
 def first_step(setting: Setting) -> tuple[lw.Env, float]:

@@ -9,6 +9,7 @@ sample is, and how each contestant makes it.
 """
 
 import dataclasses
+import statistics
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -182,7 +183,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def _median(values: list[float]) -> list[float]:
-    return [sorted(values)[len(values) // 2]] if values else []
+    return [statistics.median(values)] if values else []
 
 
 def _kept_line(row: Row) -> list[str]:

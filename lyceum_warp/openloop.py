@@ -223,6 +223,7 @@ class OpenLoop:
         launch_worlds(self.env.task.kernels.judge_rows, rows, args, self.env.device)
 
     def _end_of_horizon(self) -> None:
+        """Count the steps, collect faults, and observe the last states."""
         wp.launch(
             planning.add_steps, self.env.nworld, [self.horizon, self.worlds.counters.step], device=self.env.device
         )

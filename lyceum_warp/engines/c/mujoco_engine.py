@@ -97,16 +97,16 @@ class MujocoEngine(Engine):
         self._state_fields = [field for field in kept if field.name in STATE_FIELDS]
         self._derived = [field for field in kept if field.name not in STATE_FIELDS]
         computed = [field for field in self._derived if field.refresh > Stage.NONE]
-        only_positions = all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in computed)
-        self._apart = bool(computed) and (only_positions or any(field.lagged for field in kept))
+        positions = all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in computed)
+        self._apart = bool(computed) and (positions or any(field.lagged for field in kept))
         """Whether the stage after a step is a call of its own, in an MjData that another world may have had before."""
         self._before_stage = [field for field in self._derived if field not in computed or field.snapshot]
         self._mixed = [field for field in computed if field.snapshot]
         early = self._state_fields + [field for field in computed if not field.snapshot]
         self._shown = [field for field in (early if self._apart else kept) if field.name != "ctrl"]
         # positions do not depend on contacts, whose search takes most of their stage
-        without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if only_positions else 0
-        self._disabled = self.batch.expand("opt.disableflags") if self._apart and without else np.zeros(0, dtype=int)
+        without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if positions and computed else 0
+        self._disabled = self.batch.expand("opt.disableflags") if without else np.zeros(0, dtype=int)
         self._step_flags, self._stage_flags = self._disabled.copy(), self._disabled | without
         self._early_columns = np.isin(np.arange(model.nsensordata), early_sensor_columns(model))
         self._written = [field for field in kept if field.written]
@@ -194,16 +194,19 @@ class MujocoEngine(Engine):
     def _advance(self, nstep: int) -> None:
         with self._errors_as_warnings:
             self.batch.step(nstep=nstep, stage=Stage.NONE if self._apart else self.stage)
-        if not self._apart:
-            return
-        self._copy(self._before_stage, self._every)
+        if self._apart:
+            self._copy(self._before_stage, self._every)
+            self.compute_stage()
+            self._copy(self._mixed, self._every, early=True)
+
+    def compute_stage(self) -> None:
+        """Compute the stage of the fields that belong to the current state, in every world."""
         self._disabled[...] = self._stage_flags
         try:
             with self._errors_as_warnings:
                 self.batch.forward(stage=self.stage)
         finally:
             self._disabled[...] = self._step_flags
-        self._copy(self._mixed, self._every, early=True)
 
     def _show_fields(self) -> None:
         self._read(self._shown, self._everyone)
