@@ -206,6 +206,7 @@ class Curve:
         self.returns: list[float] = []
         """Returns of the episodes that ended since the last point, of the policy with its noise."""
         self._began, self._waited = 0.0, 0.0
+        self._next = 0
 
     def start(self, act: Act) -> None:
         """Judge the first policy and start the clock."""
@@ -222,13 +223,18 @@ class Curve:
 
     def due(self, samples: int) -> bool:
         """Whether the policy is to be judged now: at even distances, and at the end."""
-        case, done = self.case, len(self._points)
-        passed = max(samples / (case.samples or math.inf), self.seconds() / (case.limit or math.inf))
-        return self.ended(samples) or passed >= done / case.judgements
+        return self.ended(samples) or self._distances(samples) >= self._next
+
+    def _distances(self, samples: int) -> float:
+        """How much of the run is over, in distances between judgements."""
+        case = self.case
+        over = (samples, case.samples), (self.seconds(), case.limit)
+        return max(case.judgements * spent / (whole or math.inf) for spent, whole in over)
 
     def add(self, samples: int, act: Act) -> None:
         """Judge a policy, or keep it until the run has left the GPU; then it must not change with further learning."""
         seconds = self.seconds()
+        self._next = int(self._distances(samples)) + 1
         before = time.perf_counter()
         noisy = statistics.fmean(self.returns) if self.returns else None
         judged = act if self.case.contestant in ON_GPU else self.judge(act)

@@ -25,6 +25,8 @@ from lyceum_warp.viz.style import finish_axes, new_figure
 
 PARTS = {"cores": ("native", "c", "envpool", "gym-async", "dm_control"), "worlds": ("warp", "c")}
 """Contestants of each part. The Warp engine takes part on a GPU, or where it is named."""
+UNIT = "native"
+"""The contestant of the part ``cores`` that the others are compared with."""
 
 WORLDS = {"warp": (1, 8, 64, 512, 2_048, 8_192, 16_384, 32_768, 65_536, 131_072), "c": (1, 8, 64, 512, 4_096)}
 CPU_WORLDS = 512
@@ -144,7 +146,23 @@ def tables(rows: Sequence[Row]) -> list[Table]:
                 share = f"{SATURATED:.0%} of the highest rate from"
                 lines.append([share, *(f"{saturation(contestants_[name]):,}" for name in names)])
             made.append(Table(f"{task}, {title}:", [size, *(LABELS[name] for name in names)], lines))
+            if part == "cores" and (others := [name for name in names if name != UNIT]) and UNIT in names:
+                title = f"{task}, ratio to {LABELS[UNIT]}'s rate on as many cores"
+                made.append(Table(
+                    f"{title}. Medians; ratios of the same repeat, with their smallest and largest:",
+                    [size, *(LABELS[name] for name in others)],
+                    [[f"{many:,}", *map(median_and_range, beside_unit(rows, task, many, others))] for many in every],
+                ))  # fmt: skip
     return made
+
+
+def beside_unit(rows: Sequence[Row], task: str, threads: int, names: Sequence[str]) -> list[list[float]]:
+    """Ratios to native C's rate on as many cores, from the same repeats."""
+    same = [
+        row for row in rows if (row.case["part"], row.case["task"], row.case["threads"]) == ("cores", task, threads)
+    ]
+    ratios = experiment.paired(same, "env_steps_per_second", UNIT)
+    return [ratios.get(name, []) for name in names]
 
 
 def _cell(sizes: dict[int, list[float]], many: int, part: str) -> str:
@@ -169,9 +187,9 @@ def figure(rows: Sequence[Row]) -> Any:
             low, high = [min(values) for values in sizes.values()], [max(values) for values in sizes.values()]
             axes.fill_between(list(sizes), low, high, color=COLORS[name], alpha=0.2, linewidth=0)
             axes.plot(list(sizes), middles, color=COLORS[name], marker=".", label=LABELS[name])
-        if size == "threads" and "native" in found and 1 in found["native"]:
-            ends = [1, max(found["native"])]
-            one = statistics.median(found["native"][1])
+        if size == "threads" and UNIT in found and 1 in found[UNIT]:
+            ends = [1, max(found[UNIT])]
+            one = statistics.median(found[UNIT][1])
             axes.plot(ends, [one * n for n in ends], color="#aaa", linewidth=0.8, linestyle="--", label="in proportion")
         axes.set_xscale("log", base=2)
         if size == "worlds":

@@ -100,6 +100,16 @@ def test_ppo_of_stable_baselines3_yields_a_curve(npg: ModuleType) -> None:
     assert result["samples"] == 512 and [point[0] for point in result["curve"]] == [0, 256, 512]
 
 
+def test_a_long_iteration_is_judged_once(npg: ModuleType) -> None:
+    curve = npg.Curve(dataclasses.replace(case(npg, "npg"), judgements=10))
+    curve.judge = lambda act: 0.0
+    curve.start(lambda obs: obs)
+    for samples in (40, 50, 60, 180, 190, 200, 500):
+        if curve.due(samples):
+            curve.add(samples, len)
+    assert [point[0] for point in curve.points()] == [0, 50, 180, 200, 500]
+
+
 def test_a_yardstick_ends_when_its_time_is_over(npg: ModuleType) -> None:
     pytest.importorskip("stable_baselines3")
     limited = dataclasses.replace(case(npg, "ppo_sb3"), samples=1_000_000, limit=1e-3)

@@ -80,6 +80,9 @@ def test_scaling_is_measured_by_cores_and_worlds(
     printed = capsys.readouterr().out
     assert "| threads | native C | ours, C engine | Gymnasium, AsyncVectorEnv |" in printed
     assert "| 90% of the highest rate from | 16 |" in printed
+    rates = {row["case"]["contestant"]: row["result"]["env_steps_per_second"] for row in lines(out)[:3]}
+    ratios = [f"{rates[name] / rates['native']:.2f}" for name in ("c", "gym-async")]
+    assert f"| 1 | {' | '.join(ratios)} |" in printed
 
     import plot
 
