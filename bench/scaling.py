@@ -17,7 +17,7 @@ import contestants
 import experiment
 from contestants import LABELS
 from experiment import Experiment, Row, Table, choose, median_and_range
-from matplotlib.ticker import LogLocator
+from matplotlib.ticker import LogLocator, NullFormatter
 from throughput import COLORS, TASKS
 
 from lyceum_warp.machine import cpu_cores
@@ -178,7 +178,7 @@ def figure(rows: Sequence[Row]) -> Any:
     """The first task's rates: by cores, and by worlds."""
     drawn = [(size, by_size(rows, part, size)) for part, size in (("cores", "threads"), ("worlds", "worlds"))]
     drawn = [(size, groups) for size, groups in drawn if groups]
-    made = new_figure("scaling", 0.5 + 4.5 * len(drawn), 4.0)
+    made = new_figure("scaling", 0.5 + 4.5 * len(drawn), 4.5)
     panels = made.subplots(1, len(drawn), squeeze=False)[0] if drawn else []
     for axes, (size, groups) in zip(panels, drawn, strict=True):
         task, found = next(iter(groups.items()))
@@ -195,11 +195,14 @@ def figure(rows: Sequence[Row]) -> Any:
         if size == "worlds":
             axes.xaxis.set_major_locator(LogLocator(base=8, numticks=10))
         axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter("{x:,.0f}")
+        axes.yaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.set_major_formatter("{x:,.0f}")
         axes.set_xlabel("cores" if size == "threads" else "worlds")
         axes.set_ylabel("env steps per second")
         axes.set_title(task, loc="left")
-        axes.legend(frameon=False, fontsize="small")
+        axes.legend(frameon=False, fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.15))
     finish_axes(panels)
     return made
 
