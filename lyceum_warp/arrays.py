@@ -88,7 +88,7 @@ def _block(device: wp.Device | None) -> int:
 
 
 def launch_worlds(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device | None) -> None:
-    """Launch a kernel with a thread for each world; its last argument is the first world."""
+    """Launch a kernel with a thread for each world, or each row; its last argument is the first one."""
     _launch(kernel, (nworld,), 0, args, device, block_dim=_block(device))
 
 
@@ -108,7 +108,10 @@ def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp
 
 
 def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.array) -> None:
-    """Launch one of the copying kernels of ``kernels.state`` over the masked rows of the target, (nworld, n)."""
+    """Launch one of the copying kernels of ``kernels.state`` over the masked rows of the target, (nworld, n).
+
+    Its last arguments are the number of lanes and the first row.
+    """
     if target.size == 0:
         return
     lanes = min(32, target.shape[1]) if wp.get_device(target.device).is_cuda else 1

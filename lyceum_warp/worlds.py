@@ -29,7 +29,6 @@ from lyceum_warp.fields import Stage
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.graphs.workers import Workers
 from lyceum_warp.kernels import random, rows, state, steps
-from lyceum_warp.machine import cpu_cores
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.spaces import Space, action_space, control_ranges, control_scale, state_space
 from lyceum_warp.task import MEMORIES
@@ -200,9 +199,10 @@ class Worlds:
 
     def _make_workers(self) -> Workers | None:
         """Threads for the launches around the engine's calls, or None where the caller's is the only one."""
-        if not self.device.is_cpu or self.engine.capturable:
+        # Warp's kernels for debugging keep the address of a stack in a variable that all threads share
+        if not self.device.is_cpu or self.engine.capturable or wp.config.mode == "debug":
             return None
-        nthread = self.engine.nthread or cpu_cores()
+        nthread = self.engine.launch_threads
         return Workers(nthread) if nthread > 1 else None
 
     # phases

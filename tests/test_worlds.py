@@ -12,6 +12,7 @@ from metered_task import Metered
 
 import lyceum_warp as lw
 from lyceum_warp import worlds
+from lyceum_warp.engines.c import mujoco_engine
 from lyceum_warp.graphs import capture
 from lyceum_warp.graphs.workers import Workers
 from lyceum_warp.kernels import steps
@@ -89,7 +90,7 @@ def test_parts_of_the_worlds_have_the_numbers_of_all_worlds_together(monkeypatch
     """Three threads replay the launches around the C engine for a part of the four worlds each."""
     together, counts = outcomes_with_faults("mujoco")
     monkeypatch.setattr(capture, "SECONDS_A_THREAD", 1e-9)
-    monkeypatch.setattr(worlds, "cpu_cores", lambda: 3)
+    monkeypatch.setattr(mujoco_engine, "cpu_cores", lambda: 3)
     shared, run = [], Workers.run
     monkeypatch.setattr(Workers, "run", lambda self, calls: (shared.append(len(calls)), run(self, calls)))
     apart, same_counts = outcomes_with_faults("mujoco")
@@ -98,19 +99,30 @@ def test_parts_of_the_worlds_have_the_numbers_of_all_worlds_together(monkeypatch
     assert all(torch.equal(a, b) for a, b in zip(together, apart, strict=True))
 
 
+class DerivedEngine(mujoco_engine.MujocoEngine):
+    """Its launches may be for all worlds, whichever part a thread has."""
+
+
 @pytest.mark.parametrize(
     ("seconds", "options", "parts"),
-    [(1e-9, {}, 3), (1e-9, {"nthread": 2}, 2), (1e-9, {"nthread": 1}, 0), (1e-9, {"graphs": False}, 0), (9.0, {}, 0)],
+    [
+        (1e-9, {}, 3),
+        (1e-9, {"nthread": 2}, 2),
+        (1e-9, {"nthread": 1}, 0),
+        (1e-9, {"graphs": False}, 0),
+        (1e-9, {"engine": DerivedEngine}, 0),
+        (9.0, {}, 0),
+    ],
 )
 def test_threads_share_a_step_only_where_it_is_long_enough(
     seconds: float, options: dict[str, Any], parts: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worlds, "cpu_cores", lambda: 3)
+    monkeypatch.setattr(mujoco_engine, "cpu_cores", lambda: 3)
     monkeypatch.setattr(capture, "SECONDS_A_THREAD", seconds)
     shared: list[int] = []
     run = Workers.run
     monkeypatch.setattr(Workers, "run", lambda self, calls: (shared.append(len(calls)), run(self, calls)))
-    env = lw.make("hopper", nworld=6, engine="mujoco", **options)
+    env = lw.make("hopper", nworld=6, **{"engine": "mujoco"} | options)
     for _ in range(capture.TIMED + 2):
         env.step()
     assert set(shared) == ({parts} if parts else set())

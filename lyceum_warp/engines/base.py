@@ -44,10 +44,10 @@ class Engine(abc.ABC):
 
     name: str
     """The engine's name, as in ``make(engine=...)``."""
-    nthread: int = 1
-    """Threads that may have a part of the worlds each in launches around a step; 0 for one on every core.
+    launch_threads: int = 1
+    """Threads that may have a part of the worlds each in launches around a step.
 
-    An engine with several of them launches through ``lyceum_warp.arrays`` wherever it makes launches for all worlds.
+    An engine with several of them makes launches for all worlds through ``lyceum_warp.arrays`` alone.
     """
     capturable: bool
     """Whether every method is made of Warp launches, so that a whole step can be captured as one graph.

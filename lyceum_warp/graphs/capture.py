@@ -8,7 +8,9 @@ Warp runs a launch on the CPU in one thread. Beside an engine that steps on all 
 apart become several graphs, each for a part of the worlds, and threads replay them side by side.
 """
 
+import contextlib
 import dataclasses
+import threading
 import time
 import weakref
 from collections.abc import Callable, Iterable
@@ -101,16 +103,18 @@ class Graphs:
 
 
 SECONDS_A_THREAD = 5e-4
-"""How much work pays off one more thread; to wake it takes some 20 microseconds."""
+"""Seconds of work that pay for one more thread; to wake it takes some 20 microseconds."""
 TIMED = 8
 """Calls of which the shortest counts: other programs interrupt some."""
+_CAPTURING = threading.RLock()
+"""Warp captures one graph at a time, while controllers and viewers have environments in threads of their own."""
 
 
 class _Graph:
     """Functions made of launches as one graph, or as one for each thread where they take long.
 
     The first call runs them directly, which loads every module that they need; the second captures and replays; all
-    further calls replay. Where there are workers, the first of these are timed, and the last one of them decides.
+    further calls replay. Where there are workers, the first of these are timed, and the shortest time decides.
     """
 
     def __init__(
@@ -140,18 +144,19 @@ class _Graph:
         self._replay()
         self._times.append(time.perf_counter() - start)
         if len(self._times) == TIMED:
-            self._share(min(self._times))
-            self._times = None
+            shortest, self._times = min(self._times), None
+            self._share(shortest)
 
     def _share(self, seconds: float) -> None:
         """Let workers share the graph, which takes some time alone, as far as that pays off."""
         assert self._workers is not None
         parts = min(self._workers.nthread, int(seconds / SECONDS_A_THREAD))
         if parts > 1:
-            self._replay = partial(self._workers.run, [self._capture_part(k, parts) for k in range(parts)])
+            with contextlib.suppress(RuntimeError):  # other code captures now: the graph for all worlds stays
+                self._replay = partial(self._workers.run, [self._capture_part(k, parts) for k in range(parts)])
 
     def _capture_part(self, part: int, parts: int) -> Callable[[], object]:
-        with part_of_worlds(part, parts), wp.ScopedCapture(device=self._device) as capture:
+        with _CAPTURING, part_of_worlds(part, parts), wp.ScopedCapture(device=self._device) as capture:
             self._run()
         return partial(wp.capture_launch, capture.graph)
 

@@ -1,16 +1,11 @@
 """Threads that replay graphs of launches side by side."""
 
-import queue
-import threading
-import weakref
 from collections.abc import Callable, Sequence
-
-_Inbox = queue.SimpleQueue[tuple[Callable[[], object], "_Outbox"] | None]
-_Outbox = queue.SimpleQueue[BaseException | None]
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 
 class Workers:
-    """Threads of one owner; they end when it is collected. They start where calls need them, on the caller's cores.
+    """Threads that start with the first calls that need them, and end once this object is garbage-collected.
 
     Args:
         nthread: The most threads that work, the caller's among them.
@@ -18,9 +13,7 @@ class Workers:
 
     def __init__(self, nthread: int) -> None:
         self.nthread = nthread
-        self._inbox: _Inbox = queue.SimpleQueue()
-        self._threads: list[threading.Thread] = []
-        weakref.finalize(self, _stop, self._inbox, self._threads)
+        self._pool = ThreadPoolExecutor(max(nthread - 1, 1), "lyceum_warp")
 
     def run(self, calls: Sequence[Callable[[], object]]) -> None:
         """Call functions that release Python's lock while they work, and wait until all have returned.
@@ -31,35 +24,24 @@ class Workers:
         Raises:
             BaseException: That of a function, once all of them have ended.
         """
-        while len(self._threads) < min(len(calls), self.nthread) - 1:
-            thread = threading.Thread(target=_work, args=(self._inbox,), name="lyceum_warp", daemon=True)
-            thread.start()
-            self._threads.append(thread)
-        outbox: _Outbox = queue.SimpleQueue()
-        for call in calls[1:]:
-            self._inbox.put((call, outbox))
-        failed: BaseException | None = None
+        others: list[Future[object]] = []
         try:
+            for call in calls[1:]:
+                others.append(self._pool.submit(call))
             calls[0]()
-        finally:  # the others work on the same arrays, and must not outlast this call
-            for _ in calls[1:]:
-                failed = outbox.get() or failed
-        if failed is not None:
-            raise failed
+        finally:
+            _wait(others)
+        for other in others:
+            other.result()
 
 
-def _work(inbox: _Inbox) -> None:
-    while (given := inbox.get()) is not None:
-        call, outbox = given
-        error: BaseException | None = None
+def _wait(futures: Sequence[Future[object]]) -> None:
+    """Wait until all have ended, after an interrupt, too: they work on arrays that the caller reads next."""
+    interrupt: KeyboardInterrupt | None = None
+    while not all(future.done() for future in futures):
         try:
-            call()
-        except BaseException as raised:
-            error = raised
-        outbox.put(error)
-        del given, call, outbox, error  # a waiting thread must keep nothing alive
-
-
-def _stop(inbox: _Inbox, threads: list[threading.Thread]) -> None:
-    for _ in threads:
-        inbox.put(None)
+            wait(futures)
+        except KeyboardInterrupt as raised:
+            interrupt = raised
+    if interrupt is not None:
+        raise interrupt

@@ -81,11 +81,11 @@ def resident() -> int:
 @pytest.mark.parametrize("fields", [(), ("xpos",)])
 def test_the_c_engine_s_estimate_covers_a_world_that_has_no_mjdata_of_its_own(fields: tuple[str, ...]) -> None:
     """An MjData takes 165 kB even of a small model."""
-    env = lw.make("hopper", fields=fields)
+    env = lw.make("hopper", fields=fields, nthread=2)
     own = 4 * (2 * env.obs_space.size + 2 * env.action_space.size) + 8 * env.state_space.size
     assert own < env.bytes_per_world
     nworld, before = 4_000, resident()
-    many = lw.make("hopper", nworld=nworld, fields=fields)
+    many = lw.make("hopper", nworld=nworld, fields=fields, nthread=2)
     many.step()
     most = nworld * 1.5 * env.bytes_per_world + 30e6
     assert most < nworld * 100_000

@@ -320,7 +320,7 @@ def test_fields_take_the_parts_that_compute_them() -> None:
         assert parts(model_of(f'<{name} joint="knee"/>'), ["xpos"]) == (mjw.kinematics,)
 
 
-def test_fields_of_a_stage_and_those_of_the_last_substep_do_not_mix_where_worlds_share_an_mjdata() -> None:
+def test_fields_of_two_states_do_not_mix_in_an_mjdata_that_worlds_use_in_turn() -> None:
     """Fields that the stage after a step does not compute are another world's in the MjData that computes it."""
     model, device = model_of(SENSORS["mixed"]), wp.get_device("cpu")
     for lagged, current in ((), ("xpos",)), (("cvel",), ("xpos",)), (("cvel", "xpos"), ("sensordata",)):
@@ -341,3 +341,9 @@ def test_fields_of_a_stage_and_those_of_the_last_substep_do_not_mix_where_worlds
             rows = np.concatenate([engine.arrays[field.name].numpy() for engine in apart])
             np.testing.assert_array_equal(together.arrays[field.name].numpy(), rows, err_msg=f"{field.name} {lagged}")
             assert len(np.unique(rows.reshape(4, -1), axis=0)) == 4, field.name
+    early = early_sensor_columns(model)  # of the current state, beside sensors of the last substep
+    for state, shown in zip(together.batch.state, together.arrays["sensordata"].numpy(), strict=True):
+        data = mujoco.MjData(model)
+        mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        mujoco.mj_forward(model, data)
+        np.testing.assert_array_equal(shown[early], data.sensordata[early].astype(np.float32))

@@ -1,5 +1,6 @@
 """Phases become graphs: the same numbers, the same order, captured where they are made of launches."""
 
+import threading
 from functools import partial
 from typing import Any
 
@@ -91,6 +92,35 @@ def test_threads_have_a_part_of_the_worlds_each_in_phases_that_allow_it(monkeypa
         assert digits.numpy().tolist() == [1234] * 5
     # the first calls launch for all worlds, the second ones capture that, and later ones two parts where they may
     assert sizes == [5, 5, 5, 5, 5, 5, 5, 5, *(2, 2, 3, 3), *(2, 3)]
+
+
+def test_a_graph_stays_whole_where_other_code_captures_when_threads_would_share_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    digits, cpu = wp.zeros(5, dtype=int, device="cpu"), wp.get_device("cpu")
+    run = partial(launch_worlds, follow, 5, [1, digits], cpu)
+    monkeypatch.setattr(capture, "SECONDS_A_THREAD", 1e-9)
+    (call,) = Graphs(cpu, workers=Workers(2)).sequence([Phase("1", run, by_world=True)])
+    for _ in range(capture.TIMED):
+        call()
+    digits.zero_()
+    capturing, called = threading.Event(), threading.Event()
+
+    def other() -> None:
+        with wp.ScopedCapture(device=cpu):
+            capturing.set()
+            called.wait()
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    capturing.wait()
+    try:
+        call()
+    finally:
+        called.set()
+        thread.join()
+    call()
+    assert digits.numpy().tolist() == [11] * 5
 
 
 def test_without_graphs_every_phase_is_called_directly() -> None:

@@ -1,6 +1,7 @@
 """Threads that replay parts of a graph: all parts, side by side, with the errors of any, and no thread that stays."""
 
 import gc
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -11,20 +12,20 @@ from lyceum_warp.graphs.workers import Workers
 
 
 def own_threads() -> set[threading.Thread]:
-    return {thread for thread in threading.enumerate() if thread.name == "lyceum_warp"}
+    return {thread for thread in threading.enumerate() if thread.name.startswith("lyceum_warp_")}
 
 
 def test_calls_run_side_by_side_on_the_threads() -> None:
-    together, names = threading.Barrier(3), []
+    together, threads = threading.Barrier(3), []
 
     def call() -> None:
         together.wait(10)  # ends only where three threads come together
-        names.append(threading.current_thread().name)
+        threads.append(threading.current_thread())
 
     workers = Workers(3)
     for _ in range(3):
         workers.run([call] * 3)
-    assert sorted(names) == 3 * [threading.current_thread().name] + 6 * ["lyceum_warp"]
+    assert threads.count(threading.current_thread()) == 3 and len(set(threads)) == 3
 
 
 def test_calls_start_the_threads_that_they_need_and_the_last_reference_ends_them() -> None:
@@ -32,7 +33,7 @@ def test_calls_start_the_threads_that_they_need_and_the_last_reference_ends_them
     workers = Workers(3)
     assert not own_threads() - before
     for calls in (1, 2, 3, 2):
-        workers.run([int] * calls)
+        workers.run([threading.Barrier(calls).wait] * calls)
     assert len(own_threads() - before) == 2
     del workers
     gc.collect()
@@ -40,6 +41,22 @@ def test_calls_start_the_threads_that_they_need_and_the_last_reference_ends_them
     while own_threads() - before and time.monotonic() < end:
         time.sleep(0.01)
     assert not own_threads() - before
+
+
+def test_an_interrupt_waits_for_the_calls_that_still_work() -> None:
+    ended: list[bool] = []
+    begun = threading.Event()
+
+    def late() -> None:
+        begun.wait()
+        time.sleep(0.05)  # the caller waits by now
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)  # type: ignore[arg-type]
+        time.sleep(0.2)
+        ended.append(True)
+
+    with pytest.raises(KeyboardInterrupt):
+        Workers(2).run([begun.set, late])
+    assert ended
 
 
 @pytest.mark.parametrize("place", [0, 1])

@@ -28,6 +28,7 @@ from lyceum_warp.fields import (
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_rows64, fill_rows64, narrow, narrow_bool, widen, widen_bool
+from lyceum_warp.machine import cpu_cores
 from lyceum_warp.model_fields import ModelField
 from lyceum_warp.mujoco_log import quiet
 from lyceum_warp.validate import whole_number
@@ -76,6 +77,8 @@ class MujocoEngine(Engine):
         super().__init__(model, nworld, device, fields, dynamics, initial)
         quiet()
         self.nthread = whole_number("nthread", nthread, low=0)
+        # launches that a derived engine adds may be for all worlds, which every thread would repeat
+        self.launch_threads = (self.nthread or cpu_cores()) if type(self) is MujocoEngine else 1
         self.native_model = copy.copy(model)
         """The model as the batch runs it."""
         # a world with a fault must be reported, not silently reset in the middle of a step
@@ -99,7 +102,8 @@ class MujocoEngine(Engine):
         computed = [field for field in self._derived if field.refresh > Stage.NONE]
         positions = all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in computed)
         self._apart = bool(computed) and (positions or any(field.lagged for field in kept))
-        """Whether the stage after a step is a call of its own, in an MjData that another world may have had before."""
+        """Whether the stage after a step is a call of its own, in an MjData that another world may have used last."""
+        # copied before that call: fields that it does not compute, or in part
         self._before_stage = [field for field in self._derived if field not in computed or field.snapshot]
         self._mixed = [field for field in computed if field.snapshot]
         early = self._state_fields + [field for field in computed if not field.snapshot]
