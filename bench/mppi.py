@@ -412,6 +412,10 @@ def episodes_of(rows: Sequence[Row]) -> dict[int, dict[int, list[Any]]]:
     return sets
 
 
+def cores_of(rows: Sequence[Row]) -> str:
+    return ", ".join(map(str, sorted({row.case["threads"] for row in rows})))
+
+
 def episode_table(found: dict[tuple[str, int | None], dict[str, list[Row]]]) -> Table:
     lines = []
     for (task, _), same in found.items():
@@ -426,13 +430,13 @@ def episode_table(found: dict[tuple[str, int | None], dict[str, list[Row]]]) -> 
                 if seeds := ours.keys() & sets.get(i, {}).keys():
                     times.append(sum(sets[i][seed][3] for seed in seeds) / sum(ours[seed][3] for seed in seeds))
             lines.append([
-                task, CONTESTANTS[name], f"{good} of {len(each)}", f"{low:.0%} to {high:.0%}", shares,
+                task, CONTESTANTS[name], cores_of(group), f"{good} of {len(each)}", f"{low:.0%} to {high:.0%}", shares,
                 f"{statistics.fmean(episode[3] for episode in each):.3g}",
                 median_and_range(times),
             ])  # fmt: skip
     title = ("Episodes: success with its 95 % interval (Wilson), in each set of seeds, and mean seconds of an episode; "
              "the last column compares the same seeds, median over the sets (smallest to largest).")  # fmt: skip
-    header = ["task", "planner", "successes", "interval", "sets", "seconds", "seconds by ours"]
+    header = ["task", "planner", "cores", "successes", "interval", "sets", "seconds", "seconds by ours"]
     return Table(title, header, lines)
 
 
@@ -484,17 +488,15 @@ def figure(rows: Sequence[Row]) -> Figure:
     """Seconds of an episode with its success, or milliseconds of a plan, as points on a logarithmic axis."""
     panels: list[tuple[str, str, list[tuple[str, float, str]]]] = []  # title, unit, contestants
     for (task, _), same in grouped(rows, "episodes").items():
-        points = []
+        points, every = [], [row for group in same.values() for row in group]
         for name, group in same.items():
             each = [episode for row in group for episode in row.result["each"]]
             share = statistics.fmean(int(episode[1]) for episode in each)
             seconds = statistics.fmean(episode[3] for episode in each)
             points.append((name, seconds, f"{seconds:.3g} s, {share:.0%} succeed"))
-        panels.append((task, "seconds of an episode", points))
+        panels.append((task, f"seconds of an episode, cores: {cores_of(every)}", points))
     for part in ("plans", "cartpole"):
         for (task, samples), same in grouped(rows, part).items():
-            if part == "plans" and any(panel[0] == task for panel in panels):
-                continue
             points = []
             for name, group in same.items():
                 plan = statistics.median(row.result["plan_ms"] for row in group)

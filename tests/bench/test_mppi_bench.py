@@ -65,13 +65,20 @@ def test_the_short_mode_runs_and_resumes(mppi: ModuleType, tmp_path: Path, capsy
 def test_an_episode_that_two_blocks_share_counts_once(mppi: ModuleType) -> None:
     def block(contestant: str, first: int, seconds: list[float]) -> Any:
         each = [[first + i, i != 1, -100.0, value] for i, value in enumerate(seconds)]
-        where = {"part": "episodes", "task": "reach", "samples": None, "contestant": contestant, "repeat": 1}
+        where = {
+            "part": "episodes",
+            "task": "reach",
+            "samples": None,
+            "contestant": contestant,
+            "repeat": 1,
+            "threads": 2,
+        }
         return mppi.Row(where | {"first": first}, {"each": each}, {}, 1.0)
 
     rows = [block("mppi", 1000, [1.0, 1.0, 1.0]), block("mppi", 1000, [1.0, 1.0]), block("python", 1000, [3.0])]
     (table,) = mppi.tables(rows)
     ours, python = table.rows
-    assert (ours[2], python[2], python[-1]) == ("2 of 3", "1 of 1", "3.00")
+    assert (ours[2:4], python[2:4], python[-1]) == (["2", "2 of 3"], ["2", "1 of 1"], "3.00")
 
 
 def test_a_python_environment_that_cannot_be_made_is_skipped(mppi: ModuleType) -> None:
