@@ -119,7 +119,10 @@ class Experiment:
     tables: Callable[[Sequence[Row]], Sequence[Table]]
     """Tables from the results of one machine alone."""
     figure: Callable[[Sequence[Row]], Any] | None
-    """Figure of matplotlib, which may be missing where cases are measured, from the results of one machine alone."""
+    """Figure of matplotlib, which may be missing where cases are measured, from the results of one machine alone.
+
+    None where they hold nothing to draw.
+    """
     options: type[Options] = Options
     packages: tuple[str, ...] = ()
     """Peers whose versions belong to the provenance."""

@@ -34,7 +34,8 @@ def main(options: Options) -> int:
             raise FileNotFoundError(f"there is no {path}: run the experiment {name} first")
         draw = experiment.load(name).figure
         for machine, rows in experiment.by_machine(experiment.read(path)).items() if draw else ():
-            figure = draw(rows)
+            if (figure := draw(rows)) is None:
+                continue
             for ending in ("png", "svg"):
                 out = options.results / f"{name}-{machine}.{ending}"
                 # names of elements that do not change with each drawing, and no date: equal figures are equal files

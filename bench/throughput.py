@@ -204,46 +204,48 @@ def _kept_line(row: Row) -> list[str]:
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    """Ratios to the unit, as bars for each task; the unit is the line at 1."""
-    drawn = [(part, unit, grouped(rows, part)) for part, unit in (("sampling", "native"), ("single", "gymnasium"))]
-    drawn = [entry for entry in drawn if entry[2]]
+    """Ratios to the unit, as bars for each task; the unit is the line at 1. None without anything to compare."""
+    drawn = []
+    for part, unit in (("sampling", "native"), ("single", "gymnasium")):
+        ratios = {
+            task: experiment.paired(same, "env_steps_per_second", unit) for task, same in grouped(rows, part).items()
+        }
+        names = [name for name in PARTS[part] if name != unit and any(found.get(name) for found in ratios.values())]
+        if names:
+            drawn.append((part, unit, names, ratios))
+    if not drawn:
+        return None
     made = new_figure("throughput", 9.0, 0.6 + 3.2 * len(drawn))
-    panels = made.subplots(len(drawn), 1, squeeze=False)[:, 0] if drawn else []
-    for axes, (part, unit, groups) in zip(panels, drawn, strict=True):
-        names = [name for name in present(groups, part) if name != unit]
-        width = 0.8 / max(len(names), 1)
+    panels = made.subplots(len(drawn), 1, squeeze=False)[:, 0]
+    for axes, (part, unit, names, ratios) in zip(panels, drawn, strict=True):
+        width = 0.8 / len(names)
         for k, name in enumerate(names):
-            for i, same in enumerate(groups.values()):
-                if values := experiment.paired(same, "env_steps_per_second", unit).get(name):
-                    middle = _median(values)[0]
-                    error = [[middle - min(values)], [max(values) - middle]]
-                    axes.bar(
-                        i + (k - (len(names) - 1) / 2) * width, middle, width, yerr=error, color=COLORS[name],
-                        ecolor="#555", error_kw={"linewidth": 0.8}, label=LABELS[name] if i == 0 else None,
-                    )  # fmt: skip
+            there = [(i, values) for i, found in enumerate(ratios.values()) if (values := found.get(name))]
+            middles = [statistics.median(values) for _, values in there]
+            error = [
+                [middle - min(values) for middle, (_, values) in zip(middles, there, strict=True)],
+                [max(values) - middle for middle, (_, values) in zip(middles, there, strict=True)],
+            ]
+            places = [i + (k - (len(names) - 1) / 2) * width for i, _ in there]
+            axes.bar(
+                places, middles, width, yerr=error, color=COLORS[name], ecolor="#555", error_kw={"linewidth": 0.8},
+                label=LABELS[name],
+            )  # fmt: skip
         axes.axhline(1.0, color=COLORS["native"], linewidth=1.0)
         if part == "sampling":
+            every = [1.0, *(ratio for found in ratios.values() for name in names for ratio in found.get(name, ()))]
             axes.set_yscale("log")
             axes.set_yticks([0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100])
             axes.minorticks_off()
-            axes.set_ylim(*_limits(groups, names, unit))
+            axes.set_ylim(0.7 * min(every), 1.4 * max(every))
             axes.yaxis.set_major_formatter("{x:g}")
-        axes.set_xticks(range(len(groups)), groups)
+        axes.set_xticks(range(len(ratios)), ratios)
         axes.set_ylabel(f"env steps per second,\n{LABELS[unit]} = 1")
-        threads = max(row.case["threads"] for same in groups.values() for row in same)
+        threads = max(row.case["threads"] for row in rows if row.case["part"] == part)
         axes.set_title(f"{threads} threads" if part == "sampling" else "one world, one thread", loc="left")
         axes.legend(frameon=False, ncols=3, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.1))
     finish_axes(panels)
     return made
-
-
-def _limits(groups: dict[str, list[Row]], names: Sequence[str], unit: str) -> tuple[float, float]:
-    """Ends of an axis of ratios that holds all of them and 1."""
-    ratios = [1.0]
-    for same in groups.values():
-        found = experiment.paired(same, "env_steps_per_second", unit)
-        ratios += [ratio for name in names for ratio in found.get(name, [])]
-    return 0.7 * min(ratios), 1.4 * max(ratios)
 
 
 EXPERIMENT = Experiment(

@@ -67,6 +67,11 @@ def test_actions_of_a_policy_are_stepped_beside_the_bare_engine(
     assert row["case"]["policy"] == str(policy) and row["result"]["kept"] > 0.0
     assert "| cartpole, of a policy | C | 16 |" in capsys.readouterr().out
 
+    import plot
+
+    assert plot.main(plot.Options(("throughput",), tmp_path)) == 0
+    assert not [*tmp_path.glob("*.svg")]  # nothing to compare
+
 
 def test_scaling_is_measured_by_cores_and_worlds(
     bench: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
