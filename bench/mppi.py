@@ -87,8 +87,8 @@ class Options(experiment.Options):
     """Parts: plans, episodes, cartpole; by default all."""
     episodes: int = 100
     """Episodes of each set of seeds."""
-    sets: int = 3
-    """Sets of seeds. Those of set i begin at 1000 i; the seeds from 0 on chose nothing, but were published before."""
+    sets: tuple[int, ...] = (1, 2, 3)
+    """Numbers of the sets of seeds. Set i begins at seed 1000 i; set 0 chose nothing, but was published before."""
     block: int = 10
     """Episodes of a contestant before the next one's turn."""
     seconds: float = 20.0
@@ -131,9 +131,10 @@ def cases(options: Options) -> list[Case]:
     simulated = [name for name in contestants if name not in PEERS]
     planning = [name for name in contestants if name not in PYTHON]
     repeats, count = options.repeats or (1 if short else 5), 2 if short else options.episodes
-    seconds, sets, steps = 1.0 if short else options.seconds, 1 if short else options.sets, 10 if short else STEPS
-    if min(count, sets, options.block, repeats) < 1:
-        raise ValueError("episodes, sets, block and repeats must be at least 1")
+    seconds, steps = (1.0, 10) if short else (options.seconds, STEPS)
+    sets = options.sets[:1] if short else options.sets
+    if min(count, options.block, repeats, *sets) < 1:
+        raise ValueError("episodes, block, repeats and the numbers of the sets must be at least 1")
     plans = [
         Case("plans", task, name, repeat, 500 + repeat, 0, steps, None, seconds, threads)
         for repeat in range(repeats) for task in PLANS for name in simulated
@@ -142,7 +143,7 @@ def cases(options: Options) -> list[Case]:
     episodes = [
         Case("episodes", task, name, number, 1000 * number + first, min(options.block, count - first), steps, None, 0.0,
              threads)
-        for number in range(1, sets + 1) for first in range(0, count, options.block)
+        for number in sets for first in range(0, count, options.block)
         for task in EPISODES for name in simulated
         if "episodes" in parts and task in tasks
     ]  # fmt: skip
