@@ -130,13 +130,24 @@ def test_judos_worker_has_our_reward(monkeypatch: pytest.MonkeyPatch) -> None:
         assert worker.rewards(after, controls) == pytest.approx(env.reward.numpy(), abs=2e-5)
 
 
+def test_sets_of_seeds_are_chosen_by_number(mppi: ModuleType) -> None:
+    options = {"parts": ("episodes",), "tasks": ("reach",), "contestants": ("mppi", "python"), "block": 40}
+    chosen = mppi.cases(mppi.Options(**options, sets=(3, 1)))
+    assert [(case.repeat, case.first, case.count) for case in chosen if case.contestant == "python"] == [
+        (3, 3000, 40), (3, 3040, 40), (3, 3080, 20), (1, 1000, 40), (1, 1040, 40), (1, 1080, 20),
+    ]  # fmt: skip
+    assert sorted(set(chosen), key=chosen.index) == chosen
+    assert set(chosen) < set(mppi.cases(mppi.Options(**options)))  # all three sets
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["--parts", "episode"], "there is no part 'episode': did you mean episodes?"),
         (["--contestants", "hydrax"], "there is no contestant 'hydrax'"),
         (["--jobs", "2"], "so that jobs must be 1: or give --parts episodes"),
-        (["--block", "0"], "block and repeats must be at least 1"),
+        (["--block", "0"], "block, repeats and the numbers of the sets must be at least 1"),
+        (["--sets", "0", "3"], "the numbers of the sets must be at least 1"),
     ],
 )
 def test_bad_input_gets_one_line(
