@@ -425,13 +425,13 @@ def episode_table(found: dict[tuple[str, int | None], dict[str, list[Row]]]) -> 
             each = [episode for same_set in sets.values() for episode in same_set.values()]
             good = sum(int(episode[1]) for episode in each)
             low, high = wilson(good, len(each))
-            shares = ", ".join(f"{statistics.fmean(int(e[1]) for e in sets[i].values()):.0%}" for i in sorted(sets))
+            by_set = ", ".join(f"{i}: {sum(int(e[1]) for e in sets[i].values())}/{len(sets[i])}" for i in sorted(sets))
             times = []
             for i, ours in episodes_of(same.get("mppi", ())).items():
                 if seeds := ours.keys() & sets.get(i, {}).keys():
                     times.append(sum(sets[i][seed][3] for seed in seeds) / sum(ours[seed][3] for seed in seeds))
             lines.append([
-                task, CONTESTANTS[name], cores_of(group), f"{good} of {len(each)}", f"{low:.0%} to {high:.0%}", shares,
+                task, CONTESTANTS[name], cores_of(group), f"{good} of {len(each)}", f"{low:.0%} to {high:.0%}", by_set,
                 f"{statistics.fmean(episode[3] for episode in each):.3g}",
                 median_and_range(times),
             ])  # fmt: skip

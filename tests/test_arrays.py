@@ -4,7 +4,7 @@ import pytest
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import flat, launch_rows, torch_view
+from lyceum_warp.arrays import flat, launch_rows, launch_several_rows, torch_view
 from lyceum_warp.kernels import state
 
 
@@ -41,3 +41,16 @@ def test_launch_rows_of_an_empty_array_launches_nothing() -> None:
     empty = wp.zeros((3, 0), dtype=float, device="cpu")
     launch_rows(state.copy_rows, wp.full(3, True, dtype=bool, device="cpu"), empty, empty)
     assert torch.equal(torch_view(empty), torch.zeros(3, 0))
+
+
+@pytest.mark.parametrize("count", [1, 4, 6])
+def test_several_rows_are_copied_in_their_order(count: int) -> None:
+    mask = wp.array([True, False, True], dtype=bool, device="cpu")
+    rows = [wp.full((3, k + 1), 0.5 + k, dtype=float, device="cpu") for k in range(count)]
+    wide = [wp.zeros((3, k + 1), dtype=wp.float64, device="cpu") for k in range(count)]
+    back = [wp.zeros((3, k + 1), dtype=float, device="cpu") for k in range(count)]
+    none = wp.zeros((3, 0), dtype=float, device="cpu"), wp.zeros((3, 0), dtype=wp.float64, device="cpu")
+    launch_several_rows(state.widen_four, mask, list(zip(rows, wide, strict=True)), none)
+    launch_several_rows(state.narrow_four, mask, list(zip(wide, back, strict=True)), none[::-1])
+    for k, copied in enumerate(back):
+        assert copied.numpy().tolist() == [[0.5 + k] * (k + 1), [0.0] * (k + 1), [0.5 + k] * (k + 1)]

@@ -32,6 +32,62 @@ def narrow(
             target_out[w, i] = float(source_in[w, i])
 
 
+@wp.func
+def narrow_row(source: wp.array2d[wp.float64], target: wp.array2d[float], w: int):
+    for i in range(target.shape[1]):
+        target[w, i] = float(source[w, i])
+
+
+@wp.func
+def widen_row(source: wp.array2d[float], target: wp.array2d[wp.float64], w: int):
+    for i in range(target.shape[1]):
+        target[w, i] = wp.float64(source[w, i])
+
+
+@wp.kernel(enable_backward=False)
+def narrow_four(
+    mask_in: wp.array[bool],
+    source0_in: wp.array2d[wp.float64],
+    target0_out: wp.array2d[float],
+    source1_in: wp.array2d[wp.float64],
+    target1_out: wp.array2d[float],
+    source2_in: wp.array2d[wp.float64],
+    target2_out: wp.array2d[float],
+    source3_in: wp.array2d[wp.float64],
+    target3_out: wp.array2d[float],
+    first: int,
+):
+    """Round the masked rows of four arrays of float64 to float32; launched over (nworld,) on the CPU."""
+    w = first + wp.tid()
+    if mask_in[w]:
+        narrow_row(source0_in, target0_out, w)
+        narrow_row(source1_in, target1_out, w)
+        narrow_row(source2_in, target2_out, w)
+        narrow_row(source3_in, target3_out, w)
+
+
+@wp.kernel(enable_backward=False)
+def widen_four(
+    mask_in: wp.array[bool],
+    source0_in: wp.array2d[float],
+    target0_out: wp.array2d[wp.float64],
+    source1_in: wp.array2d[float],
+    target1_out: wp.array2d[wp.float64],
+    source2_in: wp.array2d[float],
+    target2_out: wp.array2d[wp.float64],
+    source3_in: wp.array2d[float],
+    target3_out: wp.array2d[wp.float64],
+    first: int,
+):
+    """Copy the masked rows of four arrays of float32 into float64; launched over (nworld,) on the CPU."""
+    w = first + wp.tid()
+    if mask_in[w]:
+        widen_row(source0_in, target0_out, w)
+        widen_row(source1_in, target1_out, w)
+        widen_row(source2_in, target2_out, w)
+        widen_row(source3_in, target3_out, w)
+
+
 @wp.kernel(enable_backward=False)
 def widen_bool(
     mask_in: wp.array[bool], source_in: wp.array2d[bool], target_out: wp.array2d[wp.float64], lanes: int, first: int

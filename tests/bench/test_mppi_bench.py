@@ -136,7 +136,6 @@ def test_sets_of_seeds_are_chosen_by_number(mppi: ModuleType) -> None:
     assert [(case.repeat, case.first, case.count) for case in chosen if case.contestant == "python"] == [
         (3, 3000, 40), (3, 3040, 40), (3, 3080, 20), (1, 1000, 40), (1, 1040, 40), (1, 1080, 20),
     ]  # fmt: skip
-    assert sorted(set(chosen), key=chosen.index) == chosen
     assert set(chosen) < set(mppi.cases(mppi.Options(**options)))  # all three sets
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from mujoco.batch import Batch
 
-from lyceum_warp.arrays import flat, launch_rows, launch_worlds
+from lyceum_warp.arrays import flat, launch_rows, launch_several_rows, launch_worlds
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.batch_faults import ErrorsAsWarnings
 from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
@@ -27,7 +27,15 @@ from lyceum_warp.fields import (
 )
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.kernels import faults
-from lyceum_warp.kernels.state import copy_rows64, fill_rows64, narrow, narrow_bool, widen, widen_bool
+from lyceum_warp.kernels.state import (
+    copy_rows64,
+    fill_rows64,
+    narrow_bool,
+    narrow_four,
+    widen,
+    widen_bool,
+    widen_four,
+)
 from lyceum_warp.machine import cpu_cores
 from lyceum_warp.model_fields import ModelField
 from lyceum_warp.mujoco_log import quiet
@@ -89,6 +97,7 @@ class MujocoEngine(Engine):
         self.batch = Batch(self.native_model, nworld, self.nthread)
         self._errors_as_warnings = ErrorsAsWarnings(self.batch)
         self._rows = self._alias(self.batch.state)
+        self._no_columns = self._rows[:, :0], wp.zeros((nworld, 0), dtype=float, device=device)
         self._warning: wp.array = wp.array(self.batch.warning, dtype=int, device=device, copy=False)
         self._initial = self._rounded_initial()
         self._sources: dict[str, wp.array] = {}
@@ -285,14 +294,17 @@ class MujocoEngine(Engine):
 
     def _read(self, fields: Iterable[Field], mask: wp.array) -> None:
         """Round the engine's values of fields into their arrays, in the masked worlds, by launches."""
+        numbers = []
         for field in fields:
             array, source = self.arrays[field.name], self._sources[field.name]
             if array.dtype is wp.bool:
                 launch_rows(narrow_bool, mask, source, array)
             else:
-                launch_rows(narrow, mask, source, flat(array))
+                numbers.append((source, flat(array)))
+        launch_several_rows(narrow_four, mask, numbers, self._no_columns)
 
     def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
+        numbers = []
         for field in self._state_fields:
             if names is not None and field.name not in names:
                 continue
@@ -300,7 +312,8 @@ class MujocoEngine(Engine):
             if array.dtype is wp.bool:
                 launch_rows(widen_bool, mask, array, column)
             elif field.name not in READ_ONLY:
-                launch_rows(widen, mask, flat(array), column)
+                numbers.append((flat(array), column))
+        launch_several_rows(widen_four, mask, numbers, self._no_columns[::-1])
 
     def refresh(self, mask: wp.array) -> None:
         computed = [field for field in self._derived if field.reset > Stage.NONE]  # the others are cleared
