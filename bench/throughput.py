@@ -25,7 +25,10 @@ import lyceum_warp as lw
 from lyceum_warp.machine import cpu_cores
 from lyceum_warp.viz.style import finish_axes, new_figure
 
-TASKS = ("cartpole", "hopper", "walker2d", "half_cheetah", "swimmer", "ant", "humanoid", "herb_reach")
+TASKS = (
+    "cartpole", "hopper", "walker2d", "half_cheetah", "swimmer", "ant", "humanoid", "herb_reach", "humanoid_standup",
+    "pusher", "reacher", "inverted_pendulum", "inverted_double_pendulum",
+)  # fmt: skip
 OTHER_TASKS = (*sorted({*lw.task_names()} - {*TASKS}), *kept.FILES)
 """Further tasks that the part kept can measure."""
 SHORT_TASKS = ("half_cheetah", "humanoid")
@@ -239,7 +242,7 @@ def figure(rows: Sequence[Row]) -> Any:
             axes.minorticks_off()
             axes.set_ylim(0.7 * min(every), 1.4 * max(every))
             axes.yaxis.set_major_formatter("{x:g}")
-        axes.set_xticks(range(len(ratios)), ratios)
+        axes.set_xticks(range(len(ratios)), [task.replace("_", "\n") for task in ratios])
         axes.set_ylabel(f"env steps per second,\n{LABELS[unit]} = 1")
         threads = max(row.case["threads"] for row in rows if row.case["part"] == part)
         axes.set_title(f"{threads} threads" if part == "sampling" else "one world, one thread", loc="left")

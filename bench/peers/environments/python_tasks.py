@@ -22,10 +22,18 @@ GYMNASIUM = {
     "swimmer": "Swimmer-v5",
     "ant": "Ant-v5",
     "humanoid": "Humanoid-v5",
+    "humanoid_standup": "HumanoidStandup-v5",
+    "reacher": "Reacher-v5",
+    "pusher": "Pusher-v5",
+    "inverted_pendulum": "InvertedPendulum-v5",
+    "inverted_double_pendulum": "InvertedDoublePendulum-v5",
     "cartpole": "LyceumCartpole-v0",
     "herb_reach": "LyceumHerbReach-v0",
 }
 """Gymnasium's names of the tasks."""
+
+JUDGE_NEW_STATE = {"humanoid_standup", "reacher", "pusher", "inverted_pendulum", "inverted_double_pendulum"}
+"""Tasks whose step in Gymnasium reads no state from before the physics."""
 
 
 class CartpoleEnv(MujocoEnv):
@@ -148,8 +156,37 @@ def dm_control_env(task: str, seed: int) -> Any:
             ends = getattr(self.env, "_terminate_when_unhealthy", False)
             return 0.0 if ends and not self.env.is_healthy else None
 
+    class FromStep(FromGymnasium):
+        """The same by the environment's own step, whose physics was made before."""
+
+        def __init__(self, env: Any, physics: Any) -> None:
+            super().__init__(env, physics)
+            env.do_simulation = lambda action, substeps: None
+            self.obs = env._get_obs()
+
+        def initialize_episode(self, physics: Any) -> None:
+            self.obs = self.env.reset_model()
+
+        def before_step(self, action: np.ndarray, physics: Any) -> None:
+            self.action = action
+            physics.set_control(action)
+
+        def after_step(self, physics: Any) -> None:
+            super().after_step(physics)
+            self.obs, self.reward, self.ends, *_ = self.env.step(self.action)
+
+        def get_reward(self, physics: Any) -> float:
+            return float(self.reward)
+
+        def get_observation(self, physics: Any) -> dict[str, np.ndarray]:
+            return {"observations": self.obs}
+
+        def get_termination(self, physics: Any) -> float | None:
+            return 0.0 if self.ends else None
+
     made = gymnasium.make(GYMNASIUM[task])
     env = made.unwrapped
     physics = dm_mujoco.Physics.from_xml_path(env.fullpath)
     limit = made.spec.max_episode_steps * env.dt
-    return control.Environment(physics, FromGymnasium(env, physics), limit, n_sub_steps=env.frame_skip)
+    judged = (FromStep if task in JUDGE_NEW_STATE else FromGymnasium)(env, physics)
+    return control.Environment(physics, judged, limit, n_sub_steps=env.frame_skip)
