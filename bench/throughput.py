@@ -218,7 +218,7 @@ def figure(rows: Sequence[Row]) -> Any:
             drawn.append((part, unit, names, ratios))
     if not drawn:
         return None
-    made = new_figure("throughput", 9.0, 0.6 + 3.2 * len(drawn))
+    made = new_figure("throughput", 9.5, 0.6 + 3.0 * len(drawn))
     panels = made.subplots(len(drawn), 1, squeeze=False)[:, 0]
     for axes, (part, unit, names, ratios) in zip(panels, drawn, strict=True):
         width = 0.8 / len(names)
@@ -242,11 +242,14 @@ def figure(rows: Sequence[Row]) -> Any:
             axes.minorticks_off()
             axes.set_ylim(0.7 * min(every), 1.4 * max(every))
             axes.yaxis.set_major_formatter("{x:g}")
-        axes.set_xticks(range(len(ratios)), [task.replace("_", "\n") for task in ratios])
+        axes.set_xticks(range(len(ratios)), [task.replace("_", "\n") for task in ratios], fontsize="small")
         axes.set_ylabel(f"env steps per second,\n{LABELS[unit]} = 1")
         threads = max(row.case["threads"] for row in rows if row.case["part"] == part)
         axes.set_title(f"{threads} threads" if part == "sampling" else "one world, one thread", loc="left")
-        axes.legend(frameon=False, ncols=3, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.1))
+        axes.legend(
+            frameon=False, ncols=len(names), fontsize="small", columnspacing=1.2, handlelength=1.4, loc="lower right",
+            bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1,
+        )  # fmt: skip
     finish_axes(panels)
     return made
 
