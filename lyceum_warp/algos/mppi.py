@@ -260,6 +260,7 @@ class MPPI:
                 self._deviation, self._nominal_deviation = (wp.zeros((count, nact), dtype=float) for _ in range(2))
         self._earned = [wp.from_torch(buffer) for buffer in (loop.reward, loop.terminated, loop.fault)]
         self.actions, self.nominal = torch_view(self._actions), torch_view(self._nominal_actions)
+        self._action = self.actions[0]
         self.knot_actions = torch_view(self._plan)
         self.standard_noise = torch_view(self._noise)
         self.sampled = loop.actions[:, :: config.models]
@@ -289,7 +290,7 @@ class MPPI:
         self._shift_view.fill_(whole_number("shift", shift, low=0))
         for call in self._calls:
             call()
-        return self.actions[0].clone()
+        return self._action.clone()
 
     def _program(self, *, first: bool) -> Calls:
         """The calls of one improvement, of which ``first`` moves the plan forward in time."""

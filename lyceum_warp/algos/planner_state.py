@@ -1,5 +1,6 @@
 """The states that a planner is given: made from their parts, and checked."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -62,8 +63,11 @@ def checked_state(env: Env, state: torch.Tensor, like: torch.Tensor) -> torch.Te
             "the same task, or make it by its parts with plan.state_of(qpos=..., qvel=...). (fields=[...] may make the "
             "states of an environment longer.)"
         )
-    # on a GPU this check would wait for the device; there every sample fails, and the plan stays
-    if state.device.type == "cpu" and not (finite := np.isfinite(state.numpy())).all():
+    if state.device.type != "cpu":  # the check would wait for the device; there every sample fails, and the plan stays
+        return state
+    values = state.numpy()
+    # one call, as a plan may take a millisecond; only what is not finite, or beyond 1e150, is looked at again
+    if not math.isfinite(values.dot(values)) and not (finite := np.isfinite(values)).all():
         column = int(np.flatnonzero(~finite)[0])
         part = next(n for n, part in env.state_space.parts.items() if part.start <= column < part.stop)
         raise ValueError(f"the state to plan from has {state[column].item()} in its {part!r}: it must be finite")

@@ -123,7 +123,6 @@ class MujocoEngine(Engine):
         self._step_flags, self._stage_flags = self._disabled.copy(), self._disabled | without
         self._early_columns = np.isin(np.arange(model.nsensordata), early_sensor_columns(model))
         self._written = [field for field in kept if field.written]
-        self._every = np.full(nworld, True)
         self._graphs = Graphs(device, capture_engine=False)
         self._steps: dict[int, Calls] = {}
         self._rollouts: dict[Any, NativeRollout | None] = {}
@@ -208,9 +207,9 @@ class MujocoEngine(Engine):
         with self._errors_as_warnings:
             self.batch.step(nstep=nstep, stage=Stage.NONE if self._apart else self.stage)
         if self._apart:
-            self._copy(self._before_stage, self._every)
+            self._copy(self._before_stage)
             self.compute_stage()
-            self._copy(self._mixed, self._every, early=True)
+            self._copy(self._mixed, early=True)
 
     def compute_stage(self) -> None:
         """Compute the stage of the fields that belong to the current state, in every world."""
@@ -224,18 +223,18 @@ class MujocoEngine(Engine):
     def _show_fields(self) -> None:
         self._read(self._shown, self._everyone)
 
-    def _copy(self, fields: list[Field], mask: np.ndarray, *, early: bool = False) -> None:
+    def _copy(self, fields: list[Field], mask: np.ndarray | None = None, *, early: bool = False) -> None:
         """Copy fields of the masked worlds from the engine's float64 arrays into their float32 arrays.
 
         Args:
             fields: Which fields.
-            mask: Which worlds.
+            mask: Which worlds; None for all.
             early: Whether to leave out sensors of the acceleration stage.
         """
         with np.errstate(over="ignore"):  # a world with a fault may hold numbers beyond float32
             for field in fields:
                 target, source = self._copies[field.name]
-                where = mask.reshape(-1, *[1] * (target.ndim - 1))
+                where: Any = True if mask is None else mask.reshape(-1, *[1] * (target.ndim - 1))
                 if early and field.name == "sensordata":
                     where = where & self._early_columns
                 np.copyto(target, source, "unsafe", where=where)
@@ -252,7 +251,7 @@ class MujocoEngine(Engine):
         native(state, controls, buffers)
         self.batch.state[:] = native.batch.state
         self.batch.warning += native.batch.warning
-        self._copy(self._state_fields, self._every)
+        self._copy(self._state_fields)
         if self.dynamics:
             self._read_columns(state, self._everyone, self.dynamics.values(), self.state_size - self._dynamics_size)
             self.apply_model(self._everyone)

@@ -83,6 +83,7 @@ class NativeRollout:
                 self.rows[field.name] = np.zeros((nworld, steps * nstep, *bound.shape[1:]))
                 if field.refresh > Stage.NONE:
                     self.final[field.name] = bound
+        self.recorded = list(self.rows)
 
     def __call__(self, state: wp.array, controls: wp.array, buffers: Mapping[str, wp.array]) -> None:
         """Roll out; see ``Engine.rollout``."""
@@ -103,12 +104,12 @@ class NativeRollout:
         batch = self.batch
         batch.state[:] = state[:, : batch.nstate]
         batch.warning[:] = 0
-        self.models.apply({name: state[:, columns].astype(np.float32) for name, columns in self.model_columns.items()})
+        if self.model_columns:
+            self.models.apply({name: state[:, part].astype(np.float32) for name, part in self.model_columns.items()})
         np.copyto(self.by_step, controls.transpose(1, 0, 2)[:, :, None])
-        rows: dict[str, Any] = {"record": list(self.rows), "out": self.rows}
         # a world that MuJoCo warns of stops there and repeats its last row: only the warning shows it
         with ErrorsAsWarnings(batch):
-            batch.rollout(nstep=self.control.shape[1], control=self.control, **rows)
+            batch.rollout(nstep=self.control.shape[1], control=self.control, record=self.recorded, out=self.rows)
         if self.stage > Stage.NONE:
             with ErrorsAsWarnings(batch):
                 batch.forward(stage=self.stage)
