@@ -118,23 +118,23 @@ def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.
     _launch(kernel, (target.shape[0], lanes), 0, [mask, source, target, lanes], target.device)
 
 
-ROWS_A_LAUNCH = 4
-"""Pairs of arrays that a launch of ``launch_several_rows`` copies."""
+PAIRS_A_LAUNCH = 4
+"""Pairs of arrays that one launch of ``narrow_four`` or ``widen_four`` copies."""
 
 
-def launch_several_rows(
-    kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple[wp.array, wp.array]], fill: tuple[wp.array, wp.array]
-) -> None:
+def launch_several_rows(kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple[wp.array, wp.array]]) -> None:
     """Launch ``narrow_four`` or ``widen_four`` of ``kernels.state`` over the masked rows of sources and targets.
 
-    On the CPU a launch takes longer than copying a few short rows, so that one launch copies four arrays.
+    On the CPU a launch takes longer than copying a few short rows, so one launch copies up to four arrays.
 
     Args:
         kernel: The kernel.
         mask: Which rows, (n,).
-        pairs: Sources and targets, (n, ...).
-        fill: A pair without columns, which stands for the fourth pair where there are three.
+        pairs: Sources and targets, (n, columns) each.
     """
-    for i in range(0, len(pairs), ROWS_A_LAUNCH):
-        some = [*pairs[i : i + ROWS_A_LAUNCH], *[fill] * ROWS_A_LAUNCH][:ROWS_A_LAUNCH]
+    pairs = [pair for pair in pairs if pair[1].size]
+    for i in range(0, len(pairs), PAIRS_A_LAUNCH):
+        some = list(pairs[i : i + PAIRS_A_LAUNCH])
+        source, target = some[0]
+        some += [(source[:, :0], target[:, :0])] * (PAIRS_A_LAUNCH - len(some))  # nothing to copy
         launch_worlds(kernel, len(mask), [mask, *(array for pair in some for array in pair)], mask.device)

@@ -43,14 +43,13 @@ def test_launch_rows_of_an_empty_array_launches_nothing() -> None:
     assert torch.equal(torch_view(empty), torch.zeros(3, 0))
 
 
-@pytest.mark.parametrize("count", [1, 4, 6])
-def test_several_rows_are_copied_in_their_order(count: int) -> None:
+@pytest.mark.parametrize("widths", [[1], [3, 2, 1, 4], [2, 0, 1, 3, 2, 1, 5]])
+def test_several_rows_are_copied_to_their_own_targets(widths: list[int]) -> None:
     mask = wp.array([True, False, True], dtype=bool, device="cpu")
-    rows = [wp.full((3, k + 1), 0.5 + k, dtype=float, device="cpu") for k in range(count)]
-    wide = [wp.zeros((3, k + 1), dtype=wp.float64, device="cpu") for k in range(count)]
-    back = [wp.zeros((3, k + 1), dtype=float, device="cpu") for k in range(count)]
-    none = wp.zeros((3, 0), dtype=float, device="cpu"), wp.zeros((3, 0), dtype=wp.float64, device="cpu")
-    launch_several_rows(state.widen_four, mask, list(zip(rows, wide, strict=True)), none)
-    launch_several_rows(state.narrow_four, mask, list(zip(wide, back, strict=True)), none[::-1])
-    for k, copied in enumerate(back):
-        assert copied.numpy().tolist() == [[0.5 + k] * (k + 1), [0.0] * (k + 1), [0.5 + k] * (k + 1)]
+    rows = [wp.full((3, width), 0.5 + k, dtype=float, device="cpu") for k, width in enumerate(widths)]
+    wide = [wp.zeros((3, width), dtype=wp.float64, device="cpu") for width in widths]
+    back = [wp.zeros((3, width), dtype=float, device="cpu") for width in widths]
+    launch_several_rows(state.widen_four, mask, list(zip(rows, wide, strict=True)))
+    launch_several_rows(state.narrow_four, mask, list(zip(wide, back, strict=True)))
+    for k, (width, copied) in enumerate(zip(widths, back, strict=True)):
+        assert copied.numpy().tolist() == [[0.5 + k] * width, [0.0] * width, [0.5 + k] * width]

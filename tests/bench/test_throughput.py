@@ -143,6 +143,21 @@ def test_bad_input_gets_one_line(
     assert captured.err.startswith(message) and captured.err.count("\n") == 1
 
 
+def test_all_of_gymnasiums_mujoco_tasks_are_compared(bench: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(BENCH / "peers" / "environments"))
+    import gymnasium
+    import python_tasks
+    import sampling
+    import throughput
+
+    theirs = {
+        name for name, spec in gymnasium.registry.items()
+        if name.endswith("-v5") and str(spec.entry_point).startswith("gymnasium.envs.mujoco")
+    }  # fmt: skip
+    assert len(theirs) == 11 and theirs <= {python_tasks.GYMNASIUM[task] for task in throughput.TASKS}
+    assert theirs <= {sampling.ENVPOOL.get(task) for task in throughput.TASKS}
+
+
 @pytest.mark.parametrize("task", ["cartpole", "herb_reach"])
 def test_python_tasks_are_ours(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Gymnasium's version of a task, from our states under our actions, returns our observations and rewards."""

@@ -1,7 +1,7 @@
 """Tasks for Gymnasium and for dm_control: the formulas that lyceum_warp's tasks have, on the same models.
 
-Gymnasium has the locomotion tasks, dm_control has cartpole. The others are written here as the library's users write
-them, with NumPy. This file runs in peers' environments, too: it does not import lyceum_warp.
+Gymnasium has all tasks but cartpole and herb_reach, dm_control has cartpole. The others are written here as the
+library's users write them, with NumPy. This file runs in peers' environments, too: it does not import lyceum_warp.
 """
 
 from pathlib import Path
@@ -157,7 +157,7 @@ def dm_control_env(task: str, seed: int) -> Any:
             return 0.0 if ends and not self.env.is_healthy else None
 
     class FromStep(FromGymnasium):
-        """The same by the environment's own step, whose physics was made before."""
+        """The same for a task that judges the new state alone: by Gymnasium's step, without its physics."""
 
         def __init__(self, env: Any, physics: Any) -> None:
             super().__init__(env, physics)

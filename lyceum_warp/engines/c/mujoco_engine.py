@@ -97,7 +97,6 @@ class MujocoEngine(Engine):
         self.batch = Batch(self.native_model, nworld, self.nthread)
         self._errors_as_warnings = ErrorsAsWarnings(self.batch)
         self._rows = self._alias(self.batch.state)
-        self._no_columns = self._rows[:, :0], wp.zeros((nworld, 0), dtype=float, device=device)
         self._warning: wp.array = wp.array(self.batch.warning, dtype=int, device=device, copy=False)
         self._initial = self._rounded_initial()
         self._sources: dict[str, wp.array] = {}
@@ -300,7 +299,7 @@ class MujocoEngine(Engine):
                 launch_rows(narrow_bool, mask, source, array)
             else:
                 numbers.append((source, flat(array)))
-        launch_several_rows(narrow_four, mask, numbers, self._no_columns)
+        launch_several_rows(narrow_four, mask, numbers)
 
     def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
         numbers = []
@@ -312,7 +311,7 @@ class MujocoEngine(Engine):
                 launch_rows(widen_bool, mask, array, column)
             elif field.name not in READ_ONLY:
                 numbers.append((flat(array), column))
-        launch_several_rows(widen_four, mask, numbers, self._no_columns[::-1])
+        launch_several_rows(widen_four, mask, numbers)
 
     def refresh(self, mask: wp.array) -> None:
         computed = [field for field in self._derived if field.reset > Stage.NONE]  # the others are cleared

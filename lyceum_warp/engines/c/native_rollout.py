@@ -83,7 +83,7 @@ class NativeRollout:
                 self.rows[field.name] = np.zeros((nworld, steps * nstep, *bound.shape[1:]))
                 if field.refresh > Stage.NONE:
                     self.final[field.name] = bound
-        self._kept: dict[str, Any] = {"record": list(self.rows), "out": self.rows}
+        self._outputs: dict[str, Any] = {"record": list(self.rows), "out": self.rows}
 
     def __call__(self, state: wp.array, controls: wp.array, buffers: Mapping[str, wp.array]) -> None:
         """Roll out; see ``Engine.rollout``."""
@@ -109,7 +109,7 @@ class NativeRollout:
         np.copyto(self.by_step, controls.transpose(1, 0, 2)[:, :, None])
         # a world that MuJoCo warns of stops there and repeats its last row: only the warning shows it
         with ErrorsAsWarnings(batch):
-            batch.rollout(nstep=self.control.shape[1], control=self.control, **self._kept)
+            batch.rollout(nstep=self.control.shape[1], control=self.control, **self._outputs)
         if self.stage > Stage.NONE:
             with ErrorsAsWarnings(batch):
                 batch.forward(stage=self.stage)
