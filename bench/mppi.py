@@ -11,7 +11,8 @@ and substeps. (hydrax has no release on the package index, where its name is tha
 The Python planners (``python_mppi.py``) are a careful one with a message a plan, and the simple one that the paper
 measured, with a message a step. All planners control the same plant. Contestants take turns in blocks of episodes.
 With --parts episodes --jobs N, N blocks run at a time, each in a process with cores of its own: successes stay the
-same, while times are those of cores whose neighbours work.
+same, while times are those of cores whose neighbours work. With --planners N, N planners share the GPU
+(``side_by_side.py``): successes stay the same, and times do not count.
 """
 
 import dataclasses
@@ -31,6 +32,7 @@ import mujoco_warp as mjw
 import numpy as np
 import peers
 import python_mppi
+import side_by_side
 import torch
 import warp as wp
 from experiment import Row, Skipped, Table, choose, installed, median_and_range
@@ -91,6 +93,8 @@ class Options(experiment.Options):
     """Numbers of the sets of seeds. Set i begins at seed 1000 i; set 0 chose nothing, but was published before."""
     block: int = 10
     """Episodes of a contestant before the next one's turn."""
+    planners: int = 1
+    """Planners that share the GPU, for episodes on the Warp engine whose times do not count."""
     seconds: float = 20.0
     """Time for the plans of a case, at least ten plans."""
 
@@ -127,14 +131,18 @@ def cases(options: Options) -> list[Case]:
     contestants = choose(options.contestants, CONTESTANTS, usual, what="contestant")
     if options.jobs > 1 and (parts != ("episodes",) or "mppi_warp" in contestants):
         raise ValueError("plans, cartpole and a GPU are timed alone, so that jobs must be 1: or give --parts episodes")
+    if options.planners > 1 and not (cuda and parts == ("episodes",) and contestants == ("mppi_warp",)):
+        raise ValueError(
+            f"planners={options.planners} share a GPU: give --device cuda --parts episodes --contestants mppi_warp"
+        )
     # a part without a contestant that has its tasks would be measured for nothing
     simulated = [name for name in contestants if name not in PEERS]
     planning = [name for name in contestants if name not in PYTHON]
     repeats, count = options.repeats or (1 if short else 5), 2 if short else options.episodes
     seconds, steps = (1.0, 10) if short else (options.seconds, STEPS)
     sets = options.sets[:1] if short else options.sets
-    if min(count, options.block, repeats, *sets) < 1:
-        raise ValueError("episodes, block, repeats and the numbers of the sets must be at least 1")
+    if min(count, options.block, options.planners, repeats, *sets) < 1:
+        raise ValueError("episodes, block, planners, repeats and the numbers of the sets must be at least 1")
     plans = [
         Case("plans", task, name, repeat, 500 + repeat, 0, steps, None, seconds, threads)
         for repeat in range(repeats) for task in PLANS for name in simulated
@@ -197,6 +205,17 @@ def plant(task: str, steps: int) -> lw.Env:
     return lw.make(task, autoreset=False, horizon=steps, engine="mujoco", nthread=1)
 
 
+@functools.cache
+def stream_planners(task: str, device: str, count: int, steps: int) -> list[side_by_side.StreamPlanner]:
+    """Planners that share a GPU, each with a plant of its own."""
+    made = [
+        side_by_side.StreamPlanner(planner.__wrapped__(task, "mppi_warp", 1, device), plant.__wrapped__(task, steps))
+        for _ in range(count)
+    ]
+    side_by_side.prepare(made)
+    return made
+
+
 def controller(case: Case, options: Options) -> Any:
     if case.contestant in PYTHON:
         return python_planner(case.task, case.contestant, case.threads)
@@ -208,16 +227,24 @@ def controller(case: Case, options: Options) -> Any:
 
 def run_episodes(case: Case, options: Options) -> dict[str, Any]:
     """A block of episodes."""
-    made, env = controller(case, options), plant(case.task, case.steps)
-    lw.control(env, made, seed=0, steps=3)  # captures graphs and wakes threads
-    done = [lw.control(env, made, seed=case.first + i) for i in range(case.count)]
+    seeds = range(case.first, case.first + case.count)
+    shared = {"planners": options.planners} if options.planners > 1 else {}
+    if shared:
+        planners = stream_planners(case.task, options.device, options.planners, case.steps)
+        done = side_by_side.episodes(planners, seeds)
+    else:
+        made, env = controller(case, options), plant(case.task, case.steps)
+        lw.control(env, made, seed=0, steps=3)  # captures graphs and wakes threads
+        done = [lw.control(env, made, seed=seed) for seed in seeds]
+    successes, returns = [bool(episode.succeeded) for episode in done], [episode.episode_return for episode in done]
+    seconds = [None if shared else round(episode.wall_seconds, 4) for episode in done]
+    each = [list(row) for row in zip(seeds, successes, (round(value, 4) for value in returns), seconds, strict=True)]
+    found = {"successes": sum(successes), "return": statistics.fmean(returns), "each": each}
+    if shared:
+        return found | shared
     plans = torch.cat([episode.plan_times for episode in done])
-    each = [[case.first + i, bool(episode.succeeded), round(episode.episode_return, 4), round(episode.wall_seconds, 4)]
-            for i, episode in enumerate(done)]  # fmt: skip
-    return {
-        "successes": sum(int(row[1]) for row in each), "return": statistics.fmean(row[2] for row in each),
-        "seconds": statistics.fmean(row[3] for row in each), "plan_ms": 1e3 * plans.median().item(), "each": each,
-    }  # fmt: skip
+    mean = statistics.fmean(episode.wall_seconds for episode in done)
+    return found | {"seconds": mean, "plan_ms": 1e3 * plans.median().item()}
 
 
 # plans from the same states
@@ -406,11 +433,17 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def episodes_of(rows: Sequence[Row]) -> dict[int, dict[int, list[Any]]]:
-    """Episodes (seed, success, return, seconds) by set and seed."""
+    """Episodes (seed, success, return, seconds) by set and seed; of planners that shared a GPU the seconds are None."""
     sets: dict[int, dict[int, list[Any]]] = {}
     for row in rows:
         sets.setdefault(row.case["repeat"], {}).update({episode[0]: episode for episode in row.result["each"]})
     return sets
+
+
+def mean_seconds(each: Sequence[Sequence[Any]]) -> str:
+    """Mean time of the episodes whose time counts; empty text without any."""
+    timed = [episode[3] for episode in each if episode[3] is not None]
+    return f"{statistics.fmean(timed):.3g}" if timed else ""
 
 
 def cores_of(rows: Sequence[Row]) -> str:
@@ -428,11 +461,12 @@ def episode_table(found: dict[tuple[str, int | None], dict[str, list[Row]]]) -> 
             by_set = ", ".join(f"{i}: {sum(int(e[1]) for e in sets[i].values())}/{len(sets[i])}" for i in sorted(sets))
             times = []
             for i, ours in episodes_of(same.get("mppi", ())).items():
-                if seeds := ours.keys() & sets.get(i, {}).keys():
-                    times.append(sum(sets[i][seed][3] for seed in seeds) / sum(ours[seed][3] for seed in seeds))
+                both = [(sets[i][seed][3], ours[seed][3]) for seed in ours.keys() & sets.get(i, {}).keys()]
+                if both := [pair for pair in both if None not in pair]:
+                    times.append(sum(pair[0] for pair in both) / sum(pair[1] for pair in both))
             lines.append([
                 task, CONTESTANTS[name], cores_of(group), f"{good} of {len(each)}", f"{low:.0%} to {high:.0%}", by_set,
-                f"{statistics.fmean(episode[3] for episode in each):.3g}",
+                mean_seconds(each),
                 median_and_range(times),
             ])  # fmt: skip
     title = ("Episodes: success with its 95 % interval (Wilson), in each set of seeds, and mean seconds of an episode; "
@@ -493,9 +527,10 @@ def figure(rows: Sequence[Row]) -> Figure:
         for name, group in same.items():
             each = [episode for row in group for episode in row.result["each"]]
             share = statistics.fmean(int(episode[1]) for episode in each)
-            seconds = statistics.fmean(episode[3] for episode in each)
-            points.append((name, seconds, f"{seconds:.3g} s, {share:.0%} succeed"))
-        panels.append((task, f"seconds of an episode, cores: {cores_of(every)}", points))
+            if seconds := mean_seconds(each):
+                points.append((name, float(seconds), f"{seconds} s, {share:.0%} succeed"))
+        if points:
+            panels.append((task, f"seconds of an episode, cores: {cores_of(every)}", points))
     for part in ("plans", "cartpole"):
         for (task, samples), same in grouped(rows, part).items():
             points = []
