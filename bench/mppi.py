@@ -228,10 +228,12 @@ def controller(case: Case, options: Options) -> Any:
 def run_episodes(case: Case, options: Options) -> dict[str, Any]:
     """A block of episodes."""
     seeds = range(case.first, case.first + case.count)
-    shared = {"planners": options.planners} if options.planners > 1 else {}
+    shared: dict[str, Any] = {"planners": options.planners} if options.planners > 1 else {}
     if shared:
         planners = stream_planners(case.task, options.device, options.planners, case.steps)
+        began = time.perf_counter()
         done = side_by_side.episodes(planners, seeds)
+        shared["seconds_of_all"] = time.perf_counter() - began
     else:
         made, env = controller(case, options), plant(case.task, case.steps)
         lw.control(env, made, seed=0, steps=3)  # captures graphs and wakes threads

@@ -39,9 +39,11 @@ class StreamPlanner:
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, *, shift: int = 1) -> torch.Tensor:
         action = self.plan(state, shift=shift)
+        event = torch.cuda.Event(blocking=True)  # other waits occupy a core
+        event.record(self._torch_stream)
         _TURN.release()
         try:
-            self._torch_stream.synchronize()
+            event.synchronize()
         finally:
             _TURN.acquire()
             self._device.set_stream(self._warp_stream, sync=False)
