@@ -521,8 +521,11 @@ def cartpole_table(found: dict[tuple[str, int | None], dict[str, list[Row]]]) ->
     return Table(title, ["samples", "planner", "plan, ms", "by ours", "return", "episodes"], lines)
 
 
-def figure(rows: Sequence[Row]) -> Figure:
-    """Seconds of an episode with its success, or milliseconds of a plan, as points on a logarithmic axis."""
+def figure(rows: Sequence[Row]) -> Figure | None:
+    """Seconds of an episode with its success, or milliseconds of a plan, as points on a logarithmic axis.
+
+    None where no two planners can be compared.
+    """
     panels: list[tuple[str, str, list[tuple[str, float, str]]]] = []  # title, unit, contestants
     for (task, _), same in grouped(rows, "episodes").items():
         points, every = [], [row for group in same.values() for row in group]
@@ -531,7 +534,7 @@ def figure(rows: Sequence[Row]) -> Figure:
             share = statistics.fmean(int(episode[1]) for episode in each)
             if seconds := mean_seconds(each):
                 points.append((name, float(seconds), f"{seconds} s, {share:.0%} succeed"))
-        if points:
+        if len(points) > 1:
             panels.append((task, f"seconds of an episode, cores: {cores_of(every)}", points))
     for part in ("plans", "cartpole"):
         for (task, samples), same in grouped(rows, part).items():
@@ -542,7 +545,11 @@ def figure(rows: Sequence[Row]) -> Figure:
                 if part == "cartpole":
                     text += f", return {statistics.fmean(row.result['return'] for row in group):.0f}"
                 points.append((name, plan, text))
-            panels.append((task if samples is None else f"{task}, {samples} samples", "milliseconds of a plan", points))
+            if len(points) > 1:
+                title = task if samples is None else f"{task}, {samples} samples"
+                panels.append((title, "milliseconds of a plan", points))
+    if not panels:
+        return None
     drawn = Figure(figsize=(10.0, 1.0 + 1.9 * ((len(panels) + 1) // 2)), layout="constrained")
     FigureCanvasAgg(drawn)
     axes = drawn.subplots((len(panels) + 1) // 2, 2, squeeze=False).flatten()

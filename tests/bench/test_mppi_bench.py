@@ -89,7 +89,9 @@ def test_episodes_of_planners_that_share_a_gpu_have_no_time(mppi: ModuleType, tm
     assert (line[3], line[6]) == ("1 of 2", "2")
     ((line,),) = (table.rows for table in mppi.tables([shared]))
     assert (line[3], line[6]) == ("0 of 1", "")
-    mppi.figure([alone, shared]).savefig(tmp_path / "mppi.svg")
+    python = mppi.Row(where | {"contestant": "python", "first": 1000}, {"each": [[1000, True, -9.0, 5.0]]}, {}, 1.0)
+    mppi.figure([alone, shared, python]).savefig(tmp_path / "mppi.svg")
+    assert mppi.figure([alone, shared]) is None  # nothing to compare
 
 
 def test_planners_share_only_a_gpu(mppi: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
