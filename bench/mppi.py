@@ -8,11 +8,13 @@ the time of a plan from the same states, the bare engine's time for the same rol
 controls taking turns with ours at every plan. *Cartpole*: judo, with our model and reward, at equal samples, horizon
 and substeps. (hydrax has no release on the package index, where its name is that of another project.)
 
-The Python planners (``python_mppi.py``) are a careful one with a message a plan, and the simple one that the paper
-measured, with a message a step. All planners control the same plant. Contestants take turns in blocks of episodes.
+A set at a time is one planner for a hundred plants, whose samples are all rolled out together; the time of an episode
+is its share. The Python planners (``python_mppi.py``) are a careful one with a message a plan, and the simple one that
+the paper measured, with a message a step. All planners control the same plant. Contestants take turns in blocks of
+episodes.
+
 With --parts episodes --jobs N, N blocks run at a time, each in a process with cores of its own: successes stay the
-same, while times are those of cores whose neighbours work. With --planners N, N planners share the GPU
-(``side_by_side.py``): successes stay the same, and times do not count.
+same, while times are those of cores whose neighbours work. With --busy episodes have no times.
 """
 
 import dataclasses
@@ -32,7 +34,6 @@ import mujoco_warp as mjw
 import numpy as np
 import peers
 import python_mppi
-import side_by_side
 import torch
 import warp as wp
 from experiment import Row, Skipped, Table, choose, installed, median_and_range
@@ -55,13 +56,19 @@ TASKS = (*PLANS, CARTPOLE)
 CONTESTANTS = {
     "mppi": "ours, C engine",
     "mppi_warp": "ours, Warp engine",
+    "mppi_together": "ours, C engine, a set at a time",
+    "mppi_warp_together": "ours, Warp engine, a set at a time",
     "python": "Python, a message a plan",
     "python_stepwise": "Python, a message a step",
     "judo": "judo",
 }
-OURS, PYTHON, PEERS = ("mppi", "mppi_warp"), ("python", "python_stepwise"), ("judo",)
+OURS, TOGETHER = ("mppi", "mppi_warp"), ("mppi_together", "mppi_warp_together")
+PYTHON, PEERS = ("python", "python_stepwise"), ("judo",)
+ON_WARP = ("mppi_warp", "mppi_warp_together")
 
-COLORS = dict(zip(CONTESTANTS, ("#c8502d", "#d99a2b", "#3d6fa5", "#8a6bb1", "#5a8f4e"), strict=True))
+COLORS = dict(
+    zip(CONTESTANTS, ("#c8502d", "#d99a2b", "#a33d1d", "#a87312", "#3d6fa5", "#8a6bb1", "#5a8f4e"), strict=True)
+)
 
 PLAN_MS = {
     "reach": {"mppi": 3.0, "mppi_warp": 12.0, "python": 5.4, "python_stepwise": 30.0},
@@ -93,8 +100,8 @@ class Options(experiment.Options):
     """Numbers of the sets of seeds. Set i begins at seed 1000 i; set 0 chose nothing, but was published before."""
     block: int = 10
     """Episodes of a contestant before the next one's turn."""
-    planners: int = 1
-    """Planners that share the GPU, for episodes on the Warp engine whose times do not count."""
+    busy: bool = False
+    """Other programs use this machine, too: keep the episodes' successes, and no times."""
     seconds: float = 20.0
     """Time for the plans of a case, at least ten plans."""
 
@@ -127,32 +134,33 @@ def cases(options: Options) -> list[Case]:
     threads = options.threads or len(os.sched_getaffinity(0)) // max(options.jobs, 1)
     parts = choose(options.parts, ("plans", "episodes", "cartpole"), what="part")
     tasks = choose(options.tasks, TASKS, ("reach",) if short else (), what="task")
-    usual = ("mppi", *(("mppi_warp",) if cuda else ()), *PYTHON, *(() if short else PEERS))
+    usual = [name for name in (*OURS, *TOGETHER, *PYTHON, *PEERS)
+             if (cuda or name not in ON_WARP) and not (short and name in PEERS)]  # fmt: skip
     contestants = choose(options.contestants, CONTESTANTS, usual, what="contestant")
-    if options.jobs > 1 and (parts != ("episodes",) or "mppi_warp" in contestants):
+    if options.jobs > 1 and (parts != ("episodes",) or {*ON_WARP} & {*contestants}):
         raise ValueError("plans, cartpole and a GPU are timed alone, so that jobs must be 1: or give --parts episodes")
-    if options.planners > 1 and not (cuda and parts == ("episodes",) and contestants == ("mppi_warp",)):
-        raise ValueError(
-            f"planners={options.planners} share a GPU: give --device cuda --parts episodes --contestants mppi_warp"
-        )
     # a part without a contestant that has its tasks would be measured for nothing
-    simulated = [name for name in contestants if name not in PEERS]
-    planning = [name for name in contestants if name not in PYTHON]
+    simulated = [name for name in contestants if name in (*OURS, *PYTHON)]
+    planning = [name for name in contestants if name in (*OURS, *PEERS)]
+    together = [name for name in contestants if name in TOGETHER]
     repeats, count = options.repeats or (1 if short else 5), 2 if short else options.episodes
     seconds, steps = (1.0, 10) if short else (options.seconds, STEPS)
     sets = options.sets[:1] if short else options.sets
-    if min(count, options.block, options.planners, repeats, *sets) < 1:
-        raise ValueError("episodes, block, planners, repeats and the numbers of the sets must be at least 1")
+    if min(count, options.block, repeats, *sets) < 1:
+        raise ValueError("episodes, block, repeats and the numbers of the sets must be at least 1")
     plans = [
         Case("plans", task, name, repeat, 500 + repeat, 0, steps, None, seconds, threads)
         for repeat in range(repeats) for task in PLANS for name in simulated
         if "plans" in parts and task in tasks
     ]  # fmt: skip
     episodes = [
-        Case("episodes", task, name, number, 1000 * number + first, min(options.block, count - first), steps, None, 0.0,
-             threads)
-        for number in sets for first in range(0, count, options.block)
-        for task in EPISODES for name in simulated
+        Case("episodes", task, name, number, 1000 * number + first, size, steps, None, 0.0, threads)
+        for number in sets
+        for first, size, names in (
+            *((first, min(options.block, count - first), simulated) for first in range(0, count, options.block)),
+            (0, count, together),
+        )
+        for task in EPISODES for name in names
         if "episodes" in parts and task in tasks
     ]  # fmt: skip
     cartpole = [
@@ -165,10 +173,11 @@ def cases(options: Options) -> list[Case]:
 
 
 def estimate(case: Case) -> float:
-    plan = 1e-3 * PLAN_MS[case.task][case.contestant]
+    times = PLAN_MS[case.task]
+    plan = 1e-3 * times.get(case.contestant, times["mppi"] if case.contestant == "mppi_together" else 50.0)
     if case.samples is not None:
         plan *= case.samples / 64
-    if case.contestant != "mppi_warp":
+    if case.contestant not in ON_WARP:
         plan *= max(2 / case.threads, 0.1)
     if case.part == "plans":
         # the states come from an episode, which the first contestant waits for
@@ -180,12 +189,14 @@ def estimate(case: Case) -> float:
 
 
 @functools.cache
-def planner(task: str, contestant: str, threads: int, device: str, samples: int | None = None) -> lw.MPPI:
+def planner(
+    task: str, contestant: str, threads: int, device: str, samples: int | None = None, plants: int = 1
+) -> lw.MPPI:
     """Ours; its settings are the task's own, but on cartpole those that all contestants have."""
-    more: dict[str, Any] = {}
+    more: dict[str, Any] = {"plants": plants}
     if samples is not None:
-        more = SWINGUP | {"samples": samples, "knots": KNOTS, "spline": "linear", "fill": "repeat"}
-    if contestant == "mppi_warp":
+        more |= SWINGUP | {"samples": samples, "knots": KNOTS, "spline": "linear", "fill": "repeat"}
+    if contestant in ON_WARP:
         return lw.MPPI(task, engine="warp", device=device, **more)
     return lw.MPPI(task, engine="mujoco", nthread=threads, **more)
 
@@ -201,19 +212,8 @@ def python_planner(task: str, contestant: str, threads: int) -> Any:
 
 
 @functools.cache
-def plant(task: str, steps: int) -> lw.Env:
-    return lw.make(task, autoreset=False, horizon=steps, engine="mujoco", nthread=1)
-
-
-@functools.cache
-def stream_planners(task: str, device: str, count: int, steps: int) -> list[side_by_side.StreamPlanner]:
-    """Planners that share a GPU, each with a plant of its own."""
-    made = [
-        side_by_side.StreamPlanner(planner.__wrapped__(task, "mppi_warp", 1, device), plant.__wrapped__(task, steps))
-        for _ in range(count)
-    ]
-    side_by_side.prepare(made)
-    return made
+def plant(task: str, steps: int, nworld: int = 1, threads: int = 1) -> lw.Env:
+    return lw.make(task, nworld=nworld, autoreset=False, horizon=steps, engine="mujoco", nthread=threads)
 
 
 def controller(case: Case, options: Options) -> Any:
@@ -226,27 +226,49 @@ def controller(case: Case, options: Options) -> Any:
 
 
 def run_episodes(case: Case, options: Options) -> dict[str, Any]:
-    """A block of episodes."""
+    """A block of episodes, one after the other or all together."""
     seeds = range(case.first, case.first + case.count)
-    shared: dict[str, Any] = {"planners": options.planners} if options.planners > 1 else {}
-    if shared:
-        planners = stream_planners(case.task, options.device, options.planners, case.steps)
-        began = time.perf_counter()
-        done = side_by_side.episodes(planners, seeds)
-        shared["seconds_of_all"] = time.perf_counter() - began
+    if case.contestant in TOGETHER:
+        successes, returns, times, plan = episodes_together(case, options, seeds)
     else:
         made, env = controller(case, options), plant(case.task, case.steps)
         lw.control(env, made, seed=0, steps=3)  # captures graphs and wakes threads
         done = [lw.control(env, made, seed=seed) for seed in seeds]
-    successes, returns = [bool(episode.succeeded) for episode in done], [episode.episode_return for episode in done]
-    seconds = [None if shared else round(episode.wall_seconds, 4) for episode in done]
-    each = [list(row) for row in zip(seeds, successes, (round(value, 4) for value in returns), seconds, strict=True)]
-    found = {"successes": sum(successes), "return": statistics.fmean(returns), "each": each}
-    if shared:
-        return found | shared
-    plans = torch.cat([episode.plan_times for episode in done])
-    mean = statistics.fmean(episode.wall_seconds for episode in done)
-    return found | {"seconds": mean, "plan_ms": 1e3 * plans.median().item()}
+        successes, returns = [episode.succeeded for episode in done], [episode.episode_return for episode in done]
+        times = [episode.wall_seconds for episode in done]
+        plan = torch.cat([episode.plan_times for episode in done]).median().item()
+    kept = [None if options.busy else round(seconds, 4) for seconds in times]
+    each = [list(row) for row in zip(seeds, successes, [round(value, 4) for value in returns], kept, strict=True)]
+    found: dict[str, Any] = {"successes": sum(successes), "return": statistics.fmean(returns), "each": each}
+    return found if options.busy else found | {"seconds": statistics.fmean(times), "plan_ms": 1e3 * plan}
+
+
+def episodes_together(
+    case: Case, options: Options, seeds: Sequence[int]
+) -> tuple[list[bool], list[float], list[float], float]:
+    """The same episodes with one planner for all plants: successes, returns, an episode's share of the time, and that
+    of a plan."""
+    made = planner(case.task, case.contestant, case.threads, options.device, None, case.count)
+    env, one = plant(case.task, case.steps, case.count, case.threads), plant(case.task, case.steps)
+    starts = []
+    for seed in seeds:
+        one.rand_reset(seed)
+        starts.append(one.get_state()[0])
+    for steps in (min(3, case.steps), case.steps):  # the first ones capture graphs and wake threads
+        env.set_state(torch.stack(starts))
+        made.reset(seeds)
+        returns = torch.zeros(case.count, dtype=torch.float64)
+        success, going = (torch.full((case.count,), value) for value in (False, True))
+        began = time.perf_counter()
+        for step in range(steps):
+            env.step(made(env.get_state(), shift=min(step, 1)).to(env.action.device))
+            returns += torch.where(going, env.reward, 0.0)
+            success = torch.where(going, env.success, success)
+            going &= ~env.done
+            if not going.any():
+                break
+    seconds = (time.perf_counter() - began) / case.count
+    return success.tolist(), returns.tolist(), [seconds] * case.count, seconds / (step + 1)
 
 
 # plans from the same states
@@ -435,7 +457,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def episodes_of(rows: Sequence[Row]) -> dict[int, dict[int, list[Any]]]:
-    """Episodes (seed, success, return, seconds) by set and seed; of planners that shared a GPU the seconds are None."""
+    """Episodes (seed, success, return, seconds) by set and seed; the seconds may be None."""
     sets: dict[int, dict[int, list[Any]]] = {}
     for row in rows:
         sets.setdefault(row.case["repeat"], {}).update({episode[0]: episode for episode in row.result["each"]})
@@ -443,7 +465,7 @@ def episodes_of(rows: Sequence[Row]) -> dict[int, dict[int, list[Any]]]:
 
 
 def mean_seconds(each: Sequence[Sequence[Any]]) -> str:
-    """Mean time of the episodes whose time counts; empty text without any."""
+    """Mean time of the episodes that have one; empty text without any."""
     timed = [episode[3] for episode in each if episode[3] is not None]
     return f"{statistics.fmean(timed):.3g}" if timed else ""
 
@@ -468,8 +490,7 @@ def episode_table(found: dict[tuple[str, int | None], dict[str, list[Row]]]) -> 
                     times.append(sum(pair[0] for pair in both) / sum(pair[1] for pair in both))
             lines.append([
                 task, CONTESTANTS[name], cores_of(group), f"{good} of {len(each)}", f"{low:.0%} to {high:.0%}", by_set,
-                mean_seconds(each),
-                median_and_range(times),
+                mean_seconds(each), median_and_range(times),
             ])  # fmt: skip
     title = ("Episodes: success with its 95 % interval (Wilson), in each set of seeds, and mean seconds of an episode; "
              "the last column compares the same seeds, median over the sets (smallest to largest).")  # fmt: skip

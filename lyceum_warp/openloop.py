@@ -20,7 +20,7 @@ from lyceum_warp.worlds import own_parts
 
 @document_attributes
 class OpenLoop:
-    """Rolls out the worlds of an environment from one state under given actions, and keeps their rewards.
+    """Rolls out the worlds of an environment from one or several states under given actions, and keeps their rewards.
 
     Write ``state`` and ``actions``, call ``run``, read the rest; every tensor stays the same object. Episodes do not
     end on the way: the caller decides what a task's termination means. The engine takes the whole horizon at once: on
@@ -36,14 +36,17 @@ class OpenLoop:
             ``state``.
         models: Values of model fields that differ between worlds, by name, each (n, size) float64 on the environment's
             device, read in every run: world w has row w % n instead of the values in ``state``.
+        states: Number of states to start from. The worlds of a state follow one another, as many for each.
 
     Raises:
-        ValueError: The environment resets its worlds automatically, ``keys`` has another shape, type or device, or the
-            buffers do not fit into memory.
+        ValueError: The environment resets its worlds automatically, ``keys`` has another shape, type or device, the
+            worlds cannot be shared among the states, or the buffers do not fit into memory.
     """
 
     state: torch.Tensor
-    """Where every world starts, (state_space.size,) float64."""
+    """Where every world starts, (state_space.size,) float64; with several states the same as ``states``."""
+    states: torch.Tensor
+    """The states to start from, (states, state_space.size) float64."""
     actions: torch.Tensor
     """Actions of each step, (horizon, nworld, nact); one that is not finite is set to zero."""
     reward: torch.Tensor
@@ -61,13 +64,15 @@ class OpenLoop:
 
     def __init__(
         self, env: Env, horizon: int, *, keys: wp.array | None = None, nominal_model: bool = False,
-        models: Mapping[str, wp.array] | None = None,
+        models: Mapping[str, wp.array] | None = None, states: int = 1,
     ) -> None:  # fmt: skip
         if env.autoreset:
             raise ValueError("open-loop rollouts need worlds that do not reset: make(..., autoreset=False)")
         self.env, self.worlds = env, env.worlds
         self.horizon = whole_number("horizon", horizon, low=1)
         n, nact, task = env.nworld, env.action_space.size, env.task
+        if n % whole_number("states", states, low=1):
+            raise ValueError(f"states={states} need as many worlds each, and nworld={n} is not a multiple")
         if keys is not None and (keys.shape, keys.dtype, keys.device) != ((n,), wp.uint32, env.device):
             raise ValueError(
                 f"keys must be a wp.array of shape ({n},) and type uint32 on {env.device}, not of shape {keys.shape} "
@@ -78,7 +83,7 @@ class OpenLoop:
         stepwise = task.functions["control"] is not None or task.functions["substep"] is not None
         check_fit(self._bytes_per_world(env, self.horizon), n, env.device)
         with wp.ScopedDevice(env.device):
-            self._state = wp.zeros(env.state_space.size, dtype=wp.float64)
+            self._state = wp.zeros((states, env.state_space.size), dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nact), dtype=float)
             # step by step, controls are made when their step comes
             self._controls = wp.zeros((self.horizon, n, 0 if stepwise else task.model.nu), dtype=float)
@@ -106,7 +111,8 @@ class OpenLoop:
                     setattr(batch, name, part)
         self._memories = {name: self._fields.pop(name) for name in MEMORIES if name in self._fields}
         self._dynamics = {f.name: self._fields.pop(f.name) for f in task.dynamics if f.name in self._fields}
-        self.state, self.actions = torch_view(self._state), torch_view(self._actions)
+        self.states, self.actions = torch_view(self._state), torch_view(self._actions)
+        self.state = self.states[0] if states == 1 else self.states
         self.reward = torch_view(self._reward).view(self.horizon, n)
         self.terminated = torch_view(self._terminated).view(self.horizon, n)
         self.fault = torch_view(self._fault)

@@ -511,3 +511,21 @@ def test_a_rollout_is_a_list_of_phases() -> None:
     names = [[phase.name for phase in rollouts(task, 2, engine="mujoco").phases] for task in (Forgetful, Servo)]
     assert names[0] == ["start", "physics", "advance", "judge", "end"]
     assert names[1] == ["start", "reset", "restore", *["act", "inputs", "physics", "fields", "judge"] * 2, "end"]
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_several_states_share_the_worlds(engine: str) -> None:
+    env = lw.make("hopper", engine=engine, nworld=6, autoreset=False, seed=1)
+    starts = lw.make("hopper", nworld=3, seed=5, autoreset=False).get_state()
+    loop, alone = OpenLoop(env, 3, states=3), OpenLoop(lw.make("hopper", engine=engine, nworld=2, autoreset=False), 3)
+    assert loop.state is loop.states and loop.states.shape == (3, env.state_space.size)
+    loop.actions.uniform_(-1.0, 1.0, generator=torch.Generator().manual_seed(0))
+    loop.state.copy_(starts)
+    loop.run()
+    for i in range(3):
+        alone.state.copy_(starts[i])
+        alone.actions.copy_(loop.actions[:, 2 * i : 2 * i + 2])
+        alone.run()
+        torch.testing.assert_close(loop.reward[:, 2 * i : 2 * i + 2], alone.reward)
+    with pytest.raises(ValueError, match="states=4 need as many worlds each, and nworld=6 is not a multiple"):
+        OpenLoop(env, 3, states=4)

@@ -14,12 +14,15 @@ The formulation is that of Williams et al. (2017, "Information theoretic MPC for
 without a cost on the controls, as in Lyceum (Summers et al. 2020) and in trajopt, which also is the source of the
 smoothing. Returns are divided by the temperature: the 5 of Summers et al. for their arm, an inverse, is 0.2 here.
 
+With several plants every plant has a plan, and the samples of all plans are rolled out together: a plan of few samples
+leaves most of a GPU, or most threads, without work.
+
 ``update`` chooses other weights in step 4. CEM (``cem.py``) weighs the best samples equally, and fits the noise to them
 afterwards. Predictive sampling (``predictive_sampling.py``) takes the best sample. With knots all of this happens to
 the knots of a spline, from which the actions of steps 3 and 5 are interpolated (``kernels/knots.py``).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -64,6 +67,10 @@ class MPPI:
     on the number of plans before it, and on the plan to start from. A task's functions draw from streams of each
     sample's own, seeded by the planner: a plan cannot know what the plant will draw.
 
+    ``plants=n`` plans for n plants at a time, as ``env.step(plan(env.get_state()))`` in an environment with n worlds.
+    The plan of plant i is that of a planner with the seed ``seed + i``. Buffers then have one more axis, for the
+    plants: after that of the steps, or, where they have none, as the first.
+
     A task's ``planning`` (see ``lw.Planning``) gives settings of the planner, and options and parameters of its
     worlds. Arguments replace what the task gives.
 
@@ -75,11 +82,13 @@ class MPPI:
             ``value(obs: Row[float]) -> float``, which becomes part of the graph on the Warp engine. With a value the
             parameters in ``planning`` do not apply, because the value function was fitted to the task's own rewards.
         seed: Seed of the noise.
+        plants: Number of plants to plan for.
         params: Parameters of the task, for names that are also settings.
         words: Single settings, by the names of ``lw.MPPIConfig`` (None leaves one as it is); options of the planner's
             worlds, as for ``lw.make``; and parameters of the task. (One value for each world: the worlds of a sample,
-            one for each model, follow one another.) With a CUDA device and engine="auto", the C engine
-            on the CPU rolls out few samples, because it is faster there; plans and actions then lie on the CPU.
+            one for each model, follow one another, and so do the samples of a plant.) With a CUDA device and
+            engine="auto", the C engine on the CPU rolls out few samples, because it is faster there; plans and actions
+            then lie on the CPU.
 
     Raises:
         ValueError: An argument is unknown, ambiguous or not valid.
@@ -88,6 +97,8 @@ class MPPI:
 
     config: MPPIConfig
     """The settings in force."""
+    plants: int
+    """Number of plants."""
     settings: dict[str, Any]
     """The same settings with the options and parameters of the planner's worlds, as JSON can hold them."""
     actions: torch.Tensor
@@ -122,21 +133,22 @@ class MPPI:
         *,
         value: Value | None = None,
         seed: int = 0,
+        plants: int = 1,
         params: Mapping[str, Any] | None = None,
         **words: Any,
     ) -> None:
         if value is not None and not callable(value):
             raise ValueError(f"value must be a function of observations, or None, not {described(value)}")
-        self.seed = whole_number("seed", seed, low=0)
+        self.seed, self.plants = whole_number("seed", seed, low=0), whole_number("plants", plants, low=1)
         task = find_task(task)
         words = words_of_update(self._update, words)
-        self.config, options, own_params = planner_arguments(task, config, words, params, value)
+        self.config, options, own_params = planner_arguments(task, config, words, params, value, self.plants)
         self.horizon, self.samples, self.iterations = self.config.horizon, self.config.samples, self.config.iterations
         self.temperature, self.discount = self.config.temperature, self.config.discount
         self.termination = self.config.termination
 
         self.settings = plain(options.given() | own_params | vars(self.config))
-        nworld = self.samples * self.config.models
+        nworld = self.plants * self.samples * self.config.models
         self.env = Env(task, options, nworld=nworld, autoreset=False, horizon=0, **own_params)
         drawn = self._drawn_fields()
         self.env.reset()
@@ -157,8 +169,9 @@ class MPPI:
             }
         self.model_fields = {name: torch_view(rows) for name, rows in fields.items()}
         self._loop = OpenLoop(
-            self.env, self.horizon, keys=self._keys, nominal_model=self.config.nominal_model, models=fields
-        )
+            self.env, self.horizon, keys=self._keys, nominal_model=self.config.nominal_model, models=fields,
+            states=self.plants,
+        )  # fmt: skip
         self._allocate()
         self._take_value(value)
         first, others = self._program(first=True), self._program(first=False)
@@ -211,7 +224,7 @@ class MPPI:
 
     def __setattr__(self, name: str, value: Any) -> None:
         if "_made" in self.__dict__:
-            if name in (*SETTINGS, "config", "value", "seed"):
+            if name in (*SETTINGS, "config", "value", "seed", "plants"):
                 raise AttributeError(f"{name} is part of the planner's graphs: make another MPPI with {name}={value!r}")
             if name in _BUFFERS:
                 raise AttributeError(
@@ -221,7 +234,8 @@ class MPPI:
 
     def _allocate(self) -> None:
         config, space, loop = self.config, self.env.action_space, self._loop
-        nact, nworld = space.size, self.env.nworld
+        nact, nworld, plants = space.size, self.env.nworld, self.plants
+        self._nsample = plants * self.samples
         factor = config.noise_factor(nact)
         self._diagonal = not np.tril(factor, -1).any()
         self._repeat = config.fill == "repeat"
@@ -234,53 +248,62 @@ class MPPI:
             self._high: wp.array = wp.array(space.high, dtype=float)
             self._fill: wp.array = wp.array(config.fill_action(space), dtype=float)
             self._scale: wp.array = wp.array(factor, dtype=float)
-            self._plan, self._nominal = (wp.zeros((count, nact), dtype=float) for _ in range(2))
-            self._noise = wp.zeros((count, self.samples, nact), dtype=float)
+            self._plan, self._nominal = (wp.zeros((count, plants, nact), dtype=float) for _ in range(2))
+            self._noise = wp.zeros((count, self._nsample, nact), dtype=float)
             self._terminal, self._world_return = (wp.zeros(nworld, dtype=float) for _ in range(2))
-            self._weight = wp.zeros(self.samples, dtype=float)
-            self._summary = wp.zeros(4, dtype=float)
-            self._seed, self._count, self._shift, self._phase = (wp.zeros(1, dtype=int) for _ in range(4))
-            self._passed = wp.zeros(1, dtype=int) if config.knots else self._shift
+            self._weight = wp.zeros(self._nsample, dtype=float)
+            self._summary = wp.zeros((plants, 4), dtype=float)
+            self._seed, self._count, self._shift, self._phase = (wp.zeros(plants, dtype=int) for _ in range(4))
+            self._passed = wp.zeros(plants, dtype=int) if config.knots else self._shift
             self._world_actions: Any = wp.from_torch(loop.actions)
             self._samples: Any = self._world_actions
             if config.knots or config.models > 1:
-                self._samples = wp.zeros((count, self.samples, nact), dtype=float)
-            self._return = self._world_return if config.models == 1 else wp.zeros(self.samples, dtype=float)
+                self._samples = wp.zeros((count, self._nsample, nact), dtype=float)
+            self._return = self._world_return if config.models == 1 else wp.zeros(self._nsample, dtype=float)
             self._actions, self._nominal_actions = (
-                [wp.zeros((self.horizon, nact), dtype=float) for _ in range(2)]
+                [wp.zeros((self.horizon, plants, nact), dtype=float) for _ in range(2)]
                 if config.knots
                 else [self._plan, self._nominal]
             )
             if config.update != "mppi":
-                self._rank = wp.zeros(self.samples, dtype=int)
+                self._rank = wp.zeros(self._nsample, dtype=int)
             if config.update == "cem":
                 self._first_deviation: wp.array = wp.array(np.diag(factor), dtype=float)
                 self._smallest: wp.array = wp.array(config.smallest_noise(nact), dtype=float)
                 self._spread: wp.array = wp.array(config.spread(count), dtype=float)
-                self._deviation, self._nominal_deviation = (wp.zeros((count, nact), dtype=float) for _ in range(2))
+                self._deviation, self._nominal_deviation = (
+                    wp.zeros((count, plants, nact), dtype=float) for _ in range(2)
+                )
         self._earned = [wp.from_torch(buffer) for buffer in (loop.reward, loop.terminated, loop.fault)]
-        self.actions, self.nominal = torch_view(self._actions), torch_view(self._nominal_actions)
+        self.actions, self.nominal, self.knot_actions = (
+            self._by_plant(torch_view(plan), 1) for plan in (self._actions, self._nominal_actions, self._plan)
+        )
+        self.standard_noise = self._by_plant(torch_view(self._noise).unflatten(1, (plants, self.samples)), 1)
+        self.sampled = self._by_plant(loop.actions[:, :: config.models].unflatten(1, (plants, self.samples)), 1)
+        self.adapted_noise = self._by_plant(torch_view(self._deviation), 1) if config.update == "cem" else None
+        self.returns, self.weights, self.model_returns = (
+            self._by_plant(torch_view(rows).view(plants, self.samples, *more), 0)
+            for rows, more in ((self._return, ()), (self._weight, ()), (self._world_return, (config.models,)))
+        )
         self._action = self.actions[0]
-        self.knot_actions = torch_view(self._plan)
-        self.standard_noise = torch_view(self._noise)
-        self.sampled = loop.actions[:, :: config.models]
-        self.adapted_noise = torch_view(self._deviation) if config.update == "cem" else None
-        self.returns, self.weights = torch_view(self._return), torch_view(self._weight)
-        self.model_returns = torch_view(self._world_return).view(self.samples, config.models)
         self._terminal_view, self._shift_view = torch_view(self._terminal), torch_view(self._shift)
+
+    def _by_plant(self, rows: torch.Tensor, axis: int) -> torch.Tensor:
+        """A buffer with an axis for the plants, which it has only if there are several."""
+        return rows.squeeze(axis) if self.plants == 1 else rows
 
     @torch.no_grad()
     def __call__(self, state: torch.Tensor, obs: torch.Tensor | None = None, *, shift: int = 1) -> torch.Tensor:
-        """Improve the plan from a state.
+        """Improve the plan from a state, or the plans from one state each.
 
         Args:
             state: (state_space.size,) float64, or one row of states: from ``get_state`` of an environment of the same
-                task, on either engine, or from ``state_of``.
+                task, on either engine, or from ``state_of``. With several plants (plants, state_space.size).
             obs: Not used; every controller is called with observations.
-            shift: Steps since the last call's state.
+            shift: Steps since the last call's states.
 
         Returns:
-            The action to take now, (nu,).
+            The action to take now, (nu,), or with several plants (plants, nu).
 
         Raises:
             ValueError: The state has another shape or type, or is not finite.
@@ -302,17 +325,17 @@ class MPPI:
         return sequence([*sample, *update])
 
     def _perturb(self, first: bool) -> None:
-        """The plan to start from, and the samples around it."""
+        """The plans to start from, and the samples around them."""
         config, device = self.config, self.env.device
         if first and config.knots:
             passed = [self._shift, self.horizon, config.knots, self._phase, self._passed]
-            wp.launch(knots.pass_knots, 1, passed, device=device)
+            wp.launch(knots.pass_knots, self.plants, passed, device=device)
         self._shifted(first, self._plan, self._fill, self._repeat, self._nominal)
         self._interpolate(self._nominal, self._nominal_actions)
-        dim = (self.samples, self._plan.shape[1])
+        dim = (self._nsample, self._plan.shape[2])
         wp.launch(planning.draw_noise, dim, [self._seed, self._count, self._noise], device=device)
         wp.launch(planning.draw_keys, self.env.nworld, [self._seed, self._count, self._keys], device=device)
-        wp.launch(planning.count_up, 1, [self._count], device=device)
+        wp.launch(planning.count_up, self.plants, [self._count], device=device)
         bounds = [self._smoothing, bool(config.include_plan), self._low, self._high, self._samples]
         if config.update == "cem":
             self._shifted(first, self._deviation, self._first_deviation, False, self._nominal_deviation)
@@ -335,8 +358,7 @@ class MPPI:
     def _interpolate(self, rows: wp.array, actions: wp.array) -> None:
         """The actions of a plan with knots; without them, rows and actions are one array."""
         if self.config.knots:
-            single: list[Any] = [array.reshape((array.shape[0], 1, array.shape[1])) for array in (rows, actions)]
-            self._interpolate_samples(*single)
+            self._interpolate_samples(rows, actions)
 
     def _interpolate_samples(self, rows: wp.array, actions: wp.array) -> None:
         args = [rows, self._phase, self.config.knots or self.horizon, self._order, self._low, self._high, actions]
@@ -352,15 +374,15 @@ class MPPI:
         wp.launch(planning.add_up, self.env.nworld, returns, device=device)
         if config.models > 1:
             combined = [self._world_return, config.risk == "worst", self._return]
-            wp.launch(planning.combine_models, self.samples, combined, device=device)
+            wp.launch(planning.combine_models, self._nsample, combined, device=device)
         if config.update == "mppi":
             weights = [self._return, self.temperature, self._weight, self._summary]
-            wp.launch_tiled(planning.weigh, dim=[1], inputs=weights, block_dim=_BLOCK, device=device)
+            wp.launch_tiled(planning.weigh, dim=[self.plants], inputs=weights, block_dim=_BLOCK, device=device)
         else:
-            wp.launch(planning.rank, self.samples, [self._return, self._rank], device=device)
+            wp.launch(planning.rank, self._nsample, [self._return, self.samples, self._rank], device=device)
             elites = 1 if config.elites is None else config.elites
             weights = [self._return, self._rank, elites, self._weight, self._summary]
-            wp.launch_tiled(planning.weigh_elites, dim=[1], inputs=weights, block_dim=_BLOCK, device=device)
+            wp.launch_tiled(planning.weigh_elites, dim=[self.plants], inputs=weights, block_dim=_BLOCK, device=device)
 
     def _average(self) -> None:
         """The new plan, the weighted mean of the samples' actions, and CEM's noise around it."""
@@ -379,11 +401,11 @@ class MPPI:
         self._terminal_view.copy_(self._torch_values())
 
     def _torch_values(self) -> torch.Tensor:
-        """Values of the states where the samples end, (samples,)."""
+        """Values of the states where the samples end, (nworld,)."""
         obs, nworld = self._value_obs, self.env.nworld
         if isinstance(self.value, ValueFunction):
-            step = self._loop.state[self.env.state_space.parts["step"]] + self.horizon
-            values = self.value(obs, step.float().expand(nworld))
+            steps = self._loop.states[:, self.env.state_space.parts["step"]] + self.horizon
+            values = self.value(obs, steps.float().expand(-1, nworld // self.plants).reshape(nworld))
         else:
             values = self.value(obs)  # type: ignore[misc]
         if not isinstance(values, torch.Tensor) or values.numel() != nworld:
@@ -392,26 +414,45 @@ class MPPI:
             )
         return values.view(nworld)
 
-    def reset(self, seed: int | None = None) -> None:
+    def reset(self, seed: int | Sequence[int] | None = None, *, where: torch.Tensor | None = None) -> None:
         """Forget the plan and the adapted noise, and start the noise again.
 
         Args:
-            seed: Another seed, also of the models that the planner draws.
+            seed: Another seed, also of the models that the planner draws. With several plants, that of the first one,
+                or one for each plant; models then are those of the first.
+            where: The plants whose plans to forget, (plants,) bool; by default all. Models stay as they are.
 
         Raises:
-            ValueError: The seed is not a whole number from 0.
+            ValueError: A seed is not a whole number from 0, or ``where`` has another shape or type.
         """
+        if where is not None:
+            if not isinstance(where, torch.Tensor) or (where.shape, where.dtype) != ((self.plants,), torch.bool):
+                raise ValueError(f"where must be a bool tensor of shape ({self.plants},), not {described(where)}")
+            where = where.to(self.actions.device)
         if seed is not None:
-            self.__dict__["seed"] = whole_number("seed", seed, low=0)
-            self._seed.fill_(self.seed)
-            if self.model_fields:
-                self._draw_models()
-        self._count.zero_()
-        self._phase.zero_()
-        for plan in (self.knot_actions, self.actions):
-            plan.copy_(torch_view(self._fill).expand_as(plan))
+            seeds = self._seeds(seed)
+            _put(torch_view(self._seed), torch.tensor(seeds, dtype=torch.int32), where)
+            if where is None:
+                self.__dict__["seed"] = seeds[0]
+                if self.model_fields:
+                    self._draw_models()
+        for counter in (self._count, self._phase):
+            _put(torch_view(counter), torch.zeros((), dtype=torch.int32), where)
+        rows = None if where is None else where[:, None]
+        for plan in (self._plan, self._actions):
+            _put(torch_view(plan), torch_view(self._fill), rows)
         if self.adapted_noise is not None:
-            self.adapted_noise.copy_(torch_view(self._first_deviation).expand_as(self.adapted_noise))
+            _put(torch_view(self._deviation), torch_view(self._first_deviation), rows)
+
+    def _seeds(self, seed: int | Sequence[int]) -> list[int]:
+        """A seed for each plant."""
+        if isinstance(seed, Sequence):
+            seeds = [whole_number("seed", one, low=0) for one in seed]
+            if len(seeds) != self.plants:
+                raise ValueError(f"seed must be one number, or one for each of {self.plants} plants, not {seed!r}")
+            return seeds
+        first = whole_number("seed", seed, low=0)
+        return list(range(first, first + self.plants))
 
     def _draw_models(self) -> None:
         """Draw the planner's models with the task's functions, from streams that no plant of this seed has."""
@@ -440,7 +481,19 @@ class MPPI:
         return state_from_parts(self.env, self._initial, parts)
 
     @property
-    def summary(self) -> dict[str, float]:
-        """Best and mean return, effective number and failures of the last improvement's samples."""
-        best, mean, effective, failed = self._summary.numpy().tolist()
-        return {"best_return": best, "mean_return": mean, "effective_samples": effective, "failed_samples": failed}
+    def summary(self) -> dict[str, Any]:
+        """Best and mean return, effective number and failures of the last improvement's samples.
+
+        Numbers, or with several plants (plants,) float32 on the CPU.
+        """
+        names = ("best_return", "mean_return", "effective_samples", "failed_samples")
+        columns = self._summary.numpy().T
+        if self.plants == 1:
+            return dict(zip(names, columns[:, 0].tolist(), strict=True))
+        return {name: torch.tensor(column) for name, column in zip(names, columns, strict=True)}
+
+
+def _put(target: torch.Tensor, values: torch.Tensor, where: torch.Tensor | None) -> None:
+    """Write values, which may be one for all, into the rows of a mask; without a mask, into all rows."""
+    values = values.to(target.device)
+    target.copy_(values.expand_as(target) if where is None else torch.where(where, values, target))

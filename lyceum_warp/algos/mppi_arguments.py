@@ -44,6 +44,7 @@ def planner_arguments(
     words: Mapping[str, Any],
     params: Mapping[str, Any] | None,
     value: object,
+    plants: int = 1,
 ) -> tuple[MPPIConfig, EnvOptions, dict[str, Any]]:
     """Sort the arguments of a call of MPPI, and complete them from the task's ``planning``.
 
@@ -54,6 +55,7 @@ def planner_arguments(
             of None is not given.
         params: Parameters of the task.
         value: The value function. With one the parameters in ``planning`` do not apply.
+        plants: Number of plants to plan for.
 
     Returns:
         The settings, the options of the planner's worlds with the engine and the device that suit the number of
@@ -88,7 +90,7 @@ def planner_arguments(
         if word not in known:
             raise ValueError(f"the task {name!r} has no parameter {word!r}: {_hint(word, known)}")
     place = place_samples(
-        options.engine, options.device, nthread=options.nthread, samples=config.samples * config.models,
+        options.engine, options.device, nthread=options.nthread, samples=config.samples * config.models * plants,
         has_noslip=lambda: _has_noslip(task, options),
     )  # fmt: skip
     return config, options.changed(place), dict(planning.params if value is None else {}) | rest
@@ -127,7 +129,7 @@ def plain(value: Any) -> Any:
 
 
 _OWN_OPTIONS = {
-    "nworld": "samples is the number of its worlds, for each of its models",
+    "nworld": "samples is the number of its worlds, for each of its models and plants",
     "autoreset": "its worlds never reset",
     "horizon": "episodes of its worlds have no limit, and the horizon of a plan is a setting",
     "seed": "every sample starts from the state to plan from",

@@ -45,30 +45,32 @@ def state_from_parts(env: Env, initial: torch.Tensor, parts: Mapping[str, Any]) 
 
 
 def checked_state(env: Env, state: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
-    """One state of an environment, (state_space.size,) float64; a single row of states is unpacked.
+    """One state of an environment, (state_space.size,) float64, or one for each plant; a single row is unpacked.
 
     Args:
         env: The environment whose states these are.
-        state: The state.
+        state: The state, or the states.
         like: The buffer for it.
 
     Raises:
         ValueError: The state has another shape or type, or it lies on the CPU and is not finite.
     """
-    if isinstance(state, torch.Tensor) and state.ndim == 2 and len(state) == 1:
+    if isinstance(state, torch.Tensor) and state.ndim == 2 and len(state) == 1 and like.ndim == 1:
         state = state[0]
     if not isinstance(state, torch.Tensor) or state.shape != like.shape or state.dtype != like.dtype:
         raise ValueError(
-            f"a state to plan from must be {described(like)}, not {described(state)}: take it from env.get_state() of "
-            "the same task, or make it by its parts with plan.state_of(qpos=..., qvel=...). (fields=[...] may make the "
-            "states of an environment longer.)"
+            f"{'a state' if like.ndim == 1 else 'the states'} to plan from must be {described(like)}, not "
+            f"{described(state)}: take it from env.get_state() of the same task, or make it by its parts with "
+            "plan.state_of(qpos=..., qvel=...). (fields=[...] may make the states of an environment longer.)"
         )
     if state.device.type != "cpu":  # the check would wait for the device; there every sample fails, and the plan stays
         return state
-    values = state.numpy()
+    values = state.numpy().ravel()
     # one call, as a plan may take a millisecond; only what is not finite, or beyond 1e150, is looked at again
     if not math.isfinite(values.dot(values)) and not (finite := np.isfinite(values)).all():
-        column = int(np.flatnonzero(~finite)[0])
+        where = int(np.flatnonzero(~finite)[0])
+        plant, column = divmod(where, env.state_space.size)
         part = next(n for n, part in env.state_space.parts.items() if part.start <= column < part.stop)
-        raise ValueError(f"the state to plan from has {state[column].item()} in its {part!r}: it must be finite")
+        which = "the state" if like.ndim == 1 else f"the state of plant {plant}"
+        raise ValueError(f"{which} to plan from has {values[where]} in its {part!r}: it must be finite")
     return state

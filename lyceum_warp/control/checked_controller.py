@@ -21,8 +21,8 @@ class CheckedController:
         env: The plant.
 
     Raises:
-        ValueError: The controller cannot be called with a state and an observation, plans in the plant itself, or has
-            a time step that is not positive.
+        ValueError: The controller cannot be called with a state and an observation, plans in the plant itself or for
+            several plants, or has a time step that is not positive.
     """
 
     def __init__(self, controller: Controller, env: Env) -> None:
@@ -31,6 +31,11 @@ class CheckedController:
             raise ValueError(
                 "the controller plans in the environment that it controls, and planning changes its state: control "
                 "another environment, made with lw.make(..., autoreset=False)"
+            )
+        if (plants := getattr(controller, "plants", 1)) != 1:
+            raise ValueError(
+                f"the controller plans for {plants} plants, and one is controlled here: make it with plants=1, or "
+                "control the worlds of an environment, as env.step(plan(env.get_state()))"
             )
         self._controller: Any = controller
         self._names = list(env.action_space.parts)

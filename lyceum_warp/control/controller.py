@@ -68,6 +68,11 @@ class PlanningController(Controller, Protocol):
         ...
 
     @property
+    def plants(self) -> int:
+        """Number of plants that it plans for. The loops control one."""
+        ...
+
+    @property
     def samples(self) -> int:
         """Number of samples of a plan."""
         ...

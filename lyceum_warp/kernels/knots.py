@@ -27,11 +27,12 @@ def knot_count(horizon: int, knots: int, spline: str) -> int:
 def pass_knots(
     steps_in: wp.array[int], horizon: int, knots: int, phase_inout: wp.array[int], passed_out: wp.array[int]
 ):
-    """Move the phase forward by some steps, and count the knots that are passed; launched over (1,)."""
-    place = wp.int64(phase_inout[0]) + wp.int64(steps_in[0]) * wp.int64(knots)
+    """Move the phases forward by some steps, and count the knots that are passed; launched over (nplant,)."""
+    p = wp.tid()
+    place = wp.int64(phase_inout[p]) + wp.int64(steps_in[p]) * wp.int64(knots)
     passed = place // wp.int64(horizon)
-    phase_inout[0] = int(place - passed * wp.int64(horizon))
-    passed_out[0] = int(wp.min(passed, wp.int64(2147483647)))
+    phase_inout[p] = int(place - passed * wp.int64(horizon))
+    passed_out[p] = int(wp.min(passed, wp.int64(2147483647)))
 
 
 @wp.kernel(enable_backward=False)
@@ -46,14 +47,15 @@ def interpolate(
 ):
     """Interpolate actions between knots and clip them to the bounds; launched over (horizon, nworld, nact).
 
-    The worlds of a sample follow one another. Order 0 holds each knot until the next one, order 1 is linear. Order 3 is
-    a cubic Hermite spline whose slope at a knot is half the difference of its neighbours (Catmull and Rom 1974); its
-    first knot lies one before the grid's.
+    The worlds of a sample follow one another, and so do those of a plant. Order 0 holds each knot until the next one,
+    order 1 is linear. Order 3 is a cubic Hermite spline whose slope at a knot is half the difference of its neighbours
+    (Catmull and Rom 1974); its first knot lies one before the grid's.
     """
     t, w, i = wp.tid()
     k = w // (action_out.shape[1] // knot_in.shape[1])
     horizon = wp.int64(action_out.shape[0])
-    place = wp.int64(t) * wp.int64(knots) + wp.int64(phase_in[0])
+    phase = phase_in[w // (action_out.shape[1] // phase_in.shape[0])]
+    place = wp.int64(t) * wp.int64(knots) + wp.int64(phase)
     j = int(place // horizon)
     f = float(place - wp.int64(j) * horizon) / float(horizon)
     value = knot_in[j, k, i]

@@ -1,7 +1,8 @@
 """Planning by sampling: controls of open-loop rollouts, noise around a plan, weights, and the weighted mean.
 
-Actions of samples are (horizon, nsample, nact), plans (horizon, nact). A plan with knots holds (knots, nact) numbers
-instead, and so do its samples: kernels that do not name a horizon take both.
+Plans are (horizon, nplant, nact), actions of samples (horizon, nsample, nact), where the samples of a plant follow one
+another. A plan with knots holds (knots, nplant, nact) numbers instead, and so do its samples: kernels that do not name
+a horizon take both.
 """
 
 import warp as wp
@@ -17,10 +18,10 @@ DRAWS = wp.constant(-3)
 
 
 @wp.kernel(enable_backward=False)
-def broadcast(state_in: wp.array[wp.float64], state_out: wp.array2d[wp.float64]):
-    """Copy one state to every world; launched over (nworld, state_size)."""
+def broadcast(state_in: wp.array2d[wp.float64], state_out: wp.array2d[wp.float64]):
+    """Copy each state to as many worlds, which follow one another; launched over (nworld, state_size)."""
     w, i = wp.tid()
-    state_out[w, i] = state_in[i]
+    state_out[w, i] = state_in[w // (state_out.shape[0] // state_in.shape[0]), i]
 
 
 @wp.kernel(enable_backward=False)
@@ -86,24 +87,29 @@ def merge_faults(fault_in: wp.array[int], fault_inout: wp.array[int]):
 
 @wp.kernel(enable_backward=False)
 def shift_plan(
-    plan_in: wp.array2d[float], steps_in: wp.array[int], fill_in: wp.array[float], repeat: bool,
-    nominal_out: wp.array2d[float],
+    plan_in: wp.array3d[float], steps_in: wp.array[int], fill_in: wp.array[float], repeat: bool,
+    nominal_out: wp.array3d[float],
 ):  # fmt: skip
-    """Move a plan forward in time and fill its end; launched over (horizon, nact), or over (knots, nact)."""
-    t, i = wp.tid()
+    """Move plans forward in time and fill their ends; launched over (horizon, nplant, nact), or (knots, ...)."""
+    t, p, i = wp.tid()
     last = plan_in.shape[0] - 1
-    if steps_in[0] <= last - t:
-        nominal_out[t, i] = plan_in[t + steps_in[0], i]
+    if steps_in[p] <= last - t:
+        nominal_out[t, p, i] = plan_in[t + steps_in[p], p, i]
     else:
-        nominal_out[t, i] = wp.where(repeat, plan_in[last, i], fill_in[i])
+        nominal_out[t, p, i] = wp.where(repeat, plan_in[last, p, i], fill_in[i])
 
 
 @wp.kernel(enable_backward=False)
 def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.array3d[float]):
-    """Draw standard normal numbers by (seed, sample, count, action, step); launched over (nsample, nact)."""
+    """Draw standard normal numbers by (seed, sample, count, action, step); launched over (nsample, nact).
+
+    Seed and count are those of the plant, and its samples are counted from 0.
+    """
     k, i = wp.tid()
-    key = stream(world_key(seed_in[0], k), NOISE, 0)
-    rng = stream(key, count_in[0], i)
+    samples = noise_out.shape[1] // seed_in.shape[0]
+    p = k // samples
+    key = stream(world_key(seed_in[p], k - p * samples), NOISE, 0)
+    rng = stream(key, count_in[p], i)
     for t in range(noise_out.shape[0]):
         noise_out[t, k, i] = wp.randn(rng)
 
@@ -114,13 +120,15 @@ def draw_keys(seed_in: wp.array[int], count_in: wp.array[int], key_out: wp.array
 
     A plant's keys are those of (seed, world) alone, so that no sample draws what the plant will draw.
     """
-    k = wp.tid()
-    key_out[k] = stream(world_key(seed_in[0], k), DRAWS, count_in[0])
+    w = wp.tid()
+    worlds = key_out.shape[0] // seed_in.shape[0]
+    p = w // worlds
+    key_out[w] = stream(world_key(seed_in[p], w - p * worlds), DRAWS, count_in[p])
 
 
 @wp.kernel(enable_backward=False)
 def perturb(
-    nominal_in: wp.array2d[float],
+    nominal_in: wp.array3d[float],
     noise_in: wp.array3d[float],
     scale_in: wp.array2d[float],
     diagonal: bool,
@@ -130,13 +138,16 @@ def perturb(
     high_in: wp.array[float],
     action_out: wp.array3d[float],
 ):
-    """Add coloured, smoothed noise to a plan and clip the sum to the bounds; launched over (nsample, nact).
+    """Add coloured, smoothed noise to plans and clip the sum to the bounds; launched over (nsample, nact).
 
     ``scale_in`` is the lower Cholesky factor L of the noise's covariance: n_t = L z_t for standard normal z_t.
     Smoothing follows trajopt: e_t = n_t in the first two steps, then e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2). With
-    ``include_plan`` the first sample is the plan without noise.
+    ``include_plan`` a plant's first sample is the plan without noise.
     """
     k, i = wp.tid()
+    samples = noise_in.shape[1] // nominal_in.shape[1]
+    p = k // samples
+    exact = include_plan and k == p * samples
     last, before_last = float(0.0), float(0.0)
     first = wp.where(diagonal, i, 0)
     for t in range(noise_in.shape[0]):
@@ -147,16 +158,16 @@ def perturb(
             e = smoothing[0] * e + smoothing[1] * last + smoothing[2] * before_last
         before_last = last
         last = e
-        if include_plan and k == 0:
+        if exact:
             e = 0.0
-        action_out[t, k, i] = wp.clamp(nominal_in[t, i] + e, low_in[i], high_in[i])
+        action_out[t, k, i] = wp.clamp(nominal_in[t, p, i] + e, low_in[i], high_in[i])
 
 
 @wp.kernel(enable_backward=False)
 def perturb_adapted(
-    nominal_in: wp.array2d[float],
+    nominal_in: wp.array3d[float],
     noise_in: wp.array3d[float],
-    deviation_in: wp.array2d[float],
+    deviation_in: wp.array3d[float],
     smoothing: wp.vec3,
     include_plan: bool,
     low_in: wp.array[float],
@@ -165,6 +176,9 @@ def perturb_adapted(
 ):
     """The same with a standard deviation for each number of the plan, which scales smoothed standard normal noise."""
     k, i = wp.tid()
+    samples = noise_in.shape[1] // nominal_in.shape[1]
+    p = k // samples
+    exact = include_plan and k == p * samples
     last, before_last = float(0.0), float(0.0)
     for t in range(noise_in.shape[0]):
         s = noise_in[t, k, i]
@@ -172,10 +186,10 @@ def perturb_adapted(
             s = smoothing[0] * s + smoothing[1] * last + smoothing[2] * before_last
         before_last = last
         last = s
-        e = deviation_in[t, i] * s
-        if include_plan and k == 0:
+        e = deviation_in[t, p, i] * s
+        if exact:
             e = 0.0
-        action_out[t, k, i] = wp.clamp(nominal_in[t, i] + e, low_in[i], high_in[i])
+        action_out[t, k, i] = wp.clamp(nominal_in[t, p, i] + e, low_in[i], high_in[i])
 
 
 @wp.kernel(enable_backward=False)
@@ -227,20 +241,21 @@ def combine_models(world_return_in: wp.array[float], worst: bool, return_out: wp
 
 
 @wp.kernel(enable_backward=False)
-def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[float], summary_out: wp.array[float]):
-    """Weigh samples by w = exp((R - max R) / temperature), divided by the sum; launched as one block.
+def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[float], summary_out: wp.array2d[float]):
+    """Weigh samples by w = exp((R - max R) / temperature), divided by the sum; launched as one block for each plant.
 
     All weights are zero where every sample failed. The summary is the best return, the mean return, the effective
     number of samples 1 / sum w^2, and the number of failed samples.
     """
-    _, lane = wp.tid()
-    n = return_in.shape[0]
+    p, lane = wp.tid()
+    n = return_in.shape[0] // summary_out.shape[0]
+    first, end = p * n, (p + 1) * n
     best = float(-wp.inf)
-    for k in range(lane, n, wp.block_dim()):
+    for k in range(first + lane, end, wp.block_dim()):
         best = wp.max(best, return_in[k])
     best = wp.tile_extract(wp.tile_max(wp.tile(best)), 0)
     total, square, mean, good = float(0.0), float(0.0), float(0.0), float(0.0)
-    for k in range(lane, n, wp.block_dim()):
+    for k in range(first + lane, end, wp.block_dim()):
         if return_in[k] > -wp.inf:
             weight = wp.exp((return_in[k] - best) / temperature)
             total += weight
@@ -251,24 +266,25 @@ def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[f
     square = wp.tile_extract(wp.tile_sum(wp.tile(square)), 0)
     mean = wp.tile_extract(wp.tile_sum(wp.tile(mean)), 0)
     good = wp.tile_extract(wp.tile_sum(wp.tile(good)), 0)
-    for k in range(lane, n, wp.block_dim()):
+    for k in range(first + lane, end, wp.block_dim()):
         weight_out[k] = 0.0
         if return_in[k] > -wp.inf:
             weight_out[k] = wp.exp((return_in[k] - best) / temperature) / total
     if lane == 0:
-        summary_out[0] = best
-        summary_out[1] = mean / good
-        summary_out[2] = total * total / square
-        summary_out[3] = float(n) - good
+        summary_out[p, 0] = best
+        summary_out[p, 1] = mean / good
+        summary_out[p, 2] = total * total / square
+        summary_out[p, 3] = float(n) - good
 
 
 @wp.kernel(enable_backward=False)
-def rank(return_in: wp.array[float], rank_out: wp.array[int]):
-    """Count the better samples of each, of equal ones those with smaller numbers; launched over (nsample,)."""
+def rank(return_in: wp.array[float], samples: int, rank_out: wp.array[int]):
+    """Count the better samples of each plant's, of equal ones those with smaller numbers; launched over (nsample,)."""
     k = wp.tid()
     own = return_in[k]
     better = int(0)
-    for j in range(return_in.shape[0]):
+    first = k // samples * samples
+    for j in range(first, first + samples):
         if return_in[j] > own or (return_in[j] == own and j < k):
             better += 1
     rank_out[k] = better
@@ -280,16 +296,17 @@ def weigh_elites(
     rank_in: wp.array[int],
     elites: int,
     weight_out: wp.array[float],
-    summary_out: wp.array[float],
+    summary_out: wp.array2d[float],
 ):
-    """Weigh the best samples equally and the others by zero; launched as one block. The summary is that of ``weigh``.
+    """Weigh the best samples equally and the others by zero; launched as one block for each plant.
 
-    Samples that failed have no weight, also where fewer than ``elites`` are left.
+    The summary is that of ``weigh``. Samples that failed have no weight, also where fewer than ``elites`` are left.
     """
-    _, lane = wp.tid()
-    n = return_in.shape[0]
+    p, lane = wp.tid()
+    n = return_in.shape[0] // summary_out.shape[0]
+    first, end = p * n, (p + 1) * n
     best, mean, good = float(-wp.inf), float(0.0), float(0.0)
-    for k in range(lane, n, wp.block_dim()):
+    for k in range(first + lane, end, wp.block_dim()):
         if return_in[k] > -wp.inf:
             best = wp.max(best, return_in[k])
             mean += return_in[k]
@@ -298,71 +315,78 @@ def weigh_elites(
     mean = wp.tile_extract(wp.tile_sum(wp.tile(mean)), 0)
     good = wp.tile_extract(wp.tile_sum(wp.tile(good)), 0)
     count = wp.min(float(elites), good)
-    for k in range(lane, n, wp.block_dim()):
+    for k in range(first + lane, end, wp.block_dim()):
         weight_out[k] = wp.where(rank_in[k] < elites and return_in[k] > -wp.inf, 1.0 / count, 0.0)
     if lane == 0:
-        summary_out[0] = best
-        summary_out[1] = mean / good
-        summary_out[2] = count
-        summary_out[3] = float(n) - good
+        summary_out[p, 0] = best
+        summary_out[p, 1] = mean / good
+        summary_out[p, 2] = count
+        summary_out[p, 3] = float(n) - good
 
 
 @wp.kernel(enable_backward=False)
 def fit_deviation(
     weight_in: wp.array[float],
     action_in: wp.array3d[float],
-    plan_in: wp.array2d[float],
+    plan_in: wp.array3d[float],
     spread_in: wp.array[float],
     smallest_in: wp.array[float],
-    deviation_in: wp.array2d[float],
-    summary_in: wp.array[float],
-    deviation_out: wp.array2d[float],
+    deviation_in: wp.array3d[float],
+    summary_in: wp.array2d[float],
+    deviation_out: wp.array3d[float],
 ):
-    """Fit the noise's standard deviation to the weighted samples; launched as one block for each number of the plan.
+    """Fit the noise's standard deviation to the weighted samples; launched as one block for each number of the plans.
 
     It is that of the samples around their mean, the plan, divided by the spread that smoothing gives standard normal
     noise in this step, and at least the smallest one. Where every sample failed it stays as it is.
     """
     number, lane = wp.tid()
-    t = number // plan_in.shape[1]
-    i = number % plan_in.shape[1]
+    plants, nact = plan_in.shape[1], plan_in.shape[2]
+    t = number // (plants * nact)
+    p = number // nact - t * plants
+    i = number % nact
+    samples = weight_in.shape[0] // plants
     total = float(0.0)
-    for k in range(lane, weight_in.shape[0], wp.block_dim()):
-        distance = action_in[t, k, i] - plan_in[t, i]
+    for k in range(p * samples + lane, (p + 1) * samples, wp.block_dim()):
+        distance = action_in[t, k, i] - plan_in[t, p, i]
         total += weight_in[k] * distance * distance
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
     if lane == 0:
         fitted = wp.max(wp.sqrt(total) / spread_in[t], smallest_in[i])
-        deviation_out[t, i] = wp.where(summary_in[0] > -wp.inf, fitted, deviation_in[t, i])
+        deviation_out[t, p, i] = wp.where(summary_in[p, 0] > -wp.inf, fitted, deviation_in[t, p, i])
 
 
 @wp.kernel(enable_backward=False)
 def average(
     weight_in: wp.array[float],
     action_in: wp.array3d[float],
-    nominal_in: wp.array2d[float],
-    summary_in: wp.array[float],
-    plan_out: wp.array2d[float],
+    nominal_in: wp.array3d[float],
+    summary_in: wp.array2d[float],
+    plan_out: wp.array3d[float],
 ):
-    """Average the samples' actions by their weights; launched as one block for each number of the plan.
+    """Average the samples' actions by their weights; launched as one block for each number of the plans.
 
     Where every sample failed the plan stays as it is.
     """
     number, lane = wp.tid()
-    t = number // plan_out.shape[1]
-    i = number % plan_out.shape[1]
+    plants, nact = plan_out.shape[1], plan_out.shape[2]
+    t = number // (plants * nact)
+    p = number // nact - t * plants
+    i = number % nact
+    samples = weight_in.shape[0] // plants
     total = float(0.0)
-    for k in range(lane, weight_in.shape[0], wp.block_dim()):
+    for k in range(p * samples + lane, (p + 1) * samples, wp.block_dim()):
         total += weight_in[k] * action_in[t, k, i]
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
     if lane == 0:
-        plan_out[t, i] = wp.where(summary_in[0] > -wp.inf, total, nominal_in[t, i])
+        plan_out[t, p, i] = wp.where(summary_in[p, 0] > -wp.inf, total, nominal_in[t, p, i])
 
 
 @wp.kernel(enable_backward=False)
 def count_up(count_inout: wp.array[int]):
-    """Count one improvement of a plan; launched over (1,)."""
-    count_inout[0] = count_inout[0] + 1
+    """Count one improvement of each plan; launched over (nplant,)."""
+    p = wp.tid()
+    count_inout[p] = count_inout[p] + 1
 
 
 def value_kernel(value: wp.Function) -> wp.Kernel:

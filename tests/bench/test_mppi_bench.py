@@ -81,31 +81,30 @@ def test_an_episode_that_two_blocks_share_counts_once(mppi: ModuleType) -> None:
     assert (ours[2:4], python[2:4], python[-1]) == (["2", "2 of 3"], ["2", "1 of 1"], "3.00")
 
 
-def test_episodes_of_planners_that_share_a_gpu_have_no_time(mppi: ModuleType, tmp_path: Path) -> None:
-    where = {"part": "episodes", "task": "reach", "samples": None, "contestant": "mppi_warp", "repeat": 1, "threads": 2}
-    alone = mppi.Row(where | {"first": 1000}, {"each": [[1000, True, -9.0, 2.0]]}, {}, 1.0)
-    shared = mppi.Row(where | {"first": 1001}, {"each": [[1001, False, -9.0, None]]}, {}, 1.0)
-    ((line,),) = (table.rows for table in mppi.tables([alone, shared]))
-    assert (line[3], line[6]) == ("1 of 2", "2")
-    ((line,),) = (table.rows for table in mppi.tables([shared]))
-    assert (line[3], line[6]) == ("0 of 1", "")
-    python = mppi.Row(where | {"contestant": "python", "first": 1000}, {"each": [[1000, True, -9.0, 5.0]]}, {}, 1.0)
-    mppi.figure([alone, shared, python]).savefig(tmp_path / "mppi.svg")
-    assert mppi.figure([alone, shared]) is None  # nothing to compare
+def test_episodes_on_a_busy_machine_have_no_time(mppi: ModuleType, tmp_path: Path) -> None:
+    assert main(mppi, tmp_path / "mppi.jsonl", "--parts", "episodes", "--contestants", "mppi", "--busy") == 0
+    import experiment
+
+    (busy,) = experiment.read(tmp_path / "mppi.jsonl")
+    assert "seconds" not in busy.result and [episode[3] for episode in busy.result["each"]] == [None, None]
+    ((line,),) = (table.rows for table in mppi.tables([busy]))
+    assert (line[3][-4:], line[6:]) == ("of 2", ["", ""])
+    timed = mppi.Row(busy.case | {"first": 1002}, {"each": [[1002, True, -9.0, 2.0]]}, {}, 1.0)
+    ((line,),) = (table.rows for table in mppi.tables([busy, timed]))
+    assert (line[3][-4:], line[6:]) == ("of 3", ["2", "1.00"])
+    assert mppi.figure([busy, timed]) is None  # nothing to compare
+    python = mppi.Row(timed.case | {"contestant": "python"}, timed.result, {}, 1.0)
+    mppi.figure([busy, timed, python]).savefig(tmp_path / "mppi.svg")
 
 
-def test_planners_share_only_a_gpu(mppi: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(mppi, tmp_path / "mppi.jsonl", "--planners", "4") == 2
-    assert "planners=4 share a GPU: give --device cuda --parts episodes" in capsys.readouterr().err
-
-
-@pytest.mark.gpu
-def test_planners_that_share_a_gpu_plan_as_alone(mppi: ModuleType) -> None:
-    case = mppi.Case("episodes", "reach", "mppi_warp", 1, 1000, 6, 20, None, 0.0, 2)
-    alone, shared = (mppi.run_episodes(case, mppi.Options(device="cuda", planners=n))["each"] for n in (1, 3))
-    assert [row[0] for row in shared] == [row[0] for row in alone] == list(range(1000, 1006))
-    np.testing.assert_allclose([row[2] for row in shared], [row[2] for row in alone], rtol=0.05)
-    assert len({row[2] for row in shared}) == 6  # every seed has an episode of its own
+@pytest.mark.parametrize("task", ["reach", "cartpole_swingup"])
+def test_episodes_of_one_planner_for_all_plants_are_those_of_single_planners(mppi: ModuleType, task: str) -> None:
+    alone, together = (
+        mppi.run_episodes(mppi.Case("episodes", task, name, 1, 1000, 3, 8, None, 0.0, 1), mppi.Options())["each"]
+        for name in ("mppi", "mppi_together")
+    )
+    assert [row[:2] for row in together] == [row[:2] for row in alone]
+    np.testing.assert_allclose([row[2] for row in together], [row[2] for row in alone], rtol=1e-4)
 
 
 def test_a_python_environment_that_cannot_be_made_is_skipped(mppi: ModuleType) -> None:
@@ -172,7 +171,7 @@ def test_sets_of_seeds_are_chosen_by_number(mppi: ModuleType) -> None:
         (["--parts", "episode"], "there is no part 'episode': did you mean episodes?"),
         (["--contestants", "hydrax"], "there is no contestant 'hydrax'"),
         (["--jobs", "2"], "so that jobs must be 1: or give --parts episodes"),
-        (["--block", "0"], "block, planners, repeats and the numbers of the sets must be at least 1"),
+        (["--block", "0"], "block, repeats and the numbers of the sets must be at least 1"),
         (["--sets", "0", "3"], "the numbers of the sets must be at least 1"),
     ],
 )
