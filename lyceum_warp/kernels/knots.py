@@ -10,6 +10,8 @@ import math
 
 import warp as wp
 
+from lyceum_warp.kernels.planning import plant_of
+
 ORDERS = {"zero": 0, "linear": 1, "cubic": 3}
 """Names of the interpolations, with their orders."""
 
@@ -54,7 +56,7 @@ def interpolate(
     t, w, i = wp.tid()
     k = w // (action_out.shape[1] // knot_in.shape[1])
     horizon = wp.int64(action_out.shape[0])
-    phase = phase_in[w // (action_out.shape[1] // phase_in.shape[0])]
+    phase = phase_in[plant_of(w, action_out.shape[1], phase_in.shape[0])]
     place = wp.int64(t) * wp.int64(knots) + wp.int64(phase)
     j = int(place // horizon)
     f = float(place - wp.int64(j) * horizon) / float(horizon)

@@ -17,11 +17,27 @@ DRAWS = wp.constant(-3)
 """The same for the keys of what a task draws in the samples."""
 
 
+@wp.func
+def plant_of(row: int, rows: int, plants: int) -> int:
+    """The plant of a row (a sample, a world), where the rows of a plant follow one another."""
+    if plants == 1:  # on the CPU a division takes as long as the rest of a small kernel
+        return 0
+    return row // (rows // plants)
+
+
+@wp.func
+def first_row(plant: int, rows: int, plants: int) -> int:
+    """The first row of a plant."""
+    if plant == 0:
+        return 0
+    return plant * (rows // plants)
+
+
 @wp.kernel(enable_backward=False)
 def broadcast(state_in: wp.array2d[wp.float64], state_out: wp.array2d[wp.float64]):
     """Copy each state to as many worlds, which follow one another; launched over (nworld, state_size)."""
     w, i = wp.tid()
-    state_out[w, i] = state_in[w // (state_out.shape[0] // state_in.shape[0]), i]
+    state_out[w, i] = state_in[plant_of(w, state_out.shape[0], state_in.shape[0]), i]
 
 
 @wp.kernel(enable_backward=False)
@@ -106,9 +122,9 @@ def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.ar
     Seed and count are those of the plant, and its samples are counted from 0.
     """
     k, i = wp.tid()
-    samples = noise_out.shape[1] // seed_in.shape[0]
-    p = k // samples
-    key = stream(world_key(seed_in[p], k - p * samples), NOISE, 0)
+    samples, plants = noise_out.shape[1], seed_in.shape[0]
+    p = plant_of(k, samples, plants)
+    key = stream(world_key(seed_in[p], k - first_row(p, samples, plants)), NOISE, 0)
     rng = stream(key, count_in[p], i)
     for t in range(noise_out.shape[0]):
         noise_out[t, k, i] = wp.randn(rng)
@@ -121,9 +137,9 @@ def draw_keys(seed_in: wp.array[int], count_in: wp.array[int], key_out: wp.array
     A plant's keys are those of (seed, world) alone, so that no sample draws what the plant will draw.
     """
     w = wp.tid()
-    worlds = key_out.shape[0] // seed_in.shape[0]
-    p = w // worlds
-    key_out[w] = stream(world_key(seed_in[p], w - p * worlds), DRAWS, count_in[p])
+    worlds, plants = key_out.shape[0], seed_in.shape[0]
+    p = plant_of(w, worlds, plants)
+    key_out[w] = stream(world_key(seed_in[p], w - first_row(p, worlds, plants)), DRAWS, count_in[p])
 
 
 @wp.kernel(enable_backward=False)
@@ -145,9 +161,9 @@ def perturb(
     ``include_plan`` a plant's first sample is the plan without noise.
     """
     k, i = wp.tid()
-    samples = noise_in.shape[1] // nominal_in.shape[1]
-    p = k // samples
-    exact = include_plan and k == p * samples
+    samples, plants = noise_in.shape[1], nominal_in.shape[1]
+    p = plant_of(k, samples, plants)
+    exact = include_plan and k == first_row(p, samples, plants)
     last, before_last = float(0.0), float(0.0)
     first = wp.where(diagonal, i, 0)
     for t in range(noise_in.shape[0]):
@@ -176,9 +192,9 @@ def perturb_adapted(
 ):
     """The same with a standard deviation for each number of the plan, which scales smoothed standard normal noise."""
     k, i = wp.tid()
-    samples = noise_in.shape[1] // nominal_in.shape[1]
-    p = k // samples
-    exact = include_plan and k == p * samples
+    samples, plants = noise_in.shape[1], nominal_in.shape[1]
+    p = plant_of(k, samples, plants)
+    exact = include_plan and k == first_row(p, samples, plants)
     last, before_last = float(0.0), float(0.0)
     for t in range(noise_in.shape[0]):
         s = noise_in[t, k, i]
@@ -341,13 +357,13 @@ def fit_deviation(
     noise in this step, and at least the smallest one. Where every sample failed it stays as it is.
     """
     number, lane = wp.tid()
-    plants, nact = plan_in.shape[1], plan_in.shape[2]
+    samples, plants, nact = weight_in.shape[0], plan_in.shape[1], plan_in.shape[2]
     t = number // (plants * nact)
-    p = number // nact - t * plants
-    i = number % nact
-    samples = weight_in.shape[0] // plants
+    column = number - t * plants * nact
+    p = plant_of(column, plants * nact, plants)
+    i = column - p * nact
     total = float(0.0)
-    for k in range(p * samples + lane, (p + 1) * samples, wp.block_dim()):
+    for k in range(first_row(p, samples, plants) + lane, first_row(p + 1, samples, plants), wp.block_dim()):
         distance = action_in[t, k, i] - plan_in[t, p, i]
         total += weight_in[k] * distance * distance
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
@@ -369,13 +385,13 @@ def average(
     Where every sample failed the plan stays as it is.
     """
     number, lane = wp.tid()
-    plants, nact = plan_out.shape[1], plan_out.shape[2]
+    samples, plants, nact = weight_in.shape[0], plan_out.shape[1], plan_out.shape[2]
     t = number // (plants * nact)
-    p = number // nact - t * plants
-    i = number % nact
-    samples = weight_in.shape[0] // plants
+    column = number - t * plants * nact
+    p = plant_of(column, plants * nact, plants)
+    i = column - p * nact
     total = float(0.0)
-    for k in range(p * samples + lane, (p + 1) * samples, wp.block_dim()):
+    for k in range(first_row(p, samples, plants) + lane, first_row(p + 1, samples, plants), wp.block_dim()):
         total += weight_in[k] * action_in[t, k, i]
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
     if lane == 0:

@@ -50,6 +50,29 @@ def test_plans_agree_with_those_of_the_cpu(task: str, horizon: int) -> None:
         env.step(other[None])
 
 
+@pytest.mark.parametrize("update", ["mppi with knots", "cem"])
+def test_plans_for_several_plants_are_those_of_single_planners(update: str) -> None:
+    settings: dict[str, Any] = dict(task="reach", device=CUDA, engine="warp", samples=40, **UPDATES[update])
+    states = lw.make("reach", nworld=5, autoreset=False, seed=3).get_state()
+    together = lw.MPPI(**settings, seed=5, plants=5)
+    alone = [lw.MPPI(**settings, seed=5 + i) for i in range(5)]
+    for _ in range(3):
+        actions = together(states)
+        for i, plan in enumerate(alone):
+            plan(states[i])
+            torch.testing.assert_close(together.standard_noise[:, i], plan.standard_noise)
+            torch.testing.assert_close(together.returns[i], plan.returns, rtol=1e-3, atol=1e-3)
+            # a difference of roundings may choose other elites: from the same returns, the same plan
+            if torch.equal(together.returns[i], plan.returns):
+                torch.testing.assert_close(actions[i], plan.actions[0])
+            plan.actions.copy_(together.actions[:, i])
+            plan.knot_actions.copy_(together.knot_actions[:, i])
+            if plan.adapted_noise is not None:
+                plan.adapted_noise.copy_(together.adapted_noise[:, i])
+    together.reset(where=torch.arange(5, device=CUDA) == 2)
+    assert not together.actions[:, 2].any() and together.actions[:, 1].any()
+
+
 @pytest.mark.parametrize("update", UPDATES)
 def test_every_update_on_a_gpu_equals_that_on_the_cpu_for_the_same_returns(update: str) -> None:
     """The first improvement's returns differ by rounding, and the order of samples that are almost equal may, too."""
