@@ -228,26 +228,26 @@ def controller(case: Case, options: Options) -> Any:
 def run_episodes(case: Case, options: Options) -> dict[str, Any]:
     """A block of episodes, one after the other or all together."""
     seeds = range(case.first, case.first + case.count)
+    plans = {}
     if case.contestant in TOGETHER:
-        successes, returns, times, plan = episodes_together(case, options, seeds)
+        successes, returns, times = episodes_together(case, options, seeds)
     else:
         made, env = controller(case, options), plant(case.task, case.steps)
         lw.control(env, made, seed=0, steps=3)  # captures graphs and wakes threads
         done = [lw.control(env, made, seed=seed) for seed in seeds]
         successes, returns = [episode.succeeded for episode in done], [episode.episode_return for episode in done]
         times = [episode.wall_seconds for episode in done]
-        plan = torch.cat([episode.plan_times for episode in done]).median().item()
+        plans["plan_ms"] = 1e3 * torch.cat([episode.plan_times for episode in done]).median().item()
     kept = [None if options.busy else round(seconds, 4) for seconds in times]
     each = [list(row) for row in zip(seeds, successes, [round(value, 4) for value in returns], kept, strict=True)]
     found: dict[str, Any] = {"successes": sum(successes), "return": statistics.fmean(returns), "each": each}
-    return found if options.busy else found | {"seconds": statistics.fmean(times), "plan_ms": 1e3 * plan}
+    return found if options.busy else found | {"seconds": statistics.fmean(times)} | plans
 
 
 def episodes_together(
     case: Case, options: Options, seeds: Sequence[int]
-) -> tuple[list[bool], list[float], list[float], float]:
-    """The same episodes with one planner for all plants: successes, returns, an episode's share of the time, and that
-    of a plan."""
+) -> tuple[list[bool], list[float], list[float]]:
+    """The same episodes with one planner for all plants: successes, returns, and each one's share of the time."""
     made = planner(case.task, case.contestant, case.threads, options.device, None, case.count)
     env, one = plant(case.task, case.steps, case.count, case.threads), plant(case.task, case.steps)
     starts = []
@@ -268,7 +268,7 @@ def episodes_together(
             if not going.any():
                 break
     seconds = (time.perf_counter() - began) / case.count
-    return success.tolist(), returns.tolist(), [seconds] * case.count, seconds / (step + 1)
+    return success.tolist(), returns.tolist(), [seconds] * case.count
 
 
 # plans from the same states

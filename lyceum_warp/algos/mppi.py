@@ -431,13 +431,13 @@ class MPPI:
             where = where.to(self.actions.device)
         if seed is not None:
             seeds = self._seeds(seed)
-            _put(torch_view(self._seed), torch.tensor(seeds, dtype=torch.int32), where)
+            _put(torch_view(self._seed), torch.tensor(seeds, dtype=torch.int32, device=self.actions.device), where)
             if where is None:
                 self.__dict__["seed"] = seeds[0]
                 if self.model_fields:
                     self._draw_models()
-        for counter in (self._count, self._phase):
-            _put(torch_view(counter), torch.zeros((), dtype=torch.int32), where)
+        for counter in (torch_view(self._count), torch_view(self._phase)):
+            _put(counter, torch.zeros_like(counter), where)
         rows = None if where is None else where[:, None]
         for plan in (self._plan, self._actions):
             _put(torch_view(plan), torch_view(self._fill), rows)
@@ -495,5 +495,4 @@ class MPPI:
 
 def _put(target: torch.Tensor, values: torch.Tensor, where: torch.Tensor | None) -> None:
     """Write values, which may be one for all, into the rows of a mask; without a mask, into all rows."""
-    values = values.to(target.device)
     target.copy_(values.expand_as(target) if where is None else torch.where(where, values, target))

@@ -262,6 +262,11 @@ def controls(given: Mapping[str, Any], env: Env) -> dict[str, Control]:
                     f"the controller {name!r} plans in the environment that is shown, and planning changes its state: "
                     "show another environment, made with lw.make"
                 )
+            if (plants := getattr(controller, "plants", 1)) != 1:
+                raise ValueError(
+                    f"the controller {name!r} plans for {plants} plants, and a controller has one world here: make it "
+                    "with plants=1"
+                )
             found[name] = WorldControl(name, controller)
     return found
 

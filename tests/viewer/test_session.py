@@ -829,6 +829,8 @@ def test_wrong_arguments_are_refused(shared_env: SharedEnv, monkeypatch: pytest.
         Session(env, controllers={"p": lambda obs: {}["x"]})
     with pytest.raises(ValueError, match="the controller 'p' must be callable, not int 3"):
         Session(env, controllers={"p": 3})
+    with pytest.raises(ValueError, match="the controller 'p' plans for 2 plants, and a controller has one world here"):
+        Session(env, controllers={"p": lw.MPPI("hopper", horizon=2, samples=2, plants=2)})
     with pytest.raises(ValueError, match="no site and no body 'nose' to trace"):
         Session(env, controllers={"mppi": lw.MPPI("hopper", horizon=2, samples=2)}, trace="nose")
     monkeypatch.delenv("DISPLAY", raising=False)
