@@ -8,10 +8,9 @@ the time of a plan from the same states, the bare engine's time for the same rol
 controls taking turns with ours at every plan. *Cartpole*: judo, with our model and reward, at equal samples, horizon
 and substeps. (hydrax has no release on the package index, where its name is that of another project.)
 
-A set at a time is one planner for a hundred plants, whose samples are all rolled out together; the time of an episode
-is its share. The Python planners (``python_mppi.py``) are a careful one with a message a plan, and the simple one that
-the paper measured, with a message a step. All planners control the same plant. Contestants take turns in blocks of
-episodes.
+The Python planners (``python_mppi.py``) are a careful one with a message a plan, and the simple one that the paper
+measured, with a message a step. All planners control the same plant, and take turns in blocks of episodes. The
+contestants "a set at a time" have their turn after them: one planner controls the plants of all episodes of a set.
 
 With --parts episodes --jobs N, N blocks run at a time, each in a process with cores of its own: successes stay the
 same, while times are those of cores whose neighbours work. With --busy episodes have no times.
@@ -71,12 +70,18 @@ COLORS = dict(
 )
 
 PLAN_MS = {
-    "reach": {"mppi": 3.0, "mppi_warp": 12.0, "python": 5.4, "python_stepwise": 30.0},
+    "reach": {"mppi": 3.0, "mppi_warp": 12.0, "mppi_warp_together": 0.2, "python": 5.4, "python_stepwise": 60.0},
     "half_cheetah": {"mppi": 27.0, "mppi_warp": 55.0, "python": 38.0, "python_stepwise": 120.0},
-    "adroit_pen": {"mppi": 514.0, "mppi_warp": 900.0, "python": 603.0, "python_stepwise": 750.0},
+    "adroit_pen": {
+        "mppi": 514.0,
+        "mppi_warp": 500.0,
+        "mppi_warp_together": 30.0,
+        "python": 603.0,
+        "python_stepwise": 1600.0,
+    },
     CARTPOLE: {"mppi": 23.0, "mppi_warp": 60.0, "judo": 28.0},
 }
-"""Rough time of a plan on two cores, or on a GPU."""
+"""Rough time of a plan on two cores, or on a GPU; with several plants, its share for each."""
 
 STEPS, CARTPOLE_STEPS = 75, 400
 """Steps of an episode: the paper's, and four seconds."""
@@ -174,7 +179,7 @@ def cases(options: Options) -> list[Case]:
 
 def estimate(case: Case) -> float:
     times = PLAN_MS[case.task]
-    plan = 1e-3 * times.get(case.contestant, times["mppi"] if case.contestant == "mppi_together" else 50.0)
+    plan = 1e-3 * times.get(case.contestant, times["mppi"])
     if case.samples is not None:
         plan *= case.samples / 64
     if case.contestant not in ON_WARP:
@@ -261,7 +266,7 @@ def episodes_together(
         success, going = (torch.full((case.count,), value) for value in (False, True))
         began = time.perf_counter()
         for step in range(steps):
-            env.step(made(env.get_state(), shift=min(step, 1)).to(env.action.device))
+            env.step(made(env.get_state(), shift=min(step, 1)))
             returns += torch.where(going, env.reward, 0.0)
             success = torch.where(going, env.success, success)
             going &= ~env.done
@@ -464,10 +469,10 @@ def episodes_of(rows: Sequence[Row]) -> dict[int, dict[int, list[Any]]]:
     return sets
 
 
-def mean_seconds(each: Sequence[Sequence[Any]]) -> str:
-    """Mean time of the episodes that have one; empty text without any."""
+def mean_seconds(each: Sequence[Sequence[Any]]) -> float | None:
+    """Mean time of the episodes that have one."""
     timed = [episode[3] for episode in each if episode[3] is not None]
-    return f"{statistics.fmean(timed):.3g}" if timed else ""
+    return statistics.fmean(timed) if timed else None
 
 
 def cores_of(rows: Sequence[Row]) -> str:
@@ -488,12 +493,16 @@ def episode_table(found: dict[tuple[str, int | None], dict[str, list[Row]]]) -> 
                 both = [(sets[i][seed][3], ours[seed][3]) for seed in ours.keys() & sets.get(i, {}).keys()]
                 if both := [pair for pair in both if None not in pair]:
                     times.append(sum(pair[0] for pair in both) / sum(pair[1] for pair in both))
+            seconds = mean_seconds(each)
             lines.append([
                 task, CONTESTANTS[name], cores_of(group), f"{good} of {len(each)}", f"{low:.0%} to {high:.0%}", by_set,
-                mean_seconds(each), median_and_range(times),
+                "" if seconds is None else f"{seconds:.3g}", median_and_range(times),
             ])  # fmt: skip
-    title = ("Episodes: success with its 95 % interval (Wilson), in each set of seeds, and mean seconds of an episode; "
-             "the last column compares the same seeds, median over the sets (smallest to largest).")  # fmt: skip
+    title = (
+        "Episodes: success with its 95 % interval (Wilson), in each set of seeds, and mean seconds of those that were "
+        "timed; where a planner controls a set at a time, those of the set divided by its episodes. The last column "
+        "compares the same seeds, median over the sets (smallest to largest)."
+    )
     header = ["task", "planner", "cores", "successes", "interval", "sets", "seconds", "seconds by ours"]
     return Table(title, header, lines)
 
@@ -553,8 +562,8 @@ def figure(rows: Sequence[Row]) -> Figure | None:
         for name, group in same.items():
             each = [episode for row in group for episode in row.result["each"]]
             share = statistics.fmean(int(episode[1]) for episode in each)
-            if seconds := mean_seconds(each):
-                points.append((name, float(seconds), f"{seconds} s, {share:.0%} succeed"))
+            if (seconds := mean_seconds(each)) is not None:
+                points.append((name, seconds, f"{seconds:.3g} s, {share:.0%} succeed"))
         if len(points) > 1:
             panels.append((task, f"seconds of an episode, cores: {cores_of(every)}", points))
     for part in ("plans", "cartpole"):

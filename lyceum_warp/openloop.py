@@ -36,7 +36,7 @@ class OpenLoop:
             ``state``.
         models: Values of model fields that differ between worlds, by name, each (n, size) float64 on the environment's
             device, read in every run: world w has row w % n instead of the values in ``state``.
-        states: Number of states to start from. The worlds of a state follow one another, as many for each.
+        states: Number of states to start from. Each has nworld / states consecutive worlds.
 
     Raises:
         ValueError: The environment resets its worlds automatically, ``keys`` has another shape, type or device, the
@@ -71,8 +71,8 @@ class OpenLoop:
         self.env, self.worlds = env, env.worlds
         self.horizon = whole_number("horizon", horizon, low=1)
         n, nact, task = env.nworld, env.action_space.size, env.task
-        if n % whole_number("states", states, low=1):
-            raise ValueError(f"states={states} need as many worlds each, and nworld={n} is not a multiple")
+        if n % (states := whole_number("states", states, low=1)):
+            raise ValueError(f"nworld={n} cannot be divided among states={states}: choose a multiple")
         if keys is not None and (keys.shape, keys.dtype, keys.device) != ((n,), wp.uint32, env.device):
             raise ValueError(
                 f"keys must be a wp.array of shape ({n},) and type uint32 on {env.device}, not of shape {keys.shape} "

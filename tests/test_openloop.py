@@ -527,5 +527,5 @@ def test_several_states_share_the_worlds(engine: str) -> None:
         alone.actions.copy_(loop.actions[:, 2 * i : 2 * i + 2])
         alone.run()
         torch.testing.assert_close(loop.reward[:, 2 * i : 2 * i + 2], alone.reward)
-    with pytest.raises(ValueError, match="states=4 need as many worlds each, and nworld=6 is not a multiple"):
+    with pytest.raises(ValueError, match="nworld=6 cannot be divided among states=4: choose a multiple"):
         OpenLoop(env, 3, states=4)

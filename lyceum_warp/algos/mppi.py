@@ -30,7 +30,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.algos.mppi_arguments import plain, planner_arguments, words_of_update
+from lyceum_warp.algos.mppi_arguments import explained_worlds, plain, planner_arguments, plant_seeds, words_of_update
 from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.planner_state import checked_state, state_from_parts
@@ -68,8 +68,9 @@ class MPPI:
     sample's own, seeded by the planner: a plan cannot know what the plant will draw.
 
     ``plants=n`` plans for n plants at a time, as ``env.step(plan(env.get_state()))`` in an environment with n worlds.
-    The plan of plant i is that of a planner with the seed ``seed + i``. Buffers then have one more axis, for the
-    plants: after that of the steps, or, where they have none, as the first.
+    Plant i has the noise of the seed ``seed + i``, and so the plan that a planner with this seed makes on the same
+    engine; with ``models``, all plants have those of the first seed. The buffers, except ``model_fields``, then have an
+    axis for the plants: the second one where the first counts steps or knots, otherwise the first.
 
     A task's ``planning`` (see ``lw.Planning``) gives settings of the planner, and options and parameters of its
     worlds. Arguments replace what the task gives.
@@ -81,17 +82,17 @@ class MPPI:
             (nworld, nobs) observations to (nworld,) values, or a Warp function of one observation,
             ``value(obs: Row[float]) -> float``, which becomes part of the graph on the Warp engine. With a value the
             parameters in ``planning`` do not apply, because the value function was fitted to the task's own rewards.
-        seed: Seed of the noise.
+        seed: Seed of the noise. With several plants, that of the first one, or a list with one for each.
         plants: Number of plants to plan for.
         params: Parameters of the task, for names that are also settings.
         words: Single settings, by the names of ``lw.MPPIConfig`` (None leaves one as it is); options of the planner's
             worlds, as for ``lw.make``; and parameters of the task. (One value for each world: the worlds of a sample,
             one for each model, follow one another, and so do the samples of a plant.) With a CUDA device and
-            engine="auto", the C engine on the CPU rolls out few samples, because it is faster there; plans and actions
-            then lie on the CPU.
+            engine="auto", the C engine on the CPU rolls out few samples, because it is faster there; plans then lie on
+            the CPU.
 
     Raises:
-        ValueError: An argument is unknown, ambiguous or not valid.
+        ValueError: An argument is unknown, ambiguous or not valid, or the samples do not fit into memory.
         FileNotFoundError: A model or task file is missing.
     """
 
@@ -132,14 +133,15 @@ class MPPI:
         config: MPPIConfig | None = None,
         *,
         value: Value | None = None,
-        seed: int = 0,
+        seed: int | Sequence[int] = 0,
         plants: int = 1,
         params: Mapping[str, Any] | None = None,
         **words: Any,
     ) -> None:
         if value is not None and not callable(value):
             raise ValueError(f"value must be a function of observations, or None, not {described(value)}")
-        self.seed, self.plants = whole_number("seed", seed, low=0), whole_number("plants", plants, low=1)
+        self.plants = whole_number("plants", plants, low=1)
+        seeds = plant_seeds(seed, self.plants)
         task = find_task(task)
         words = words_of_update(self._update, words)
         self.config, options, own_params = planner_arguments(task, config, words, params, value, self.plants)
@@ -149,7 +151,8 @@ class MPPI:
 
         self.settings = plain(options.given() | own_params | vars(self.config))
         nworld = self.plants * self.samples * self.config.models
-        self.env = Env(task, options, nworld=nworld, autoreset=False, horizon=0, **own_params)
+        with explained_worlds(self.config, self.plants):
+            self.env = Env(task, options, nworld=nworld, autoreset=False, horizon=0, **own_params)
         drawn = self._drawn_fields()
         self.env.reset()
         self.timestep = self.env.timestep
@@ -168,15 +171,16 @@ class MPPI:
                 n: wp.zeros((rows, part.stop - part.start), dtype=wp.float64) for n, (rows, part) in shapes.items()
             }
         self.model_fields = {name: torch_view(rows) for name, rows in fields.items()}
-        self._loop = OpenLoop(
-            self.env, self.horizon, keys=self._keys, nominal_model=self.config.nominal_model, models=fields,
-            states=self.plants,
-        )  # fmt: skip
+        with explained_worlds(self.config, self.plants):
+            self._loop = OpenLoop(
+                self.env, self.horizon, keys=self._keys, nominal_model=self.config.nominal_model, models=fields,
+                states=self.plants,
+            )  # fmt: skip
         self._allocate()
         self._take_value(value)
         first, others = self._program(first=True), self._program(first=False)
         self._calls = first + others * (self.iterations - 1)
-        self.reset(seed)
+        self.reset(seeds)
         self._made = True
 
     def _drawn_fields(self) -> list[str]:
@@ -303,7 +307,7 @@ class MPPI:
             shift: Steps since the last call's states.
 
         Returns:
-            The action to take now, (nu,), or with several plants (plants, nu).
+            The action to take now, (nu,), or with several plants (plants, nu), on the states' device.
 
         Raises:
             ValueError: The state has another shape or type, or is not finite.
@@ -313,7 +317,7 @@ class MPPI:
         self._shift_view.fill_(whole_number("shift", shift, low=0))
         for call in self._calls:
             call()
-        return self._action.clone()
+        return self._action.to(state.device, copy=True)
 
     def _program(self, *, first: bool) -> Calls:
         """The calls of one improvement, of which ``first`` moves the plan forward in time."""
@@ -418,9 +422,10 @@ class MPPI:
         """Forget the plan and the adapted noise, and start the noise again.
 
         Args:
-            seed: Another seed, also of the models that the planner draws. With several plants, that of the first one,
-                or one for each plant; models then are those of the first.
-            where: The plants whose plans to forget, (plants,) bool; by default all. Models stay as they are.
+            seed: Another seed, also of the models that the planner draws. With several plants, plant i gets the seed
+                ``seed + i``, or there is a list with a seed for each; models are drawn with the first.
+            where: The plants whose plans to forget, (plants,) bool; by default all. The others keep their seeds, and
+                the planner its models.
 
         Raises:
             ValueError: A seed is not a whole number from 0, or ``where`` has another shape or type.
@@ -430,12 +435,10 @@ class MPPI:
                 raise ValueError(f"where must be a bool tensor of shape ({self.plants},), not {described(where)}")
             where = where.to(self.actions.device)
         if seed is not None:
-            seeds = self._seeds(seed)
+            seeds = plant_seeds(seed, self.plants)
             _put(torch_view(self._seed), torch.tensor(seeds, dtype=torch.int32, device=self.actions.device), where)
-            if where is None:
-                self.__dict__["seed"] = seeds[0]
-                if self.model_fields:
-                    self._draw_models()
+            if where is None and self.model_fields:
+                self._draw_models(seeds[0])
         for counter in (torch_view(self._count), torch_view(self._phase)):
             _put(counter, torch.zeros_like(counter), where)
         rows = None if where is None else where[:, None]
@@ -444,19 +447,14 @@ class MPPI:
         if self.adapted_noise is not None:
             _put(torch_view(self._deviation), torch_view(self._first_deviation), rows)
 
-    def _seeds(self, seed: int | Sequence[int]) -> list[int]:
-        """A seed for each plant."""
-        if isinstance(seed, Sequence):
-            seeds = [whole_number("seed", one, low=0) for one in seed]
-            if len(seeds) != self.plants:
-                raise ValueError(f"seed must be one number, or one for each of {self.plants} plants, not {seed!r}")
-            return seeds
-        first = whole_number("seed", seed, low=0)
-        return list(range(first, first + self.plants))
+    @property
+    def seeds(self) -> list[int]:
+        """Seed of each plant's noise."""
+        return list(self._seed.numpy().tolist())
 
-    def _draw_models(self) -> None:
+    def _draw_models(self, seed: int) -> None:
         """Draw the planner's models with the task's functions, from streams that no plant of this seed has."""
-        self.env.rand_reset(int(np.random.SeedSequence([self.seed, _MODELS]).generate_state(1)[0]) >> 1)
+        self.env.rand_reset(int(np.random.SeedSequence([seed, _MODELS]).generate_state(1)[0]) >> 1)
         states = self.env.get_state()[: self.config.models]
         for name, rows in self.model_fields.items():
             rows.copy_(states[:, self.env.state_space.parts[name]])

@@ -1,8 +1,9 @@
 """The arguments of a call of MPPI: sorted, and completed from the task's planning."""
 
+import contextlib
 import dataclasses
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,11 @@ from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig
 from lyceum_warp.binding.bound_task import task_spec
 from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.registry import task_name
+from lyceum_warp.engines.memory import NotEnoughMemoryError
 from lyceum_warp.engines.placement import place_samples
 from lyceum_warp.options import OPTIONS, EnvOptions, suggestion
 from lyceum_warp.task import Planning, Task
-from lyceum_warp.validate import described
+from lyceum_warp.validate import described, whole_number
 
 
 def task_config(task: type[Task], value: object = None) -> MPPIConfig:
@@ -94,6 +96,37 @@ def planner_arguments(
         has_noslip=lambda: _has_noslip(task, options),
     )  # fmt: skip
     return config, options.changed(place), dict(planning.params if value is None else {}) | rest
+
+
+def plant_seeds(seed: int | Sequence[int], plants: int) -> list[int]:
+    """A seed for each plant, from that of the first one or from a list.
+
+    Raises:
+        ValueError: A seed is not a whole number from 0, or there are too few or too many.
+    """
+    given: Any = seed
+    if isinstance(given, (np.ndarray, torch.Tensor)):
+        given = given.tolist()
+    if isinstance(given, Sequence) and not isinstance(given, str):
+        if len(given) != plants:
+            raise ValueError(f"seed must be a number, or a list with one for each of {plants} plants, not {given!r}")
+        return [whole_number("seed", one, low=0) for one in given]
+    first = whole_number("seed", given, low=0, high=2**31 - plants)
+    return list(range(first, first + plants))
+
+
+@contextlib.contextmanager
+def explained_worlds(config: MPPIConfig, plants: int) -> Iterator[None]:
+    """Make worlds of a planner; where they do not fit into memory, the error says which settings their number is from.
+
+    Raises:
+        NotEnoughMemoryError: They do not fit into memory.
+    """
+    try:
+        yield
+    except NotEnoughMemoryError as error:
+        product = f"{plants} * {config.samples} * {config.models}"
+        raise NotEnoughMemoryError(f"{error}, where nworld is plants * samples * models, {product}") from error
 
 
 def words_of_update(update: str | None, words: Mapping[str, Any]) -> dict[str, Any]:

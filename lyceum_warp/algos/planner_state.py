@@ -58,10 +58,12 @@ def checked_state(env: Env, state: torch.Tensor, like: torch.Tensor) -> torch.Te
     if isinstance(state, torch.Tensor) and state.ndim == 2 and len(state) == 1 and like.ndim == 1:
         state = state[0]
     if not isinstance(state, torch.Tensor) or state.shape != like.shape or state.dtype != like.dtype:
+        which, source = ("a state", "it") if like.ndim == 1 else ("the states", "them")
+        parts = "make it by its parts with" if like.ndim == 1 else "stack for each plant a"
         raise ValueError(
-            f"{'a state' if like.ndim == 1 else 'the states'} to plan from must be {described(like)}, not "
-            f"{described(state)}: take it from env.get_state() of the same task, or make it by its parts with "
-            "plan.state_of(qpos=..., qvel=...). (fields=[...] may make the states of an environment longer.)"
+            f"{which} to plan from must be {described(like)}, not {described(state)}: take {source} from "
+            f"env.get_state() of the same task, or {parts} plan.state_of(qpos=..., qvel=...). "
+            "(fields=[...] may make the states of an environment longer.)"
         )
     if state.device.type != "cpu":  # the check would wait for the device; there every sample fails, and the plan stays
         return state

@@ -69,7 +69,7 @@ class PlanningController(Controller, Protocol):
 
     @property
     def plants(self) -> int:
-        """Number of plants that it plans for. The loops control one."""
+        """Number of plants that it plans for, by default 1. The loops control one."""
         ...
 
     @property

@@ -35,7 +35,7 @@ def first_row(plant: int, rows: int, plants: int) -> int:
 
 @wp.kernel(enable_backward=False)
 def broadcast(state_in: wp.array2d[wp.float64], state_out: wp.array2d[wp.float64]):
-    """Copy each state to as many worlds, which follow one another; launched over (nworld, state_size)."""
+    """Copy each state to its consecutive worlds, as many for each; launched over (nworld, state_size)."""
     w, i = wp.tid()
     state_out[w, i] = state_in[plant_of(w, state_out.shape[0], state_in.shape[0]), i]
 
@@ -122,9 +122,9 @@ def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.ar
     Seed and count are those of the plant, and its samples are counted from 0.
     """
     k, i = wp.tid()
-    samples, plants = noise_out.shape[1], seed_in.shape[0]
-    p = plant_of(k, samples, plants)
-    key = stream(world_key(seed_in[p], k - first_row(p, samples, plants)), NOISE, 0)
+    nsample, plants = noise_out.shape[1], seed_in.shape[0]
+    p = plant_of(k, nsample, plants)
+    key = stream(world_key(seed_in[p], k - first_row(p, nsample, plants)), NOISE, 0)
     rng = stream(key, count_in[p], i)
     for t in range(noise_out.shape[0]):
         noise_out[t, k, i] = wp.randn(rng)
@@ -161,9 +161,9 @@ def perturb(
     ``include_plan`` a plant's first sample is the plan without noise.
     """
     k, i = wp.tid()
-    samples, plants = noise_in.shape[1], nominal_in.shape[1]
-    p = plant_of(k, samples, plants)
-    exact = include_plan and k == first_row(p, samples, plants)
+    nsample, plants = noise_in.shape[1], nominal_in.shape[1]
+    p = plant_of(k, nsample, plants)
+    exact = include_plan and k == first_row(p, nsample, plants)
     last, before_last = float(0.0), float(0.0)
     first = wp.where(diagonal, i, 0)
     for t in range(noise_in.shape[0]):
@@ -192,9 +192,9 @@ def perturb_adapted(
 ):
     """The same with a standard deviation for each number of the plan, which scales smoothed standard normal noise."""
     k, i = wp.tid()
-    samples, plants = noise_in.shape[1], nominal_in.shape[1]
-    p = plant_of(k, samples, plants)
-    exact = include_plan and k == first_row(p, samples, plants)
+    nsample, plants = noise_in.shape[1], nominal_in.shape[1]
+    p = plant_of(k, nsample, plants)
+    exact = include_plan and k == first_row(p, nsample, plants)
     last, before_last = float(0.0), float(0.0)
     for t in range(noise_in.shape[0]):
         s = noise_in[t, k, i]
@@ -295,7 +295,10 @@ def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[f
 
 @wp.kernel(enable_backward=False)
 def rank(return_in: wp.array[float], samples: int, rank_out: wp.array[int]):
-    """Count the better samples of each plant's, of equal ones those with smaller numbers; launched over (nsample,)."""
+    """For each sample, count the better ones of its plant; launched over (nsample,).
+
+    Of equal samples those with smaller numbers are the better ones.
+    """
     k = wp.tid()
     own = return_in[k]
     better = int(0)
@@ -357,13 +360,13 @@ def fit_deviation(
     noise in this step, and at least the smallest one. Where every sample failed it stays as it is.
     """
     number, lane = wp.tid()
-    samples, plants, nact = weight_in.shape[0], plan_in.shape[1], plan_in.shape[2]
+    nsample, plants, nact = weight_in.shape[0], plan_in.shape[1], plan_in.shape[2]
     t = number // (plants * nact)
     column = number - t * plants * nact
     p = plant_of(column, plants * nact, plants)
     i = column - p * nact
     total = float(0.0)
-    for k in range(first_row(p, samples, plants) + lane, first_row(p + 1, samples, plants), wp.block_dim()):
+    for k in range(first_row(p, nsample, plants) + lane, first_row(p + 1, nsample, plants), wp.block_dim()):
         distance = action_in[t, k, i] - plan_in[t, p, i]
         total += weight_in[k] * distance * distance
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
@@ -385,13 +388,13 @@ def average(
     Where every sample failed the plan stays as it is.
     """
     number, lane = wp.tid()
-    samples, plants, nact = weight_in.shape[0], plan_out.shape[1], plan_out.shape[2]
+    nsample, plants, nact = weight_in.shape[0], plan_out.shape[1], plan_out.shape[2]
     t = number // (plants * nact)
     column = number - t * plants * nact
     p = plant_of(column, plants * nact, plants)
     i = column - p * nact
     total = float(0.0)
-    for k in range(first_row(p, samples, plants) + lane, first_row(p + 1, samples, plants), wp.block_dim()):
+    for k in range(first_row(p, nsample, plants) + lane, first_row(p + 1, nsample, plants), wp.block_dim()):
         total += weight_in[k] * action_in[t, k, i]
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
     if lane == 0:

@@ -745,7 +745,7 @@ def test_buffers_cannot_be_replaced(name: str) -> None:
 def test_reset_with_a_seed_changes_the_seed() -> None:
     plan = MPPI("point_mass", horizon=3, samples=2)
     plan.reset(7)
-    assert plan.seed == 7
+    assert plan.seeds == [7]
 
 
 @pytest.mark.parametrize("seed", [-1, 0.5, "a"])

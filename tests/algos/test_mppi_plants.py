@@ -2,13 +2,21 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import warp as wp
+from form_tasks import Pushed
 from varied_task import Varied
 
 import lyceum_warp as lw
 from lyceum_warp import Row
+
+
+@wp.func
+def first_squared(obs: Row[float]) -> float:
+    return 3.0 * obs[0] * obs[0]
+
 
 CASES: dict[str, dict[str, Any]] = {
     "mppi": dict(task="point_mass"),
@@ -21,25 +29,21 @@ CASES: dict[str, dict[str, Any]] = {
     ),
     "predictive sampling": dict(task="point_mass", update="predictive_sampling", iterations=2),
     "models": dict(task=Varied, models=2, risk="worst", knots=2),
+    "models with a value": dict(task=Varied, models=3, value=first_squared),
+    "control of the task": dict(task=Pushed, noise=0.5),
     "stop": dict(task="hopper", termination="stop"),
     "frame skip": dict(task="reach", frame_skip=2),
 }
+ON_WARP = ("mppi", "cem with knots", "models", "control of the task")
 BUFFERS = ("actions", "nominal", "knot_actions", "standard_noise", "sampled", "adapted_noise")  # the second axis
 FIRST = ("returns", "weights", "model_returns")
-
-
-@wp.func
-def first_squared(obs: Row[float]) -> float:
-    return 3.0 * obs[0] * obs[0]
 
 
 def states_of(task: Any, count: int) -> torch.Tensor:
     return lw.make(task, nworld=count, autoreset=False, seed=3).get_state()
 
 
-@pytest.mark.parametrize(
-    "case, engine", [*((c, "mujoco") for c in CASES), *((c, "warp") for c in ("mppi", "cem with knots", "models"))]
-)
+@pytest.mark.parametrize("case, engine", [*((c, "mujoco") for c in CASES), *((c, "warp") for c in ON_WARP)])
 def test_plans_for_several_plants_are_those_of_single_planners(case: str, engine: str) -> None:
     settings = dict(horizon=6, samples=8, temperature=0.5, engine=engine) | CASES[case]
     states = states_of(settings["task"], 3)
@@ -95,25 +99,61 @@ def test_some_plants_restart() -> None:
     again = plan(states)
     torch.testing.assert_close(again[2], lw.MPPI("point_mass", horizon=5, samples=6, update="cem", elites=2, knots=2,
                                                  seed=1)(states[2]))  # fmt: skip
-    plan.reset(9, where=torch.tensor([True, False, False]))
-    assert plan.seed == 4  # the others keep theirs
-    torch.testing.assert_close(plan(states)[0], lw.MPPI("point_mass", horizon=5, samples=6, update="cem", elites=2,
-                                                        knots=2, seed=9)(states[0]))  # fmt: skip
+    plan.reset(9, where=torch.tensor([False, False, True]))
+    assert plan.seeds == [4, 9, 11]  # the others keep theirs
+    torch.testing.assert_close(plan(states)[2], lw.MPPI("point_mass", horizon=5, samples=6, update="cem", elites=2,
+                                                        knots=2, seed=11)(states[2]))  # fmt: skip
     assert not torch.allclose(again[0], again[1])
+
+
+@pytest.mark.parametrize("update", ["mppi", "cem", "predictive_sampling"])
+def test_a_plant_whose_samples_all_fail_keeps_its_plan(update: str) -> None:
+    def second_fails(obs: torch.Tensor) -> torch.Tensor:
+        plant = torch.arange(len(obs)) // 5
+        return torch.where(plant == 1, torch.nan, obs[:, 0])
+
+    settings: dict[str, Any] = dict(task="point_mass", horizon=4, samples=5, update=update, noise=0.3)
+    states = states_of("point_mass", 3)
+    plan = lw.MPPI(**settings, value=second_fails, seed=7, plants=3)
+    plan.actions[:, 1] = 0.125
+    actions = plan(states, shift=0)
+    assert (plan.actions[:, 1] == 0.125).all() and not plan.weights[1].any()
+    assert plan.summary["failed_samples"].tolist() == [0, 5, 0]
+    if plan.adapted_noise is not None:
+        torch.testing.assert_close(plan.adapted_noise[:, 1], torch.full((4, 2), 0.3))
+    for i in (0, 2):
+        alone = lw.MPPI(**settings, value=lambda obs: obs[:, 0], seed=7 + i)
+        torch.testing.assert_close(actions[i], alone(states[i], shift=0))
 
 
 def test_a_plan_for_each_world_controls_an_environment() -> None:
     env = lw.make("point_mass", nworld=4, seed=2, horizon=30)
-    plan = lw.MPPI("point_mass", horizon=12, samples=64, temperature=0.1, plants=4)
-    start, ended = env.reward.clone(), 0
-    distance = env.obs[:, :2].clone() - env.obs[:, 4:6]
-    for _ in range(29):
-        env.step(plan(env.get_state()))
-        plan.reset(where=env.done)
-        ended += int(env.done.sum())
-    now = env.obs[:, :2] - env.obs[:, 4:6]
-    assert ended == 0 and start.shape == (4,)
-    assert (now.norm(dim=1) < 0.3 * distance.norm(dim=1)).all()
+    state = env.get_state()
+    state[1, env.state_space.parts["step"]] = 10  # its episode ends after 20 steps
+    env.set_state(state)
+    settings: dict[str, Any] = dict(task="point_mass", horizon=12, samples=64, temperature=0.1)
+    plan, alone = lw.MPPI(**settings, plants=4), lw.MPPI(**settings, seed=101)
+    far = (env.obs[:, :2] - env.obs[:, 4:6]).norm(dim=1)
+    for step in range(29):
+        state = env.get_state()
+        action = plan(state)
+        if step in (20, 21):
+            torch.testing.assert_close(action[1], alone(state[1]))
+        env.step(action)
+        assert env.done.tolist() == [False, step == 19, False, False]
+        plan.reset(100, where=env.done)
+    now = (env.obs[:, :2] - env.obs[:, 4:6]).norm(dim=1)
+    assert (now < 0.3 * far)[[0, 2, 3]].all()
+
+
+@pytest.mark.parametrize("seeds", [[4, 9], (4, 9), torch.tensor([4, 9]), np.array([4, 9])])
+def test_every_plant_can_have_a_seed_of_its_own(seeds: Any) -> None:
+    plan = lw.MPPI("point_mass", horizon=3, samples=4, plants=2, seed=seeds)
+    assert plan.seeds == [4, 9]
+    plan.reset(3)
+    assert plan.seeds == [3, 4]
+    plan.reset(seeds)
+    assert plan.seeds == [4, 9]
 
 
 @pytest.mark.parametrize("plants", [0, 2.5, True, "3"])
@@ -125,18 +165,28 @@ def test_plants_are_a_whole_number(plants: Any) -> None:
 def test_bad_input_gets_one_line() -> None:
     plan = lw.MPPI("point_mass", horizon=3, samples=4, plants=2)
     states = states_of("point_mass", 2)
-    with pytest.raises(ValueError, match=r"the states to plan from must be a float64 tensor of shape \(2, "):
+    with pytest.raises(ValueError, match=r"the states .* of shape \(2, .*: take them from .* for each plant a"):
         plan(states[0])
     states[1, 1] = torch.nan
     with pytest.raises(ValueError, match="the state of plant 1 to plan from has nan in its "):
         plan(states)
     with pytest.raises(ValueError, match=r"where must be a bool tensor of shape \(2,\), not a float32 tensor"):
         plan.reset(where=torch.zeros(2))
-    with pytest.raises(ValueError, match=r"one for each of 2 plants, not \[1, 2, 3\]"):
+    with pytest.raises(ValueError, match=r"a list with one for each of 2 plants, not \[1, 2, 3\]"):
         plan.reset([1, 2, 3])
+    with pytest.raises(ValueError, match=r"seed must be a whole number from 0 to 2147483646, not 2147483647"):
+        plan.reset(2**31 - 1)
     with pytest.raises(ValueError, match=r"seed must be a whole number .* not -1"):
         plan.reset([1, -1])
+    assert plan.seeds == [0, 1]
     with pytest.raises(AttributeError, match="make another MPPI with plants=3"):
         plan.plants = 3
     with pytest.raises(ValueError, match="plans for 2 plants, and one is controlled here: make it with plants=1"):
         lw.control(lw.make("point_mass", autoreset=False), plan, steps=2)
+
+
+def test_plants_that_do_not_fit_into_memory_are_refused() -> None:
+    with pytest.raises(
+        ValueError, match=r"use nworld=.*, where nworld is plants \* samples \* models, 10000 "
+    ):
+        lw.MPPI("point_mass", horizon=4, samples=10**5, plants=10**4)

@@ -73,6 +73,17 @@ def test_plans_for_several_plants_are_those_of_single_planners(update: str) -> N
     assert not together.actions[:, 2].any() and together.actions[:, 1].any()
 
 
+@pytest.mark.parametrize("of_plants, of_plan", [(CUDA, "cpu"), ("cpu", CUDA)])
+def test_actions_lie_where_the_states_do(of_plants: str, of_plan: str) -> None:
+    env = lw.make("point_mass", nworld=3, device=of_plants, engine="warp", autoreset=False, seed=1)
+    plan = lw.MPPI("point_mass", plants=3, horizon=8, samples=32, device=of_plan, engine="warp")
+    before = env.get_state()
+    for _ in range(3):
+        env.step(plan(env.get_state()))
+    assert plan.actions.device.type == torch.device(of_plan).type
+    assert not torch.equal(env.get_state(), before)
+
+
 @pytest.mark.parametrize("update", UPDATES)
 def test_every_update_on_a_gpu_equals_that_on_the_cpu_for_the_same_returns(update: str) -> None:
     """The first improvement's returns differ by rounding, and the order of samples that are almost equal may, too."""
