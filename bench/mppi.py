@@ -561,9 +561,9 @@ def figure(rows: Sequence[Row]) -> Figure | None:
         points, every = [], [row for group in same.values() for row in group]
         for name, group in same.items():
             each = [episode for row in group for episode in row.result["each"]]
-            share = statistics.fmean(int(episode[1]) for episode in each)
+            good = sum(int(episode[1]) for episode in each)
             if (seconds := mean_seconds(each)) is not None:
-                points.append((name, seconds, f"{seconds:.3g} s, {share:.0%} succeed"))
+                points.append((name, seconds, f"{seconds:.3g} s, {good} of {len(each)} succeed"))
         if len(points) > 1:
             panels.append((task, f"seconds of an episode, cores: {cores_of(every)}", points))
     for part in ("plans", "cartpole"):
@@ -580,7 +580,7 @@ def figure(rows: Sequence[Row]) -> Figure | None:
                 panels.append((title, "milliseconds of a plan", points))
     if not panels:
         return None
-    drawn = Figure(figsize=(10.0, 1.0 + 1.9 * ((len(panels) + 1) // 2)), layout="constrained")
+    drawn = Figure(figsize=(11.0, 1.0 + 1.9 * ((len(panels) + 1) // 2)), layout="constrained")
     FigureCanvasAgg(drawn)
     axes = drawn.subplots((len(panels) + 1) // 2, 2, squeeze=False).flatten()
     for panel, (task, unit, points) in zip(axes, panels, strict=False):
@@ -592,7 +592,8 @@ def figure(rows: Sequence[Row]) -> Figure | None:
         panel.scatter(values, places, s=60, color=[COLORS[name] for name in names], zorder=2)
         panel.set_yticks(places, [CONTESTANTS[name] for name in names])
         panel.set_ylim(-0.7, len(points) - 0.3)
-        panel.set_xlim(min(values) / 2, max(values) * 20)  # room for the text beside the last point
+        left, right = min(values) / 2, max(values)
+        panel.set_xlim(left, max(right * 20, left * (right / left) ** 2.3))  # room for the text beside the last point
         panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         panel.xaxis.set_minor_formatter(NullFormatter())
         for place, value, text in zip(places, values, texts, strict=True):
