@@ -64,7 +64,7 @@ def test_plans_for_several_plants_are_those_of_single_planners(update: str) -> N
             torch.testing.assert_close(together.returns[i], plan.returns, rtol=1e-3, atol=1e-3)
             # a difference of roundings may choose other elites: from the same returns, the same plan
             if torch.equal(together.returns[i], plan.returns):
-                torch.testing.assert_close(actions[i], plan.actions[0])
+                torch.testing.assert_close(actions[i].to(CUDA), plan.actions[0])
             plan.actions.copy_(together.actions[:, i])
             plan.knot_actions.copy_(together.knot_actions[:, i])
             if plan.adapted_noise is not None:
