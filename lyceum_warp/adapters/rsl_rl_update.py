@@ -6,6 +6,8 @@ from typing import Any
 import torch
 from torch import nn
 
+from lyceum_warp.graphs.capture import capturing
+
 
 class CapturedUpdate:
     """Computes what ``PPO.update`` of rsl_rl computes, up to rounding and with fewer random numbers.
@@ -107,7 +109,7 @@ class CapturedUpdate:
                 return
             if self._graph is None:
                 self._graph = torch.cuda.CUDAGraph()
-                with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
+                with capturing(), torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
                     self._epoch()
             self._graph.replay()
 

@@ -9,6 +9,7 @@ from lyceum_warp.algos.dense import DensePasses, DenseValue
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.timing import one_thread
 from lyceum_warp.algos.value import BOUND, ValueFunction
+from lyceum_warp.graphs.capture import capturing
 
 
 class ValueFit:
@@ -273,7 +274,7 @@ class CapturedStep:
         torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
         # other threads, such as NCCL's, call CUDA during the capture
-        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        with capturing(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
             self.learn()
         self.fit.team.keep(graph)
         self.graph = graph

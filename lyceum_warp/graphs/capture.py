@@ -10,10 +10,11 @@ apart become several graphs, each for a part of the worlds, and threads replay t
 
 import contextlib
 import dataclasses
+import gc
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 
 import torch
@@ -110,6 +111,23 @@ _CAPTURING = threading.RLock()
 """Warp captures one graph at a time, while controllers and viewers have environments in threads of their own."""
 
 
+@contextlib.contextmanager
+def capturing() -> Iterator[None]:
+    """Keep other captures and Python's garbage collection away from a capture.
+
+    A collection may delete graphs of torch that are no longer used. CUDA forbids that while a stream is captured, and
+    the capture fails.
+    """
+    with _CAPTURING:
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            yield
+        finally:
+            if collects:
+                gc.enable()
+
+
 class _Graph:
     """Functions made of launches as one graph, or as one for each thread where they take long.
 
@@ -156,7 +174,7 @@ class _Graph:
                 self._replay = partial(self._workers.run, [self._capture_part(k, parts) for k in range(parts)])
 
     def _capture_part(self, part: int, parts: int) -> Callable[[], object]:
-        with _CAPTURING, part_of_worlds(part, parts), wp.ScopedCapture(device=self._device) as capture:
+        with capturing(), part_of_worlds(part, parts), wp.ScopedCapture(device=self._device) as capture:
             self._run()
         return partial(wp.capture_launch, capture.graph)
 

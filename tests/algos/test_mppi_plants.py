@@ -186,7 +186,5 @@ def test_bad_input_gets_one_line() -> None:
 
 
 def test_plants_that_do_not_fit_into_memory_are_refused() -> None:
-    with pytest.raises(
-        ValueError, match=r"use nworld=.*, where nworld is plants \* samples \* models, 10000 "
-    ):
+    with pytest.raises(ValueError, match=r"use nworld=.*, where nworld is plants \* samples \* models, 10000 "):
         lw.MPPI("point_mass", horizon=4, samples=10**5, plants=10**4)

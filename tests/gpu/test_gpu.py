@@ -117,6 +117,27 @@ def run(env: lw.Env, steps: int) -> list[torch.Tensor]:
     return results
 
 
+def test_a_graph_of_torch_that_is_no_longer_used_leaves_a_capture_unharmed() -> None:
+    """Python deletes it whenever it collects garbage, and CUDA forbids that during a capture."""
+    env = lw.make("hopper", nworld=8, device=CUDA)
+    env.step()
+    graph, x = torch.cuda.CUDAGraph(), torch.zeros(4, device=CUDA)
+    with torch.cuda.graph(graph):
+        x += 1.0
+    gc.collect()
+    unused = [graph]
+    unused.append(unused)  # type: ignore[arg-type]  # only a collection finds it
+    del graph, unused
+    thresholds = gc.get_threshold()
+    gc.set_threshold(1, 1, 1)
+    try:
+        env.step()  # captures
+    finally:
+        gc.set_threshold(*thresholds)
+    env.step()
+    assert env.obs.isfinite().all()
+
+
 @pytest.mark.parametrize("task", ["hopper", "humanoid", "half_cheetah"])
 def test_deterministic_graphs_equal_direct_launches(task: str) -> None:
     replayed, direct = (

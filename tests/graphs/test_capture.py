@@ -1,5 +1,6 @@
 """Phases become graphs: the same numbers, the same order, captured where they are made of launches."""
 
+import gc
 import threading
 from functools import partial
 from typing import Any
@@ -139,3 +140,29 @@ def test_forget_captures_again_what_the_phases_launch_now() -> None:
     assert digits.after(calls) == 1  # the graph holds the argument
     made.forget()
     assert [digits.after(calls) for _ in range(3)] == [2] * 3
+
+
+def test_what_is_no_longer_used_is_deleted_after_a_capture() -> None:
+    """To delete a graph of torch during a capture would end it with an error."""
+    digits, captures, deleted = Digits(), 0, []
+
+    class Unused:
+        def __init__(self) -> None:
+            self.itself = self  # only a collection finds it
+
+        def __del__(self) -> None:
+            deleted.append(captures)
+
+    def run() -> None:
+        nonlocal captures
+        captures += 1
+        [[] for _ in range(10_000)]  # enough new objects for a collection
+        captures += 1
+
+    calls = Graphs(wp.get_device("cpu"), enabled=True).sequence([digits.phase(1), Phase("run", run)])
+    digits.after(calls)
+    gc.collect()
+    Unused()
+    digits.after(calls)
+    gc.collect()
+    assert captures == 4 and deleted == [4] and gc.isenabled()

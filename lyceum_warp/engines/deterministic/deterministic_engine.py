@@ -16,6 +16,7 @@ from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.engines.warp import substep
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import Field
+from lyceum_warp.graphs.capture import capturing
 from lyceum_warp.model_fields import ModelField
 
 _TIMES_THE_MEMORY = 5
@@ -92,7 +93,7 @@ class DeterministicEngine(WarpEngine):
         with wp.ScopedDevice(self.device), scratch.serving():
             CanonicalOrder(model, data, scratch.open)
             substep.step(model, data)
-            with wp.ScopedCapture(self.device):
+            with capturing(), wp.ScopedCapture(self.device):
                 substep.step(model, data)
         return scratch
 
