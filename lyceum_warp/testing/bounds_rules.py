@@ -3,13 +3,16 @@
 from typing import Any
 
 import numpy as np
+import torch
 import warp as wp
 
 from lyceum_warp.arrays import torch_view
 from lyceum_warp.binding.writes import written_fields
+from lyceum_warp.done import FAULTS
 from lyceum_warp.task import FUNCTIONS, MEMORIES, observer_name
 from lyceum_warp.testing.checked_functions import CheckedFunctions, Unchecked, checked_functions
 from lyceum_warp.testing.context import Context
+from lyceum_warp.worlds import Worlds
 
 _RESET = ("startup", "initialize", "randomize")
 """The functions that a reset runs, in order, on the engine's initial state."""
@@ -81,17 +84,33 @@ class _Run:
             self._copy(self.worlds.after, self.before)
             self._run("control", self.before)
             self._copy(self.worlds.after, self.before)
+            state = env.get_state()
             env.step(action)
-            self._run_step()
+            if (env.done_reason & int(FAULTS)).any():
+                self._run_before_restart(state, action)
+            self._run_step(self.worlds)
 
-    def _run_step(self) -> None:
+    def _run_before_restart(self, state: torch.Tensor, action: torch.Tensor) -> None:
+        """Run the functions of a step on the state that a fault ended, which the step has replaced by a new one.
+
+        What lies beyond an array may be not-a-number, so that the read itself is what ends the episode.
+        """
+        env = self.ctx.b
+        env.set_state(state)
+        env.action.copy_(action)
+        env.worlds.act()
+        for phase in env.worlds.physics_phases():
+            phase.run()
+        self._run_step(env.worlds)
+
+    def _run_step(self, worlds: Worlds) -> None:
         """Run the functions of a step on the transition that it made, and on the state that it led to."""
         dirty = True
         for name, function in self.functions.items():
             if name in (*_RESET, "control"):
                 continue
             if dirty:
-                self._copy(self.worlds.after, self.after)
+                self._copy(worlds.after, self.after)
             if name == "advance":  # it finds them as the step before left them
                 for memory in MEMORIES:
                     if memory in self.env.task.types:

@@ -14,6 +14,7 @@ import lyceum_warp as lw
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.options import OPTIONS
 from lyceum_warp.testing import check_task
+from lyceum_warp.testing.bounds_rules import check_bounds
 
 XML = """
 <mujoco>
@@ -251,11 +252,22 @@ def test_a_table_is_not_written_by_functions(task_file: Any) -> None:
         lw.make(str(task_file("writes_table.py", wrong)))
 
 
-def test_check_task_finds_a_read_out_of_a_table(task_file: Any) -> None:
-    check_task(Follow, steps=12)
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+@pytest.mark.parametrize("found", ["number", "nan"])
+def test_check_task_finds_a_read_out_of_a_table(task_file: Any, found: str, engine: str) -> None:
+    """Also where what lies beyond the table is not-a-number, so that the episode ends with a fault there."""
     source = (Path(__file__).parent.parent / "table_task.py").read_text()
     wrong = source.replace("p.motion.shape[0] - 1)", "p.motion.shape[0])")
+    value = {"number": "0.0", "nan": "wp.nan"}[found]
+    read = "p.motion[frame(s, p), 0]"
+    wrong = wrong.replace(f"obs[1] = {read}", f"x = {read}\n    obs[1] = wp.where(frame(s, p) > 2, {value}, x)")
+    wrong = wrong.replace("obs[2] = p.motion[frame(s, p)][1]", "obs[2] = 0.0")
+    assert wrong.count(read) == 1 and value in wrong
     with pytest.raises(
         AssertionError, match=r"observe reads p\.motion\[frame.*out of range .*the index is 3, and there"
     ):
-        check_task(str(task_file("beyond_table.py", wrong)), steps=12)
+        check_task(str(task_file(f"beyond_{found}.py", wrong)), engine=engine, steps=12, checks=[check_bounds])
+
+
+def test_check_task_accepts_reads_within_a_table() -> None:
+    check_task(Follow, steps=12)
