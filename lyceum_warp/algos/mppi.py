@@ -423,7 +423,7 @@ class MPPI:
 
         Args:
             seed: Another seed, also of the models that the planner draws. With several plants, plant i gets the seed
-                ``seed + i``, or there is a list with a seed for each; models are drawn with the first.
+                ``seed + i``; a list has a seed for each. Models are drawn with the first seed.
             where: The plants whose plans to forget, (plants,) bool; by default all. The others keep their seeds, and
                 the planner its models.
 
@@ -450,7 +450,7 @@ class MPPI:
     @property
     def seeds(self) -> list[int]:
         """Seed of each plant's noise."""
-        return list(self._seed.numpy().tolist())
+        return [int(seed) for seed in self._seed.numpy()]
 
     def _draw_models(self, seed: int) -> None:
         """Draw the planner's models with the task's functions, from streams that no plant of this seed has."""

@@ -58,12 +58,14 @@ def checked_state(env: Env, state: torch.Tensor, like: torch.Tensor) -> torch.Te
     if isinstance(state, torch.Tensor) and state.ndim == 2 and len(state) == 1 and like.ndim == 1:
         state = state[0]
     if not isinstance(state, torch.Tensor) or state.shape != like.shape or state.dtype != like.dtype:
-        which, source = ("a state", "it") if like.ndim == 1 else ("the states", "them")
-        parts = "make it by its parts with" if like.ndim == 1 else "stack for each plant a"
+        parts = "plan.state_of(qpos=..., qvel=...)"
+        if like.ndim == 1:
+            which, hint = "a state", f"make it by its parts with {parts}"
+        else:
+            which, hint = "the states", f"stack one {parts} for each plant"
         raise ValueError(
-            f"{which} to plan from must be {described(like)}, not {described(state)}: take {source} from "
-            f"env.get_state() of the same task, or {parts} plan.state_of(qpos=..., qvel=...). "
-            "(fields=[...] may make the states of an environment longer.)"
+            f"{which} to plan from must be {described(like)}, not {described(state)}: call env.get_state() of the same "
+            f"task, or {hint}. (fields=[...] may make the states of an environment longer.)"
         )
     if state.device.type != "cpu":  # the check would wait for the device; there every sample fails, and the plan stays
         return state

@@ -165,7 +165,7 @@ def test_plants_are_a_whole_number(plants: Any) -> None:
 def test_bad_input_gets_one_line() -> None:
     plan = lw.MPPI("point_mass", horizon=3, samples=4, plants=2)
     states = states_of("point_mass", 2)
-    with pytest.raises(ValueError, match=r"the states .* of shape \(2, .*: take them from .* for each plant a"):
+    with pytest.raises(ValueError, match=r"the states .* of shape \(2, .*: call .* or stack one .* for each plant"):
         plan(states[0])
     states[1, 1] = torch.nan
     with pytest.raises(ValueError, match="the state of plant 1 to plan from has nan in its "):
