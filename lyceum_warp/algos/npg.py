@@ -22,7 +22,7 @@ from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
 from lyceum_warp.algos.learner import fitted_config
 from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, score_gradient
 from lyceum_warp.algos.networks import Normalizer
-from lyceum_warp.algos.npg_config import NPGConfig, enough_samples
+from lyceum_warp.algos.npg_config import NPGConfig, enough_samples, least_restarts
 from lyceum_warp.algos.npg_statistics import (
     Iteration,
     ProcessNumbers,
@@ -168,6 +168,7 @@ class NPG:
                 "%d samples of %d worlds are %d steps: no episode will reach its horizon of %d; use fewer worlds, "
                 "more samples, or rollout='segments'", samples, nworld, self.rollout.steps, env.horizon,
             )  # fmt: skip
+        self._least_restarts = least_restarts(config, nworld, steps, env.horizon) if self.segments else 0
         self.noise = torch.empty(self.rollout.steps, nworld, nact, device=device)
         self._advantage = torch.empty_like(self.rollout.reward)
         self._return = torch.empty_like(self.rollout.reward)
@@ -200,6 +201,8 @@ class NPG:
         # 1. Samples of the current policy.
         if not self.segments:
             rollout.restart()
+        elif self._least_restarts:
+            rollout.renew(self._least_restarts, self.generator, team)
         self.sample()
         timer.mark()
 

@@ -18,8 +18,16 @@ _REAL = {
     "gamma": (0.0, 1.0), "lam": (0.0, 1.0), "delta": (0.0, math.inf), "damping": (0.0, math.inf),
     "fisher_fraction": (0.0, 1.0), "kl_limit": (1.0, math.inf), "log_std": (-math.inf, math.inf),
     "min_log_std": (-math.inf, math.inf), "value_rate": (0.0, math.inf),
+    "min_restarts": (0.0, math.inf),
 }  # fmt: skip
 """The smallest and the largest value of each number."""
+
+_LONG = 20
+"""Iterations in an episode, beyond which restarts must not become rare: NPG on hopper lost what it had learned with 63
+iterations and with 31, and did not with 16 (bench/README.md, "NPG's learning curves")."""
+
+_OPTIONAL = ("samples", "value_batch", "min_restarts")
+"""Numbers that may be None."""
 
 
 @document_attributes
@@ -38,6 +46,12 @@ class NPGConfig:
     """"episodes" begins new episodes in every iteration, as in the paper; "segments" continues those of the last
     iteration, for many worlds and few steps of each; "auto" selects episodes where whole ones fit, that is where
     samples / worlds >= horizon."""
+    min_restarts: float | None = None
+    """Where an iteration continues the episodes of the last one: the least number of worlds that begin an episode in an
+    iteration, as a multiple of samples / horizon, the number if time limits fell evenly. Where fewer do, further worlds
+    restart, drawn at random, and their episodes do not count. Otherwise worlds that fell together reach the time limit
+    together, and until then the policy forgets how episodes begin. 0 for no such restarts; by default 0.5 where an
+    episode lasts longer than 20 iterations, as it does in thousands of worlds, and otherwise 0."""
     gamma: float = 0.995
     """Discount."""
     lam: float = 0.97
@@ -91,10 +105,11 @@ class NPGConfig:
         """Check every value."""
         checked: dict[str, object] = {}
         for name, low in _WHOLE.items():
-            if (number := getattr(self, name)) is not None or name not in ("samples", "value_batch"):
+            if (number := getattr(self, name)) is not None or name not in _OPTIONAL:
                 checked[name] = whole_number(name, number, low=low)
         for name, (smallest, largest) in _REAL.items():
-            checked[name] = finite_number(name, getattr(self, name), low=smallest, high=largest)
+            if (number := getattr(self, name)) is not None or name not in _OPTIONAL:
+                checked[name] = finite_number(name, number, low=smallest, high=largest)
         for name in ("hidden", "value_hidden"):
             checked[name] = tuple(layer_sizes(getattr(self, name), name))
         for name in ("activation", "value_activation"):
@@ -117,3 +132,20 @@ class NPGConfig:
 def enough_samples(config: NPGConfig, nworld: int) -> int:
     """Samples in an iteration of ``nworld`` worlds, those of all processes."""
     return max(10_000, 16 * nworld) if config.samples is None else config.samples
+
+
+def least_restarts(config: NPGConfig, nworld: int, steps: int, horizon: int) -> int:
+    """Worlds that must begin an episode in an iteration of ``steps`` steps of ``nworld`` worlds, those of all processes.
+
+    Args:
+        config: The hyperparameters.
+        nworld: Worlds of all processes.
+        steps: Steps of each world in an iteration.
+        horizon: Steps of an episode; 0 where the task has no time limit.
+    """
+    if horizon == 0:
+        return 0
+    share = config.min_restarts
+    if share is None:
+        share = 0.5 if horizon > _LONG * steps else 0.0
+    return min(nworld, round(share * nworld * steps / horizon))

@@ -171,6 +171,25 @@ class Rollout:
         env.set_state(state)
         self.running_return.masked_fill_(first > 0, torch.nan)
 
+    def renew(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
+        """Begin new episodes in random worlds until enough worlds began one within as many steps as the buffer holds.
+
+        The episodes that this ends do not count. Nothing waits for the device.
+
+        Args:
+            least: Number of worlds of all processes.
+            generator: Draws the worlds, the same in every process.
+            team: The processes.
+        """
+        env, team = self.env, team or Team()
+        began = team.gather((env.episode_step < self.steps).int())
+        order = torch.rand(len(began), generator=generator, device=began.device) + 2.0 * began
+        rank = order.argsort(stable=True).argsort()
+        chosen = rank < least - began.sum()
+        mask = chosen[team.rank * env.nworld :][: env.nworld]
+        env.rand_reset(mask=mask)
+        self.running_return.masked_fill_(mask, 0.0)
+
     def explain_not_finite(self) -> str:
         """A sentence that names what is not finite, or too large for float32, and how to fix it; waits for the device.
 
