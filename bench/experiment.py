@@ -212,9 +212,12 @@ def machine(row: Row) -> tuple[Any, ...]:
     return tuple(row.provenance.get(name) for name in measurements.HARDWARE)
 
 
-def _software(row: Row) -> tuple[Any, ...]:
-    peers = row.provenance.get("peers") or {}
-    return *(row.provenance.get(name) for name in SOFTWARE), *sorted(peers.items())
+def _same_software(row: Row, other: Row) -> bool:
+    """Whether two rows have the same versions; a peer that one of them lacks took no part in that one."""
+    if any(row.provenance.get(name) != other.provenance.get(name) for name in SOFTWARE):
+        return False
+    mine, theirs = row.provenance.get("peers") or {}, other.provenance.get("peers") or {}
+    return all(mine[name] == theirs[name] for name in mine.keys() & theirs.keys())
 
 
 def by_machine(rows: Sequence[Row]) -> dict[str, list[Row]]:
@@ -228,7 +231,7 @@ def by_machine(rows: Sequence[Row]) -> dict[str, list[Row]]:
         machines.setdefault(machine(row), []).append(row)
     named: dict[str, list[Row]] = {}
     for same in machines.values():
-        latest = {key(row.case): row for row in same if _software(row) == _software(same[-1])}
+        latest = {key(row.case): row for row in same if _same_software(row, same[-1])}
         name = slug(same[-1])
         while name in named:
             name += "-other"
@@ -340,7 +343,7 @@ def run(experiment: Experiment, options: Options) -> int:
     path = options.out or folder / f"{experiment.name}.jsonl"
     rows, size = _read(path) if path.exists() else ([], 0)
     now = Row({}, {}, provenance(experiment, options.device), 0.0)
-    known = {key(row.case) for row in rows if (machine(row), _software(row)) == (machine(now), _software(now))}
+    known = {key(row.case) for row in rows if machine(row) == machine(now) and _same_software(row, now)}
     left = {name: case for name, case in cases.items() if name not in known}
     took = duration(sum(map(experiment.estimate, left.values())) / max(1, options.jobs))
     print(f"{experiment.name}: {len(cases) - len(left)} of {len(cases)} cases are there; the rest takes about {took}")

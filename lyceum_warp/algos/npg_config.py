@@ -135,7 +135,7 @@ def enough_samples(config: NPGConfig, nworld: int) -> int:
 
 
 def least_restarts(config: NPGConfig, nworld: int, steps: int, horizon: int) -> int:
-    """Worlds that must begin an episode in an iteration of ``steps`` steps of ``nworld`` worlds, those of all processes.
+    """The least number of worlds that begin an episode in an iteration, those of all processes.
 
     Args:
         config: The hyperparameters.

@@ -20,10 +20,10 @@ from lyceum_warp.algos.distributed import Team
 from lyceum_warp.runs import Run
 
 # everything that might differ between one process and two: unfinished episodes, a normaliser, a part of the samples
-# for the Fisher information, a smaller last mini-batch, an evaluation
+# for the Fisher information, a smaller last mini-batch, an evaluation, restarts between iterations
 OPTIONS = ["--samples", "600", "--nworld", "12", "--hidden", "8", "--value-hidden", "8", "--mean-every", "1",
            "--mean-episodes", "2", "--rollout", "segments", "--normalize", "--time-orders", "2",
-           "--fisher-fraction", "0.34"]  # fmt: skip
+           "--fisher-fraction", "0.34", "--min-restarts", "10"]  # fmt: skip
 QUIET = ["--no-video", "--no-plot"]
 
 

@@ -37,7 +37,7 @@ def test_a_step_has_the_kl_divergence_that_delta_sets(env: lw.Env) -> None:
 
 @pytest.mark.parametrize("rollout", ["episodes", "segments"])
 def test_a_run_is_reproducible_and_resumes_to_the_bit(env: lw.Env, rollout: str) -> None:
-    config = dataclasses.replace(SMALL, rollout=rollout, time_orders=2, normalize=True)
+    config = dataclasses.replace(SMALL, rollout=rollout, time_orders=2, normalize=True, min_restarts=1.5)
 
     def numbers(it: lw.Iteration) -> dict[str, object]:
         skipped = {"samples_per_second", "faults"}
@@ -212,6 +212,22 @@ def test_segments_continue_where_the_last_ones_ended(env: lw.Env) -> None:
     # an episode that began in its middle does not count, whole ones do
     assert math.isnan(lengths[0])
     assert lengths[-1] == 12.0
+
+
+@pytest.mark.parametrize(("min_restarts", "begun"), [(None, 1), (2.0, 3), (0.0, 0)])
+def test_iterations_have_the_least_number_of_restarts(min_restarts: float | None, begun: int) -> None:
+    """Time limits that fall evenly would restart 40 * 5 / 128 = 1.6 worlds in an iteration of 5 steps."""
+    env = lw.make("point_mass", nworld=40, horizon=128)
+    config = lw.NPGConfig(samples=40 * 5, hidden=(8,), value_hidden=(8,), mean_every=0, min_restarts=min_restarts)
+    npg = lw.NPG(env, config=config)
+    npg.rollout.restart()
+    next(npg)
+    counts = []
+    for _ in range(6):
+        next(npg)
+        assert not npg.rollout.done.any()
+        counts.append(int((npg.rollout.step == 0.0).sum()))
+    assert counts == [begun] * 6
 
 
 def test_point_mass_learns_to_reach_the_target() -> None:

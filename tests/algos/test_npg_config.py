@@ -7,7 +7,7 @@ import math
 import pytest
 
 import lyceum_warp as lw
-from lyceum_warp.algos.npg_config import enough_samples
+from lyceum_warp.algos.npg_config import enough_samples, least_restarts
 
 
 @pytest.mark.parametrize(
@@ -25,6 +25,7 @@ from lyceum_warp.algos.npg_config import enough_samples
         ("value_rate", None, "a finite number of at least 0"),
         ("cg_iterations", None, "a whole number from 1"),
         ("mean_every", -1, "a whole number from 0"),
+        ("min_restarts", -1, "a finite number of at least 0"),
         ("log_std", math.nan, "a finite number"),
         ("log_std", True, "a finite number"),
         ("min_log_std", math.nan, "a finite number"),
@@ -70,3 +71,14 @@ def test_help_lists_every_hyperparameter() -> None:
 def test_default_samples_are_the_papers_or_16_steps_of_every_world() -> None:
     assert [enough_samples(lw.NPGConfig(), n) for n in (10, 64, 1000)] == [10_000, 10_000, 16_000]
     assert enough_samples(lw.NPGConfig(samples=5), 1000) == 5
+
+
+def test_default_least_restarts_are_half_the_even_number_in_long_episodes() -> None:
+    def least(steps: int, horizon: int = 1000, nworld: int = 2000, **changes: float) -> int:
+        return least_restarts(lw.NPGConfig(**changes), nworld, steps, horizon)  # type: ignore[arg-type]
+
+    assert [least(steps) for steps in (16, 49, 50, 200)] == [16, 49, 0, 0]
+    assert [least(steps, min_restarts=1) for steps in (16, 200)] == [32, 400]
+    assert least(16, min_restarts=0) == 0
+    assert least(16, min_restarts=1e9) == 2000
+    assert least(16, horizon=0, min_restarts=1) == 0

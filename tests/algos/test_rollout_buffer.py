@@ -80,6 +80,34 @@ def test_only_the_first_episode_of_each_world_counts_on_request() -> None:
     assert torch.equal(first.int().argmax(0), every.int().argmax(0))
 
 
+def test_renew_restarts_as_many_random_worlds_as_lack() -> None:
+    env = lw.make("point_mass", nworld=16, horizon=100)
+    rollout = lw.Rollout(env, 5)
+    rollout.restart()
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
+    for _ in range(2):
+        rollout.collect(policy, torch.zeros(rollout.action.shape))
+    env.rand_reset(mask=torch.arange(16) == 3)  # one world that began lately
+    before, returns = env.get_state(), rollout.running_return.clone()
+
+    def chosen(seed: int) -> torch.Tensor:
+        env.set_state(before)
+        rollout.running_return.copy_(returns)
+        rollout.renew(5, torch.Generator().manual_seed(seed))
+        began = env.episode_step == 0
+        assert began.sum() == 5 and began[3]
+        restarted = began & (torch.arange(16) != 3)
+        assert torch.equal(env.get_state()[~restarted], before[~restarted])
+        assert torch.equal(rollout.running_return, returns.masked_fill(restarted, 0.0))
+        return began
+
+    assert torch.equal(chosen(0), chosen(0))
+    assert not torch.equal(chosen(0), chosen(1))
+    after = env.get_state()
+    rollout.renew(5, torch.Generator().manual_seed(2))  # none lacks
+    assert torch.equal(env.get_state(), after)
+
+
 def test_faults_within_a_rollout_are_counted() -> None:
     env = lw.make("hopper", nworld=3)
     rollout = lw.Rollout(env, 4)

@@ -1,5 +1,6 @@
 """What the experiments share."""
 
+import copy
 import dataclasses
 import json
 import sys
@@ -118,6 +119,19 @@ def test_results_of_other_machines_and_versions_do_not_count(
             {r.provenance["cores"] for r in rows}
         )
         row = lines(path)[-1]
+
+
+def test_only_other_versions_of_a_peer_separate_results(toy: Any, tmp_path: Path, experiment: ModuleType) -> None:
+    path, options = tmp_path / "toy.jsonl", ("--contestants", "ours", "--tasks", "hop", "--repeats", 1)
+    toy.main("--out", path, *options)
+    row = lines(path)[0]
+    for installed, kept in (({}, 2), ({"other": "2"}, 2), ({"peer": "1", "other": "2"}, 2), ({"peer": "2"}, 1)):
+        first, second = copy.deepcopy(row), copy.deepcopy(row)
+        first["provenance"]["peers"], second["provenance"]["peers"] = {"peer": "1"}, installed
+        second["case"]["repeat"] = 1
+        path.write_text("".join(json.dumps(line) + "\n" for line in (first, second)))
+        (same,) = experiment.by_machine(experiment.read(path)).values()
+        assert len(same) == kept
 
 
 def test_failing_case_leaves_the_others(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
