@@ -452,7 +452,7 @@ def on_gpu(**changes: object) -> lw.NPG:
 @pytest.mark.gpu
 def test_gpu_an_iteration_waits_for_one_copy_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every other call that makes torch wait for the device raises."""
-    npg = on_gpu(normalize=True)
+    npg = on_gpu(normalize=True, min_restarts=2.0)
     copies = []
 
     def tolist(tensor: torch.Tensor) -> list[list[float]]:

@@ -44,6 +44,7 @@ def test_calls_start_the_threads_that_they_need_and_the_last_reference_ends_them
 
 
 def test_an_interrupt_waits_for_the_calls_that_still_work() -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it in background processes
     ended: list[bool] = []
     begun = threading.Event()
 
@@ -54,8 +55,11 @@ def test_an_interrupt_waits_for_the_calls_that_still_work() -> None:
         time.sleep(0.2)
         ended.append(True)
 
-    with pytest.raises(KeyboardInterrupt):
-        Workers(2).run([begun.set, late])
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            Workers(2).run([begun.set, late])
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert ended
 
 
