@@ -23,8 +23,8 @@ _REAL = {
 """The smallest and the largest value of each number."""
 
 _LONG = 20
-"""Iterations in an episode, beyond which restarts must not become rare: NPG on hopper lost what it had learned with 63
-iterations and with 31, and did not with 16 (bench/README.md, "NPG's learning curves")."""
+"""If an episode lasts longer than this many iterations, restarts must not become rare: NPG on hopper lost what it had
+learned where episodes lasted 63 and 31 iterations, and did not at 16 (bench/README.md, "NPG's learning curves")."""
 
 _OPTIONAL = ("samples", "value_batch", "min_restarts")
 """Numbers that may be None."""
@@ -47,11 +47,12 @@ class NPGConfig:
     iteration, for many worlds and few steps of each; "auto" selects episodes where whole ones fit, that is where
     samples / worlds >= horizon."""
     min_restarts: float | None = None
-    """Where an iteration continues the episodes of the last one: the least number of worlds that begin an episode in an
-    iteration, as a multiple of samples / horizon, the number if time limits fell evenly. Where fewer do, further worlds
-    restart, drawn at random, and their episodes do not count. Otherwise worlds that fell together reach the time limit
-    together, and until then the policy forgets how episodes begin. 0 for no such restarts; by default 0.5 where an
-    episode lasts longer than 20 iterations, as it does in thousands of worlds, and otherwise 0."""
+    """With segments, the least number of worlds that begin an episode in an iteration, as a multiple of
+    samples / horizon, the average where no episode ends early. If fewer do, worlds drawn at random restart before the
+    next iteration, and the episodes that this cuts off do not count in the statistics. Without it, worlds that fell at
+    about the same time reach the time limit together, and meanwhile the policy forgets how episodes begin. 0 turns it
+    off; the default is 0.5 if an episode lasts longer than 20 iterations, as with thousands of worlds, and 0
+    otherwise."""
     gamma: float = 0.995
     """Discount."""
     lam: float = 0.97

@@ -172,12 +172,12 @@ class Rollout:
         self.running_return.masked_fill_(first > 0, torch.nan)
 
     def renew(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
-        """Begin new episodes in random worlds until enough worlds began one within as many steps as the buffer holds.
+        """Restart random worlds so that at least ``least`` worlds began an episode within the last ``steps`` steps.
 
-        The episodes that this ends do not count. Nothing waits for the device.
+        The episodes that this cuts off do not count. Nothing waits for the device.
 
         Args:
-            least: Number of worlds of all processes.
+            least: Number of worlds, of those of all processes.
             generator: Draws the worlds, the same in every process.
             team: The processes.
         """
