@@ -212,26 +212,36 @@ def machine(row: Row) -> tuple[Any, ...]:
     return tuple(row.provenance.get(name) for name in measurements.HARDWARE)
 
 
-def _same_software(row: Row, other: Row) -> bool:
-    """Whether two rows have the same versions; a peer that one of them lacks took no part in that one."""
-    if any(row.provenance.get(name) != other.provenance.get(name) for name in SOFTWARE):
-        return False
-    mine, theirs = row.provenance.get("peers") or {}, other.provenance.get("peers") or {}
-    return all(mine[name] == theirs[name] for name in mine.keys() & theirs.keys())
+Software = tuple[tuple[Any, ...], frozenset[tuple[str, str]]]
+"""Versions of SOFTWARE, and those of the peers that are installed."""
+
+
+def _software(row: Row) -> Software:
+    peers = row.provenance.get("peers") or {}
+    return tuple(row.provenance.get(name) for name in SOFTWARE), frozenset(peers.items())
+
+
+def _agree(one: Software, other: Software) -> bool:
+    """Whether the versions are the same; a peer that is missing on one side took no part there."""
+    mine, theirs = dict(one[1]), dict(other[1])
+    return one[0] == other[0] and all(mine[name] == theirs[name] for name in mine.keys() & theirs.keys())
 
 
 def by_machine(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """Rows of each machine under a short name of it, such as "64-cores-h200".
 
-    Of each case it takes the last row. Where a machine measured with several sets of versions, it takes the rows of the
-    last set alone.
+    Of each case it takes the last row. It leaves out rows whose versions differ from those of a later row that it takes.
     """
     machines: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         machines.setdefault(machine(row), []).append(row)
     named: dict[str, list[Row]] = {}
     for same in machines.values():
-        latest = {key(row.case): row for row in same if _same_software(row, same[-1])}
+        accepted: dict[Software, bool] = {}
+        for software in map(_software, reversed(same)):
+            if software not in accepted:
+                accepted[software] = all(_agree(software, later) for later, kept in accepted.items() if kept)
+        latest = {key(row.case): row for row in same if accepted[_software(row)]}
         name = slug(same[-1])
         while name in named:
             name += "-other"
@@ -343,7 +353,7 @@ def run(experiment: Experiment, options: Options) -> int:
     path = options.out or folder / f"{experiment.name}.jsonl"
     rows, size = _read(path) if path.exists() else ([], 0)
     now = Row({}, {}, provenance(experiment, options.device), 0.0)
-    known = {key(row.case) for row in rows if machine(row) == machine(now) and _same_software(row, now)}
+    known = {key(row.case) for row in rows if machine(row) == machine(now) and _agree(_software(row), _software(now))}
     left = {name: case for name, case in cases.items() if name not in known}
     took = duration(sum(map(experiment.estimate, left.values())) / max(1, options.jobs))
     print(f"{experiment.name}: {len(cases) - len(left)} of {len(cases)} cases are there; the rest takes about {took}")

@@ -44,7 +44,7 @@ class GymnasiumRollout(Rollout):
     def stagger(self, generator: torch.Generator, team: Team | None = None) -> None:
         raise NotImplementedError("the clocks of Gymnasium's environments are set once, to those of our environment")
 
-    def renew(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
+    def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
         raise NotImplementedError("worlds of Gymnasium's environments restart at the end of their episodes alone")
 
     @torch.no_grad()

@@ -202,7 +202,7 @@ class NPG:
         if not self.segments:
             rollout.restart()
         elif self._least_restarts:
-            rollout.renew(self._least_restarts, self.generator, team)
+            rollout.restart_some(self._least_restarts, self.generator, team)
         self.sample()
         timer.mark()
 

@@ -22,9 +22,9 @@ _REAL = {
 }  # fmt: skip
 """The smallest and the largest value of each number."""
 
-_LONG = 20
-"""If an episode lasts longer than this many iterations, restarts must not become rare: NPG on hopper lost what it had
-learned where episodes lasted 63 and 31 iterations, and did not at 16 (bench/README.md, "NPG's learning curves")."""
+_LONG_EPISODE = 20
+"""Iterations that an episode lasts at most for restarts to be off by default. On hopper, NPG's returns dropped for long
+where an episode lasted 63 or 31 iterations, and not at 16, on few seeds (bench/README.md, "NPG's learning curves")."""
 
 _OPTIONAL = ("samples", "value_batch", "min_restarts")
 """Numbers that may be None."""
@@ -47,12 +47,13 @@ class NPGConfig:
     iteration, for many worlds and few steps of each; "auto" selects episodes where whole ones fit, that is where
     samples / worlds >= horizon."""
     min_restarts: float | None = None
-    """With segments, the least number of worlds that begin an episode in an iteration, as a multiple of
-    samples / horizon, the average where no episode ends early. If fewer do, worlds drawn at random restart before the
-    next iteration, and the episodes that this cuts off do not count in the statistics. Without it, worlds that fell at
-    about the same time reach the time limit together, and meanwhile the policy forgets how episodes begin. 0 turns it
-    off; the default is 0.5 if an episode lasts longer than 20 iterations, as with thousands of worlds, and 0
-    otherwise."""
+    """With segments and a time limit, the number of worlds that should begin an episode in an iteration, as a multiple
+    of samples / horizon, the average where no episode ends early. If fewer worlds than this began an episode in the
+    last iteration, random further ones restart before the next. The episodes that this cuts off do not count in the
+    statistics; values well above 1 cut off so many long ones that ``return_mean`` favours short ones. Without such
+    restarts, worlds that began at about the same time reach the time limit together, and meanwhile few samples show
+    how episodes begin. 0 means no such restarts. The default is 0.5 if an episode lasts longer than 20 iterations, as
+    with 205 or more worlds, 1,000 steps and the default samples, and 0 otherwise."""
     gamma: float = 0.995
     """Discount."""
     lam: float = 0.97
@@ -136,7 +137,7 @@ def enough_samples(config: NPGConfig, nworld: int) -> int:
 
 
 def least_restarts(config: NPGConfig, nworld: int, steps: int, horizon: int) -> int:
-    """The least number of worlds that begin an episode in an iteration, those of all processes.
+    """The number of worlds that should begin an episode in an iteration, of those of all processes.
 
     Args:
         config: The hyperparameters.
@@ -148,5 +149,5 @@ def least_restarts(config: NPGConfig, nworld: int, steps: int, horizon: int) -> 
         return 0
     share = config.min_restarts
     if share is None:
-        share = 0.5 if horizon > _LONG * steps else 0.0
+        share = 0.5 if horizon > _LONG_EPISODE * steps else 0.0
     return min(nworld, round(share * nworld * steps / horizon))

@@ -171,10 +171,11 @@ class Rollout:
         env.set_state(state)
         self.running_return.masked_fill_(first > 0, torch.nan)
 
-    def renew(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
+    def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
         """Restart random worlds so that at least ``least`` worlds began an episode within the last ``steps`` steps.
 
-        The episodes that this cuts off do not count. Nothing waits for the device.
+        The episodes that this cuts off do not count. For buffers that count all episodes, not the first ones alone.
+        Nothing waits for the device.
 
         Args:
             least: Number of worlds, of those of all processes.
@@ -185,7 +186,7 @@ class Rollout:
         began = team.gather((env.episode_step < self.steps).int())
         order = torch.rand(len(began), generator=generator, device=began.device) + 2.0 * began
         rank = order.argsort(stable=True).argsort()
-        chosen = rank < least - began.sum()
+        chosen = (rank < least - began.sum()) & (began == 0)
         mask = chosen[team.rank * env.nworld :][: env.nworld]
         env.rand_reset(mask=mask)
         self.running_return.masked_fill_(mask, 0.0)

@@ -80,7 +80,7 @@ def test_only_the_first_episode_of_each_world_counts_on_request() -> None:
     assert torch.equal(first.int().argmax(0), every.int().argmax(0))
 
 
-def test_renew_restarts_as_many_random_worlds_as_lack() -> None:
+def test_restart_some_restarts_as_many_random_worlds_as_lack() -> None:
     env = lw.make("point_mass", nworld=16, horizon=100)
     rollout = lw.Rollout(env, 5)
     rollout.restart()
@@ -93,7 +93,7 @@ def test_renew_restarts_as_many_random_worlds_as_lack() -> None:
     def chosen(seed: int) -> torch.Tensor:
         env.set_state(before)
         rollout.running_return.copy_(returns)
-        rollout.renew(5, torch.Generator().manual_seed(seed))
+        rollout.restart_some(5, torch.Generator().manual_seed(seed))
         began = env.episode_step == 0
         assert began.sum() == 5 and began[3]
         restarted = began & (torch.arange(16) != 3)
@@ -104,8 +104,12 @@ def test_renew_restarts_as_many_random_worlds_as_lack() -> None:
     assert torch.equal(chosen(0), chosen(0))
     assert not torch.equal(chosen(0), chosen(1))
     after = env.get_state()
-    rollout.renew(5, torch.Generator().manual_seed(2))  # none lacks
+    rollout.restart_some(5, torch.Generator().manual_seed(2))  # none lacks
     assert torch.equal(env.get_state(), after)
+    env.step()
+    began = env.episode_step < rollout.steps
+    rollout.restart_some(20, torch.Generator().manual_seed(2))  # more than there are: those that just began go on
+    assert torch.equal(env.episode_step, began.int())
 
 
 def test_faults_within_a_rollout_are_counted() -> None:

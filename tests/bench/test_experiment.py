@@ -132,6 +132,12 @@ def test_only_other_versions_of_a_peer_separate_results(toy: Any, tmp_path: Path
         path.write_text("".join(json.dumps(line) + "\n" for line in (first, second)))
         (same,) = experiment.by_machine(experiment.read(path)).values()
         assert len(same) == kept
+    numbered = [copy.deepcopy(row) for _ in range(3)]
+    for number, (line, installed) in enumerate(zip(numbered, ({"peer": "1"}, {"peer": "2"}, {}), strict=True)):
+        line["provenance"]["peers"], line["case"]["repeat"] = installed, number
+    path.write_text("".join(json.dumps(line) + "\n" for line in numbered))
+    (same,) = experiment.by_machine(experiment.read(path)).values()
+    assert [found.case["repeat"] for found in same] == [1, 2]
 
 
 def test_failing_case_leaves_the_others(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
