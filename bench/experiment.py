@@ -230,7 +230,7 @@ def _agree(one: Software, other: Software) -> bool:
 def by_machine(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """Rows of each machine under a short name of it, such as "64-cores-h200".
 
-    Of each case it takes the last row. It leaves out rows whose versions differ from those of a later row that it takes.
+    Of each case it takes the last row. It leaves out rows whose versions differ from those of a later row that stays.
     """
     machines: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
