@@ -23,8 +23,8 @@ _REAL = {
 """The smallest and the largest value of each number."""
 
 _LONG_EPISODE = 20
-"""Iterations that an episode lasts at most for restarts to be off by default. On hopper, NPG's returns dropped for long
-where an episode lasted 63 or 31 iterations, and not at 16, on few seeds (bench/README.md, "NPG's learning curves")."""
+"""Restarts are on by default if an episode lasts longer than this number of iterations. On a few seeds of hopper, NPG's
+return stayed low for long at 63 and 31 iterations and not at 16 (bench/README.md, "NPG's learning curves")."""
 
 _OPTIONAL = ("samples", "value_batch", "min_restarts")
 """Numbers that may be None."""

@@ -174,8 +174,8 @@ class Rollout:
     def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
         """Restart random worlds so that at least ``least`` worlds began an episode within the last ``steps`` steps.
 
-        The episodes that this cuts off do not count. For buffers that count all episodes, not the first ones alone.
-        Nothing waits for the device.
+        The episodes that this cuts off do not count. With ``first_only`` a restarted world would count again, so do not
+        call it there. Nothing waits for the device.
 
         Args:
             least: Number of worlds, of those of all processes.

@@ -217,8 +217,8 @@ def test_segments_continue_where_the_last_ones_ended(env: lw.Env) -> None:
 
 
 @pytest.mark.parametrize(("min_restarts", "begun"), [(None, 1), (2.0, 3), (0.0, 0)])
-def test_iterations_have_the_least_number_of_restarts(min_restarts: float | None, begun: int) -> None:
-    """Time limits that fall evenly would restart 40 * 5 / 128 = 1.6 worlds in an iteration of 5 steps."""
+def test_worlds_restart_where_too_few_begin_an_episode(min_restarts: float | None, begun: int) -> None:
+    """If time limits fell evenly, 40 * 5 / 128 = 1.6 worlds would begin an episode in an iteration of 5 steps."""
     env = lw.make("point_mass", nworld=40, horizon=128)
     config = lw.NPGConfig(samples=40 * 5, hidden=(8,), value_hidden=(8,), mean_every=0, min_restarts=min_restarts)
     npg = lw.NPG(env, config=config)
