@@ -272,7 +272,7 @@ def mean_action(policy: torch.nn.Module) -> Act:
 def config_of(case: Case) -> lw.NPGConfig:
     changes = dict(SHORT) if case.short else {}
     if case.contestant not in ON_GPU:
-        changes["min_restarts"] = 0.0  # on both sides, as Gymnasium's buffer cannot restart some of its worlds
+        changes["min_restarts"] = 0.0  # on both sides: Gymnasium's buffer cannot restart some of its worlds
     return dataclasses.replace(CONFIGS[case.task], **changes)
 
 

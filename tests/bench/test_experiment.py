@@ -121,7 +121,7 @@ def test_results_of_other_machines_and_versions_do_not_count(
         row = lines(path)[-1]
 
 
-def test_a_missing_peer_does_not_separate_results_as_another_version_does(toy: Any, tmp_path: Path, experiment: ModuleType) -> None:
+def test_a_missing_peer_separates_no_results(toy: Any, tmp_path: Path, experiment: ModuleType) -> None:
     path, options = tmp_path / "toy.jsonl", ("--contestants", "ours", "--tasks", "hop", "--repeats", 1)
     toy.main("--out", path, *options)
     row = lines(path)[0]
