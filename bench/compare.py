@@ -47,7 +47,7 @@ PARTS: tuple[Part, ...] = ("env", "plans", "learners", "commands")
 ENGINES = ("mujoco", "warp")
 
 EVERY_VARIANT = ("MPPI", "CEM", "PredictiveSampling", "knots", "plants", "control")
-MANY_PLANNERS = ("point_mass", "reach", "hopper", "go1_velocity")
+MANY_PLANNERS = ("point_mass", "reach", "hopper")
 """Tasks on which every planner is compared; on the others it is MPPI alone."""
 LEARNING = {"mujoco": ("point_mass", "hopper", "go1_velocity"), "warp": ("hopper",)}
 """Tasks on which learners are compared, by engine."""
@@ -208,7 +208,7 @@ def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
         ValueError: There is neither.
     """
     if Path(given, PACKAGE, "__init__.py").is_file():
-        yield Path(given).resolve(), f"{Path(given).resolve()}"
+        yield Path(given).resolve(), str(Path(given).resolve())
         return
     git = ["git", "-C", str(ROOT)]
     found = subprocess.run(
@@ -220,7 +220,7 @@ def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
     packed = subprocess.run([*git, "archive", "--format=tar", commit, PACKAGE], capture_output=True, check=True).stdout
     with tarfile.open(fileobj=io.BytesIO(packed)) as files:
         files.extractall(folder, filter="data")
-    yield folder, f"{given} ({commit[:10]})"
+    yield folder.resolve(), f"{given} ({commit[:10]})"
 
 
 class Side:

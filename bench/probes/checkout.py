@@ -143,9 +143,13 @@ def constants(model: Any) -> Iterator[tuple[str, Any]]:
             yield name, value
 
 
-def is_clock(name: str) -> bool:
-    """Whether a number of an iteration is a measured time."""
-    return name.startswith("time_") or name.endswith("per_second")
+def without_clocks(numbers: Mapping[str, Any]) -> dict[str, Any]:
+    """The numbers of an iteration that are no measured times; nan stands for None."""
+    return {
+        name: without_clocks(value) if isinstance(value, Mapping) else np.nan if value is None else value
+        for name, value in numbers.items()
+        if not (name.startswith("time_") or name.endswith("per_second"))
+    }
 
 
 # the parts
@@ -222,6 +226,11 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 """Planners by name: the class, and settings."""
 
+PLAN = (
+    "actions", "nominal", "knot_actions", "standard_noise", "sampled", "returns", "weights", "adapted_noise",
+)  # fmt: skip
+"""Buffers of a planner; one that a checkout lacks is reported."""
+
 TRAJECTORY = (
     "states", "obs", "actions", "rewards", "evals", "success", "plan_of", "plan_steps", "plan_failed", "plan_effective",
     "done_reason",
@@ -240,15 +249,13 @@ def plans(records: Records, *, task: str, engine: str, device: str, variants: Se
         planner = getattr(lw, kind)(task, samples=6, horizon=4, seed=3, **settings, **placed(engine, device))
         if variant == "control":
             trajectory = lw.control(env, planner, steps=4, seed=4)
-            records.add(variant, {name: getattr(trajectory, name) for name in TRAJECTORY})
+            records.add(variant, {name: getattr(trajectory, name, None) for name in TRAJECTORY})
             continue
         env.rand_reset(seed=4)
         for _ in range(4):
             state = env.get_state()
             action = planner(state if plants > 1 else state[0])
-            names = ("actions", "nominal", "knot_actions", "standard_noise", "sampled", "returns", "weights",
-                     "adapted_noise")  # fmt: skip
-            plan = {"action": action, **{name: getattr(planner, name) for name in names}}
+            plan = {"action": action, **{name: getattr(planner, name, None) for name in PLAN}}
             records.add(variant, plan, along="plan")
             env.step(action.reshape(env.action.shape).to(env.action.device))
             records.add(f"{variant}/plant", {"state": split(env, env.get_state()), "reward": env.reward}, "world",
@@ -263,10 +270,7 @@ def learning(records: Records, *, task: str, engine: str, device: str, learner: 
     more = {"config": lw.NPGConfig(samples=1024, mean_every=5, mean_episodes=2)} if learner == "NPG" else {}
     learns = getattr(lw, learner)(env, seed=6, **more)
     for _ in range(iterations):
-        numbers = {name: value for name, value in vars(next(learns)).items() if not is_clock(name)}
-        # the mean policy is evaluated in some iterations alone
-        numbers = {name: np.nan if value is None else value for name, value in numbers.items()}
-        records.add("iterations", numbers, along="iteration")
+        records.add("iterations", without_clocks(vars(next(learns))), along="iteration")
     for name in ("policy", "value"):
         if (network := getattr(learns, name, None)) is not None:
             records.add(name, dict(network.state_dict()))
@@ -277,7 +281,7 @@ def commands(records: Records, *, task: str, engine: str, device: str, iteration
     """A run by the command line, and the same run with a break in the middle."""
     where = placed(engine, device)
     flags = ["--engine", engine, "--device", where["device"], *(["--deterministic"] if where["deterministic"] else [])]
-    flags += ["--samples", "1024", "--nworld", "4", "--seed", "7", "--mean-every", "5", "--mean-episodes", "2"]
+    flags += ["--samples", "1024", "--nworld", "4", "--seed", "7", "--mean-every", "2", "--mean-episodes", "2"]
     quiet = ["--no-video", "--no-plot"]
     make(task, engine, device)  # which says whether the model is installed
     with tempfile.TemporaryDirectory(dir=".") as folder, contextlib.chdir(folder):
@@ -287,8 +291,8 @@ def commands(records: Records, *, task: str, engine: str, device: str, iteration
         for run in ("whole", "resumed"):
             with Path(run, "metrics.csv").open(newline="") as file:
                 for row in csv.DictReader(file):
-                    numbers = {name: float(cell or "nan") for name, cell in row.items() if not is_clock(name)}
-                    records.add(f"{run}/metrics.csv", numbers, along="row")
+                    numbers = {name: float(cell or "nan") for name, cell in row.items()}
+                    records.add(f"{run}/metrics.csv", without_clocks(numbers), along="row")
             for name in ("policy.pt", "best.pt"):
                 records.add(f"{run}/{name}", torch.load(Path(run, name), map_location="cpu", weights_only=True))
     records.equal.append(("whole", "resumed"))

@@ -43,15 +43,17 @@ QUICK: dict[str, Any] = {"engines": ("mujoco",), "parts": ("env",), "steps": 3}
 
 @pytest.fixture(scope="module")
 def report(compare: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The report on a copy in which point_mass has another reward, and the file of cartpole raises an error."""
+    """The report on a copy in which a task ends the process, another one raises an error, and point_mass has another
+    reward."""
     changes = {
         "tasks/point_mass.py": ("return 1.0 - distance(s1)", "return 2.0 - distance(s1)"),
+        "tasks/cartpole_swingup.py": ("import warp as wp\n", "import os\nos._exit(3)\n"),
         "tasks/cartpole.py": ("import warp as wp\n", "raise RuntimeError('broken on purpose')\n"),
     }
     folder = tmp_path_factory.mktemp("changed")
     out = folder / "report.json"
     options = compare.Options(
-        str(ROOT), str(copied(folder / "copy", changes)), tasks=("point_mass", "cartpole"), out=out,
+        str(ROOT), str(copied(folder / "copy", changes)), tasks=("cartpole_swingup", "cartpole", "point_mass"), out=out,
         ignore=("*/masked_step/*",), **QUICK,
     )  # fmt: skip
     assert compare.run(options) == 1
@@ -74,11 +76,14 @@ def test_a_changed_reward_is_reported_with_its_numbers_and_nothing_else(report: 
     assert old == new
 
 
-def test_an_error_of_one_checkout_is_reported(report: dict[str, Any]) -> None:
-    (unit,) = (unit for unit in report["units"] if unit["name"] == "env/cartpole/mujoco")
+@pytest.mark.parametrize(
+    "task, text",
+    [("cartpole", "RuntimeError: broken on purpose"), ("cartpole_swingup", "the process ended with 3")],
+)
+def test_a_failure_of_one_checkout_is_reported(task: str, text: str, report: dict[str, Any]) -> None:
+    (unit,) = (unit for unit in report["units"] if unit["name"] == f"env/{task}/mujoco")
     (failure,) = unit["differences"]
-    assert failure["kind"] == "failure"
-    assert failure["text"] == "new failed: RuntimeError: broken on purpose"
+    assert (failure["kind"], failure["text"]) == ("failure", f"new failed: {text}")
 
 
 def test_a_working_tree_equals_itself(compare: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
@@ -135,6 +140,34 @@ def test_names_of_one_checkout_alone_are_added_or_removed(compare: ModuleType) -
     zero = np.zeros(1)
     found = compare.differences("u", {"both": zero, "gone": zero}, {"new": zero, "both": zero}, {})
     assert [(each.name, each.kind) for each in found] == [("u/gone", "removed"), ("u/new", "added")]
+
+
+class Saved:
+    """A side that has computed a run and a resumed one."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def ask(self, unit: dict[str, Any]) -> None:
+        pass
+
+    def answer(self) -> dict[str, Any]:
+        return {"axes": {"whole/return": ["row"]}, "equal": [["whole", "resumed"]]}
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {"whole/return": np.array([1.0, 2.0]), "resumed/return": np.array([1.0, 3.0])}
+
+
+def test_a_resumed_run_that_differs_is_reported_in_both_checkouts(compare: ModuleType) -> None:
+    report = compare.Report(())
+    unit = compare.Unit("commands", "point_mass", "mujoco", {})
+    compare.compare_unit(unit, [Saved("old"), Saved("new")], "cpu", report)
+    found = [(each.name, each.first, each.text.partition(";")[0]) for each in report.found]
+    name = "commands/point_mass/mujoco/return"
+    assert found == [
+        (name, {"row": 1}, "old, whole -> resumed: 2.0 -> 3.0 at row 1"),
+        (name, {"row": 1}, "new, whole -> resumed: 2.0 -> 3.0 at row 1"),
+    ]
 
 
 # the whole program
