@@ -394,7 +394,7 @@ def compare_unit(unit: Unit, sides: Sequence[Side], device: str, report: Report)
     )
     axes = {**answers["new"].get("axes", {}), **answers["old"].get("axes", {})}
     found = [each for each in failures(unit.name, answers) if report.kept(each.name)]
-    if found:  # what a failure left out is no further difference
+    if found:  # what a failure left out is not a further difference
         old, new = ({name: array for name, array in side.items() if name in old and name in new} for side in (old, new))
     found += differences(unit.name, old, new, axes)
     for side, arrays in (("old", old), ("new", new)):

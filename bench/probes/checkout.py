@@ -18,7 +18,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 import traceback
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -39,7 +38,7 @@ class MissingModel(Exception):  # noqa: N818
     """A task's model belongs to an extra that is not installed."""
 
 
-class Records:
+class Numbers:
     """The arrays of a unit by their names, in the order in which they were computed."""
 
     def __init__(self) -> None:
@@ -143,11 +142,11 @@ def constants(model: Any) -> Iterator[tuple[str, Any]]:
             yield name, value
 
 
-def without_clocks(numbers: Mapping[str, Any]) -> dict[str, Any]:
+def without_clocks(row: Mapping[str, Any]) -> dict[str, Any]:
     """The numbers of an iteration that are no measured times; nan stands for None."""
     return {
         name: without_clocks(value) if isinstance(value, Mapping) else np.nan if value is None else value
-        for name, value in numbers.items()
+        for name, value in row.items()
         if not (name.startswith("time_") or name.endswith("per_second"))
     }
 
@@ -155,53 +154,53 @@ def without_clocks(numbers: Mapping[str, Any]) -> dict[str, Any]:
 # the parts
 
 
-def environment(records: Records, *, task: str, engine: str, device: str, steps: int) -> None:
+def environment(numbers: Numbers, *, task: str, engine: str, device: str, steps: int) -> None:
     """Model, resets, steps with short episodes, getters, a fault, and a rollout of given actions."""
     import lyceum_warp as lw
 
     env = make(task, engine, device, nworld=4, horizon=max(2, steps // 3))
     for name, value in constants(env.model):
-        records.add(f"model/{name}", value)
+        numbers.add(f"model/{name}", value)
     for name in ("state_space", "action_space"):
         space = getattr(env, name)
         bounds = {bound: getattr(space, bound) for bound in ("low", "high")}
-        records.add(name, {"parts": json.dumps({n: [p.start, p.stop] for n, p in space.parts.items()}), **bounds})
-    records.add("obs_space", {
+        numbers.add(name, {"parts": json.dumps({n: [p.start, p.stop] for n, p in space.parts.items()}), **bounds})
+    numbers.add("obs_space", {
         group: json.dumps({n: [p.start, p.stop] for n, p in space.parts.items()})
         for group, space in env.obs_spaces.items()
     })  # fmt: skip
-    records.add("timestep", env.timestep)
+    numbers.add("timestep", env.timestep)
 
     env.reset()
-    records.add("reset", observed(env), "world")
+    numbers.add("reset", observed(env), "world")
     env.rand_reset(seed=1)
-    records.add("rand_reset", observed(env), "world")
+    numbers.add("rand_reset", observed(env), "world")
     states, actions = [env.get_state()], draw_actions(env, task, steps)
     for action in actions:
         env.step(action)
         states.append(env.get_state())
-        records.add("steps", observed(env), "world", along="step")
+        numbers.add("steps", observed(env), "world", along="step")
 
     for t in sorted({0, steps // 2, steps - 1}):
         judged = {"reward": env.get_reward(states[t], actions[t], states[t + 1])}
         judged["obs"] = {group: env.get_obs(states[t], group=group) for group in env.obs_groups}
         judged |= {"eval": env.get_eval(states[t]), "terminated": env.get_terminated(states[t])}
-        records.add("of_states", judged, "world", along="state")
-    records.add("after_getters", observed(env), "world")
+        numbers.add("of_states", judged, "world", along="state")
+    numbers.add("after_getters", observed(env), "world")
     env.set_state(states[0])
-    records.add("restored", observed(env), "world")
+    numbers.add("restored", observed(env), "world")
     env.step(actions[0])
-    records.add("restored_step", observed(env), "world")
+    numbers.add("restored_step", observed(env), "world")
     mask = torch.tensor([False, True, False, True], device=env.action.device)
     env.rand_reset(mask=mask)
-    records.add("masked_rand_reset", observed(env), "world")
+    numbers.add("masked_rand_reset", observed(env), "world")
     env.reset(mask=~mask)
-    records.add("masked_reset", observed(env), "world")
+    numbers.add("masked_reset", observed(env), "world")
     env.step(actions[0])
-    records.add("masked_step", observed(env), "world")
+    numbers.add("masked_step", observed(env), "world")
     env.step(torch.where(mask[:, None], torch.nan, actions[0]))
-    records.add("fault", observed(env), "world")
-    records.add("fault_counts", env.fault_counts)
+    numbers.add("fault", observed(env), "world")
+    numbers.add("fault_counts", env.fault_counts)
 
     env = make(task, engine, device, nworld=4, autoreset=False)
     env.rand_reset(seed=2)
@@ -211,9 +210,9 @@ def environment(records: Records, *, task: str, engine: str, device: str, steps:
     rollout.actions.copy_(actions[:horizon])
     rollout.run()
     for name in ("reward", "terminated"):
-        records.add(f"rollout/{name}", getattr(rollout, name), "step", "world")
+        numbers.add(f"rollout/{name}", getattr(rollout, name), "step", "world")
     for name in ("final_obs_groups", "fault"):
-        records.add(f"rollout/{name}", getattr(rollout, name), "world")
+        numbers.add(f"rollout/{name}", getattr(rollout, name), "world")
 
 
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -235,10 +234,10 @@ TRAJECTORY = (
     "states", "obs", "actions", "rewards", "evals", "success", "plan_of", "plan_steps", "plan_failed", "plan_effective",
     "done_reason",
 )  # fmt: skip
-"""What of a trajectory is no measured time."""
+"""Fields of a trajectory that are not measured times."""
 
 
-def plans(records: Records, *, task: str, engine: str, device: str, variants: Sequence[str]) -> None:
+def plans(numbers: Numbers, *, task: str, engine: str, device: str, variants: Sequence[str]) -> None:
     """Several plans of each planner along a controlled episode."""
     import lyceum_warp as lw
 
@@ -249,20 +248,20 @@ def plans(records: Records, *, task: str, engine: str, device: str, variants: Se
         planner = getattr(lw, kind)(task, samples=6, horizon=4, seed=3, **settings, **placed(engine, device))
         if variant == "control":
             trajectory = lw.control(env, planner, steps=4, seed=4)
-            records.add(variant, {name: getattr(trajectory, name, None) for name in TRAJECTORY})
+            numbers.add(variant, {name: getattr(trajectory, name, None) for name in TRAJECTORY})
             continue
         env.rand_reset(seed=4)
         for _ in range(4):
             state = env.get_state()
             action = planner(state if plants > 1 else state[0])
             plan = {"action": action, **{name: getattr(planner, name, None) for name in PLAN}}
-            records.add(variant, plan, along="plan")
+            numbers.add(variant, plan, along="plan")
             env.step(action.reshape(env.action.shape).to(env.action.device))
-            records.add(f"{variant}/plant", {"state": split(env, env.get_state()), "reward": env.reward}, "world",
+            numbers.add(f"{variant}/plant", {"state": split(env, env.get_state()), "reward": env.reward}, "world",
                         along="plan")  # fmt: skip
 
 
-def learning(records: Records, *, task: str, engine: str, device: str, learner: str, iterations: int) -> None:
+def learning(numbers: Numbers, *, task: str, engine: str, device: str, learner: str, iterations: int) -> None:
     """Iterations of a learner, and its networks afterwards."""
     import lyceum_warp as lw
 
@@ -270,14 +269,14 @@ def learning(records: Records, *, task: str, engine: str, device: str, learner: 
     more = {"config": lw.NPGConfig(samples=1024, mean_every=5, mean_episodes=2)} if learner == "NPG" else {}
     learns = getattr(lw, learner)(env, seed=6, **more)
     for _ in range(iterations):
-        records.add("iterations", without_clocks(vars(next(learns))), along="iteration")
+        numbers.add("iterations", without_clocks(vars(next(learns))), along="iteration")
     for name in ("policy", "value"):
         if (network := getattr(learns, name, None)) is not None:
-            records.add(name, dict(network.state_dict()))
-    records.add("env", {"state": split(env, env.get_state())}, "world")
+            numbers.add(name, dict(network.state_dict()))
+    numbers.add("env", {"state": split(env, env.get_state())}, "world")
 
 
-def commands(records: Records, *, task: str, engine: str, device: str, iterations: int) -> None:
+def commands(numbers: Numbers, *, task: str, engine: str, device: str, iterations: int) -> None:
     """A run by the command line, and the same run with a break in the middle."""
     where = placed(engine, device)
     flags = ["--engine", engine, "--device", where["device"], *(["--deterministic"] if where["deterministic"] else [])]
@@ -291,11 +290,11 @@ def commands(records: Records, *, task: str, engine: str, device: str, iteration
         for run in ("whole", "resumed"):
             with Path(run, "metrics.csv").open(newline="") as file:
                 for row in csv.DictReader(file):
-                    numbers = {name: float(cell or "nan") for name, cell in row.items()}
-                    records.add(f"{run}/metrics.csv", without_clocks(numbers), along="row")
+                    cells = {name: float(cell or "nan") for name, cell in row.items()}
+                    numbers.add(f"{run}/metrics.csv", without_clocks(cells), along="row")
             for name in ("policy.pt", "best.pt"):
-                records.add(f"{run}/{name}", torch.load(Path(run, name), map_location="cpu", weights_only=True))
-    records.equal.append(("whole", "resumed"))
+                numbers.add(f"{run}/{name}", torch.load(Path(run, name), map_location="cpu", weights_only=True))
+    numbers.equal.append(("whole", "resumed"))
 
 
 def command(*words: str) -> None:
@@ -337,14 +336,14 @@ def failure(error: Exception) -> dict[str, Any]:
 
 def compute(unit: dict[str, Any], file: Path) -> dict[str, Any]:
     """Compute a unit, and write its arrays, those before a failure included."""
-    records, answer, began = Records(), {}, time.perf_counter()
+    numbers, answer = Numbers(), {}
     try:
-        PARTS[unit.pop("part")](records, **unit)
+        PARTS[unit.pop("part")](numbers, **unit)
     except Exception as error:
         answer["failure"] = failure(error)
-    np.savez(file, **records.arrays())
+    np.savez(file, **numbers.arrays())
     gc.collect()  # environments refer to themselves
-    return {**answer, "axes": records.axes, "equal": records.equal, "seconds": time.perf_counter() - began}
+    return {**answer, "axes": numbers.axes, "equal": numbers.equal}
 
 
 def main() -> None:

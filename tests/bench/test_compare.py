@@ -101,9 +101,9 @@ def test_a_package_that_cannot_be_imported_is_reported(
     assert "    package: new failed: RuntimeError: no package" in capsys.readouterr().out.splitlines()
 
 
-def test_what_is_no_checkout_is_refused(compare: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
-    assert compare.main(compare.Options("no_such_revision", str(ROOT))) == 2
-    assert "'no_such_revision' is neither a folder with lyceum_warp/ nor a revision" in capsys.readouterr().err
+def test_a_name_of_neither_folder_nor_revision_is_refused(compare: ModuleType) -> None:
+    with pytest.raises(ValueError, match="'no_such_revision' is neither a folder with lyceum_warp/ nor a revision"):
+        compare.run(compare.Options("no_such_revision", str(ROOT)))
 
 
 # arrays
