@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.table import Table
 
 import lyceum_warp as lw
-from lyceum_warp.keeper import POLICY_SHARE, SHARE, Keeper
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.saving import POLICY_SHARE, SHARE, Keeper
 
 
 @dataclasses.dataclass(frozen=True)

@@ -28,7 +28,7 @@ from rich.table import Table
 import lyceum_warp as lw
 from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
 from lyceum_warp.adapters.rsl_rl_learner import RslRlLearner
-from lyceum_warp.checkpoints import policy_content, serialized
+from lyceum_warp.runs.checkpoints import policy_content, serialized
 
 
 @dataclasses.dataclass(frozen=True)

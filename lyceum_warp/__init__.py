@@ -61,7 +61,7 @@ from lyceum_warp.kernels.terms import (
 from lyceum_warp.model_files import ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, package_model
 from lyceum_warp.openloop import OpenLoop
 from lyceum_warp.options import EnvOptions, PhysicsOptions
-from lyceum_warp.runs import load, load_value
+from lyceum_warp.runs.folder import load, load_value
 from lyceum_warp.task import (
     Planning,
     Row,

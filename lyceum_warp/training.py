@@ -15,13 +15,13 @@ from lyceum_warp.binding.registry import spelled_task
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted, ending, postponed
-from lyceum_warp.keeper import Keeper, NotSavedError
-from lyceum_warp.kept_task import KeptTask, given_params, note_changes
-from lyceum_warp.runs import Run
-from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
+from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.saving import Keeper, NotSavedError
+from lyceum_warp.runs.task_copy import KeptTask, given_params, note_changes
 from lyceum_warp.validate import whole_number
 from lyceum_warp.viz.cameras import CameraChoice, find_camera
 from lyceum_warp.viz.policy_videos import Videos
+from lyceum_warp.viz.tensorboard import TensorBoard, check_tensorboard
 from lyceum_warp.viz.video import check_video
 
 Callback = Callable[[Any], Any]

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from training_runs import train
 
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

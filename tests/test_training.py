@@ -12,7 +12,7 @@ from training_runs import CONFIG, QUIET, algorithm, mean_action, metrics, refuse
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos.value_fit import ValueFit
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
 from lyceum_warp.training import describe
 
 

@@ -17,7 +17,7 @@ from lyceum_warp.control.control_report import ControlReport
 from lyceum_warp.control.episode_collector import ControlProgress
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
 from lyceum_warp.viz.cameras import CameraChoice
 from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.policy_videos import one_line, policy_states

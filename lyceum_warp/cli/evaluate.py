@@ -11,16 +11,16 @@ from rich.table import Table
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.checkpoints import check_sizes
 from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, Repeated, given, optional_flags, parameters, run_options
 from lyceum_warp.cli.display import make_console, note, policy_video
 from lyceum_warp.control.policy_episodes import policy_episodes
 from lyceum_warp.control.trajectory import source
 from lyceum_warp.engines.placement import options_for_few_worlds
 from lyceum_warp.env import Env
-from lyceum_warp.kept_task import run_env
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.runs import Run, load
+from lyceum_warp.runs.checkpoints import check_sizes
+from lyceum_warp.runs.folder import Run, load
+from lyceum_warp.runs.task_copy import run_env
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.video import check_video

@@ -8,7 +8,7 @@ import tyro
 
 from lyceum_warp.algos.policy_export import check_export, export_policy
 from lyceum_warp.cli.display import make_console
-from lyceum_warp.runs import Run, load
+from lyceum_warp.runs.folder import Run, load
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

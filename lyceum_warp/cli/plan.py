@@ -32,7 +32,7 @@ from lyceum_warp.control.real_time import control_async
 from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted
-from lyceum_warp.runs import Run, load_value
+from lyceum_warp.runs.folder import Run, load_value
 from lyceum_warp.validate import whole_number
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 

@@ -17,7 +17,6 @@ from lyceum_warp.algos.evaluation import Episodes, evaluate, evaluation_seed, ev
 from lyceum_warp.algos.learner import Learner, LearnerIteration, fitted_config
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.binding.registry import find_task, task_name, task_names
-from lyceum_warp.checkpoints import PolicyContent, check_sizes, policy_of, read_checkpoint, value_of
 from lyceum_warp.cli.algorithms import ALGORITHMS, Algorithm, AlgorithmName, NPGOptions, RslRlOptions
 from lyceum_warp.cli.arguments import (
     NO_FLAGS,
@@ -43,17 +42,18 @@ from lyceum_warp.cli.display import (
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted
-from lyceum_warp.kept_task import KeptTask, run_env, run_params, run_task
 from lyceum_warp.machine import cpu_cores
-from lyceum_warp.runs import Run
-from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
+from lyceum_warp.runs.checkpoints import PolicyContent, check_sizes, policy_of, read_checkpoint, value_of
+from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.task_copy import KeptTask, run_env, run_params, run_task
+from lyceum_warp.support.versions import versions
 from lyceum_warp.training import check_resumable, checked_settings, learn, reopen, restore
 from lyceum_warp.validate import whole_number
-from lyceum_warp.versions import versions
 from lyceum_warp.viewer.follow import RunViewer
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.policy_videos import Videos
+from lyceum_warp.viz.tensorboard import TensorBoard, check_tensorboard
 from lyceum_warp.viz.video import check_video
 
 _FINAL_EPISODES = 32

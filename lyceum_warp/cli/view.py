@@ -10,7 +10,6 @@ import tyro
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.checkpoints import check_sizes
 from lyceum_warp.cli.algorithms import ALGORITHMS
 from lyceum_warp.cli.arguments import NO_FLAGS, Repeated, given, optional_flags, parameters, run_options
 from lyceum_warp.cli.display import note
@@ -20,9 +19,10 @@ from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.engines.placement import options_for_few_worlds
 from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted, signals
-from lyceum_warp.kept_task import run_env
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.runs import Run, load
+from lyceum_warp.runs.checkpoints import check_sizes
+from lyceum_warp.runs.folder import Run, load
+from lyceum_warp.runs.task_copy import run_env
 from lyceum_warp.validate import whole_number
 from lyceum_warp.viewer.follow import Follower, Parent, wait_for_run
 from lyceum_warp.viewer.session import Watcher, check_world

@@ -17,8 +17,8 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.checkpoints import read_checkpoint
-from lyceum_warp.runs import Run, load
+from lyceum_warp.runs.checkpoints import read_checkpoint
+from lyceum_warp.runs.folder import Run, load
 
 _NICE = 10  # how much the process of `RunViewer` gives way to the training
 

@@ -12,8 +12,8 @@ from lyceum_warp.algos.learner import Learner, LearnerIteration
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.env import Env
-from lyceum_warp.tensorboard import TensorBoard
 from lyceum_warp.viz.cameras import CameraChoice
+from lyceum_warp.viz.tensorboard import TensorBoard
 from lyceum_warp.viz.video import Progress, episode, write_video
 
 log = logging.getLogger(__name__)

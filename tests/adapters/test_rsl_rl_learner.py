@@ -14,7 +14,7 @@ from training_runs import metrics
 import lyceum_warp as lw
 from lyceum_warp.adapters.rsl_rl_config import Bootstrap, RslRlConfig
 from lyceum_warp.adapters.rsl_rl_learner import RslRlLearner
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
 
 SMALL = RslRlConfig(hidden=(8,), value_hidden=(8, 8), num_steps_per_env=12, mean_every=2, mean_episodes=2)
 

@@ -19,7 +19,7 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.cli.train import Train, _config
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
 from lyceum_warp.viewer import show as views
 
 METERED = str(Path(__file__).parent.parent / "metered_task.py")

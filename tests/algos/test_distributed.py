@@ -17,7 +17,7 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos import distributed
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
 
 # everything that might differ between one process and two: unfinished episodes, a normaliser, a part of the samples
 # for the Fisher information, a smaller last mini-batch, an evaluation, restarts between iterations

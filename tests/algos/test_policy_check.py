@@ -11,7 +11,7 @@ from torch import nn
 import lyceum_warp as lw
 from lyceum_warp.algos.networks import mlp
 from lyceum_warp.algos.policy_check import check_policy
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
 
 
 class Net(nn.Module):

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
 
 
 def test_a_value_function_has_the_discount_of_the_returns_that_it_was_fitted_to(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.checkpoints import policy_content, serialized
+from lyceum_warp.runs.checkpoints import policy_content, serialized
 
 BENCH = Path(__file__).parents[2] / "bench"
 METERED = Path(__file__).parents[1] / "metered_task.py"

@@ -25,7 +25,7 @@ from lyceum_warp.binding.registry import find_task
 from lyceum_warp.cli import display
 from lyceum_warp.cli.arguments import EnvFlags
 from lyceum_warp.cli.train import NPGOptions, Train, _config, saved_options
-from lyceum_warp.runs import Run, load
+from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.viz import drawing
 
 

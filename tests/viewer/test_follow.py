@@ -13,8 +13,8 @@ import torch
 from training_runs import train
 
 import lyceum_warp as lw
-from lyceum_warp.checkpoints import policy_content
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.checkpoints import policy_content
+from lyceum_warp.runs.folder import Run
 from lyceum_warp.viewer.follow import Follower, wait_for_run
 
 # the package has a function of this name

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
 from lyceum_warp.viz import learning_curve as module
 from lyceum_warp.viz.learning_curve import learning_curve
 

@@ -23,7 +23,7 @@ from lyceum_warp.binding.registry import find_task
 from lyceum_warp.env import Env
 from lyceum_warp.model_files import ModelFile, read_spec
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
 from lyceum_warp.task import Task
 
 log = logging.getLogger(__name__)

@@ -12,10 +12,10 @@ import pytest
 from training_runs import QUIET, train
 
 import lyceum_warp as lw
-from lyceum_warp import tensorboard as module
 from lyceum_warp.cli import main
-from lyceum_warp.runs import Run
-from lyceum_warp.tensorboard import TensorBoard, tag
+from lyceum_warp.runs.folder import Run
+from lyceum_warp.viz import tensorboard as module
+from lyceum_warp.viz.tensorboard import TensorBoard, tag
 
 pytest.importorskip("tensorboard")
 

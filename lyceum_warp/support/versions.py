@@ -56,7 +56,7 @@ def _cpu_name() -> str:
 
 @functools.cache
 def _commit() -> str | None:
-    root = Path(__file__).resolve().parent.parent
+    root = Path(__file__).resolve().parent.parent.parent
     git = shutil.which("git")
     # an installed package may lie inside the checkout of another project, whose commit would be wrong
     if git is None or not (root / ".git").exists():

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lyceum_warp.metrics_table import append_row, cut_rows, read_metrics
+from lyceum_warp.runs.metrics_table import append_row, cut_rows, read_metrics
 
 
 @pytest.fixture

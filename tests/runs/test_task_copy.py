@@ -12,8 +12,8 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.cli.arguments import run_options
 from lyceum_warp.env import Env
-from lyceum_warp.kept_task import KeptTask, run_env
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.task_copy import KeptTask, run_env
 
 SOURCE = """
 import warp as wp
@@ -164,7 +164,7 @@ def test_too_many_modules_are_not_copied(folder: Path, monkeypatch: pytest.Monke
     (folder / "mine" / "slide.py").write_text(f"import slide_goal\n{SOURCE}")
     env = lw.make(str(folder / "mine" / "slide.py"), nworld=1)
     assert "slide_goal.py" in KeptTask.of(env).files
-    monkeypatch.setattr("lyceum_warp.kept_task._LARGEST_MODULES", 5)
+    monkeypatch.setattr("lyceum_warp.runs.task_copy._LARGEST_MODULES", 5)
     assert "slide.py" in KeptTask.of(env).files and "slide_goal.py" not in KeptTask.of(env).files
 
 

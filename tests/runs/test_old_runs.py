@@ -8,7 +8,7 @@ import torch
 
 import lyceum_warp as lw
 from lyceum_warp.cli import main
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
 from lyceum_warp.training import restore
 
 OLD = Path(__file__).parent.parent / "data" / "old_run"
@@ -34,7 +34,7 @@ def test_an_old_run_is_evaluated_in_its_own_physics(old_run: Path, capsys: pytes
 def test_an_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["train", "--resume", str(old_run), "--iterations", "3", "--no-video", "--no-plot"]
     assert main(arguments) == 0
-    assert [row["iteration"] for row in lw.runs.Run.open(old_run).rows()] == [1, 2, 3]
+    assert [row["iteration"] for row in Run.open(old_run).rows()] == [1, 2, 3]
     out = capsys.readouterr().out
     assert "4 worlds, mujoco engine on cpu" in out
 

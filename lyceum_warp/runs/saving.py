@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from lyceum_warp.algos.learner import Learner, LearnerIteration
-from lyceum_warp.checkpoints import PolicyContent, policy_content
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.checkpoints import PolicyContent, policy_content
+from lyceum_warp.runs.folder import Run
 
 SHARE = 400
 """The complete state is saved once training has taken this many times as long as the last such save."""

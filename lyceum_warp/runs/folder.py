@@ -12,7 +12,8 @@ import torch
 
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
-from lyceum_warp.checkpoints import (
+from lyceum_warp.files import replaced
+from lyceum_warp.runs.checkpoints import (
     FORMAT,
     PolicyContent,
     check_format,
@@ -22,9 +23,8 @@ from lyceum_warp.checkpoints import (
     serialized,
     value_of,
 )
-from lyceum_warp.files import replaced
-from lyceum_warp.metrics_table import append_row, cut_rows, read_metrics
-from lyceum_warp.versions import versions
+from lyceum_warp.runs.metrics_table import append_row, cut_rows, read_metrics
+from lyceum_warp.support.versions import versions
 
 _CONFIG, _VERSIONS, _METRICS, _CHECKPOINT = "config.json", "versions.json", "metrics.csv", "checkpoint.pt"
 _PREVIOUS, _LAST, _BEST, _NUMBERED = "previous.pt", "policy.pt", "best.pt", "policies"

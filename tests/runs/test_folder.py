@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.checkpoints import FORMAT
-from lyceum_warp.runs import Run, load
+from lyceum_warp.runs.checkpoints import FORMAT
+from lyceum_warp.runs.folder import Run, load
 
 
 @pytest.fixture

@@ -14,9 +14,10 @@ from conftest import SharedEnv
 from training_runs import QUIET, algorithm, mean_action, metrics, refused, six_iterations
 
 import lyceum_warp as lw
-from lyceum_warp import cli, keeper
-from lyceum_warp.keeper import POLICY_SHARE, SHARE, Keeper, NotSavedError
-from lyceum_warp.runs import Run
+from lyceum_warp import cli
+from lyceum_warp.runs import saving as keeper
+from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.saving import POLICY_SHARE, SHARE, Keeper, NotSavedError
 
 
 @pytest.fixture
