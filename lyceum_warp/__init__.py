@@ -8,13 +8,15 @@ if _wp.config.log_level == _wp.LOG_INFO:  # Warp's default, at which it greets a
 from lyceum_warp.actuators import follow_velocity
 from lyceum_warp.algos.cem import CEM
 from lyceum_warp.algos.evaluation import Episodes, evaluate
+from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_config import MPPIConfig
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig
-from lyceum_warp.algos.npg_statistics import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.policy_export import export_policy
+from lyceum_warp.algos.ppo import PPO
+from lyceum_warp.algos.ppo_config import PPOConfig
 from lyceum_warp.algos.predictive_sampling import PredictiveSampling
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.value import ValueFunction
@@ -91,6 +93,7 @@ __all__ = [
     "CEM",
     "MPPI",
     "NPG",
+    "PPO",
     "ControlProgress",
     "ControlReport",
     "Controller",
@@ -100,10 +103,12 @@ __all__ = [
     "Episodes",
     "GaussianPolicy",
     "Iteration",
+    "Learner",
     "MPPIConfig",
     "ModelFile",
     "NPGConfig",
     "OpenLoop",
+    "PPOConfig",
     "PhysicsOptions",
     "Planning",
     "PlanningController",

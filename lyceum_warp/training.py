@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.evaluation import evaluation_seed
-from lyceum_warp.algos.learner import Learner, LearnerIteration
+from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.binding.registry import spelled_task
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.env import Env
@@ -115,7 +115,7 @@ def train(
     seed = evaluation_seed(learner.env.options.seed + 1)
     videos = Videos(learner, run.folder / "videos", video_every, seed, board, camera=camera)
 
-    def after(iteration: LearnerIteration) -> Any:
+    def after(iteration: Iteration) -> Any:
         videos(iteration)
         return None if callback is None else callback(iteration)
 
@@ -387,7 +387,7 @@ class _Loop:
             except Exception as error:
                 self.error = error
 
-    def _decide(self, iteration: LearnerIteration) -> None:
+    def _decide(self, iteration: Iteration) -> None:
         """Call the callbacks, and compare with the return at which training ends."""
         if self.keeper is None or self.error is not None:
             return

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from lyceum_warp.algos.learner import LearnerIteration
+from lyceum_warp.algos.learner import Iteration
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.control.control_report import ControlReport
 from lyceum_warp.control.episode_collector import ControlProgress
@@ -62,7 +62,7 @@ class Display:
     def __exit__(self, *exception: object) -> None:
         self.progress.stop()
 
-    def __call__(self, it: LearnerIteration) -> None:
+    def __call__(self, it: Iteration) -> None:
         """Show an iteration."""
         if it.mean_return is not None:
             self.mean = it.mean_return

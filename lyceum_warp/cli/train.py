@@ -14,7 +14,7 @@ from rich.console import Console
 
 from lyceum_warp.algos.distributed import Team, join
 from lyceum_warp.algos.evaluation import Episodes, evaluate, evaluation_seed, evaluation_worlds
-from lyceum_warp.algos.learner import Learner, LearnerIteration, fitted_config
+from lyceum_warp.algos.learner import Iteration, Learner, fitted_config
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.cli.algorithms import ALGORITHMS, Algorithm, AlgorithmName, NPGOptions, RslRlOptions
@@ -466,7 +466,7 @@ def _learn(run: Run | None, learner: Learner, options: Train) -> int:
             note=note, progress=display.work,
         )  # fmt: skip
 
-    def show(iteration: LearnerIteration) -> None:
+    def show(iteration: Iteration) -> None:
         if display is not None and videos is not None:
             display(iteration)
             videos(iteration)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.algos.learner import Learner, LearnerIteration
+from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.runs.checkpoints import PolicyContent, policy_content
 from lyceum_warp.runs.folder import Run
 
@@ -73,7 +73,7 @@ class Keeper:
             return (self.learner.iteration + 1) % self.save_every == 0
         return time.perf_counter() - self._when >= SHARE * self._seconds
 
-    def return_of(self, iteration: LearnerIteration) -> float | None:
+    def return_of(self, iteration: Iteration) -> float | None:
         """The return by which policies are compared, where the iteration has one."""
         number = iteration.mean_return if self._by_mean else iteration.return_mean
         return None if number is None or not math.isfinite(number) else number
@@ -91,7 +91,7 @@ class Keeper:
 
     def keep(
         self,
-        iteration: LearnerIteration,
+        iteration: Iteration,
         state: dict[str, Any] | None,
         *,
         renewed: bool = True,
@@ -129,7 +129,7 @@ class Keeper:
     def _score_name(self) -> str:
         return "mean_return" if self._by_mean else "return_mean"
 
-    def note_target(self, iteration: LearnerIteration, reached: float) -> None:
+    def note_target(self, iteration: Iteration, reached: float) -> None:
         """Note in the configuration that the run reached its return."""
         self.run.amend(reached={"iteration": iteration.iteration, "return": reached})
 

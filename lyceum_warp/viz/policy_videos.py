@@ -8,7 +8,7 @@ from typing import TypeAlias
 import torch
 
 from lyceum_warp.algos.evaluation import evaluation_worlds
-from lyceum_warp.algos.learner import Learner, LearnerIteration
+from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.env import Env
@@ -62,7 +62,7 @@ class Videos:
         self.learner, self.folder, self.every, self.seed, self.board = learner, folder, every, seed, board
         self.camera, self.note, self.progress = camera, note, progress
 
-    def __call__(self, iteration: LearnerIteration) -> None:
+    def __call__(self, iteration: Iteration) -> None:
         """Write a video after an iteration, if it is time for one."""
         if not self.every or iteration.iteration % self.every:
             return

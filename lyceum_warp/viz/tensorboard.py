@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.algos.learner import LearnerIteration
+from lyceum_warp.algos.learner import Iteration
 
 EXTRA = "pip install 'lyceum-warp[tensorboard]'"
 """Command that installs the package for TensorBoard."""
@@ -73,7 +73,7 @@ class TensorBoard:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    def __call__(self, iteration: LearnerIteration) -> None:
+    def __call__(self, iteration: Iteration) -> None:
         """Add an iteration. Numbers that are not finite, such as returns where no episode ended, are left out."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
