@@ -78,28 +78,39 @@ def obeyed() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def postponed(when: bool = True) -> Iterator[list[int]]:
-    """List Ctrl-C, SIGTERM and SIGHUP instead of handling them, which is left to the caller.
+def postponed(*, insist: bool = False) -> Iterator[list[int]]:
+    """Within the block, list Ctrl-C, SIGTERM and SIGHUP; the first is handled at the end of the block.
 
-    A signal that is still listed at the end of the context is handled there, within ``signals`` by raising Interrupted.
     Once Interrupted is raised, later signals are ignored.
 
     Args:
-        when: False leaves signals alone.
+        insist: Whether a second signal is handled at once.
 
     Raises:
         Interrupted: A signal came, and the caller did not raise it.
     """
     noted: list[int] = []
-    previous = _handled_by(lambda number, frame: noted.append(number)) if when else {}
+
+    def note(number: int, frame: Any) -> None:
+        if noted and insist:
+            restore()
+            noted.clear()
+            signal.raise_signal(signal.Signals(number))
+        else:
+            noted.append(number)
+
+    def restore() -> None:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+    previous = _handled_by(note)
     try:
         yield noted
     except Interrupted:
         previous = dict.fromkeys(previous, _ignore)
         raise
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        restore()
     if noted:
         signal.raise_signal(signal.Signals(noted[0]))
 

@@ -1,9 +1,10 @@
-"""The content of a checkpoint, and of a saved policy: made, serialised, read, and turned into networks."""
+"""Read and write the content of checkpoints and of saved policies."""
 
 import io
-from collections.abc import Callable, Mapping
+import pydoc
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import nn
@@ -11,9 +12,7 @@ from torch import nn
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
-from lyceum_warp.files import newer_format
-
-Module = TypeVar("Module", bound=nn.Module)
+from lyceum_warp.files import newer_format, replaced
 
 FORMAT = 1
 """Format of a run's folder and of its files. It is raised when an older release could no longer read them."""
@@ -23,8 +22,11 @@ _FIX = "restore the file from a copy, or train again into another folder"
 PolicyContent = dict[str, Any]
 """A policy and a value function as they are saved: ``iteration``, ``policy``, and ``value`` if there is one."""
 
+_CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": ValueFunction}
+"""The classes of networks whose files name none."""
 
-def policy_content(iteration: int, policy: GaussianPolicy, value: ValueFunction | None = None) -> PolicyContent:
+
+def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> PolicyContent:
     """A copy of a policy and of a value function on the CPU.
 
     Args:
@@ -35,8 +37,11 @@ def policy_content(iteration: int, policy: GaussianPolicy, value: ValueFunction 
     content: PolicyContent = {"lyceum_warp": FORMAT, "iteration": iteration}
     for name, module in (("policy", policy), ("value", value)):
         if module is not None:
+            kind = type(module)
+            own = {} if isinstance(module, _CLASSES[name]) else {"class": f"{kind.__module__}.{kind.__qualname__}"}
             content[name] = {
-                "shape": module.shape,
+                **own,
+                "shape": getattr(module, "shape", None),
                 "state": {key: tensor.detach().cpu().clone() for key, tensor in module.state_dict().items()},
             }
     return content
@@ -49,7 +54,13 @@ def serialized(content: Mapping[str, Any]) -> memoryview:
     return buffer.getbuffer()
 
 
-def policy_of(content: PolicyContent, path: Path, given: GaussianPolicy | None = None) -> GaussianPolicy:
+def write_content(path: Path, content: PolicyContent) -> None:
+    """Replace a file of a policy."""
+    with replaced(path) as temporary:
+        temporary.write_bytes(serialized(content))
+
+
+def policy_of(content: PolicyContent, path: Path, given: nn.Module | None = None) -> nn.Module:
     """The policy of a file.
 
     Args:
@@ -60,12 +71,10 @@ def policy_of(content: PolicyContent, path: Path, given: GaussianPolicy | None =
     Raises:
         ValueError: The file holds something else, or another policy than the given one.
     """
-    if given is None:
-        return _filled(content, path, "policy", GaussianPolicy.like)
-    return _filled(content, path, "policy", lambda shape: given, fix="give one like that of the run")
+    return _filled(content, path, "policy", given)
 
 
-def value_of(content: PolicyContent, path: Path) -> ValueFunction:
+def value_of(content: PolicyContent, path: Path) -> nn.Module:
     """The value function of a file.
 
     Args:
@@ -75,22 +84,35 @@ def value_of(content: PolicyContent, path: Path) -> ValueFunction:
     Raises:
         ValueError: The file holds none.
     """
-    return _filled(content, path, "value", lambda shape: ValueFunction(**shape))
+    if "value" not in content:
+        raise ValueError(f"{path} holds no value function: the run's algorithm has none")
+    return _filled(content, path, "value", None)
 
 
-def _filled(
-    content: PolicyContent, path: Path, name: str, made: Callable[[Mapping[str, Any]], Module], *, fix: str = _FIX
-) -> Module:
-    """A network with the weights of a checkpoint."""
+def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | None) -> nn.Module:
+    """A network with the weights of a file."""
     try:
         saved = content[name]
-        module = made(saved["shape"])
+        module = given if given is not None else _made(name, saved)
         if different := _difference(module, saved["state"]):
+            fix = _FIX if given is None else "give one like that of the run"
             raise ValueError(f"{path} holds a {name} of other parameters ({different}): {fix}")
         module.load_state_dict(saved["state"])
     except (KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"{path} holds no {name} of lyceum_warp ({_first_sentence(error)}): {_FIX}") from error
     return module
+
+
+def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
+    """A new network of the class and the shape that a file names. Only classes of the package are made."""
+    kind: Any = _CLASSES[name]
+    own = saved.get("class")
+    if own is not None:
+        kind = pydoc.locate(own) if own.startswith("lyceum_warp.") and saved["shape"] is not None else None
+        if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
+            fix = f": give one, as in lw.load(run, policy={own.rpartition('.')[2]}(...))" if name == "policy" else ""
+            raise ValueError(f"the {name} is of a class of its own, {own}{fix}")
+    return kind.like(saved["shape"]) if hasattr(kind, "like") else kind(**saved["shape"])
 
 
 def check_sizes(policy: Any, env: Env, path: Path) -> None:

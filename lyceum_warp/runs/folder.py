@@ -1,37 +1,37 @@
-"""Runs: the folder of a training run, its files, and the policies in it."""
+"""Read and write the folder of a training run."""
 
 import contextlib
 import json
 import logging
 import os
+import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.files import replaced
 from lyceum_warp.runs.checkpoints import (
     FORMAT,
     PolicyContent,
     check_format,
-    policy_content,
     policy_of,
     read_checkpoint,
     serialized,
     value_of,
+    write_content,
 )
-from lyceum_warp.runs.metrics_table import append_row, cut_rows, read_metrics
+from lyceum_warp.runs.metrics_table import read_metrics
 from lyceum_warp.support.versions import versions
 
-_CONFIG, _VERSIONS, _METRICS, _CHECKPOINT = "config.json", "versions.json", "metrics.csv", "checkpoint.pt"
-_PREVIOUS, _LAST, _BEST, _NUMBERED = "previous.pt", "policy.pt", "best.pt", "policies"
+_CONFIG, _VERSIONS = "config.json", "versions.json"
 
 log = logging.getLogger(__name__)
 
 
+@document_attributes
 class Run:
     """The folder of a training run.
 
@@ -39,10 +39,10 @@ class Run:
     ``config.json``     the task, its parameters, the engine, its physics, the seed and all hyperparameters
     ``versions.json``   versions of the packages and of Python, the machine, the commit
     ``metrics.csv``     one row per iteration
-    ``policy.pt``       the policy and the value function after the last iteration
-    ``best.pt``         those of the iteration with the best return
-    ``policies/``       those of every n-th iteration, if asked for
-    ``checkpoint.pt``   the complete state from which a run continues exactly, of the last iteration or an earlier one
+    ``policy.pt``       the last policy, and its value function
+    ``best.pt``         the policy with the best return
+    ``policies/``       the policies of every n-th iteration, if asked for
+    ``checkpoint.pt``   the complete state from which a run continues exactly, of the same iteration as ``policy.pt``
     ``previous.pt``     the checkpoint before it
     ``task/``           the task's file with modules beside it, and its model, where they are not the package's
     =================== ======================================================================================
@@ -52,24 +52,24 @@ class Run:
         config: The content of ``config.json``.
     """
 
+    metrics: Path
+    """Path of the table of iterations."""
+    checkpoint: Path
+    """Path of the checkpoint."""
+    previous: Path
+    """Path of the checkpoint before the last one."""
+    policy: Path
+    """Path of the last policy."""
+    best: Path
+    """Path of the best policy."""
+    task_folder: Path
+    """Path of the folder with the task's file and its model."""
+
     def __init__(self, folder: Path, config: dict[str, Any]) -> None:
-        self.folder = folder
-        self.config = config
-
-    @property
-    def metrics(self) -> Path:
-        """Path of the table of iterations."""
-        return self.folder / _METRICS
-
-    @property
-    def checkpoint(self) -> Path:
-        """Path of the checkpoint."""
-        return self.folder / _CHECKPOINT
-
-    @property
-    def previous(self) -> Path:
-        """Path of the checkpoint before the last one."""
-        return self.folder / _PREVIOUS
+        self.folder, self.config = folder, config
+        self.metrics, self.task_folder = folder / "metrics.csv", folder / "task"
+        self.checkpoint, self.previous = folder / "checkpoint.pt", folder / "previous.pt"
+        self.policy, self.best = folder / "policy.pt", folder / "best.pt"
 
     @property
     def task_name(self) -> str:
@@ -77,58 +77,61 @@ class Run:
         task = self.config.get("kept", {}).get("name") or str(self.config.get("task"))
         return Path(task.partition(":")[0]).stem
 
-    @property
-    def task_folder(self) -> Path:
-        """Path of the folder with the task's file and its model."""
-        return self.folder / "task"
-
     @staticmethod
-    def check_free(folder: str | Path, *, resumable: bool = True, command: bool = True) -> None:
+    def check_free(folder: str | Path) -> None:
         """Check that a folder can be used for a new run.
 
         Args:
             folder: A folder, which need not exist.
-            resumable: Whether the message may suggest to continue the run that is in the folder.
-            command: Whether the message names flags of the command line rather than arguments of ``train``.
-
-        Raises:
-            ValueError: The folder is not empty, or is a file.
-        """
-        folder, other = Path(folder), "give another --out" if command else "give another folder"
-        if (folder / _CONFIG).exists():
-            way = f"--resume {folder}" if command else "resume=True"
-            fix = f"continue it with {way}, or {other}" if resumable else other
-            raise ValueError(f"{folder} holds a run: {fix}")
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise ValueError(f"{folder} exists and is not an empty folder: {other}")
-
-    @classmethod
-    def create(cls, folder: str | Path, config: Mapping[str, Any], *, device: str = "cpu") -> "Run":
-        """Begin a run: make its folder, and write the configuration and the versions.
-
-        Args:
-            folder: A new or empty folder.
-            config: The configuration, of values that JSON can hold.
-            device: Device of the run; see ``versions``.
 
         Raises:
             ValueError: The folder is not empty, or is a file.
         """
         folder = Path(folder)
-        cls.check_free(folder, command=False)
+        if (folder / _CONFIG).exists():
+            raise ValueError(
+                f"{folder} holds a run: give another folder, or continue the run (train --resume {folder}, or "
+                "resume=True in Python)"
+            )
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise ValueError(f"{folder} exists and is not an empty folder: give another folder")
+
+    @classmethod
+    def create(
+        cls,
+        folder: str | Path,
+        config: Mapping[str, Any],
+        *,
+        device: str = "cpu",
+        files: Mapping[str, Path | bytes] | None = None,
+    ) -> "Run":
+        """Begin a run: make its folder, with the versions, the copy of the task, and the configuration.
+
+        If this fails, nothing is left in the folder.
+
+        Args:
+            folder: A new or empty folder.
+            config: The configuration, of values that JSON can hold.
+            device: Device of the run; see ``versions``.
+            files: What the folder ``task`` holds, by path: files to copy, or their contents.
+
+        Raises:
+            ValueError: The folder is not empty, or is a file.
+        """
+        folder = Path(folder)
+        cls.check_free(folder)
         run = cls(folder, {"format": FORMAT, **config})
         text = json.dumps(run.config, indent=2)  # before the folder is made, because it may fail
-        new = [path for path in (folder, *folder.parents) if not path.exists()]
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            _write(folder / _VERSIONS, json.dumps(versions(device), indent=2))
-            _write(folder / _CONFIG, text)
+            (folder / _VERSIONS).write_text(json.dumps(versions(device), indent=2))
+            for name, content in (files or {}).items():
+                path = run.task_folder / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(content if isinstance(content, bytes) else content.read_bytes())
+            (folder / _CONFIG).write_text(text)
         except BaseException:  # a full disk, a folder that cannot be written, a signal
-            with contextlib.suppress(OSError):
-                for name in (_VERSIONS, _CONFIG):
-                    (folder / name).unlink(missing_ok=True)
-                for path in new:
-                    path.rmdir()
+            shutil.rmtree(folder, ignore_errors=True)
             raise
         return run
 
@@ -155,7 +158,8 @@ class Run:
     def amend(self, **changes: Any) -> None:
         """Change entries of the configuration, here and in the file."""
         self.config = {**self.config, **changes}
-        _write(self.folder / _CONFIG, json.dumps(self.config, indent=2))
+        with replaced(self.folder / _CONFIG) as temporary:
+            temporary.write_text(json.dumps(self.config, indent=2))
 
     def changed(self, now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
         """Compare versions with those that the run began with, and note the changes in ``versions.json``.
@@ -174,14 +178,9 @@ class Run:
         changed = {name: (then.get(name), value) for name, value in now.items() if then.get(name) != value}
         if changed:
             then.setdefault("resumed", []).append({name: value for name, (_, value) in changed.items()})
-            _write(path, json.dumps(then, indent=2))
+            with replaced(path) as temporary:
+                temporary.write_text(json.dumps(then, indent=2))
         return changed
-
-    # the table
-
-    def write(self, row: Mapping[str, Any]) -> None:
-        """Append a row to the table; see ``append_row``."""
-        append_row(self.metrics, row)
 
     def rows(self) -> list[dict[str, float | None]]:
         """Read the rows of the table. An empty cell is None.
@@ -194,23 +193,11 @@ class Run:
             raise FileNotFoundError(f"there is no {self.metrics}: the run has no complete iteration")
         return read_metrics(self.metrics)
 
-    def cut(self, iteration: int) -> None:
-        """Drop the rows after an iteration, and an incomplete last row.
-
-        An interrupted run may have written a row, or a part of one, without its checkpoint.
-
-        Args:
-            iteration: Number of the last iteration to keep. The first row may have another number than 1.
-        """
-        cut_rows(self.metrics, iteration)
-
-    def files(self) -> dict[str, bytes]:
-        """The content of versions, table, best policy and task, by their paths below the folder."""
-        paths = [self.folder / name for name in (_VERSIONS, _METRICS, _BEST)]
-        paths += [path for path in sorted(self.task_folder.rglob("*")) if path.is_file()]
-        return {path.relative_to(self.folder).as_posix(): path.read_bytes() for path in paths if path.is_file()}
-
     # policies
+
+    def numbered(self, iteration: int) -> Path:
+        """Path of the policy of an iteration, if the run keeps it."""
+        return self.folder / "policies" / f"{iteration:06d}.pt"
 
     def policy_file(self, which: str | int = "last") -> Path:
         """Path of a saved policy.
@@ -224,11 +211,11 @@ class Run:
         """
         if which == "last":
             # earlier releases kept the policy in the checkpoint alone
-            return self.folder / _LAST if (self.folder / _LAST).is_file() else self.checkpoint
+            return self.policy if self.policy.is_file() else self.checkpoint
         if which == "best":
-            path = self.folder / _BEST
-        elif (number := _number(which)) is not None:
-            path = self._numbered(number)
+            path = self.best
+        elif isinstance(which, int | str) and str(which).isdigit():
+            path = self.numbered(int(which))
         else:
             raise ValueError(f"which must be 'last', 'best' or the number of an iteration, not {which!r}")
         if not path.is_file():
@@ -238,75 +225,32 @@ class Run:
         return path
 
     def _known_policies(self) -> str:
-        known = [name for name, file in (("last", _LAST), ("best", _BEST)) if (self.folder / file).is_file()]
-        if not known and self.checkpoint.is_file():
-            known = ["last"]
-        numbers = sorted(int(path.stem) for path in (self.folder / _NUMBERED).glob("*.pt") if path.stem.isdigit())
-        return ", ".join([*map(repr, known), *map(str, numbers)]) or "none yet"
-
-    def _numbered(self, iteration: int) -> Path:
-        return self.folder / _NUMBERED / f"{iteration:06d}.pt"
-
-    def save_policy(self, content: PolicyContent, *, number: bool = False) -> None:
-        """Replace the last policy.
-
-        Args:
-            content: The policy and the value function.
-            number: Whether to keep it under the number of its iteration, too.
-        """
-        data = serialized(content)
-        if number:
-            (self.folder / _NUMBERED).mkdir(exist_ok=True)
-            _write_bytes(self._numbered(content["iteration"]), data)
-        _write_bytes(self.folder / _LAST, data)
-
-    def save_best(self, content: PolicyContent, name: str, score: float) -> None:
-        """Replace the best policy.
-
-        Args:
-            content: The policy and the value function.
-            name: The column of the table by which it is the best.
-            score: The number there.
-        """
-        _write_bytes(self.folder / _BEST, serialized({**content, "score": {"name": name, "value": score}}))
+        known = ["'last'"] * self.policy_file().is_file() + ["'best'"] * self.best.is_file()
+        numbers = sorted(int(path.stem) for path in self.numbered(0).parent.glob("*.pt") if path.stem.isdigit())
+        return ", ".join([*known, *map(str, numbers)]) or "none yet"
 
     def best_score(self) -> tuple[int, float] | None:
-        """The iteration and the score of the best policy; None where there is none."""
-        if not (self.folder / _BEST).is_file():
-            return None
+        """The iteration and the score of the best policy; None if there is none."""
         try:
-            content = read_checkpoint(self.folder / _BEST, parts=("iteration", "policy", "score"))
-        except ValueError:
+            content = read_checkpoint(self.best, parts=("iteration", "policy", "score"))
+        except (ValueError, FileNotFoundError):
             return None
         return content["iteration"], content["score"]["value"]
 
     # the checkpoint
 
-    def save(
-        self, iteration: int, policy: GaussianPolicy, state: Mapping[str, Any], value: ValueFunction | None = None
-    ) -> None:
-        """Replace the checkpoint; the old one is kept as the previous one.
+    def save(self, content: PolicyContent, state: Mapping[str, Any]) -> None:
+        """Replace the last policy, and the checkpoint; the old checkpoint is kept as the previous one.
 
-        A reader finds the old checkpoint or the whole new one.
-
-        Args:
-            iteration: Number of complete iterations.
-            policy: The policy for ``load``.
-            state: State of the algorithm: tensors, numbers, strings and containers of them.
-            value: The value function for ``load_value``.
-        """
-        self.save_state(policy_content(iteration, policy, value), state)
-
-    def save_state(self, content: PolicyContent, state: Mapping[str, Any]) -> None:
-        """The same with a policy and a value function that were copied before.
+        A reader finds the old files or the whole new ones.
 
         Args:
             content: The policy and the value function.
-            state: State of the algorithm.
+            state: The state of the algorithm: tensors, numbers, strings and containers of them.
         """
-        data = serialized({**content, "state": dict(state)})
+        write_content(self.policy, content)
         with replaced(self.checkpoint, durable=True) as temporary:
-            temporary.write_bytes(data)
+            temporary.write_bytes(serialized({**content, "state": dict(state)}))
             if self.checkpoint.exists():
                 _keep(self.checkpoint, self.previous)
 
@@ -331,10 +275,8 @@ class Run:
                 cause = str(error).rpartition(": ")[0]
                 note(f"{cause}: {self.previous}, of iteration {content['iteration']}, is used instead")
                 return content
-            if isinstance(error, ValueError) and (self.folder / _LAST).is_file():
-                raise ValueError(
-                    f"{error}, or begin with the run's policy: train --from {self.folder}, or NPG(env, lw.load(run))"
-                ) from error
+            if isinstance(error, ValueError) and self.policy.is_file():
+                raise ValueError(f"{error}, or begin with the run's policy: train --from {self.folder}") from error
             raise
 
 
@@ -342,17 +284,19 @@ def load(
     run: str | Path | Run,
     *,
     which: str | int = "last",
-    policy: GaussianPolicy | None = None,
+    policy: Any = None,
     device: str | torch.device = "cpu",
-) -> GaussianPolicy:
-    """Load the policy of a run, with its observation normaliser: ``action = policy(obs)`` is the mean action.
+) -> Any:
+    """Load the policy of a run, with its observation normaliser: ``action = policy.act(obs)`` has no noise.
 
-    Its parameters are frozen; ``NPG(env, policy=lw.load(RUN))`` trains them further.
+    A ``GaussianPolicy`` also returns its mean actions when it is called, ``policy(obs)``. The parameters are frozen;
+    ``NPG(env, policy=lw.load(RUN))`` trains them further.
 
     Args:
         run: A run's folder, or a file of it with a policy.
         which: "last", "best" (see ``train``), or the number of an iteration that the run kept.
-        policy: A policy that takes the run's weights and is returned; necessary where its network is your own.
+        policy: A policy that takes the run's weights and is returned; necessary if its class or its network is your
+            own.
         device: Device for its parameters.
 
     Raises:
@@ -364,10 +308,8 @@ def load(
     return policy_of(content, path, policy).to(device).eval().requires_grad_(False)
 
 
-def load_value(
-    run: str | Path | Run, *, which: str | int = "last", device: str | torch.device = "cpu"
-) -> ValueFunction:
-    """Load the value function of a run: ``value(obs, step)`` predicts discounted returns.
+def load_value(run: str | Path | Run, *, which: str | int = "last", device: str | torch.device = "cpu") -> Any:
+    """Load the value function of a run, as a ``ValueFunction``: ``value(obs, step)`` predicts discounted returns.
 
     Args:
         run: A run's folder, or a file of it with a value function.
@@ -395,16 +337,6 @@ def _content(run: str | Path | Run, which: str | int, device: str | torch.device
     return read_checkpoint(path, device, parts=("iteration", "policy")), path
 
 
-def _write(path: Path, text: str) -> None:
-    with replaced(path) as temporary:
-        temporary.write_text(text)
-
-
-def _write_bytes(path: Path, data: memoryview) -> None:
-    with replaced(path) as temporary:
-        temporary.write_bytes(data)
-
-
 def _keep(path: Path, other: Path) -> None:
     """Give a file a second name, in place of another file. It exists under its first name all the time."""
     temporary = other.with_name(other.name + ".tmp")
@@ -414,10 +346,3 @@ def _keep(path: Path, other: Path) -> None:
         os.replace(temporary, other)
     except OSError:  # a file system without links
         os.replace(path, other)
-
-
-def _number(which: Any) -> int | None:
-    """The number of an iteration, also where it is written as a text."""
-    if isinstance(which, int) and not isinstance(which, bool):
-        return which
-    return int(which) if isinstance(which, str) and which.isdigit() else None

@@ -1,16 +1,14 @@
-"""A run's copies of its task and its model, and whether a later command uses them."""
+"""Copy a run's task into its folder, and decide whether a later command uses the copy."""
 
-import dataclasses
 import hashlib
-import itertools
+import io
 import json
 import logging
 import os
-import shutil
 import sys
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,6 @@ import numpy as np
 
 from lyceum_warp.binding.local_modules import local_modules
 from lyceum_warp.binding.models import find_model
-from lyceum_warp.binding.registry import find_task
 from lyceum_warp.env import Env
 from lyceum_warp.model_files import ModelFile, read_spec
 from lyceum_warp.options import EnvOptions
@@ -30,6 +27,9 @@ log = logging.getLogger(__name__)
 
 Note = Callable[[str], None]
 
+Files = dict[Path, Path | bytes]
+"""Files with their contents, or with the paths to copy."""
+
 _MODEL, _TABLES = "model", "tables"
 _APART = 2
 """A task's file lies at most this many folders below the common one of it and its model."""
@@ -39,66 +39,35 @@ _MOST_MODULES, _LARGEST_MODULES = 100, 8 * 2**20
 """Modules that a task imports from its folder are not copied if they are more, or larger in bytes."""
 
 
-def _file(task: type[Task]) -> Path | None:
-    """The file that defines a task; None in a notebook."""
-    file = getattr(sys.modules.get(task.__module__), "__file__", None)
-    return Path(file).resolve() if file and file.endswith(".py") and Path(file).is_file() else None
-
-
-@dataclasses.dataclass(frozen=True)
-class KeptTask:
-    """What a run's folder keeps of its task.
+def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
+    """What a run's folder keeps of an environment's task.
 
     The file and the model of a task of the package are not copied: the release, which versions.json holds, has them.
+
+    Returns:
+        The entry ``kept`` of config.json; and what the folder ``task`` will hold, by path.
     """
-
-    config: dict[str, Any]
-    """Entries of config.json."""
-    files: dict[str, Path | bytes | np.ndarray]
-    """What the folder ``task`` will hold, by path."""
-
-    @classmethod
-    def of(cls, env: Env) -> "KeptTask":
-        """What to keep of an environment's task."""
-        task = env.task.task
-        file, own = _file(task), not task.__module__.startswith("lyceum_warp.")
-        kept: dict[str, Any] = {"name": env.task.name, "model_hash": _model_hash(env)}
-        files: dict[str, Path | bytes | np.ndarray] = {}
-        if file is not None:
-            kept["source_hash"] = _digest(file.read_bytes())
-        sources: dict[Path, Path | bytes] = {}
-        modules: list[Path] = []
-        if own and file is not None:
-            modules = _module_files(file)
-            sources = {path: path for path in (file, *modules)}
-            kept["modules"] = {_beside(path, file): _digest(path.read_bytes()) for path in modules}
-        main = None
-        if own or env.options.model is not None:
-            main, model = _model_files(env)
-            sources |= model
-        names = _names_in_copy(sources, file, modules)
-        if own and file is not None:
-            kept["file"], kept["program"] = names[file], task.__module__ == "__main__"
-        if main is not None:
-            kept["model"] = names[main]
-        files |= {names[path]: content for path, content in sources.items()}
-        kept["model_given"] = env.options.model is not None
-        for name, value in env.given_params.items():
-            if (table := _table(value)) is not None:
-                files[f"{_TABLES}/{name}.npy"] = table
-        return cls({"kept": kept}, files)
-
-    def write(self, run: Run) -> None:
-        """Write the files into a run's folder."""
-        for name, content in self.files.items():
-            path = run.task_folder / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if isinstance(content, bytes):
-                path.write_bytes(content)
-            elif isinstance(content, np.ndarray):
-                np.save(path, content)
-            else:
-                shutil.copyfile(content, path)
+    task, given = env.task.task, env.options.model is not None
+    file, own = _file(task), not task.__module__.startswith("lyceum_warp.")
+    kept: dict[str, Any] = {"name": env.task.name, "model_hash": _model_hash(env), "model_given": given}
+    sources = {} if file is None else _sources(file)
+    if file is not None:
+        kept["source_hash"] = _digest(sources[file])
+    if not own:
+        sources = {}
+    main, model = _model_files(env) if own or given else (None, {})
+    modules = [path for path in sources if path != file]
+    names = _names_in_copy([*sources, *model], file, modules)
+    if file is not None and own:
+        kept["modules"] = {_beside(path, file): _digest(sources[path]) for path in modules}
+        kept["file"], kept["program"] = names[file], task.__module__ == "__main__"
+    if main is not None:
+        kept["model"] = names[main]
+    files = {names[path]: content for path, content in {**sources, **model}.items()}
+    for name, value in env.given_params.items():
+        if (table := _table(value)) is not None:
+            files[f"{_TABLES}/{name}.npy"] = table if isinstance(table, Path) else _npy(table)
+    return kept, files
 
 
 def given_params(env: Env) -> dict[str, Any]:
@@ -120,6 +89,31 @@ def _table(value: Any) -> Any:
         return Path(value)
     array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
     return array if array.dtype.kind in "fiu" and array.size > 64 else None
+
+
+def _npy(array: np.ndarray) -> bytes:
+    """The content of a file with an array."""
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
+
+
+def _file(task: type[Task]) -> Path | None:
+    """The file that defines a task; None in a notebook."""
+    file = getattr(sys.modules.get(task.__module__), "__file__", None)
+    return Path(file).resolve() if file and file.endswith(".py") and Path(file).is_file() else None
+
+
+def _sources(file: Path) -> dict[Path, bytes]:
+    """The contents of a task's file, and of the modules beside it that it imports.
+
+    The modules are left out if they are too many or too large to copy.
+    """
+    modules = [path for path in local_modules(file).values() if path.is_file()]
+    if len(modules) > _MOST_MODULES or sum(path.stat().st_size for path in modules) > _LARGEST_MODULES:
+        log.info("%s imports %d modules from its folder, too many or too large to copy", file, len(modules))
+        modules = []
+    return {path: path.read_bytes() for path in (file, *modules)}
 
 
 # what a later command uses
@@ -146,20 +140,16 @@ def run_env(
     """
     if task is not None:
         return Env(task, options, **params)
-    kept = run.config.get("kept", {})
-    chosen = run_task(run, note=note)
+    kept, chosen = run.config.get("kept", {}), _run_task(run, note)
     params = run_params(run, params)
     copy = run.task_folder / kept["model"] if "model" in kept else None
     if copy is None or not copy.is_file():
-        env = Env(chosen, options, **params)
-        if _model_changed(run, kept, env):
-            note(f"the model of the task {env.task.name!r} has changed since the run began")
-        return env
-    if kept["model_given"] and not isinstance(options.model, str):
+        return Env(chosen, options, **params)
+    if kept["model_given"] and not isinstance(options.model, str):  # it was made in Python
         return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
     try:
         env = Env(chosen, options, **params)
-        if not _model_changed(run, kept, env):
+        if not _model_changed(run, env):
             return env
         reason = "has changed since the run began"
     except FileNotFoundError:
@@ -168,16 +158,8 @@ def run_env(
     return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
 
 
-def run_task(run: Run, *, note: Note = log.warning) -> str:
-    """The task, by name or file, that stands for a run's; see ``run_env``.
-
-    Args:
-        run: The run.
-        note: Called with each line.
-
-    Raises:
-        ValueError: The task was defined in a program or a notebook.
-    """
+def _run_task(run: Run, note: Note) -> str:
+    """The task, by name or file, that stands for a run's."""
     task, kept = run.config["task"], run.config.get("kept", {})
     if task is None or kept.get("program"):
         where = "a notebook" if task is None else task.partition(":")[0]
@@ -186,11 +168,6 @@ def run_task(run: Run, *, note: Note = log.warning) -> str:
             "file that only defines it (eval --task my_task.py, train my_task.py --from), or go on there (resume=True)"
         )
     path, colon, attribute = task.partition(":")
-    if not path.endswith(".py"):
-        file = _file(find_task(task))
-        if file is not None and kept.get("source_hash") not in (None, _digest(file.read_bytes())):
-            note(f"the task {task!r} has changed since the run began: it is used as it is now")
-        return task
     copy = run.task_folder / kept["file"] if "file" in kept else None
     if copy is None or not copy.is_file():
         return task
@@ -215,7 +192,7 @@ def _source_changes(file: Path, kept: Mapping[str, Any]) -> list[str]:
 
 
 def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
-    """Note where an environment's task or its model is another than the run's; both are used as they are.
+    """Note if an environment's task or its model is another than the run's; both are used as they are.
 
     Args:
         run: The run.
@@ -226,30 +203,28 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
     hashed = None if kept.get("program") else kept.get("source_hash")  # a program that trains changes on its own
     for change in _source_changes(file, {**kept, "source_hash": hashed}) if file is not None else ():
         note(f"{change}: it is used as it is now" if "changed" in change else change)
-    if _model_changed(run, kept, env):
+    if _model_changed(run, env):
         note(f"the model of the task {env.task.name!r} has changed since the run began: it is used as it is now")
 
 
 def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
     """Parameters of a run's task; a table that is not where it was is the run's own copy."""
-    return {name: _found_table(run, name, value) for name, value in params.items()}
+
+    def missing(value: Any) -> bool:
+        return isinstance(value, str) and value.endswith(".npy") and not Path(value).is_file()
+
+    copies = {name: run.task_folder / _TABLES / f"{name}.npy" for name, value in params.items() if missing(value)}
+    return {**params, **{name: str(copy) for name, copy in copies.items() if copy.is_file()}}
 
 
-def _found_table(run: Run, name: str, value: Any) -> Any:
-    """A parameter, with the run's copy of a table that is not where it was."""
-    copy = run.task_folder / _TABLES / f"{name}.npy"
-    if isinstance(value, str) and value.endswith(".npy") and not Path(value).is_file() and copy.is_file():
-        return str(copy)
-    return value
-
-
-def _model_changed(run: Run, kept: Mapping[str, Any], env: Env) -> bool:
+def _model_changed(run: Run, env: Env) -> bool:
     """Whether the model differs from the one that the run began with; False where MuJoCo is another version."""
     try:
         version = json.loads((run.folder / "versions.json").read_text())["mujoco"]
     except (OSError, ValueError, KeyError):
         return False
-    return version == mujoco.__version__ and kept.get("model_hash") not in (None, _model_hash(env))
+    known = run.config.get("kept", {}).get("model_hash")
+    return version == mujoco.__version__ and known not in (None, _model_hash(env))
 
 
 # copies
@@ -274,41 +249,31 @@ def _model_hash(env: Env) -> str:
     return found.hexdigest()[:16]
 
 
-def _module_files(file: Path) -> list[Path]:
-    """The modules beside a task's file that it imports; none where they are too many or too large to copy."""
-    found = [path for path in local_modules(file).values() if path.is_file()]
-    if len(found) > _MOST_MODULES or sum(path.stat().st_size for path in found) > _LARGEST_MODULES:
-        log.info("%s imports %d modules from its folder, too many or too large to copy into the run", file, len(found))
-        return []
-    return found
-
-
 def _beside(path: Path, file: Path) -> str:
     """The path of a module relative to the folder of a task's file."""
     return path.relative_to(file.parent).as_posix()
 
 
-def _names_in_copy(paths: Iterable[Path], file: Path | None, modules: Sequence[Path] = ()) -> dict[Path, str]:
+def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collection[Path] = ()) -> dict[Path, str]:
     """The paths in the folder ``task`` of a task's file, of the modules beside it, and of its model's files.
 
     The files keep their places relative to each other, so that the copy of the task finds the copy of its model. Where
     the task's file lies elsewhere than its model, each has a place of its own.
     """
-    paths = list(paths)
     if not paths:
         return {}
     root = Path(os.path.commonpath([path.parent for path in paths]))
-    if file in paths and len(file.parent.relative_to(root).parts) > _APART:
+    if file is not None and file in paths and len(file.parent.relative_to(root).parts) > _APART:
         own = {path: _beside(path, file) for path in (file, *modules)}
         rest = _names_in_copy([path for path in paths if path not in own], None)
         return own | {path: f"{_MODEL}/{name}" for path, name in rest.items()}
     return {path: path.relative_to(root).as_posix() for path in paths}
 
 
-def _model_files(env: Env) -> tuple[Path | None, dict[Path, Path | bytes]]:
-    """The main file of a task's model, and all its files with their contents or the paths to copy.
+def _model_files(env: Env) -> tuple[Path | None, Files]:
+    """The main file of a task's model, and all its files.
 
-    A model that was made in Python is written as MJCF, with the files that it names.
+    A model that was made in Python is written as MJCF; the files that it names are copied as they are.
     """
     task, given = env.task.task, env.options.model
     source = given if given is not None else task.model
@@ -316,8 +281,10 @@ def _model_files(env: Env) -> tuple[Path | None, dict[Path, Path | bytes]]:
         source = find_model(source, None if given is not None else task)
     if isinstance(source, ModelFile):
         source = source.path()
-    text = None
-    if not isinstance(source, Path):
+    if isinstance(source, Path):
+        source = source.resolve()
+        files: Files = {path: path for path in (source, *_dependencies(source))}
+    else:
         spec = env.task.spec.copy()
         try:
             with warnings.catch_warnings():
@@ -327,46 +294,36 @@ def _model_files(env: Env) -> tuple[Path | None, dict[Path, Path | bytes]]:
         except (ValueError, mujoco.FatalError) as error:
             log.info("the model of %s cannot be written as MJCF, so the run has no copy of it: %s", task, error)
             return None, {}
-        source = Path(spec.modelfiledir or ".").absolute() / "model.xml"
-    source = source.resolve()
-    found = [source, *_named_files(source, text)]
-    if sum(path.stat().st_size for path in found if path.is_file()) > _LARGEST:
+        folder = Path(spec.modelfiledir or ".").resolve()
+        source = folder / "model.xml"
+        files = {source: text.encode(), **{path: path for path in _spec_dependencies(spec, folder)}}
+        for name, content in env.task.spec.assets.items():
+            files.setdefault(folder / name, content)
+    if sum(path.stat().st_size for path in files.values() if isinstance(path, Path)) > _LARGEST:
         log.info("the model of %s is larger than %d MiB, so the run has no copy of it", task, _LARGEST // 2**20)
         return None, {}
-    files: dict[Path, Path | bytes] = {path: path for path in found}
-    if text is not None:
-        files[source] = text.encode()
-        for name, content in env.task.spec.assets.items():
-            files.setdefault(source.parent / name, content)
     return source, files
 
 
-def _named_files(source: Path, text: str | None = None) -> list[Path]:
+def _dependencies(source: Path) -> list[Path]:
     """The files that a model file names: included files, other models, meshes, textures, height fields."""
-    found: dict[Path, None] = {}
-    pending = [(source, text)]
-    while pending:
-        path, content = pending.pop()
-        try:
-            root = ET.fromstring(path.read_bytes() if content is None else content)
-        except (ET.ParseError, OSError):
-            continue
-        folders = {path.parent, source.parent}
-        for compiler in root.iter("compiler"):
-            names = [compiler.get(name) for name in ("assetdir", "meshdir", "texturedir")]
-            folders |= {base / name for base, name in itertools.product(tuple(folders), filter(None, names))}
-        for file in _names(root):
-            for folder, name in itertools.product(sorted(folders), (file, Path(file).name)):
-                other = Path(os.path.normpath(folder / name))
-                if other.is_file() and other not in found and other != source:
-                    found[other] = None
-                    if other.suffix.lower() in (".xml", ".mjcf", ".urdf"):
-                        pending.append((other, None))
-    return list(found)
+    if source.suffix.lower() != ".urdf":
+        return [path for name in mujoco.mju_getXMLDependencies(str(source)) if (path := Path(name)) != source]
+    root = ET.parse(source).getroot()  # MuJoCo lists nothing for a URDF
+    folders = [source.parent / (compiler.get("meshdir") or "") for compiler in root.iter("compiler")]
+    names = [mesh.get("filename", "").removeprefix("package://") for mesh in root.iter("mesh")]
+    found = {
+        Path(os.path.normpath(folder / name)): None
+        for folder in (*folders, source.parent) for named in names for name in (named, Path(named).name)
+    }  # fmt: skip
+    return [path for path in found if path.is_file()]
 
 
-def _names(root: ET.Element) -> Iterator[str]:
-    for element in root.iter():
-        for attribute, value in element.attrib.items():
-            if attribute.startswith("file") and value:
-                yield value.removeprefix("package://")
+def _spec_dependencies(spec: mujoco.MjSpec, folder: Path) -> list[Path]:
+    """The files that a model made in Python names."""
+    parts = (*spec.meshes, *spec.hfields, *spec.skins)
+    names = [Path(spec.meshdir, part.file) for part in parts if part.file]
+    for texture in spec.textures:
+        names += [Path(spec.texturedir, name) for name in (texture.file, *texture.cubefiles) if name]
+    found = dict.fromkeys(Path(os.path.normpath(folder / name)) for name in names)
+    return [path for path in found if path.is_file()]
