@@ -137,6 +137,7 @@ INTERRUPTED = """
 import os, signal, sys
 from lyceum_warp import NPG
 from lyceum_warp.cli import main
+from lyceum_warp.cli.train import Train
 
 where, rank = sys.argv.pop(1), sys.argv.pop(1)
 iterate = NPG.__next__
@@ -154,7 +155,7 @@ if os.environ["RANK"] == rank:
     if where == "learning":
         NPG.__next__ = interrupting
     else:
-        sys.modules["lyceum_warp.cli.train"]._algorithm = interrupted
+        Train.configuration = interrupted
 sys.exit(main())
 """
 

@@ -9,13 +9,14 @@ import torch
 
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.runs.checkpoints import FORMAT
+from lyceum_warp.runs.checkpoints import policy_content as content
 from lyceum_warp.runs.folder import Run, load
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
     run = Run.create(tmp_path / "run", {"task": "hopper", "seed": 0, "scale": float("inf")})
-    run.save(0, GaussianPolicy(3, 2, (8, 4), normalize=True), {"counter": 5, "tensor": torch.arange(3)})
+    run.save(content(0, GaussianPolicy(3, 2, (8, 4), normalize=True)), {"counter": 5, "tensor": torch.arange(3)})
     return run
 
 
@@ -34,12 +35,17 @@ def test_read_returns_the_saved_state(run: Run) -> None:
     state = Run.open(run.folder).read()["state"]
     assert state["counter"] == 5
     assert state["tensor"].tolist() == [0, 1, 2]
-    assert {path.name for path in run.folder.iterdir()} == {"config.json", "versions.json", "checkpoint.pt"}
+    assert {path.name for path in run.folder.iterdir()} == {
+        "config.json",
+        "versions.json",
+        "policy.pt",
+        "checkpoint.pt",
+    }
 
 
 def test_create_refuses_a_folder_with_content(run: Run, tmp_path: Path) -> None:
     before = {path: path.read_bytes() for path in run.folder.iterdir()}
-    with pytest.raises(ValueError, match=r"holds a run: continue it with resume=True, or give another folder"):
+    with pytest.raises(ValueError, match=r"holds a run: give another folder, or continue the run"):
         Run.create(run.folder, {})
     assert before == {path: path.read_bytes() for path in run.folder.iterdir()}
     (tmp_path / "file").write_text("mine")
@@ -51,6 +57,12 @@ def test_create_refuses_a_folder_with_content(run: Run, tmp_path: Path) -> None:
 def test_create_leaves_no_folder_when_the_configuration_is_bad(tmp_path: Path) -> None:
     with pytest.raises(TypeError):
         Run.create(tmp_path / "run", {"task": object()})
+    assert not (tmp_path / "run").exists()
+
+
+def test_create_leaves_nothing_when_a_file_of_the_task_cannot_be_copied(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        Run.create(tmp_path / "run", {}, files={"task.py": b"x = 1", "robot.xml": tmp_path / "gone.xml"})
     assert not (tmp_path / "run").exists()
 
 
@@ -83,7 +95,7 @@ def test_rows_before_the_first_iteration_are_missing(run: Run) -> None:
 def test_load_returns_the_same_policy(run: Run) -> None:
     policy = GaussianPolicy(3, 2, (8, 4), normalize=True)
     policy.normalizer.update(3.0 + 2.0 * torch.randn(100, 3))  # type: ignore[operator]
-    run.save(1, policy, {})
+    run.save(content(1, policy), {})
     for given in (run, run.folder, str(run.folder), run.checkpoint):
         loaded = load(given)
         obs = torch.randn(5, 3)
@@ -98,7 +110,7 @@ def test_a_failed_save_keeps_the_old_checkpoint(run: Run) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))
     try:
         with pytest.raises(OSError, match="File too large"):
-            run.save(1, GaussianPolicy(3, 2), {})
+            run.save(content(1, GaussianPolicy(3, 2)), {})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert run.checkpoint.read_bytes() == before
@@ -106,7 +118,7 @@ def test_a_failed_save_keeps_the_old_checkpoint(run: Run) -> None:
 
 
 def test_a_checkpoint_keeps_the_one_before_it(run: Run, caplog: pytest.LogCaptureFixture) -> None:
-    run.save(1, GaussianPolicy(3, 2), {"counter": 6})
+    run.save(content(1, GaussianPolicy(3, 2)), {"counter": 6})
     assert run.read()["iteration"] == 1
     run.checkpoint.write_bytes(b"PK half")
     assert run.read()["iteration"] == 0 and f"{run.previous}, of iteration 0, is used instead" in caplog.text

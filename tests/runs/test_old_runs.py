@@ -9,9 +9,10 @@ import torch
 import lyceum_warp as lw
 from lyceum_warp.cli import main
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.training import restore
 
-OLD = Path(__file__).parent.parent / "data" / "old_run"
+DATA = Path(__file__).parent.parent / "data"
+OLD = DATA / "old_run"
+QUIET = ["--no-video", "--no-plot"]
 
 
 @pytest.fixture
@@ -32,7 +33,7 @@ def test_an_old_run_is_evaluated_in_its_own_physics(old_run: Path, capsys: pytes
 
 
 def test_an_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["train", "--resume", str(old_run), "--iterations", "3", "--no-video", "--no-plot"]
+    arguments = ["train", "--resume", str(old_run), "--iterations", "3", *QUIET]
     assert main(arguments) == 0
     assert [row["iteration"] for row in Run.open(old_run).rows()] == [1, 2, 3]
     out = capsys.readouterr().out
@@ -49,9 +50,43 @@ def test_the_value_function_of_an_old_run_keeps_its_scale(gamma: float, old_run:
     saved = run.config["npg"] | {"gamma": gamma, "hidden": (8,), "value_hidden": (8,)}
     run.amend(npg=saved)
     npg = lw.NPG(lw.make("hopper", nworld=4, integrator="euler"), config=lw.NPGConfig(**saved))
-    restore(run, npg, run.read())
+    npg.load_state_dict(run.read()["state"])
     obs, step = torch.linspace(-1.0, 1.0, 22).view(2, 11), torch.zeros(2)
     torch.testing.assert_close(npg.value(obs, step), lw.load_value(old_run)(obs, step))
     # before the release that scales to the returns, a prediction was the network's output times this factor
     plain = npg.value.network(obs).squeeze(-1) / (1.0 - gamma)
     torch.testing.assert_close(npg.value(obs, step), plain)
+
+
+@pytest.fixture(params=["command", "python", "task_file"])
+def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A run of two iterations of release 0.1: of the command, of Python with a model of its own, and of a task's file
+    with a model, a mesh and a table, which are only in the run's copy."""
+    return Path(shutil.copytree(DATA / "runs_0_1" / request.param, tmp_path / "run"))
+
+
+def test_a_run_of_0_1_loads_and_is_evaluated(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    policy = lw.load(run)
+    assert policy.act(torch.zeros(2, policy.nobs)).shape == (2, policy.nact)
+    assert lw.load_value(run).discount == 0.995
+    assert main(["eval", str(run), "--episodes", "2"]) == 0
+    assert "2 episodes of the mean policy" in capsys.readouterr().out
+
+
+def test_a_run_of_0_1_resumes_and_another_begins_with_it(run: Path, tmp_path: Path) -> None:
+    before = Run.open(run)
+    assert main(["train", "--resume", str(run), "--iterations", "4", *QUIET]) == 0
+    after = Run.open(run)
+    assert [row["iteration"] for row in after.rows()] == [1, 2, 3, 4] and after.read()["iteration"] == 4
+    assert after.config["npg"] == before.config["npg"]
+    out = tmp_path / "out"
+    assert main(["train", "--from", str(run), "--out", str(out), "--iterations", "1", *QUIET]) == 0
+    config = Run.open(out).config
+    assert config["npg"] == before.config["npg"] and config["from"]["iteration"] == 4
+
+
+def test_a_run_of_0_1_resumes_in_python(tmp_path: Path) -> None:
+    run = Path(shutil.copytree(DATA / "runs_0_1" / "command", tmp_path / "run"))
+    config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=2, mean_episodes=2)
+    npg = lw.NPG(lw.make("point_mass", nworld=2, success_distance=0.1), config=config)
+    assert [row["iteration"] for row in lw.train(npg, run, iterations=3, resume=True).rows()] == [1, 2, 3]

@@ -4,16 +4,17 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from training_runs import QUIET, TINY, metrics, refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.cli.arguments import run_options
 from lyceum_warp.env import Env
+from lyceum_warp.runs.configuration import Configuration
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.task_copy import KeptTask, run_env
+from lyceum_warp.runs.task_copy import run_env, task_copy
 
 SOURCE = """
 import warp as wp
@@ -86,6 +87,13 @@ def trained(folder: Path) -> Path:
     return out
 
 
+def env_of(folder: Path) -> Env:
+    """An environment as a run has it."""
+    run = Run.open(folder)
+    saved = Configuration.of(run)
+    return run_env(run, saved.options, saved.params)
+
+
 def returns(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     """The line of returns that eval prints."""
     capsys.readouterr()
@@ -115,6 +123,55 @@ def test_a_run_goes_on_after_its_task_has_moved(folder: Path, capsys: pytest.Cap
         assert Run.open(folder / "warm").config["from"]["run"] == str(out)
     finally:
         shutil.rmtree(folder / "moved")
+
+
+def test_the_copies_are_the_files_byte_for_byte(folder: Path) -> None:
+    mine = folder / "mine"
+    (mine / "robot" / "scene.xml").write_bytes(SCENE.replace("\n", "\r\n").encode() + b"<!-- 1e0 == 1.000 -->")
+    env = lw.make(str(mine / "slide.py"), nworld=1, goal=mine / "goal.npy")
+    run = Run.create(folder / "run", {}, files=task_copy(env)[1])
+    copies = {path.relative_to(run.task_folder).as_posix(): path.read_bytes() for path in run.task_folder.rglob("*.*")}
+    names = ("slide.py", "robot/scene.xml", "robot/parts/block.xml", "meshes/block.obj")
+    assert copies == {name: (mine / name).read_bytes() for name in names} | {
+        "tables/goal.npy": (mine / "goal.npy").read_bytes()
+    }
+
+
+URDF = """<robot name="arm"><mujoco><compiler meshdir="../meshes" strippath="true"/></mujoco>
+<link name="base"/><link name="tip"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>
+</inertial><collision><geometry><mesh filename="package://arm/block.obj"/></geometry></collision></link>
+<joint name="x" type="prismatic"><parent link="base"/><child link="tip"/><axis xyz="1 0 0"/>
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+
+
+@pytest.mark.parametrize("kind", ["attached", "urdf", "python"])
+def test_all_files_of_a_model_are_copied(kind: str, folder: Path) -> None:
+    """Of a model that attaches another one, of a URDF, and of one that was made in Python."""
+    robot = folder / "mine" / "robot"
+    (robot / "arm.urdf").write_text(URDF)
+    (robot / "whole.xml").write_text(
+        '<mujoco><asset><model name="a" file="scene.xml"/></asset><worldbody><frame>'
+        '<attach model="a" body="slider" prefix="a_"/></frame></worldbody></mujoco>'
+    )
+    (robot / "parts" / "block.xml").write_text(PART.replace("<body>", '<body name="slider">'))
+    given: Any = {"attached": robot / "whole.xml", "urdf": robot / "arm.urdf"}.get(kind)
+    if kind == "python":
+        given = mujoco.MjSpec.from_file(str(robot / "scene.xml"))
+    motor = """
+    @staticmethod
+    def edit_model(spec):
+        for joint in spec.joints[: not spec.actuators]:
+            spec.add_actuator(target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+"""
+    (folder / "mine" / "slide.py").write_text(f"import mujoco\n{SOURCE}{motor}")
+    kept, files = task_copy(lw.make(str(folder / "mine" / "slide.py"), nworld=1, model=given))
+    names = {
+        "attached": {"robot/whole.xml", "robot/scene.xml", "robot/parts/block.xml"},
+        "urdf": {"robot/arm.urdf"},
+        "python": {"robot/model.xml"},
+    }[kind]
+    assert files.keys() == names | {"meshes/block.obj", "slide.py"}
+    assert kept["model"] == {"attached": "robot/whole.xml", "urdf": "robot/arm.urdf", "python": "robot/model.xml"}[kind]
 
 
 def test_an_edited_task_is_named_and_the_runs_own_copy_used(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -163,9 +220,9 @@ def test_too_many_modules_are_not_copied(folder: Path, monkeypatch: pytest.Monke
     (folder / "mine" / "slide_goal.py").write_text("GOAL = 0.1\n")
     (folder / "mine" / "slide.py").write_text(f"import slide_goal\n{SOURCE}")
     env = lw.make(str(folder / "mine" / "slide.py"), nworld=1)
-    assert "slide_goal.py" in KeptTask.of(env).files
+    assert "slide_goal.py" in task_copy(env)[1]
     monkeypatch.setattr("lyceum_warp.runs.task_copy._LARGEST_MODULES", 5)
-    assert "slide.py" in KeptTask.of(env).files and "slide_goal.py" not in KeptTask.of(env).files
+    assert "slide.py" in task_copy(env)[1] and "slide_goal.py" not in task_copy(env)[1]
 
 
 def test_an_edited_model_is_named_and_the_runs_own_copy_used(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -198,13 +255,13 @@ def test_a_run_that_begins_with_another_uses_its_copy_of_the_model(
     arguments = ["train", "--from", str(out), "--out", str(warm), *QUIET, "--iterations"]
     assert cli.main([*arguments, "1"]) == 0
     refused(capsys, f"{line}: the run's own copy is used, {out / 'task' / 'robot' / 'scene.xml'}")
-    env = run_env(Run.open(warm), *run_options(Run.open(warm).config))
+    env = env_of(warm)
     assert np.array_equal(env.model.body_mass, masses)
     assert cli.main(["train", "--resume", str(warm), "--iterations", "2", *QUIET]) == 0
     if not moved:  # a task that is named is used as it is now
         arguments[4] = str(folder / "new")
         assert cli.main([*arguments, "1", str(folder / "mine" / "slide.py")]) == 0
-        env = run_env(Run.open(folder / "new"), *run_options(Run.open(folder / "new").config))
+        env = env_of(folder / "new")
         assert env.model.body_mass[-1] == 9.0
 
 
