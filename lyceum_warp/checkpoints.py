@@ -24,7 +24,7 @@ PolicyContent = dict[str, Any]
 """A policy and a value function as they are saved: ``iteration``, ``policy``, and ``value`` if there is one."""
 
 
-def policy_content(iteration: int, policy: GaussianPolicy, value: ValueFunction | None = None) -> PolicyContent:
+def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> PolicyContent:
     """A copy of a policy and of a value function on the CPU.
 
     Args:
@@ -36,7 +36,7 @@ def policy_content(iteration: int, policy: GaussianPolicy, value: ValueFunction 
     for name, module in (("policy", policy), ("value", value)):
         if module is not None:
             content[name] = {
-                "shape": module.shape,
+                "shape": getattr(module, "shape", None),
                 "state": {key: tensor.detach().cpu().clone() for key, tensor in module.state_dict().items()},
             }
     return content

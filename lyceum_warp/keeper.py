@@ -75,12 +75,12 @@ class Keeper:
 
     def return_of(self, iteration: Iteration) -> float | None:
         """The return by which policies are compared, where the iteration has one."""
-        number = iteration.mean_return if self._by_mean else iteration.return_mean
+        number: float | None = getattr(iteration, self.learner.best_by)
         return None if number is None or not math.isfinite(number) else number
 
     @property
     def _by_mean(self) -> bool:
-        return self.learner.config.mean_every > 0
+        return self.learner.best_by == "mean_return"
 
     def take(self, state: dict[str, Any]) -> None:
         """Make the algorithm's present state the boundary."""
@@ -117,17 +117,13 @@ class Keeper:
             # the iteration's own episodes were sampled with the policy before its step
             self._best_content = self._latest if self._by_mean else before
             self._best = self._best_content["iteration"], score
-            self.run.save_best(self._best_content, self._score_name, score)
+            self.run.save_best(self._best_content, self.learner.best_by, score)
         if not renewed:
             return
         self.iteration, self._state, self._content = self.learner.iteration, state, self._latest
         self.run.save_policy(self._content, number=bool(self.keep_every) and self.iteration % self.keep_every == 0)
         self._policy_when = time.perf_counter()
         self._policy_seconds = self._policy_when - start
-
-    @property
-    def _score_name(self) -> str:
-        return "mean_return" if self._by_mean else "return_mean"
 
     def note_target(self, iteration: Iteration, reached: float) -> None:
         """Note in the configuration that the run reached its return."""
@@ -209,7 +205,7 @@ class Keeper:
                 path.write_bytes(content)
             self._write_table(run)
             if self._best_content is not None and self._best is not None:
-                run.save_best(self._best_content, self._score_name, self._best[1])
+                run.save_best(self._best_content, self.learner.best_by, self._best[1])
             run.save_policy(self._content)
             if whole:
                 complete = self._complete if self._state is None else (self._content, self._state)

@@ -238,7 +238,7 @@ class PPO(Learner):
             mean = self._evaluate_mean(self.policy)
         timer.mark()
 
-        statistics = episode_statistics(episodes)
+        statistics: dict[str, Any] = episode_statistics(episodes)
         if self.env.task.functions["success"] is None:
             statistics["success"], mean["mean_success"] = math.nan, None
         time_sample, time_update, time_mean = timer.seconds()
@@ -260,7 +260,7 @@ class PPO(Learner):
             time_update=time_update,
             time_mean=time_mean,
             samples_per_second=self.count / time_sample,
-            metrics=metric_means(sum(part.episodes for part in episodes), others, self.env.metrics),
+            metrics=metric_means(sum(part.episodes for part in episodes), others, list(self.env.metrics)),
         )
 
     @torch.no_grad()
@@ -388,7 +388,8 @@ class PPO(Learner):
         """Returns of the episodes of all processes that ended in the iteration and count, in the order of the steps."""
         ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
         ended = self.team.gather(ended.T).T
-        return ended[~ended.isnan()].tolist()  # type: ignore[no-any-return]
+        found: list[float] = ended[~ended.isnan()].tolist()
+        return found
 
     def settings(self) -> dict[str, Any]:
         """The hyperparameters, with the sizes of the networks, as a run's config.json holds them."""

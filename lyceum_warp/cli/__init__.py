@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from lyceum_warp.cli.algorithms import refuse_rsl_rl
 from lyceum_warp.cli.bench import Bench, bench
 from lyceum_warp.cli.check import Check, check
 from lyceum_warp.cli.evaluate import Eval, evaluate_run
@@ -62,6 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv, rest = (argv[:2], argv[2:]) if argv[:1] == ["bench"] else (argv, [])
     try:
         with signals():
+            refuse_rsl_rl(argv)
             command = _parse(argv)
             if isinstance(command, Bench):
                 return bench(command, rest)

@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from lyceum_warp.algos.learner import Iteration
-from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.policy import Policy
 from lyceum_warp.control.control_report import ControlReport
 from lyceum_warp.control.episode_collector import ControlProgress
 from lyceum_warp.control.trajectory import Trajectory
@@ -67,20 +67,21 @@ class Display:
         if it.mean_return is not None:
             self.mean = it.mean_return
         shown = self.mean if self.console.is_terminal else math.nan if it.mean_return is None else self.mean
-        # until an episode has ended, the reward shows how the policy does
-        result = f"reward {it.reward_mean:.3g} a step" if math.isnan(it.return_mean) else f"return {it.return_mean:.4g}"
-        mean = "" if math.isnan(shown) else f"(mean policy {shown:.4g})"
-        success = "" if math.isnan(it.success) else f"success {it.success:.0%}"
         row = it.row()
+        # until an episode has ended, the reward shows how the policy does
+        reward = "" if _missing(row, "reward_mean") else f"reward {row['reward_mean']:.3g} a step"
+        result = reward if _missing(row, "return_mean") else f"return {row['return_mean']:.4g}"
+        mean = "" if math.isnan(shown) else f"(mean policy {shown:.4g})"
+        success = "" if _missing(row, "success") else f"success {row['success']:.0%}"
         bad = [counted(row.get(column, 0), what) for column, what in _COUNTED.items()]
-        rate = f"{it.samples_per_second / 1000:.3g}k"
+        rate = "" if _missing(row, "samples_per_second") else f"{row['samples_per_second'] / 1000:.3g}k samples/s"
         if self.console.is_terminal:
-            most = [result, mean, success, *bad, f"{rate}/s"]
+            most = [result, mean, success, *bad, rate.replace(" samples", "")]
             less = (most[:-1], [result, success, *bad], [result, *bad])
             text = _first_that_fits([most, *less], self.console.width - _BAR_WIDTH)
             self.progress.update(self.bar, completed=it.iteration, text=text)
         else:
-            text = _first_that_fits([[result, mean, success, *bad, f"{rate} samples/s"]], 1)
+            text = _first_that_fits([[result, mean, success, *bad, rate]], 1)
             self.console.print(f"iteration {it.iteration:4d}/{self.total}  {text}", soft_wrap=True)
             sys.stdout.flush()
 
@@ -147,7 +148,7 @@ def _spread(rows: list[dict[str, float | None]]) -> list[dict[str, float | None]
     """At most 15 rows, with the first and the last; where at least 5 have an evaluation, only those between them."""
     if sum(row.get("mean_return") is not None for row in rows) >= 5:
         ends = (0, len(rows) - 1)
-        rows = [row for i, row in enumerate(rows) if i in ends or row["mean_return"] is not None]
+        rows = [row for i, row in enumerate(rows) if i in ends or row.get("mean_return") is not None]
     if len(rows) <= _TABLE_ROWS:
         return rows
     return [rows[round(i * (len(rows) - 1) / (_TABLE_ROWS - 1))] for i in range(_TABLE_ROWS)]
@@ -175,7 +176,7 @@ def plotted(run: Run) -> str:
     return tried(draw)
 
 
-def policy_video(env: Env, policy: GaussianPolicy, path: Path, seed: int, *, camera: CameraChoice = None) -> str:
+def policy_video(env: Env, policy: Policy, path: Path, seed: int, *, camera: CameraChoice = None) -> str:
     """Write a video of an episode under a policy; returns its path, or the reason why there is none.
 
     Args:

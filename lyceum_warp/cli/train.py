@@ -18,7 +18,7 @@ from lyceum_warp.algos.learner import Iteration, Learner, fitted_config
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.checkpoints import PolicyContent, check_sizes, policy_of, read_checkpoint, value_of
-from lyceum_warp.cli.algorithms import ALGORITHMS, Algorithm, AlgorithmName, NPGOptions, RslRlOptions
+from lyceum_warp.cli.algorithms import ALGORITHMS, AlgorithmName, LearnerFlags, flag, run_algorithm
 from lyceum_warp.cli.arguments import (
     NO_FLAGS,
     CameraWords,
@@ -61,7 +61,7 @@ _FINAL_EPISODES = 32
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Train:
-    """Train a policy on a task, with the natural policy gradient or with rsl_rl's PPO.
+    """Train a policy on a task, with the natural policy gradient or with PPO.
 
     The run's folder then holds config.json, versions.json, metrics.csv (one row for each iteration), policy.pt,
     best.pt, checkpoint.pt, curve.png and video.mp4. Ctrl-C loses at most the current iteration; where iterations are
@@ -73,7 +73,7 @@ class Train:
     $ lyceum-warp train humanoid --device cuda --integrator euler --solver iterations=4
     $ lyceum-warp train --resume runs/mine --iterations 200
     $ lyceum-warp train my_changed_task.py --from runs/mine --which best
-    $ lyceum-warp train hopper --algorithm rsl-rl --iterations 300 --config.learning-rate 3e-4
+    $ lyceum-warp train hopper --algorithm ppo --iterations 300 --learning-rate 3e-4
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
     Processes that torchrun starts share the worlds, also on several machines. With --device cuda each process takes the
@@ -86,8 +86,7 @@ class Train:
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
     algorithm: AlgorithmName = "npg"
-    """npg, the natural policy gradient; or rsl-rl, rsl_rl's PPO, whose hyperparameters begin with --config. and which
-    needs pip install 'lyceum-warp[rsl-rl]'. All other hyperparameters are npg's."""
+    """npg, the natural policy gradient; or ppo, proximal policy optimisation."""
     iterations: int = 100
     """Iterations in total, including those before --resume."""
     seed: int = 0
@@ -139,8 +138,7 @@ class Train:
     """Exit with code 1 unless the trained mean policy's return exceeds this."""
     env: tyro.conf.OmitArgPrefixes[EnvFlags] = dataclasses.field(default_factory=EnvFlags)
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
-    npg: tyro.conf.OmitArgPrefixes[NPGOptions] = dataclasses.field(default_factory=NPGOptions)
-    config: RslRlOptions = dataclasses.field(default_factory=RslRlOptions)
+    learner: tyro.conf.OmitArgPrefixes[LearnerFlags] = dataclasses.field(default_factory=LearnerFlags)
 
 
 def train(options: Train) -> int:
@@ -170,7 +168,8 @@ def _origin(options: Train) -> tuple[PolicyContent, Path] | None:
     if options.from_run is None:
         return None
     run = Run.open(options.from_run)
-    if (algorithm := run.config["algorithm"]) != options.algorithm:
+    found = run_algorithm(run.config)
+    if (algorithm := found[0].name if found else run.config["algorithm"]) != options.algorithm:
         raise ValueError(
             f"the run in {options.from_run} was trained by {algorithm}, and --from begins with a run of the same "
             f"algorithm: leave out --algorithm {options.algorithm}"
@@ -197,15 +196,14 @@ def _config(
         check_tensorboard()
     _check_videos(options)
     find_task(options.task)
-    algorithm, nworld = _algorithm(options), options.nworld
-    algorithm.check(team)
-    hyperparameters = getattr(options, algorithm.flags).checked()
+    algorithm, nworld = ALGORITHMS[options.algorithm], options.nworld
+    hyperparameters = algorithm.config(options.learner)
     settings = checked_settings(
         target_return=options.target_return, keep_every=options.keep_every, save_every=options.save_every
     )
     source = {}
     if origin is not None and options.from_run is not None:
-        hyperparameters = _fitted(algorithm, hyperparameters, *origin)
+        hyperparameters = _fitted(hyperparameters, *origin)
         place = {"run": str(options.from_run.resolve()), "which": options.which, "iteration": origin[0]["iteration"]}
         source = {"from": place}
     if nworld is None:
@@ -237,22 +235,7 @@ def _shown(options: Train) -> dict[str, Any]:
     return {"tensorboard": options.tensorboard, "video_every": options.video_every}
 
 
-def _algorithm(options: Train) -> Algorithm:
-    """The algorithm, without hyperparameters of another one.
-
-    Raises:
-        ValueError: A hyperparameter of another algorithm is given.
-    """
-    algorithm = ALGORITHMS[options.algorithm]
-    for other in ALGORITHMS.values():
-        if other is not algorithm and (names := list(given(getattr(options, other.flags)))):
-            flag = f"{other.prefix}{names[0].replace('_', '-')}"
-            raise ValueError(f"{flag} is a setting of {other.name}, not of {algorithm.name}: leave it out, or give "
-                             f"--algorithm {other.name}")  # fmt: skip
-    return algorithm
-
-
-def _fitted(algorithm: Algorithm, config: Any, content: PolicyContent, path: Path) -> Any:
+def _fitted(config: Any, content: PolicyContent, path: Path) -> Any:
     """Hyperparameters with the sizes and the group of loaded networks.
 
     Raises:
@@ -262,8 +245,9 @@ def _fitted(algorithm: Algorithm, config: Any, content: PolicyContent, path: Pat
     for field in dataclasses.fields(config):
         given, saved = getattr(config, field.name), getattr(fitted, field.name)
         if given != saved:  # the flags' defaults are those of the run
-            flag = f"{algorithm.prefix}{field.name.replace('_', '-')}"
-            raise ValueError(f"the networks in {path} have {field.name} {saved}, not {given}: leave out {flag}")
+            raise ValueError(
+                f"the networks in {path} have {field.name} {saved}, not {given}: leave out {flag(field.name)}"
+            )
     if fitted.value_group is None:  # the new run's own default would be that of its task
         fitted = dataclasses.replace(fitted, value_group=content["value"]["shape"].get("group", "policy"))
     return fitted
@@ -282,11 +266,11 @@ def saved_options(folder: Path) -> Train:
         ValueError: The run's configuration is not one of a training.
     """
     config = Run.open(folder).config
-    algorithm = ALGORITHMS.get(config.get("algorithm", ""))
-    if algorithm is None:
+    found = run_algorithm(config)
+    if found is None:
         raise ValueError(f"{folder / 'config.json'} is not the configuration of a training run")
+    algorithm, entry = found
     try:
-        own = {algorithm.flags: algorithm.options(config[algorithm.name])}
         known, params = run_options(config)
         for name in ("iterations", "seed", "nworld", "threads"):
             if not isinstance(config[name], int):
@@ -298,10 +282,11 @@ def saved_options(folder: Path) -> Train:
             target_return=config.get("target_return"), keep_every=config.get("keep_every", 0),
             save_every=config.get("save_every", 0),
             tensorboard=config.get("tensorboard", False), video_every=config.get("video_every", 0),
-            env=EnvFlags.of(known), physics=Physics.of(known.physics), **own,
+            env=EnvFlags.of(known), physics=Physics.of(known.physics),
+            learner=algorithm.flags(entry),
         )  # fmt: skip
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        text = f"{folder / 'config.json'} is not the configuration of an {algorithm.title} run ({error})"
+        text = f"{folder / 'config.json'} is not the configuration of a run of {algorithm.name} ({error})"
         raise ValueError(text) from error
 
 
@@ -353,8 +338,11 @@ def resume(options: Train, folder: Path) -> int:
 def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, Learner]:
     """A run, and its algorithm in the state of the checkpoint."""
     run = Run.open(folder)
-    if options.algorithm == run.config["algorithm"]:
-        _algorithm(options).check(team)
+    if run.config["algorithm"] not in ALGORITHMS:
+        raise ValueError(
+            f"the run in {folder} was trained by rsl-rl, which ppo has replaced: begin a new run with its policy by "
+            f"train --from {folder} --algorithm ppo"
+        )
     given, saved = (_settings(o) for o in (options, saved_options(folder)))
     for name, value in given.items():
         if value != saved[name]:
@@ -376,13 +364,13 @@ def _reopened(options: Train, folder: Path, team: Team) -> tuple[Run, Learner]:
 
 def _settings(options: Train) -> dict[str, Any]:
     """The settings that a resumed run must keep."""
-    free = ("iterations", "out", "resume", "video", "plot", "require_return", "npg", "config", "param", "env",
+    free = ("iterations", "out", "resume", "video", "plot", "require_return", "learner", "param", "env",
             "physics", "from_run", "which", "target_return", "keep_every", "save_every", "tensorboard",
             "video_every", "camera")  # fmt: skip
     settings = {f.name: getattr(options, f.name) for f in dataclasses.fields(options) if f.name not in free}
     settings["task"] = portable(options.task or "")
     settings["param"] = parameters(options.param, options)
-    hyperparameters = vars(getattr(options, ALGORITHMS[options.algorithm].flags))
+    hyperparameters = vars(ALGORITHMS[options.algorithm].config(options.learner))
     return settings | vars(options.env) | vars(options.physics.options()) | hyperparameters
 
 

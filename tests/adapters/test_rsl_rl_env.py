@@ -14,7 +14,7 @@ from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 import lyceum_warp as lw
-from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
+from lyceum_warp.adapters.rsl_rl_config import runner_config
 from lyceum_warp.adapters.rsl_rl_env import RslRlVecEnv
 
 
@@ -137,7 +137,7 @@ def test_rsl_rls_own_runner_learns(tmp_path: Path) -> None:
     """The best possible return is about 250; a policy that has learned nothing is negative on average."""
     env = lw.make("point_mass", nworld=32)
     few = env.replicate(nworld=16)
-    config = RslRlConfig(hidden=(32, 32), value_hidden=(32, 32)).runner_config(env)
+    config = runner_config(env, lw.PPOConfig(hidden=(32, 32), value_hidden=(32, 32)))
     torch.manual_seed(0)
     runner = OnPolicyRunner(RslRlVecEnv(env), config, str(tmp_path), "cpu")
 
