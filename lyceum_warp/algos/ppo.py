@@ -19,7 +19,7 @@ from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
 from lyceum_warp.algos.learner import Learner, fitted_config
 from lyceum_warp.algos.minibatches import Minibatches, Samples, precision
-from lyceum_warp.algos.networks import trainable
+from lyceum_warp.algos.networks import initialize_as_torch, trainable
 from lyceum_warp.algos.on_policy import (
     EpisodeSums,
     OnPolicyIteration,
@@ -155,6 +155,9 @@ class PPO(Learner):
             env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation, scale=1.0,
             group=group, **options,
         )  # fmt: skip
+        for given, module in ((policy, self.policy), (value, self.value)):
+            if given is None:  # a policy's last layer near zero, as NPG's, lets the adaptive rate begin much higher
+                initialize_as_torch(module, init)
         self.value.discount = config.gamma
         self.policy.to(device)
         self.value.to(device)

@@ -267,6 +267,11 @@ def saved_options(folder: Path) -> Train:
     """
     config = Run.open(folder).config
     found = run_algorithm(config)
+    if found is None and "algorithm" in config:
+        raise ValueError(
+            f"the run in {folder} was trained by {config['algorithm']!r}, a learner of a program: go on there, by "
+            "lw.train(..., resume=True)"
+        )
     if found is None:
         raise ValueError(f"{folder / 'config.json'} is not the configuration of a training run")
     algorithm, entry = found
