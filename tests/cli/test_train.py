@@ -23,8 +23,9 @@ from lyceum_warp import cli
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.cli import display
+from lyceum_warp.cli.algorithms import ALGORITHMS, LearnerFlags, refuse_rsl_rl
 from lyceum_warp.cli.arguments import EnvFlags
-from lyceum_warp.cli.train import NPGOptions, Train, _config, saved_options
+from lyceum_warp.cli.train import Train, _config, saved_options
 from lyceum_warp.runs import Run, load
 from lyceum_warp.viz import drawing
 
@@ -245,7 +246,35 @@ def test_a_run_with_options_among_its_parameters_resumes_and_is_evaluated(
 
 
 def test_every_hyperparameter_has_a_flag_with_its_default() -> None:
-    assert vars(NPGOptions()) == vars(lw.NPGConfig()) and NPGOptions().checked() == lw.NPGConfig()
+    for name, config in (("npg", lw.NPGConfig()), ("ppo", lw.PPOConfig())):
+        assert vars(config).keys() <= vars(LearnerFlags()).keys()
+        assert ALGORITHMS[name].config(LearnerFlags()) == config
+        assert ALGORITHMS[name].config(ALGORITHMS[name].flags(vars(config))) == config
+
+
+def test_a_flag_of_the_other_algorithm_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, message in (
+        (
+            ["--learning-rate", "3"],
+            "--learning-rate is a setting of ppo, not of npg: leave it out, or give --algorithm",
+        ),
+        (["--no-stagger"], "--stagger is a setting of ppo, not of npg"),
+        (["--algorithm", "ppo", "--samples", "9"], "--samples is a setting of npg, not of ppo"),
+    ):
+        assert cli.main(["train", "hopper", *words]) == 2
+        refused(capsys, message)
+
+
+def test_what_replaced_rsl_rl_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, message in (
+        (["--algorithm", "rsl-rl"], "--algorithm rsl-rl is now --algorithm ppo"),
+        (["--algorithm=rsl-rl", "--config.num-steps-per-env", "9"], "--config.num-steps-per-env is --num-steps"),
+        (["--config.no-random-start"], "--config.no-random-start is --stagger"),
+        (["--config.bootstrap=before"], "it has no --config.bootstrap"),
+    ):
+        assert cli.main(["train", "hopper", *words]) == 2
+        refused(capsys, message, "docs/ppo.md")
+    refuse_rsl_rl(["train", "hopper", "--out", "runs/rsl-rl-like"])
 
 
 @pytest.mark.parametrize("change, words", [
@@ -259,7 +288,7 @@ def test_a_configuration_that_does_not_fit_is_one_line(
     change: Any, words: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(changed_config(trained, tmp_path / "run", change)) == 2
-    refused(capsys, "config.json is not the configuration of an NPG run (", words)
+    refused(capsys, "config.json is not the configuration of a run of npg (", words)
 
 
 def test_a_configuration_of_an_earlier_release_has_the_defaults_of_newer_hyperparameters(
