@@ -11,6 +11,7 @@ import torch
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
+from lyceum_warp.validate import whole_number
 
 METRIC_COLUMN = "metrics/"
 """What the columns of a task's own metrics begin with."""
@@ -86,7 +87,8 @@ class Learner(abc.ABC):
             process alone.
 
     Raises:
-        ValueError: The environment does not reset automatically, or has other worlds than its share.
+        ValueError: The environment does not reset automatically, or has other worlds than its share; or the seed is
+            not a whole number.
     """
 
     algorithm: str
@@ -112,7 +114,7 @@ class Learner(abc.ABC):
     """Samples in all iterations so far."""
 
     def __init__(self, env: Env, *, seed: int = 0, team: Team | None = None) -> None:
-        self.env, self.seed = env, seed
+        self.env, self.seed = env, whole_number("seed", seed, low=0)
         self.team = team = team or Team()
         self.iteration = self.samples = 0
         n = env.nworld

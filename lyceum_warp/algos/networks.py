@@ -67,6 +67,16 @@ def mlp(
     return nn.Sequential(*layers)
 
 
+@torch.no_grad()
+def initialize_as_torch(network: nn.Module, generator: torch.Generator) -> None:
+    """Draw the weights of all linear layers as ``nn.Linear`` does by default: uniform in +-1 / sqrt(inputs)."""
+    for layer in network.modules():
+        if isinstance(layer, nn.Linear):
+            bound = 1.0 / math.sqrt(layer.in_features)
+            layer.weight.uniform_(-bound, bound, generator=generator)
+            layer.bias.uniform_(-bound, bound, generator=generator)
+
+
 LIMIT = 10.0
 """The largest normalised observation, unless another limit is given."""
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from torch import nn
@@ -138,7 +138,11 @@ def divergence(
     return (log_std - old_log_std + 0.5 * square * torch.exp(-2 * log_std) - 0.5).sum(-1)
 
 
-def acting(policy: Any) -> Callable[[torch.Tensor], torch.Tensor]:
+Policy: TypeAlias = nn.Module | Callable[[torch.Tensor], torch.Tensor]
+"""A module with ``act``, or a function from observations to actions."""
+
+
+def acting(policy: Policy) -> Callable[[torch.Tensor], torch.Tensor]:
     """The function from observations to actions without noise: a policy's ``act``, or a function itself."""
     act: Callable[[torch.Tensor], torch.Tensor] = getattr(policy, "act", policy)
     return act

@@ -19,7 +19,7 @@ from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
 from lyceum_warp.algos.learner import Learner, fitted_config
 from lyceum_warp.algos.minibatches import Minibatches, Samples, precision
-from lyceum_warp.algos.networks import trainable
+from lyceum_warp.algos.networks import initialize_as_torch, trainable
 from lyceum_warp.algos.on_policy import (
     EpisodeSums,
     OnPolicyIteration,
@@ -155,6 +155,9 @@ class PPO(Learner):
             env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation, scale=1.0,
             group=group, **options,
         )  # fmt: skip
+        for given, module in ((policy, self.policy), (value, self.value)):
+            if given is None:  # a policy's last layer near zero, as NPG's, lets the adaptive rate begin much higher
+                initialize_as_torch(module, init)
         self.value.discount = config.gamma
         self.policy.to(device)
         self.value.to(device)
@@ -238,7 +241,7 @@ class PPO(Learner):
             mean = self._evaluate_mean(self.policy)
         timer.mark()
 
-        statistics = episode_statistics(episodes)
+        statistics: dict[str, Any] = episode_statistics(episodes)
         if self.env.task.functions["success"] is None:
             statistics["success"], mean["mean_success"] = math.nan, None
         time_sample, time_update, time_mean = timer.seconds()
@@ -260,7 +263,7 @@ class PPO(Learner):
             time_update=time_update,
             time_mean=time_mean,
             samples_per_second=self.count / time_sample,
-            metrics=metric_means(sum(part.episodes for part in episodes), others, self.env.metrics),
+            metrics=metric_means(sum(part.episodes for part in episodes), others, list(self.env.metrics)),
         )
 
     @torch.no_grad()
@@ -388,7 +391,8 @@ class PPO(Learner):
         """Returns of the episodes of all processes that ended in the iteration and count, in the order of the steps."""
         ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
         ended = self.team.gather(ended.T).T
-        return ended[~ended.isnan()].tolist()  # type: ignore[no-any-return]
+        found: list[float] = ended[~ended.isnan()].tolist()
+        return found
 
     def settings(self) -> dict[str, Any]:
         """The hyperparameters, with the sizes of the networks, as a run's config.json holds them."""

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from lyceum_warp import training
 from lyceum_warp.algos.learner import Iteration, Learner
+from lyceum_warp.algos.policy import Policy
 from lyceum_warp.control.control_report import ControlReport
 from lyceum_warp.control.episode_collector import ControlProgress
 from lyceum_warp.control.trajectory import Trajectory
@@ -180,7 +181,7 @@ def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
         return f"none: {one_line(error)}"
 
 
-def policy_video(env: Env, policy: torch.nn.Module, path: Path, seed: int, *, camera: CameraChoice = None) -> Path:
+def policy_video(env: Env, policy: Policy, path: Path, seed: int, *, camera: CameraChoice = None) -> Path:
     """Write a video of an episode under a policy; returns its path.
 
     Args:

@@ -9,7 +9,7 @@ import tyro
 from rich.table import Table
 
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
-from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.binding.registry import find_task, task_name
 from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, Repeated, given, optional_flags, parameters
 from lyceum_warp.cli.display import make_console, note, policy_video, tried
@@ -137,13 +137,13 @@ class Eval:
         return 0
 
 
-def _save_episodes(env: Env, policy: GaussianPolicy, options: Eval, source: dict[str, Any]) -> str:
+def _save_episodes(env: Env, policy: Policy, options: Eval, source: dict[str, Any]) -> str:
     """Run the same episodes again, and write a file of each; returns what names them all."""
     assert options.episodes_to is not None
-    whose = {"run": str(options.folder.resolve()), "which": options.which}
+    whose = {"name": type(policy).__name__, "run": str(options.folder.resolve()), "which": options.which}
     with LongWork("running the episodes that are saved", "steps", make_console()) as work:
         episodes = policy_episodes(
-            env.replicate(autoreset=False), policy, options.episodes, seed=evaluation_seed(options.seed),
+            env.replicate(autoreset=False), acting(policy), options.episodes, seed=evaluation_seed(options.seed),
             controller=whose, progress=work,
         )  # fmt: skip
         for number, episode in enumerate(episodes):

@@ -166,7 +166,13 @@ class Train:
         for name, flag in _KEPT.items():
             if getattr(self, name) is not None:
                 raise ValueError(f"{flag} has no effect with --resume, which continues a run as it is: leave it out")
-        return Run.open(self.resume)
+        run = Run.open(self.resume)
+        if run.config.get("algorithm") == "rsl-rl":
+            raise ValueError(
+                f"the run in {self.resume} was trained by rsl-rl, which ppo has replaced: begin a new run with its "
+                f"policy (train --from {self.resume})"
+            )
+        return run
 
     def configuration(self, source: Run | None, team: Team) -> Configuration:
         """What is trained: what the flags say, on top of the configuration of another run, or of the defaults."""
@@ -185,9 +191,8 @@ class Train:
         algorithm = self.algorithm or base.algorithm
         if source is not None and algorithm not in ALGORITHMS:
             raise ValueError(
-                f"the run in {source.folder} was trained by {algorithm!r}, which this command does not know: begin a "
-                f"new run with its policy (--from {source.folder} --algorithm ppo), or, if it is a learner of a "
-                "program, continue it there with lw.train(..., resume=True)"
+                f"the run in {source.folder} was trained by {algorithm!r}, a learner of a program: go on there, by "
+                "lw.train(..., resume=True)"
             )
         known = base.hyperparameters if algorithm == base.algorithm else None
         return dataclasses.replace(

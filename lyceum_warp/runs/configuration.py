@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,14 @@ log = logging.getLogger(__name__)
 ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig)}
 """The algorithms that the command line and config.json know by name: the class of the learner, and of its
 hyperparameters."""
+
+
+_RSL_RL = {
+    "num_steps_per_env": "num_steps", "num_learning_epochs": "epochs", "num_mini_batches": "minibatches",
+    "clip_param": "clip", "use_clipped_value_loss": "clip_value_loss", "value_loss_coef": "value_coef",
+    "normalize_advantage_per_mini_batch": "whiten_minibatches", "random_start": "stagger",
+}  # fmt: skip
+"""Hyperparameters of the former algorithm rsl-rl that ppo calls otherwise."""
 
 
 def algorithm_of(name: str) -> tuple[Any, Any]:
@@ -91,7 +100,7 @@ class Configuration:
 
     @classmethod
     def of(cls, run: Run) -> "Configuration":
-        """Read the configuration of a run.
+        """Read the configuration of a run. A run of the former algorithm rsl-rl is read as one of ppo.
 
         Raises:
             ValueError: A value is missing or not valid.
@@ -102,10 +111,16 @@ class Configuration:
             words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
             base = EnvOptions(**{name: config[name] for name in ("engine", "device", "nworld", "seed")})
             options, params = EnvOptions.split(words, base)
-            name = config["algorithm"]
+            name: str = config["algorithm"]
+            entry: Any = config.get(name)
+            if name == "rsl-rl":  # of an earlier release
+                renamed = {_RSL_RL.get(old, old): value for old, value in entry.items()}
+                known = {field.name for field in dataclasses.fields(PPOConfig)}
+                init = {"log_std": math.log(entry.get("init_std", 1.0))}
+                name, entry = "ppo", {new: value for new, value in renamed.items() if new in known} | init
             return cls(
                 task=config["task"], params=params, options=options, algorithm=name,
-                hyperparameters=ALGORITHMS[name][1](**config[name]) if name in ALGORITHMS else None,
+                hyperparameters=ALGORITHMS[name][1](**entry) if name in ALGORITHMS else None,
                 seed=config.get(f"{name}_seed"), threads=config["threads"],
             )  # fmt: skip
         except (KeyError, TypeError, AttributeError, ValueError) as error:

@@ -6,17 +6,12 @@ import os
 import platform
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import torch
 
 _PACKAGES = ("lyceum-warp", "mujoco", "mujoco-warp", "warp-lang", "torch", "numpy", "gymnasium")
-
-
-_WHERE_USED = {"rsl_rl": "rsl-rl-lib"}
-"""Packages that are named where a program has imported them, by their modules."""
 
 
 def versions(device: str = "cpu") -> dict[str, Any]:
@@ -26,7 +21,7 @@ def versions(device: str = "cpu") -> dict[str, Any]:
         device: Device of the run; a CUDA device adds the names of the GPU and of the CUDA version.
     """
     found: dict[str, Any] = {}
-    for package in (*_PACKAGES, *(package for module, package in _WHERE_USED.items() if module in sys.modules)):
+    for package in _PACKAGES:
         try:
             found[package.replace("-", "_")] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:

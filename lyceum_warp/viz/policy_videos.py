@@ -10,7 +10,7 @@ import torch
 from lyceum_warp.algos.evaluation import evaluation_worlds
 from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.algos.networks import moved
-from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.policy import Policy
 from lyceum_warp.env import Env
 from lyceum_warp.viz.cameras import CameraChoice
 from lyceum_warp.viz.tensorboard import TensorBoard
@@ -22,9 +22,7 @@ NamedProgress: TypeAlias = Callable[[str, str, int, int], object]
 """Called with what is done, the unit in which it is counted, how much is done, and how much there is in all."""
 
 
-def policy_states(
-    env: Env, policy: GaussianPolicy, seed: int, *, progress: Progress | None = None
-) -> tuple[Env, torch.Tensor]:
+def policy_states(env: Env, policy: Policy, seed: int, *, progress: Progress | None = None) -> tuple[Env, torch.Tensor]:
     """Run an episode of a policy in a world of its own; returns its environment, and the states for ``write_video``.
 
     Args:
@@ -34,7 +32,8 @@ def policy_states(
         progress: Called now and then with the number of steps so far and the horizon.
     """
     one = evaluation_worlds(env, 1, autoreset=False)
-    return one, episode(one, moved(policy, one), seed=seed, progress=progress)
+    policy = moved(policy, one) if isinstance(policy, torch.nn.Module) else policy
+    return one, episode(one, policy, seed=seed, progress=progress)
 
 
 class Videos:

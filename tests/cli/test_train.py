@@ -240,6 +240,19 @@ def test_every_hyperparameter_has_a_flag(algorithm: str) -> None:
     assert changed.on_top_of(config(hidden=(3,)), algorithm) == config(hidden=(3,), gamma=0.5, normalize=False)
 
 
+def test_a_flag_of_the_other_algorithm_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, message in (
+        (
+            ["--learning-rate", "3"],
+            "--learning-rate is a setting of ppo, not of npg: leave it out, or give --algorithm",
+        ),
+        (["--no-stagger"], "--stagger is a setting of ppo, not of npg"),
+        (["--algorithm", "ppo", "--samples", "9"], "--samples is a setting of npg, not of ppo"),
+    ):
+        assert cli.main(["train", "hopper", *words]) == 2
+        refused(capsys, message)
+
+
 def test_hyperparameters_are_shown_by_help_with_their_algorithms(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main(["train", "--help"])
@@ -314,8 +327,6 @@ def test_train_refuses_to_overwrite_a_run(trained: Path, capsys: pytest.CaptureF
         ("point_mass", ["--iterations", "0"], ["iterations", "not 0"]),
         ("point_mass", ["--seed", "-1"], ["seed", "-1"]),
         ("point_mass", ["--algorithm", "rsl-rl"], ["no algorithm 'rsl-rl'", "npg or ppo"]),
-        ("point_mass", ["--algorithm", "ppo"], ["--samples is a setting of npg, not of ppo", "--algorithm npg"]),
-        ("point_mass", ["--num-steps", "9"], ["--num-steps is a setting of ppo, not of npg", "--algorithm ppo"]),
         ("point_mass", ["--gamma", "1.5"], ["gamma must be", "from 0 to 1, not 1.5"]),
         ("point_mass", ["--log-std", "nan"], ["log_std must be", "not nan"]),
         ("point_mass", ["--hidden", "8", "0"], ["hidden must be", "not (8, 0)"]),

@@ -89,7 +89,7 @@ def test_a_module_of_the_package_is_made_again_by_its_class_and_its_shape(tmp_pa
     run = Run.create(tmp_path / "run", {})
     run.save(policy_content(1, ValueFunction(3, (4,))), {})
     loaded = load(run)
-    assert isinstance(loaded, ValueFunction) and loaded.shape["hidden"] == (4,)
+    assert isinstance(loaded, ValueFunction) and list(loaded.shape["hidden"]) == [4]
 
 
 @pytest.mark.parametrize("name", ["os.system", "lyceum_warp.cli.main", "lyceum_warp.runs.folder.Run"])

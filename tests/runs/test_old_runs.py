@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from training_runs import refused
 
 import lyceum_warp as lw
 from lyceum_warp.cli import main
@@ -12,6 +13,7 @@ from lyceum_warp.runs.folder import Run
 
 DATA = Path(__file__).parent.parent / "data"
 OLD = DATA / "old_run"
+RSL_RL = DATA / "rsl_rl_run"
 QUIET = ["--no-video", "--no-plot"]
 
 
@@ -90,3 +92,42 @@ def test_a_run_of_0_1_resumes_in_python(tmp_path: Path) -> None:
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=2, mean_episodes=2)
     npg = lw.NPG(lw.make("point_mass", nworld=2, success_distance=0.1), config=config)
     assert [row["iteration"] for row in lw.train(npg, run, iterations=3, resume=True).rows()] == [1, 2, 3]
+
+
+@pytest.fixture
+def rsl_rl_run(tmp_path: Path) -> Path:
+    """A run of the former algorithm rsl-rl, by rsl_rl's PPO."""
+    return Path(shutil.copytree(RSL_RL, tmp_path / "rsl_rl"))
+
+
+def test_a_run_of_rsl_rl_loads_is_evaluated_and_exported(rsl_rl_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    policy, value = lw.load(rsl_rl_run), lw.load_value(rsl_rl_run)
+    obs = torch.linspace(-9.0, 9.0, 12).view(2, 6)
+    assert policy.act(obs).shape == (2, 2) and value(obs, torch.zeros(2)).shape == (2,)
+    assert policy.normalizer.count == 96 and value.discount == 0.99
+    assert main(["eval", str(rsl_rl_run), "--episodes", "2"]) == 0
+    assert "point_mass: 2 episodes of the mean policy" in capsys.readouterr().out
+    assert main(["export", str(rsl_rl_run), "--to", str(rsl_rl_run / "policy.pt2")]) == 0
+    exported = torch.export.load(rsl_rl_run / "policy.pt2").module()
+    torch.testing.assert_close(exported(obs), policy(obs))
+
+
+def test_ppo_begins_with_a_run_of_rsl_rl(rsl_rl_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With its settings, by their new names."""
+    out = tmp_path / "new"
+    assert main(["train", "--from", str(rsl_rl_run), "--iterations", "1", "--out", str(out), *QUIET]) == 0
+    run = Run.open(out)
+    assert run.config["algorithm"] == "ppo" and run.config["from"]["iteration"] == 2
+    settings = run.config["ppo"]
+    assert (settings["num_steps"], settings["hidden"], settings["log_std"], settings["epochs"]) == (12, [8], 0.0, 5)
+    new, old = lw.load(out), lw.load(rsl_rl_run)
+    assert new.normalizer.count == 96 + 48
+    change = (new.network[0].weight - old.network[0].weight).abs().max()
+    assert 0.0 < change < 0.1
+    ppo = lw.PPO(lw.make("point_mass", nworld=4), old, lw.load_value(rsl_rl_run), lw.PPOConfig(num_steps=12))
+    assert next(ppo).kl > 0.0  # in Python, too
+
+
+def test_a_run_of_rsl_rl_is_not_resumed(rsl_rl_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "--resume", str(rsl_rl_run), "--iterations", "5"]) == 2
+    refused(capsys, "was trained by rsl-rl, which ppo has replaced", f"train --from {rsl_rl_run}")

@@ -138,7 +138,8 @@ def test_the_copies_are_the_files_byte_for_byte(folder: Path) -> None:
 
 
 URDF = """<robot name="arm"><mujoco><compiler meshdir="../meshes" strippath="true"/></mujoco>
-<link name="base"/><link name="tip"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>
+<link name="base"/><link name="tip"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>
 </inertial><collision><geometry><mesh filename="package://arm/block.obj"/></geometry></collision></link>
 <joint name="x" type="prismatic"><parent link="base"/><child link="tip"/><axis xyz="1 0 0"/>
 <limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
