@@ -11,15 +11,11 @@ def _default(name: str) -> str:
     """Which algorithms have a hyperparameter, and its default in each."""
     texts = []
     for algorithm, (_, config) in ALGORITHMS.items():
-        if name in _names(config):
+        if name in config.__dataclass_fields__:
             value = getattr(config, name)
             words = " ".join(map(str, value)) if isinstance(value, tuple) else "" if value is None else str(value)
             texts.append(f"{algorithm} {words}".strip())
     return f"({', '.join(texts)})"
-
-
-def _names(config: type) -> list[str]:
-    return [field.name for field in dataclasses.fields(config)]
 
 
 @optional_flags(*(config for _, config in ALGORITHMS.values()), default=_default)
@@ -37,8 +33,10 @@ class Hyperparameters:
             ValueError: A value is not valid, or belongs to another algorithm.
         """
         values, (_, kind) = given(self), algorithm_of(algorithm)
-        for name in values.keys() - set(_names(kind)):
-            fitting = " or ".join(other for other, (_, config) in ALGORITHMS.items() if name in _names(config))
+        for name in values.keys() - kind.__dataclass_fields__.keys():
+            fitting = " or ".join(
+                other for other, (_, config) in ALGORITHMS.items() if name in config.__dataclass_fields__
+            )
             raise ValueError(
                 f"--{name.replace('_', '-')} is a setting of {fitting}, not of {algorithm}: leave it out, or give "
                 f"--algorithm {fitting}"

@@ -60,14 +60,11 @@ class Display(training.Display):
         processes = f" each in {size} processes" if size > 1 else ""
         self.console.print(
             f"[bold]{env.task.name}[/]: {env.obs_space.size} observations, {env.action_space.size} actions; "
-            f"{env.nworld} worlds{processes}, {env.engine.name} engine on {env.options.device}, {learner.algorithm}; "
-            f"run in {run.folder}", soft_wrap=True,
+            f"{env.nworld} worlds{processes}, {env.engine.name} engine on {env.options.device or 'cpu'}, "
+            f"{learner.algorithm}; run in {run.folder}", soft_wrap=True,
         )  # fmt: skip
-        self.start(learner.iteration, iterations)
-
-    def start(self, done: int, total: int) -> None:
-        """Show the bar: so many complete iterations, of so many in all."""
-        self.total, self.bar = total, self.progress.add_task("", total=total, completed=done, text="")
+        self.total = iterations
+        self.bar = self.progress.add_task("", total=iterations, completed=learner.iteration, text="")
         self.progress.start()
 
     def end(self) -> None:
@@ -93,11 +90,13 @@ class Display(training.Display):
         rate = "" if _missing(row, "samples_per_second") else f"{row['samples_per_second'] / 1000:.3g}k samples/s"
         if self.console.is_terminal:
             most = [result, mean, success, *bad, rate.replace(" samples", "")]
-            less = (most[:-1], [result, success, *bad], [result, *bad])
-            text = _first_that_fits([most, *less], self.console.width - _BAR_WIDTH)
+            for parts in (most, most[:-1], [result, success, *bad], [result, *bad]):
+                text = " ".join(filter(None, parts))
+                if len(text) <= self.console.width - _BAR_WIDTH:
+                    break
             self.progress.update(self.bar, completed=it.iteration, text=text)
         else:
-            text = _first_that_fits([[result, mean, success, *bad, rate]], 1)
+            text = " ".join(filter(None, [result, mean, success, *bad, rate]))
             self.console.print(f"iteration {it.iteration:4d}/{self.total}  {text}", soft_wrap=True)
             sys.stdout.flush()
 
@@ -118,12 +117,6 @@ _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skippe
 
 _BAR_WIDTH = 36
 """Columns that the bar, the number of the iteration and the times take."""
-
-
-def _first_that_fits(lines: list[list[str]], width: int) -> str:
-    """The first of some lines, each given in parts, that fits into a width; the last one if none does."""
-    texts = [" ".join(part for part in parts if part) for parts in lines]
-    return next((text for text in texts if len(text) <= width), texts[-1])
 
 
 def counted(number: int, what: str) -> str:

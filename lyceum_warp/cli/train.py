@@ -139,7 +139,16 @@ class Train:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        source = self._source()
+        if self.resume is not None:
+            for name, flag in _KEPT.items():
+                if getattr(self, name) is not None:
+                    raise ValueError(
+                        f"{flag} has no effect with --resume, which continues a run as it is: leave it out"
+                    )
+        elif self.from_run is None and self.task is None:
+            raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
+        folder = self.resume or self.from_run
+        source = None if folder is None else Run.open(folder)
         saved = {} if source is None else source.config
         settings = {name: value if (value := getattr(self, name)) is not None else saved.get(name, default)
                     for name, default in _SETTINGS.items()}  # fmt: skip
@@ -151,28 +160,6 @@ class Train:
             with team.together():  # every mistake in the options is found before the folder is made
                 learner, folder, entries = self._learner(source, team)
             return self._train(learner, folder, settings, entries)
-
-    def _source(self) -> Run | None:
-        """The run that is continued, or from which another one begins.
-
-        Raises:
-            FileNotFoundError: There is no run.
-            ValueError: A flag does not fit.
-        """
-        if self.resume is None:
-            if self.from_run is None and self.task is None:
-                raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
-            return None if self.from_run is None else Run.open(self.from_run)
-        for name, flag in _KEPT.items():
-            if getattr(self, name) is not None:
-                raise ValueError(f"{flag} has no effect with --resume, which continues a run as it is: leave it out")
-        run = Run.open(self.resume)
-        if run.config.get("algorithm") == "rsl-rl":
-            raise ValueError(
-                f"the run in {self.resume} was trained by rsl-rl, which ppo has replaced: begin a new run with its "
-                f"policy (train --from {self.resume})"
-            )
-        return run
 
     def configuration(self, source: Run | None, team: Team) -> Configuration:
         """What is trained: what the flags say, on top of the configuration of another run, or of the defaults."""
@@ -189,10 +176,15 @@ class Train:
             words["solver"] = {**solver, **words["solver"]}
         other = source is not None and self.task is not None and task_name(find_task(self.task)) != source.task_name
         algorithm = self.algorithm or base.algorithm
-        if source is not None and algorithm not in ALGORITHMS:
+        if source is not None and self.algorithm is None and algorithm not in ALGORITHMS:
             raise ValueError(
                 f"the run in {source.folder} was trained by {algorithm!r}, a learner of a program: go on there, by "
                 "lw.train(..., resume=True)"
+            )
+        if source is not None and self.resume is not None and (old := source.config["algorithm"]) != algorithm:
+            raise ValueError(
+                f"the run in {source.folder} was trained by {old}, which {algorithm} has replaced: begin a new run "
+                f"with its policy (train --from {source.folder})"
             )
         known = base.hyperparameters if algorithm == base.algorithm else None
         return dataclasses.replace(
@@ -218,12 +210,12 @@ class Train:
         own = source if self.task is None else None  # a task that is named is used as it is now
         learner = configuration.learner(team, run=own, networks=(policy, value), note=says)
         if policy is not None:
-            settings = learner.settings()
-            for name, number in given(self.hyperparameters).items():
-                if settings[name] != number:
+            fitted = type(learner.config)(**learner.settings())
+            for name, value in given(self.hyperparameters).items():
+                if (found := getattr(fitted, name)) != value:
                     raise ValueError(
-                        f"the networks in {self.from_run or self.resume} have {name} {settings[name]}, not {number}: "
-                        f"leave out --{name.replace('_', '-')}"
+                        f"the networks in {self.from_run or self.resume} have {name} {found}, not {value}: leave out "
+                        f"--{name.replace('_', '-')}"
                     )
         if own is not None and self.resume is None:
             note_changes(own, learner.env, note=says)

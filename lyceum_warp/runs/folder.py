@@ -3,7 +3,6 @@
 import contextlib
 import json
 import logging
-import os
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -231,9 +230,11 @@ class Run:
 
     def best_score(self) -> tuple[int, float] | None:
         """The iteration and the score of the best policy; None if there is none."""
+        if not self.best.is_file():
+            return None
         try:
             content = read_checkpoint(self.best, parts=("iteration", "policy", "score"))
-        except (ValueError, FileNotFoundError):
+        except ValueError:
             return None
         return content["iteration"], content["score"]["value"]
 
@@ -249,10 +250,8 @@ class Run:
             state: The state of the algorithm: tensors, numbers, strings and containers of them.
         """
         write_content(self.policy, content)
-        with replaced(self.checkpoint, durable=True) as temporary:
+        with replaced(self.checkpoint, durable=True, previous=self.previous) as temporary:
             temporary.write_bytes(serialized({**content, "state": dict(state)}))
-            if self.checkpoint.exists():
-                _keep(self.checkpoint, self.previous)
 
     def read(self, device: str | torch.device = "cpu", *, note: Callable[[str], None] = log.warning) -> dict[str, Any]:
         """Read the checkpoint: ``iteration``, ``policy``, ``state``, and ``value`` if there is one.
@@ -335,14 +334,3 @@ def _content(run: str | Path | Run, which: str | int, device: str | torch.device
         run = run if isinstance(run, Run) else Run.open(run)
         path = run.policy_file(which)
     return read_checkpoint(path, device, parts=("iteration", "policy")), path
-
-
-def _keep(path: Path, other: Path) -> None:
-    """Give a file a second name, in place of another file. It exists under its first name all the time."""
-    temporary = other.with_name(other.name + ".tmp")
-    try:
-        temporary.unlink(missing_ok=True)
-        os.link(path, temporary)
-        os.replace(temporary, other)
-    except OSError:  # a file system without links
-        os.replace(path, other)

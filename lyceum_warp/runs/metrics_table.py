@@ -15,7 +15,10 @@ def append_row(path: Path, row: Mapping[str, Any]) -> None:
         path: The table, which need not exist.
         row: Values by the names of their columns. None becomes an empty cell; floats keep all their digits.
     """
-    columns = _columns(path)
+    columns: list[str] = []
+    if path.exists():
+        with path.open(newline="") as file:
+            columns = next(csv.reader(file), [])
     if new := [name for name in row if name not in columns]:
         cells = []
         if columns:
@@ -61,14 +64,6 @@ def cut_rows(path: Path, iteration: int) -> None:
     if kept != lines:
         with replaced(path) as temporary:
             temporary.write_text("".join(kept))
-
-
-def _columns(path: Path) -> list[str]:
-    """The names in the header; none where there is no table yet."""
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return next(csv.reader(file), [])
 
 
 def _cells(line: str) -> list[str]:

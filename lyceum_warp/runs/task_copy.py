@@ -50,20 +50,21 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
     task, given = env.task.task, env.options.model is not None
     file, own = _file(task), not task.__module__.startswith("lyceum_warp.")
     kept: dict[str, Any] = {"name": env.task.name, "model_hash": _model_hash(env), "model_given": given}
-    sources = {} if file is None else _sources(file)
+    files: dict[str, Path | bytes] = {}
     if file is not None:
-        kept["source_hash"] = _digest(sources[file])
-    if not own:
-        sources = {}
-    main, model = _model_files(env) if own or given else (None, {})
-    modules = [path for path in sources if path != file]
-    names = _names_in_copy([*sources, *model], file, modules)
-    if file is not None and own:
-        kept["modules"] = {_beside(path, file): _digest(sources[path]) for path in modules}
-        kept["file"], kept["program"] = names[file], task.__module__ == "__main__"
-    if main is not None:
-        kept["model"] = names[main]
-    files = {names[path]: content for path, content in {**sources, **model}.items()}
+        kept["source_hash"] = _digest(file.read_bytes())
+    if own or given:
+        sources = _sources(file) if own and file is not None else {}
+        main, model = _model_files(env)
+        modules = [path for path in sources if path != file]
+        names = _names_in_copy([*sources, *model], file, modules)
+        if own and file is not None:
+            kept["modules"] = {_beside(path, file): _digest(sources[path]) for path in modules}
+            kept["source_hash"] = _digest(sources[file])
+            kept["file"], kept["program"] = names[file], task.__module__ == "__main__"
+        if main is not None:
+            kept["model"] = names[main]
+        files = {names[path]: content for path, content in {**sources, **model}.items()}
     for name, value in env.given_params.items():
         if (table := _table(value)) is not None:
             files[f"{_TABLES}/{name}.npy"] = table if isinstance(table, Path) else _npy(table)
