@@ -25,7 +25,7 @@ from rich.console import Console
 import lyceum_warp as lw
 from lyceum_warp.cli.arguments import parameter
 from lyceum_warp.controllers.control_statistics import wilson
-from lyceum_warp.versions import versions
+from lyceum_warp.support.versions import versions
 
 
 @dataclasses.dataclass(frozen=True)

@@ -42,7 +42,7 @@ import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.done import FAULTS
 from lyceum_warp.machine import cpu_cores
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
 from lyceum_warp.spaces import COUNTERS
 from lyceum_warp.validate import positive_number, whole_number
 from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure

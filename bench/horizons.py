@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 import lyceum_warp as lw
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
 
 
 @dataclasses.dataclass(frozen=True)

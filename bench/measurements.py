@@ -18,7 +18,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from lyceum_warp.versions import versions
+from lyceum_warp.support.versions import versions
 
 HARDWARE = ("cpu", "cores", "gpu", "driver", "power_limit")
 """Entries that must be equal in two files for their numbers to be compared."""

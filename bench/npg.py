@@ -5,8 +5,8 @@
 Both sides run the same class with the same settings, the same number of worlds and the same seeds; only the buffer of
 samples is filled by other environments. Gymnasium's have the faster one of its two vector modes on these cores,
 measured before the clock starts. Beside them learn PPO of stable-baselines3 and TRPO of sb3-contrib with the settings
-that RL Baselines3 Zoo tuned for these tasks, for twelve minutes each, and, with --device cuda, our NPG and rsl_rl's PPO
-on the same worlds of a GPU.
+that RL Baselines3 Zoo tuned for these tasks, for twelve minutes each, and, with --device cuda, our NPG and PPO on the
+same worlds of a GPU.
 
 The policies of all contestants are judged by the same judge: the mean action, in single environments of Gymnasium,
 from the same initial states. The clock stands still meanwhile, and starts once kernels are compiled and environments
@@ -58,7 +58,7 @@ CONTESTANTS = {
     "ppo_sb3": "PPO, stable-baselines3",
     "trpo_sb3": "TRPO, sb3-contrib",
     "npg_gpu": "NPG, our environments on a GPU",
-    "ppo_rsl_rl": "PPO, rsl_rl, our environments on a GPU",
+    "ppo_rsl_rl": "PPO, our environments on a GPU",  # the stored runs are of rsl_rl's PPO, which ours equals
 }
 ON_CPU, ON_GPU, YARDSTICKS = tuple(CONTESTANTS)[:4], tuple(CONTESTANTS)[4:], ("ppo_sb3", "trpo_sb3")
 
@@ -302,16 +302,12 @@ def npg(case: Case, options: Options, curve: Curve) -> dict[str, Any]:
         return more | iterate(learner, curve, lambda it: it.time_gradient + it.time_solve + it.time_value)
 
 
-def rsl_rl(case: Case, options: Options, curve: Curve) -> dict[str, Any]:
-    """PPO of rsl_rl, with the settings of its learner here."""
-    installed("rsl_rl", "rsl-rl-lib")
-    from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
-    from lyceum_warp.adapters.rsl_rl_learner import RslRlLearner
-
+def ppo(case: Case, options: Options, curve: Curve) -> dict[str, Any]:
+    """PPO with its default settings."""
     assert case.nworld is not None
-    config = RslRlConfig(mean_every=0)
-    next(RslRlLearner(environment(case, options, config.num_mini_batches), config=config, seed=case.seed))
-    learner = RslRlLearner(environment(case, options, case.nworld), config=config, seed=case.seed)
+    config = lw.PPOConfig(mean_every=0)
+    next(lw.PPO(environment(case, options, config.minibatches), config=config, seed=case.seed))  # compiles kernels
+    learner = lw.PPO(environment(case, options, case.nworld), config=config, seed=case.seed)
     return iterate(learner, curve, lambda it: it.time_update)
 
 
@@ -376,7 +372,7 @@ def stable_baselines3(case: Case, options: Options, curve: Curve) -> dict[str, A
     return {}
 
 
-RUN = {"npg": npg, "npg_gymnasium": npg, "npg_gpu": npg, "ppo_rsl_rl": rsl_rl, "ppo_sb3": stable_baselines3,
+RUN = {"npg": npg, "npg_gymnasium": npg, "npg_gpu": npg, "ppo_rsl_rl": ppo, "ppo_sb3": stable_baselines3,
        "trpo_sb3": stable_baselines3}  # fmt: skip
 
 
@@ -567,7 +563,7 @@ def draw(axes: Any, group: Sequence[Row], name: str, x: int) -> None:
 EXPERIMENT = experiment.Experiment(
     name="npg", summary="NPG's learning curves on our environments and on Gymnasium's, beside PPO and TRPO",
     cases=cases, estimate=estimate, measure=measure, tables=tables, figure=figure, options=Options,
-    packages=("stable-baselines3", "sb3-contrib", "rsl-rl-lib"), apart=True,
+    packages=("stable-baselines3", "sb3-contrib"), apart=True,
 )  # fmt: skip
 
 if __name__ == "__main__":

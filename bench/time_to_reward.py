@@ -1,4 +1,4 @@
-"""Seconds until rsl_rl's PPO, through the adapter, or NPG first reaches given mean rewards.
+"""Seconds until PPO or NPG first reaches given mean rewards.
 
 python bench/time_to_reward.py go1_velocity --device cuda --nworld 4096 --targets 20 40 50 60 70 75 80 \\
     --seeds 42 43 44 --out bench/results/ppo-go1_velocity-h200.csv
@@ -26,9 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 import lyceum_warp as lw
-from lyceum_warp.adapters.rsl_rl_config import RslRlConfig
-from lyceum_warp.adapters.rsl_rl_learner import RslRlLearner
-from lyceum_warp.checkpoints import policy_content, serialized
+from lyceum_warp.runs.checkpoints import policy_content, serialized
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,10 +35,10 @@ class Options:
 
     task: tyro.conf.Positional[str]
     """Task: a name, or a file."""
-    algorithm: Literal["rsl-rl", "npg"] = "rsl-rl"
+    algorithm: Literal["ppo", "npg"] = "ppo"
     """Algorithm."""
-    ppo: RslRlConfig = dataclasses.field(default_factory=lambda: RslRlConfig(mean_every=0))
-    """Hyperparameters of rsl_rl's PPO."""
+    ppo: lw.PPOConfig = dataclasses.field(default_factory=lambda: lw.PPOConfig(mean_every=0))
+    """Hyperparameters of PPO."""
     npg: lw.NPGConfig = dataclasses.field(default_factory=lambda: lw.NPGConfig(mean_every=0))
     """Hyperparameters of NPG."""
     targets: tuple[float, ...] = ()
@@ -92,11 +90,11 @@ RECENT = 100
 """Episodes in the mean reward."""
 
 
-def learner(options: Options, seed: int, nworld: int) -> RslRlLearner | lw.NPG:
+def learner(options: Options, seed: int, nworld: int) -> lw.PPO | lw.NPG:
     env = lw.make(options.task, nworld=nworld, seed=seed, device=options.device, engine=options.engine)
     if options.algorithm == "npg":
         return lw.NPG(env, config=options.npg, seed=seed)
-    return RslRlLearner(env, config=options.ppo, seed=seed)
+    return lw.PPO(env, config=options.ppo, seed=seed)
 
 
 def run(options: Options, seed: int) -> tuple[Result, list[dict[str, Any]]]:
@@ -131,7 +129,7 @@ def run(options: Options, seed: int) -> tuple[Result, list[dict[str, Any]]]:
 def main(options: Options) -> None:
     torch.set_num_threads(options.threads)
     # kernels and libraries; at least as many worlds as fill the mini-batches
-    next(learner(options, 0, max(2, options.ppo.num_mini_batches)))
+    next(learner(options, 0, max(2, options.ppo.minibatches)))
     console, results, rows = Console(width=130), [], []
     for seed in options.seeds:
         gc.collect()

@@ -11,13 +11,15 @@ if TYPE_CHECKING:
     from lyceum_warp.actuators import follow_velocity
     from lyceum_warp.algos.cem import CEM
     from lyceum_warp.algos.evaluation import Episodes, evaluate
+    from lyceum_warp.algos.learner import Iteration, Learner
     from lyceum_warp.algos.mppi import MPPI
     from lyceum_warp.algos.mppi_config import MPPIConfig
     from lyceum_warp.algos.npg import NPG
     from lyceum_warp.algos.npg_config import NPGConfig
-    from lyceum_warp.algos.npg_statistics import Iteration
     from lyceum_warp.algos.policy import GaussianPolicy
     from lyceum_warp.algos.policy_export import export_policy
+    from lyceum_warp.algos.ppo import PPO
+    from lyceum_warp.algos.ppo_config import PPOConfig
     from lyceum_warp.algos.predictive_sampling import PredictiveSampling
     from lyceum_warp.algos.rollout_buffer import Rollout
     from lyceum_warp.algos.value import ValueFunction
@@ -70,7 +72,7 @@ if TYPE_CHECKING:
     )
     from lyceum_warp.openloop import OpenLoop
     from lyceum_warp.options import EnvOptions, PhysicsOptions
-    from lyceum_warp.runs import load, load_value
+    from lyceum_warp.runs.folder import load, load_value
     from lyceum_warp.task import (
         Planning,
         Row,
@@ -100,13 +102,15 @@ _NAMES = {
     "actuators": "follow_velocity",
     "algos.cem": "CEM",
     "algos.evaluation": "Episodes evaluate",
+    "algos.learner": "Iteration Learner",
     "algos.mppi": "MPPI",
     "algos.mppi_config": "MPPIConfig",
     "algos.npg": "NPG",
     "algos.npg_config": "NPGConfig",
-    "algos.npg_statistics": "Iteration",
     "algos.policy": "GaussianPolicy",
     "algos.policy_export": "export_policy",
+    "algos.ppo": "PPO",
+    "algos.ppo_config": "PPOConfig",
     "algos.predictive_sampling": "PredictiveSampling",
     "algos.rollout_buffer": "Rollout",
     "algos.value": "ValueFunction",
@@ -129,7 +133,7 @@ _NAMES = {
     "model_files": "ModelFile gymnasium_model gymnasium_robotics_model menagerie_model package_model",
     "openloop": "OpenLoop",
     "options": "EnvOptions PhysicsOptions",
-    "runs": "load load_value",
+    "runs.folder": "load load_value",
     "task": "Planning Row Task act actuator body camera ctrl dof equality geom joint mocap qpos sensor site tendon",
     "training": "train",
     "viewer.follow": "RunViewer",
@@ -157,6 +161,7 @@ __all__ = [
     "CEM",
     "MPPI",
     "NPG",
+    "PPO",
     "ControlProgress",
     "ControlReport",
     "Controller",
@@ -166,10 +171,12 @@ __all__ = [
     "Episodes",
     "GaussianPolicy",
     "Iteration",
+    "Learner",
     "MPPIConfig",
     "ModelFile",
     "NPGConfig",
     "OpenLoop",
+    "PPOConfig",
     "PhysicsOptions",
     "Planning",
     "PlanningController",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 @contextlib.contextmanager
-def replaced(path: Path, *, durable: bool = False) -> Iterator[Path]:
+def replaced(path: Path, *, durable: bool = False, previous: Path | None = None) -> Iterator[Path]:
     """Replace a file in one go: a reader finds the old file or the whole new one.
 
     The block writes into the path that it is given, a temporary file beside the target. If the block raises, the target
@@ -16,6 +16,7 @@ def replaced(path: Path, *, durable: bool = False) -> Iterator[Path]:
     Args:
         path: The file.
         durable: Whether the new content must reach the disk before the old file is given up, for a loss of power.
+        previous: Where the old file is kept, in place of another one. It exists under ``path``, too, until the end.
     """
     temporary = path.with_name(path.name + ".tmp")
     try:
@@ -23,6 +24,12 @@ def replaced(path: Path, *, durable: bool = False) -> Iterator[Path]:
         if durable:
             with temporary.open("rb") as file:
                 os.fsync(file.fileno())
+        if previous is not None and path.exists():
+            previous.unlink(missing_ok=True)
+            try:
+                os.link(path, previous)
+            except OSError:  # a file system without links
+                os.replace(path, previous)
         os.replace(temporary, path)
     except OSError as error:
         if error.filename is None:  # as on a full disk

@@ -5,6 +5,9 @@ import signal
 from collections.abc import Callable, Iterator
 from typing import Any
 
+_NUMBERS = [int(getattr(signal, name)) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+"""Ctrl-C, SIGTERM and SIGHUP, which Windows lacks."""
+
 
 class Interrupted(BaseException):
     """A signal asks the program to end."""
@@ -41,7 +44,7 @@ def ending() -> Iterator[None]:
     def leave(number: int, frame: Any) -> None:
         raise SystemExit(128 + number)
 
-    numbers = [number for number in _numbers()[1:] if signal.getsignal(number) is signal.SIG_DFL]
+    numbers = [number for number in _NUMBERS[1:] if signal.getsignal(number) is signal.SIG_DFL]
     previous: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # only the main thread may set handlers
         for number in numbers:
@@ -65,7 +68,7 @@ def obeyed() -> Iterator[None]:
             signal.signal(other, _ignore)
         raise Interrupted(number)
 
-    numbers = [number for number in _numbers() if signal.getsignal(number) is _ignore]
+    numbers = [number for number in _NUMBERS if signal.getsignal(number) is _ignore]
     with contextlib.suppress(ValueError):  # only the main thread may set handlers
         for number in numbers:
             signal.signal(number, interrupt)
@@ -78,20 +81,28 @@ def obeyed() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def postponed(when: bool = True) -> Iterator[list[int]]:
-    """List Ctrl-C, SIGTERM and SIGHUP instead of handling them, which is left to the caller.
+def postponed(*, insist: bool = False) -> Iterator[list[int]]:
+    """Within the block, list Ctrl-C, SIGTERM and SIGHUP; the first is handled at the end of the block.
 
-    A signal that is still listed at the end of the context is handled there, within ``signals`` by raising Interrupted.
     Once Interrupted is raised, later signals are ignored.
 
     Args:
-        when: False leaves signals alone.
+        insist: Whether a second signal is handled at once.
 
     Raises:
         Interrupted: A signal came, and the caller did not raise it.
     """
     noted: list[int] = []
-    previous = _handled_by(lambda number, frame: noted.append(number)) if when else {}
+
+    def note(number: int, frame: Any) -> None:
+        if noted and insist:
+            noted.clear()
+            signal.signal(number, previous[number])
+            signal.raise_signal(signal.Signals(number))
+        else:
+            noted.append(number)
+
+    previous = _handled_by(note)
     try:
         yield noted
     except Interrupted:
@@ -111,16 +122,11 @@ def _ignore(number: int, frame: Any) -> None:
     """
 
 
-def _numbers() -> list[int]:
-    names = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
-    return [int(getattr(signal, name)) for name in names if hasattr(signal, name)]
-
-
 def _handled_by(handler: Callable[[int, Any], None]) -> dict[int, Any]:
     """Handle Ctrl-C, SIGTERM and SIGHUP, and return their previous handlers."""
     previous: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # only the main thread may set handlers
-        for number in _numbers():
+        for number in _NUMBERS:
             # a shell that starts a program in the background makes it ignore SIGINT on purpose, and nohup SIGHUP
             if signal.getsignal(number) not in (signal.SIG_IGN, _ignore):
                 previous[number] = signal.signal(number, handler)

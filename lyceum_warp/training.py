@@ -1,8 +1,9 @@
-"""Training with a run's folder: the loop that the command line and ``lw.train`` share."""
+"""Train a learner, and write its run: the loop that the command line and ``lw.train`` share."""
 
+import contextlib
 import json
+import logging
 import math
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,22 +11,45 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.evaluation import evaluation_seed
-from lyceum_warp.algos.learner import Learner, LearnerIteration
-from lyceum_warp.binding.registry import spelled_task
+from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.engines.placement import engine_name
-from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted, ending, postponed
-from lyceum_warp.keeper import Keeper, NotSavedError
-from lyceum_warp.kept_task import KeptTask, given_params, note_changes
-from lyceum_warp.runs import Run
-from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
+from lyceum_warp.runs.configuration import Configuration, describe
+from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.metrics_table import cut_rows
+from lyceum_warp.runs.saving import Saver
+from lyceum_warp.runs.task_copy import note_changes, run_params, task_copy
+from lyceum_warp.support.versions import versions
 from lyceum_warp.validate import whole_number
 from lyceum_warp.viz.cameras import CameraChoice, find_camera
 from lyceum_warp.viz.policy_videos import Videos
+from lyceum_warp.viz.tensorboard import TensorBoard, check_tensorboard
 from lyceum_warp.viz.video import check_video
+
+log = logging.getLogger(__name__)
 
 Callback = Callable[[Any], Any]
 """Called with the statistics of each iteration, which are of the algorithm's own class."""
+
+
+class Display:
+    """What a training shows on its way: nothing but log messages. The command line shows more."""
+
+    def begin(self, run: Run, learner: Learner, iterations: int) -> None:
+        """Training begins, or goes on, up to so many iterations."""
+
+    def __call__(self, iteration: Iteration) -> None:
+        """An iteration is complete."""
+
+    def work(self, text: str, unit: str, done: int, total: int) -> None:
+        """Other work between two iterations has made progress."""
+
+    def note(self, line: str) -> None:
+        """Something is worth a line."""
+        log.warning(line)
+
+    def end(self) -> None:
+        """Training ends, with or without an error."""
 
 
 def train(
@@ -41,35 +65,37 @@ def train(
     video_every: int = 0,
     camera: CameraChoice = None,
     resume: bool = False,
+    entries: Mapping[str, Any] | None = None,
+    display: Display | None = None,
 ) -> Run:
     """Train, and write the same folder as ``lyceum-warp train``: metrics, policies and checkpoints.
 
     ``lw.load(folder)`` returns the last policy, ``lw.load(folder, which="best")`` the one with the best return:
-    the mean policy's where the configuration has it evaluated (``mean_every``), otherwise the mean return of the
-    episodes that ended in an iteration, which were sampled with the policy before it.
+    that of ``mean_return``, the evaluations without noise, if the learner makes some; otherwise that of
+    ``return_mean``, the episodes of an iteration, which were sampled with the policy before it.
 
-    The policy and the value function are saved after every iteration; where iterations take less than about a second,
-    whenever training has taken 200 times as long as the last such save. The complete state, from which a run continues
-    exactly, is larger. It is saved at the start, at the end, after an error or a signal, and whenever training has
-    taken 400 times as long as the last such save, or every ``save_every`` iterations. A run that is killed continues
-    from the last one, to the same numbers.
+    The policy and the complete state, from which a run continues exactly, are saved at the start, at the end, and every
+    30 s, or more often while that takes at most 1 % of the time; see ``lyceum_warp.runs.saving``. A run that is killed
+    continues from the last save, to the same numbers. Ctrl-C, SIGTERM and SIGHUP end it after the iteration, with a
+    save; a second one ends it at once.
 
     Args:
         learner: The algorithm: ``NPG(env)``, or another ``lyceum_warp.algos.learner.Learner``.
         folder: The run's folder, new or empty.
         iterations: Iterations in all, including those before ``resume``.
-        callback: Called with each iteration after it was saved. Training ends where it returns True, and where it
-            raises an error, which is passed on.
-        target_return: Training ends once the mean policy's return, or, without its evaluation, ``return_mean``, is at
-            least this.
+        callback: Called with each iteration after its row was written. Training ends if it returns True, and if it
+            raises an error, which is passed on after a save.
+        target_return: Training ends once the return by which the best policy is selected is at least this.
         keep_every: Iterations between two policies that are kept under their numbers; 0 for none.
-        save_every: Iterations between two saves of the complete state; 0 for a number that follows from their time.
+        save_every: Iterations between two saves; 0 for a number that follows from their time.
         tensorboard: Whether to write the metrics for TensorBoard, too.
-        video_every: Iterations between two videos of the mean policy, ``videos/000100.mp4`` and so on in the folder,
-            which TensorBoard shows, too; 0 for none. Where one fails, a warning says so, and training goes on.
+        video_every: Iterations between two videos of the policy, ``videos/000100.mp4`` and so on in the folder, which
+            TensorBoard shows, too; 0 for none. If one fails, a warning says so, and training goes on.
         camera: Camera of the videos: one of the model's by name or index, a ``viz.cameras.FreeCamera``, or "free" for
             MuJoCo's default free camera.
         resume: Whether the folder holds a run that is continued; ``learner`` must be made with the same arguments.
+        entries: Further entries of config.json, of values that JSON can hold.
+        display: Shows the training; by default notes are logged.
 
     Returns:
         The run. ``run.rows()`` returns the metrics.
@@ -79,173 +105,155 @@ def train(
             ``learner``.
         ImportError: The extra ``tensorboard`` is not installed.
         NoVideoError: The extra ``viz`` is not installed, and there should be videos.
-        NotSavedError: The folder could no longer be written; the message says where the run was saved instead.
-        FloatingPointError: Ten iterations in a row had an update that is not finite; see ``NPG``. Other
-            algorithms say when they raise it.
+        OSError: The folder could no longer be written. The last save stands, and ``resume=True`` continues from it.
+        FloatingPointError: The learner's updates are no longer finite; see there.
         Interrupted: One of several processes received a signal.
     """
-    iterations = whole_number("iterations", iterations, low=1)
-    settings = checked_settings(target_return=target_return, keep_every=keep_every, save_every=save_every)
-    team, folder = learner.team, Path(folder)
-    shown = {"tensorboard": tensorboard, "video_every": whole_number("video_every", video_every, low=0)}
-    config = describe(learner) | {"iterations": iterations, **settings, **shown}
-    with team.together():
+    if target_return is not None and (not isinstance(target_return, (int, float)) or math.isnan(target_return)):
+        raise ValueError(f"target_return must be a number, not {target_return!r}")
+    settings: dict[str, Any] = {
+        "iterations": whole_number("iterations", iterations, low=1),
+        "target_return": None if target_return is None else float(target_return),
+        "keep_every": whole_number("keep_every", keep_every, low=0),
+        "save_every": whole_number("save_every", save_every, low=0),
+        "tensorboard": tensorboard,
+        "video_every": whole_number("video_every", video_every, low=0),
+    }
+    env, leads, display = learner.env, learner.team.leads, display or Display()
+    with learner.team.together():
         if tensorboard:
             check_tensorboard()
         if video_every:
             check_video()
-            find_camera(learner.env.model, camera)
+        find_camera(env.model, camera)
         if resume:
-            run = Run.open(folder)
-            content = run.read()
-            check_resumable(run, content, iterations, target_return)
-            _check_equal(run, config, learner.env)
-            if team.leads:
-                note_changes(run, learner.env)
-            restore(run, learner, content)
-        elif team.leads:
-            kept = KeptTask.of(learner.env)
-            run = Run.create(folder, config | kept.config, device=learner.env.options.device or "cpu")
-            kept.write(run)
+            run = _reopened(Path(folder), learner, settings, display.note if leads else log.debug)
         else:
-            run = Run(folder, config)
-    if resume and team.leads:
-        reopen(run, learner, iterations=iterations, **settings, **shown)
-    board = TensorBoard(folder, run.config) if tensorboard and team.leads else None
-    seed = evaluation_seed(learner.env.options.seed + 1)
-    videos = Videos(learner, run.folder / "videos", video_every, seed, board, camera=camera)
-
-    def after(iteration: LearnerIteration) -> Any:
-        videos(iteration)
-        return None if callback is None else callback(iteration)
-
-    with ending():
-        learn(
-            run if team.leads else None, learner, iterations=iterations, callback=after, board=board, resumed=resume,
-            **settings,
-        )  # fmt: skip
+            run = Run(Path(folder), describe(learner) | settings | dict(entries or {}))
+            if leads:
+                kept, files = task_copy(env)
+                device = env.options.device or "cpu"
+                run = Run.create(folder, run.config | {"kept": kept}, device=device, files=files)
+    saver = Saver(
+        run if leads else None, learner, keep_every=keep_every, save_every=save_every,
+        saved=learner.iteration if resume else -1,
+    )  # fmt: skip
+    callbacks: list[Callback] = []
+    with contextlib.ExitStack() as shown:
+        if leads:
+            board = shown.enter_context(TensorBoard(run.folder, run.config)) if tensorboard else None
+            seed = evaluation_seed(env.options.seed + 1)
+            videos = Videos(
+                learner, run.folder / "videos", video_every, seed, board, camera=camera, note=display.note,
+                progress=display.work,
+            )  # fmt: skip
+            shown.callback(display.end)
+            display.begin(run, learner, iterations)
+            callbacks = [function for function in (board, display, videos, callback) if function is not None]
+        try:
+            _learn(learner, saver, iterations, callbacks, target_return)
+        except Exception as error:
+            if leads and saver.saved >= 0:
+                error.add_note(f"the run in {run.folder} is saved up to iteration {saver.saved}")
+            raise
     return run
 
 
-def checked_settings(*, target_return: float | None = None, keep_every: int = 0, save_every: int = 0) -> dict[str, Any]:
-    """The settings of a run that do not change its numbers, as config.json holds them.
-
-    Raises:
-        ValueError: A value is out of range.
-    """
-    if target_return is not None and (not isinstance(target_return, (int, float)) or math.isnan(target_return)):
-        raise ValueError(f"target_return must be a number, not {target_return!r}")
-    return {
-        "target_return": None if target_return is None else float(target_return),
-        "keep_every": whole_number("keep_every", keep_every, low=0),
-        "save_every": whole_number("save_every", save_every, low=0),
-    }
-
-
-def describe(learner: Learner) -> dict[str, Any]:
-    """The configuration of a run that an algorithm stands for, as config.json holds it."""
-    env, options = learner.env, learner.env.options
-    others = {name: value for name, value in options.given().items() if name in ("nthread", "horizon", "graphs")}
-    others |= {name: list(names) for name in ("fields", "dynamics") if (names := getattr(options, name))}
-    if isinstance(options.model, str | Path):
-        others["model"] = str(Path(options.model).absolute()) if Path(options.model).is_file() else str(options.model)
-    seed = {} if learner.seed == options.seed else {f"{learner.algorithm}_seed": learner.seed}
-    return {
-        "algorithm": learner.algorithm,
-        "task": spelled_task(env.task.task),
-        "params": given_params(env),
-        "physics": options.physics.given(),
-        "engine": options.engine if isinstance(options.engine, str) else env.engine.name,
-        "device": options.device or "cpu",
-        "options": others,
-        "nworld": env.nworld * learner.team.size,
-        "threads": torch.get_num_threads(),
-        "seed": options.seed,
-        **seed,
-        learner.algorithm: learner.settings(),
-    }
-
-
-# continuing
-
-
-def check_resumable(
-    run: Run, content: Mapping[str, Any], iterations: int, target_return: float | None, *, command: bool = False
+def _learn(
+    learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None
 ) -> None:
-    """Refuse to continue a run that is finished.
+    """Iterate, and decide with all processes when the run is saved and when it ends."""
+    team, run = learner.team, saver.run
+    ended = False
+    with ending(), postponed(insist=team.size == 1) as noted:
+        if saver.saved != learner.iteration:
+            saver.save()
+        while learner.iteration < iterations and not ended:
+            iteration, error = next(learner), None
+            with team.together():
+                if run is not None:
+                    score = saver.write(iteration)
+                    if target_return is not None and score is not None and score >= target_return:
+                        run.amend(reached={"iteration": iteration.iteration, "return": score})
+                        ended = True
+            try:
+                for function in callbacks:
+                    ended = function(iteration) is True or ended
+            except Exception as raised:
+                error = raised
+            ended = ended or error is not None or learner.iteration >= iterations
+            numbers = max(noted, default=0), ended, error is not None, saver.due()
+            signal, last, failed, due = team.largest(*map(int, numbers))
+            if signal or last or due:
+                saver.save()
+            if error is not None:
+                raise error
+            if failed:
+                raise SystemExit(2)
+            if signal and team.size > 1:
+                raise Interrupted(signal)
+            ended = bool(last or signal)
 
-    Args:
-        run: The run.
-        content: The content of its checkpoint.
-        iterations: Iterations in all.
-        target_return: The return at which it will end.
-        command: Whether the message names a flag of the command line rather than an argument of ``train``.
 
-    Raises:
-        ValueError: The run has as many iterations, or has reached the return.
-    """
-    reached = run.config.get("reached")
-    if reached is not None and target_return is not None and reached["return"] >= target_return:
+def _reopened(folder: Path, learner: Learner, settings: dict[str, Any], note: Callable[[str], None]) -> Run:
+    """Open a run that is continued, and put the learner into the state of its checkpoint."""
+    run = Run.open(folder)
+    content = run.read(note=note)
+    reached, target, done = run.config.get("reached"), settings["target_return"], content["iteration"]
+    if reached is not None and target is not None and reached["return"] >= target:
         raise ValueError(
-            f"the run in {run.folder} is finished: its return reached {reached['return']:.6g} in iteration "
+            f"the run in {folder} is finished: its return reached {reached['return']:.6g} in iteration "
             f"{reached['iteration']}: give a target return above that, or inf for none"
         )
-    done = content["iteration"]
-    if iterations <= done:
-        more = f"--iterations {2 * done}" if command else f"iterations={2 * done}"
-        raise ValueError(f"the run in {run.folder} already has {done} iterations: give more, as in {more}")
-
-
-def _check_equal(run: Run, config: Mapping[str, Any], env: Env) -> None:
-    """Refuse an algorithm with other settings than the run's."""
-    now = json.loads(json.dumps(config))  # lists in place of tuples
-    engine, engine_now = (engine_name(c["engine"], c["device"]) for c in (run.config, now))
-    task = run.config.get("kept", {}).get("name", env.task.name)  # an older run lacks it
-    names = [("task", task, env.task.name), ("engine", engine, engine_now)]
-    names.append(("algorithm", run.config.get("algorithm"), now["algorithm"]))
-    parts = ("params", "physics", now["algorithm"], "nworld")
-    entries = [_entries(part, run.config.get(part), now[part]) for part in parts]
-    options = _entries("options", run.config.get("options", {}), now["options"])
-    others = [entry for entry in options if entry[0] not in _FREE_OPTIONS]
-    for part in (names, *entries, others):
-        for name, then, given in part:
-            if then != given:
-                raise ValueError(
-                    f"the run in {run.folder} has {name} {then}, not {given}, and a run keeps its settings: make "
-                    "the algorithm with the same arguments, or give another folder"
-                )
-
-
-def _entries(name: str, then: Any, now: Any) -> list[tuple[str, Any, Any]]:
-    """Two values of a configuration's entry; for a table those of its entries that are known."""
-    if not isinstance(then, Mapping):
-        return [(name, then, now)]
-    # an older run lacks the newest hyperparameters
-    known = {**then, **now} if name in ("params", "physics", "options") else then
-    return [(entry, then.get(entry), now.get(entry)) for entry in known]
-
-
-_FREE_OPTIONS = ("nthread", "graphs", "model")
-"""Options that do not change a run's numbers, and the model, which is compared by its content."""
-
-
-def restore(run: Run, learner: Learner, content: Mapping[str, Any]) -> None:
-    """Put an algorithm into the state of a run's checkpoint.
-
-    Args:
-        run: The run.
-        learner: The algorithm.
-        content: The content of the checkpoint.
-
-    Raises:
-        ValueError: The checkpoint does not fit the algorithm.
-    """
+    if settings["iterations"] <= done:
+        raise ValueError(
+            f"the run in {folder} already has {done} iterations: give more (--iterations {2 * done}, or "
+            f"iterations={2 * done} in Python)"
+        )
+    _check_equal(run, learner)
+    note_changes(run, learner.env, note=note)
     try:
         learner.load_state_dict(_on(learner.env.obs.device, content["state"]))
     except (KeyError, RuntimeError, ValueError) as error:
-        raise ValueError(
-            f"{run.checkpoint} does not fit the configuration beside it: {' '.join(str(error).split())}"
-        ) from error
+        text = " ".join(str(error).split())
+        raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {text}") from error
+    if learner.team.leads:
+        if changed := run.changed(versions(run.config["device"])):
+            text = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
+            note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")
+        cut_rows(run.metrics, done)  # an interrupted run may have written rows that were not saved
+        run.amend(**settings)
+    return run
+
+
+def _check_equal(run: Run, learner: Learner) -> None:
+    """Refuse a learner with other settings than the run's."""
+    then, now, env = Configuration.of(run), describe(learner), learner.env
+    pairs = [
+        ("task", run.config.get("kept", {}).get("name", env.task.name), env.task.name),
+        ("engine", *(engine_name(engine, device) for engine, device in (
+            (then.options.engine, then.options.device), (now["engine"], now["device"])))),
+        ("algorithm", then.algorithm, learner.algorithm),
+        ("nworld", then.options.nworld, now["nworld"]),
+    ]  # fmt: skip
+    # nthread and graphs do not change the numbers, and the model is compared by its content
+    pairs += [(name, getattr(then.options, name), getattr(env.options, name)) for name in _KEPT_OPTIONS]
+    pairs += [(name, getattr(then.options.physics, name), value) for name, value in vars(env.options.physics).items()]
+    old, new = run_params(run, then.params), now["params"]
+    pairs += [(name, old.get(name), new.get(name)) for name in {**old, **new}]
+    # a run of an earlier release lacks the newest hyperparameters
+    new = json.loads(json.dumps(learner.settings()))  # lists in place of tuples
+    pairs += [(name, value, new.get(name)) for name, value in run.config[then.algorithm].items()]
+    for name, before, after in pairs:
+        if before != after:
+            raise ValueError(
+                f"the run in {run.folder} has {name} {before}, not {after}, and a run keeps its settings: leave that "
+                "out, or begin a new run in another folder"
+            )
+
+
+_KEPT_OPTIONS = ("horizon", "fields", "dynamics")
+"""Options of the environment that a run keeps, beside those of the physics."""
 
 
 def _on(device: torch.device, state: Any) -> Any:
@@ -255,163 +263,3 @@ def _on(device: torch.device, state: Any) -> Any:
     if isinstance(state, Mapping):
         return {name: _on(device, part) for name, part in state.items()}
     return [_on(device, part) for part in state] if isinstance(state, list) else state
-
-
-def reopen(run: Run, learner: Learner, **settings: Any) -> None:
-    """Cut a run's table to the iterations of its checkpoint, and note new settings."""
-    run.cut(learner.iteration)
-    run.amend(**settings)
-
-
-# the loop
-
-
-def learn(
-    run: Run | None,
-    learner: Learner,
-    *,
-    iterations: int,
-    callback: Callback | None = None,
-    target_return: float | None = None,
-    keep_every: int = 0,
-    save_every: int = 0,
-    board: Any = None,
-    resumed: bool = False,
-) -> None:
-    """Iterate, and write a run's files.
-
-    Of several processes one has the run. When another one receives a signal, all of them finish the iteration and end
-    together: they would wait endlessly for a process that ended within the iteration.
-
-    Args:
-        run: The run; None in processes that do not write.
-        learner: The algorithm.
-        iterations: Iterations in all.
-        callback: Called with each iteration after it was saved; see ``train``.
-        target_return: The return at which training ends.
-        keep_every: Iterations between two numbered policies; 0 for none.
-        save_every: Iterations between two complete states; 0 for a number that follows from their time.
-        board: TensorBoard's writer.
-        resumed: Whether the run holds the algorithm's present state.
-
-    Raises:
-        NotSavedError: The folder could no longer be written.
-        Interrupted: One of several processes received a signal.
-    """
-    alone = learner.team.size == 1
-    keeper = None if run is None else Keeper(
-        run, learner, keep_every=keep_every, save_every=save_every, resumed=resumed
-    )  # fmt: skip
-    loop = None
-    try:
-        with postponed(not alone) as noted:
-            loop = _Loop(keeper, learner, noted, [board, callback], target_return, resumed=resumed)
-            loop.save()
-            while learner.iteration < iterations and not loop.ended:
-                loop.step()
-            loop.save()
-    except BaseException as error:
-        if alone and keeper is not None and not isinstance(error, NotSavedError):
-            with postponed():
-                if loop is not None and not loop.iterating:
-                    keeper.take(learner.state_dict())
-                keeper.save_boundary()
-            if isinstance(error, Exception):
-                error.add_note(f"the run in {keeper.run.folder} is saved up to iteration {keeper.iteration}")
-        raise
-    finally:
-        if board is not None:
-            board.close()
-
-
-class _Loop:
-    """The order of a run's iterations, and the decisions that all processes make together.
-
-    Args:
-        keeper: Writes the files; None in processes that do not.
-        learner: The algorithm.
-        noted: Signals that this process received and postponed.
-        callbacks: Called with each iteration; some may be None.
-        target_return: The return at which training ends.
-        resumed: Whether the run holds the algorithm's present state.
-    """
-
-    def __init__(
-        self, keeper: Keeper | None, learner: Learner, noted: list[int], callbacks: list[Callback | None],
-        target_return: float | None, *, resumed: bool,
-    ) -> None:  # fmt: skip
-        self.keeper, self.learner, self.noted, self.target_return = keeper, learner, noted, target_return
-        self.callbacks = [function for function in callbacks if function is not None]
-        self.alone = learner.team.size == 1
-        self.due = self.ended = self.iterating = False
-        self.saved = learner.iteration if resumed else -1
-        self.error: Exception | None = None
-
-    def step(self) -> None:
-        """Make an iteration, keep it, and decide whether it was the last."""
-        complete = self.due
-        self.iterating = True
-        iteration = next(self.learner)
-        # a signal counts either before the iteration or after its row, so that the table and the state agree
-        with postponed(self.alone):
-            start = time.perf_counter()
-            renewed = complete or (self.keeper is not None and self.keeper.policy_due())
-            # the worlds of several processes are brought together only to be saved
-            state = self.learner.state_dict() if complete or (renewed and self.alone) else None
-            self._write(lambda keeper: keeper.keep(iteration, state, renewed=renewed, start=start))
-            self.iterating = False
-        if complete:
-            self._write_state()
-        self._decide(iteration)
-        self._agree()
-
-    def save(self) -> None:
-        """Save the complete state, unless it is saved."""
-        if self.saved < self.learner.iteration:
-            state = self.learner.state_dict()
-            self._write(lambda keeper: keeper.take(state))
-            self._write_state()
-            self._agree()
-
-    def _write_state(self) -> None:
-        self.saved = self.learner.iteration
-        self._write(lambda keeper: keeper.save_boundary())
-
-    def _write(self, action: Callable[[Keeper], None]) -> None:
-        """Write files in the process that has the run; an error waits until all processes know of it."""
-        if self.keeper is None or self.error is not None:
-            return
-        with postponed(self.alone):
-            try:
-                self.keeper.guarded(action, between=self.alone)
-            except Exception as error:
-                self.error = error
-
-    def _decide(self, iteration: LearnerIteration) -> None:
-        """Call the callbacks, and compare with the return at which training ends."""
-        if self.keeper is None or self.error is not None:
-            return
-        try:
-            for function in self.callbacks:
-                self.ended = function(iteration) is True or self.ended
-        except Exception as error:
-            self.error = error
-        reached = self.keeper.return_of(iteration)
-        if self.target_return is not None and reached is not None and reached >= self.target_return:
-            self._write(lambda keeper: keeper.note_target(iteration, reached))
-            self.ended = True
-
-    def _agree(self) -> None:
-        """Bring the processes to the same decisions, and raise what one of them met."""
-        due = self.keeper is not None and self.keeper.due()
-        numbers = max(self.noted, default=0), self.ended, self.error is not None, due
-        signal, ended, failed, complete = self.learner.team.largest(*map(int, numbers))
-        self.ended, self.due = bool(ended), bool(complete)
-        if self.error is not None:
-            raise self.error
-        if failed:
-            raise SystemExit(2)
-        if signal:
-            if self.saved < self.learner.iteration:
-                self.save()
-            raise Interrupted(signal)

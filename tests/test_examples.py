@@ -9,9 +9,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from training_runs import train
 
-from lyceum_warp.runs import Run
+from lyceum_warp import cli
+from lyceum_warp.runs.folder import Run
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -49,6 +51,20 @@ def test_own_policy_improves(run) -> None:
     assert len(returns) == 9  # eight iterations and the mean policy
     assert returns[-1] > max(returns[:3]) + 50
     assert lines[-1].endswith("370 parameters")
+
+
+def test_random_search_gets_a_run_without_code_for_it(run, tmp_path: Path) -> None:
+    """A folder, resumption to the bit, an evaluation and an export."""
+    once = numbers(r"return (-?[\d.]+)", run("random_search.py", "--out", "once", "--iterations", "6"))
+    assert once[-1] > 3 * once[0] > 0
+    run("random_search.py", "--out", "twice", "--iterations", "3")
+    run("random_search.py", "--out", "twice", "--iterations", "6", "--resume", "--seed", "0")
+    rows = [Run.open(tmp_path / name).rows() for name in ("once", "twice")]
+    assert rows[0] == rows[1] and list(rows[0][0])[-1] == "weight_norm"
+    assert cli.main(["eval", "twice", "--which", "best", "--episodes", "4"]) == 0
+    assert cli.main(["export", "twice", "--to", "policy.pt2"]) == 0
+    assert torch.export.load("policy.pt2").module()(torch.zeros(3, 4)).shape == (3, 1)
+    assert cli.main(["train", "--resume", "twice", "--iterations", "9"]) == 2  # the class is in a program
 
 
 def test_plan_reaches_the_target_in_each_episode(run) -> None:

@@ -55,11 +55,20 @@ def test_signals_after_an_empty_postponement_raise_again() -> None:
             signal.raise_signal(signal.SIGTERM)
 
 
-def test_postponed_false_leaves_signals_alone() -> None:
+def test_a_second_signal_is_handled_at_once_if_it_may_insist() -> None:
+    reached = []
     with signals():
-        with pytest.raises(Interrupted), postponed(False) as noted:
+        with pytest.raises(Interrupted) as raised, postponed(insist=True):
             signal.raise_signal(signal.SIGTERM)
-        assert noted == []
+            reached.append(1)
+            signal.raise_signal(signal.SIGINT)
+            reached.append(2)
+        assert raised.value.number == signal.SIGINT and reached == [1]
+        signal.raise_signal(signal.SIGTERM)  # is ignored
+    with pytest.raises(KeyboardInterrupt), postponed(insist=True):  # outside of a command
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_second_signal_raises_within_obeyed_and_a_third_is_ignored() -> None:

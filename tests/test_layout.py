@@ -18,8 +18,7 @@ TESTS = Path(__file__).parent
 
 LEVELS = {
     "docstrings": -1, "arrays": 0, "done": 0, "files": 0, "forks": 0, "interrupts": 0, "machine": 0,
-    "metrics_table": 1, "model_files": 0,
-    "mujoco_log": 0, "validate": 0, "versions": 0, "warp_log": 0,
+    "model_files": 0, "mujoco_log": 0, "support": 0, "validate": 0, "warp_log": 0,
     "actuators": 1, "fields": 1, "kernels": 1, "model_fields": 1, "options": 1, "task": 1,
     "graphs": 2, "spaces": 2,
     "binding": 3, "engines": 3,
@@ -27,16 +26,15 @@ LEVELS = {
     "env": 5,
     "openloop": 6,
     "algos": 7, "controllers": 7, "testing": 7,
-    "checkpoints": 8, "tensorboard": 8,
-    "runs": 9,
-    "keeper": 10, "kept_task": 10, "viz": 10,
+    "runs": 8,
+    "viz": 10,
     "training": 11,
     "adapters": 12, "viewer": 12,
     "cli": 13, "gym": 13,
 }  # fmt: skip
 """The floor of every room: a room imports from lower floors, or from itself."""
 
-TESTED_BY = {"done": "test_faults.py", "forks": "test_env.py", "testing": "conformance", "versions": "test_runs.py"}
+TESTED_BY = {"done": "test_faults.py", "forks": "test_env.py", "testing": "conformance", "support": "runs"}
 """Tests of rooms that have none of their own name."""
 
 NAMEDTUPLE = {"_fields", "_asdict", "_replace", "_make"}

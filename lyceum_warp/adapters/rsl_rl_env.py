@@ -6,7 +6,6 @@ import torch
 
 from lyceum_warp.adapters.adapted_env import environment_of
 from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl
-from lyceum_warp.adapters.rsl_rl_statistics import RECENT
 from lyceum_warp.adapters.step_results import episode_ends, faulty
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
@@ -16,6 +15,9 @@ check_rsl_rl()  # its error says more than that of the imports below
 
 from rsl_rl.env import VecEnv  # noqa: E402
 from tensordict import TensorDict  # noqa: E402
+
+RECENT = 100
+"""Episodes in the means of the log."""
 
 
 class RslRlVecEnv(VecEnv):  # type: ignore[misc]

@@ -8,6 +8,7 @@ import torch
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.networks import moved
+from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
 from lyceum_warp.validate import whole_number
@@ -52,7 +53,7 @@ class Episodes:
 @torch.no_grad()
 def evaluate(
     env: Env,
-    policy: torch.nn.Module,
+    policy: Policy,
     episodes: int,
     *,
     seed: int | None = None,
@@ -65,7 +66,8 @@ def evaluate(
 
     Args:
         env: The environment; its worlds are reset.
-        policy: Called with observations (nworld, nobs), returns actions (nworld, nact).
+        policy: Its ``act``, or else the policy itself, is called with observations (nworld, nobs) and returns actions
+            (nworld, nact).
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
         seed: Seed of the initial states, which differ from those of an environment made with the same seed; by default
             the worlds continue their random streams.
@@ -78,7 +80,7 @@ def evaluate(
         raise ValueError(f"episodes of {env.task.name!r} never end without a horizon: give make() a horizon")
     if not env.autoreset:
         raise ValueError("evaluate needs an environment that resets automatically: make it with autoreset=True")
-    each = -(-episodes // env.nworld)
+    act, each = acting(policy), -(-episodes // env.nworld)
     env.rand_reset(None if seed is None else evaluation_seed(seed))
     metrics = list(env.episode_metrics.values())
     results = torch.zeros(5 + len(metrics), each, env.nworld, device=env.obs.device)
@@ -87,7 +89,7 @@ def evaluate(
     worlds = torch.arange(env.nworld, device=env.obs.device)
     for t in range(each * env.horizon):
         length = env.episode_step + 1.0
-        env.action.copy_(policy(env.obs))
+        env.action.copy_(act(env.obs))
         env.step()
         total += env.reward
         now = torch.stack([total, length, env.reward, env.eval, env.success.float(), *metrics])

@@ -67,6 +67,16 @@ def mlp(
     return nn.Sequential(*layers)
 
 
+@torch.no_grad()
+def initialize_as_torch(network: nn.Module, generator: torch.Generator) -> None:
+    """Draw the weights of all linear layers as ``nn.Linear`` does by default: uniform in +-1 / sqrt(inputs)."""
+    for layer in network.modules():
+        if isinstance(layer, nn.Linear):
+            bound = 1.0 / math.sqrt(layer.in_features)
+            layer.weight.uniform_(-bound, bound, generator=generator)
+            layer.bias.uniform_(-bound, bound, generator=generator)
+
+
 LIMIT = 10.0
 """The largest normalised observation, unless another limit is given."""
 
@@ -97,12 +107,13 @@ class Normalizer(nn.Module):
         self.register_buffer("scale", torch.ones(size))
 
     @torch.no_grad()
-    def update(self, obs: torch.Tensor, team: Team | None = None) -> None:
+    def update(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
         """Take observations into the mean and variance (Chan et al. 1983, parallel mean and variance).
 
         Args:
             obs: Observations, (..., size).
             team: The processes; each brings the same number of observations.
+            eps: Added to the standard deviations that observations are divided by.
         """
         team = team or Team()
         obs = obs.reshape(-1, obs.shape[-1]).double()
@@ -114,7 +125,7 @@ class Normalizer(nn.Module):
         self.mean += delta * (n / total)
         self.count.copy_(total)
         self.shift.copy_(self.mean)
-        self.scale.copy_((self.square / total).sqrt().clamp_min(1e-4).reciprocal())
+        self.scale.copy_(((self.square / total).sqrt() + eps).clamp_min(1e-4).reciprocal())
 
     @torch.no_grad()
     def interpolate(self, before: _Applied, after: _Applied, part: torch.Tensor) -> None:
@@ -140,3 +151,10 @@ def moved(module: Module, env: Env) -> Module:
     if all(parameter.device == device for parameter in module.parameters()):
         return module
     return copy.deepcopy(module).to(device)
+
+
+def trainable(module: Module) -> Module:
+    """The module, whose parameters are learned again if all of them are frozen, as ``lw.load`` leaves them."""
+    if isinstance(module, nn.Module) and not any(parameter.requires_grad for parameter in module.parameters()):
+        module.requires_grad_(True)
+    return module

@@ -10,7 +10,6 @@ import dataclasses
 import functools
 import logging
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -19,25 +18,24 @@ import warp as wp
 from lyceum_warp.algos.dense import DensePolicy, DenseValue
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
-from lyceum_warp.algos.learner import fitted_config
+from lyceum_warp.algos.learner import Learner, fitted_config
 from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, score_gradient
-from lyceum_warp.algos.networks import Normalizer
+from lyceum_warp.algos.networks import Normalizer, trainable
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples, least_restarts
 from lyceum_warp.algos.npg_statistics import (
-    Iteration,
+    NPGIteration,
     ProcessNumbers,
     UpdateNumbers,
     ValueSums,
-    finished,
-    finished_metrics,
     prediction_sums,
     summary,
 )
+from lyceum_warp.algos.on_policy import finished, finished_metrics
 from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.algos.policy_check import check_policy
+from lyceum_warp.algos.policy_check import check_policy, check_value
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.timing import PhaseTimer, beside, one_thread
-from lyceum_warp.algos.value import BOUND, ValueFunction
+from lyceum_warp.algos.value import BOUND, ValueFunction, value_group
 from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
@@ -60,8 +58,8 @@ _DRIFT = 0.2
 
 
 @document_attributes
-class NPG:
-    """Learns a policy; an endless iterator that yields an ``Iteration`` each time.
+class NPG(Learner):
+    """Learns a policy; an endless iterator that yields an ``NPGIteration`` each time.
 
     Example:
         >>> for it in NPG(env):
@@ -80,7 +78,7 @@ class NPG:
         ValueError: The environment does not reset automatically, or an argument is of the wrong type, or
             the policy cannot be learned (``lyceum_warp.algos.policy_check``).
         FloatingPointError: In 10 iterations in a row, the step of the policy or the fit of the value function was not
-            finite. Each such update is left out, and counted in ``Iteration.skipped_updates``.
+            finite. Each such update is left out, and counted in ``NPGIteration.skipped_updates``.
     """
 
     algorithm = "npg"
@@ -89,18 +87,16 @@ class NPG:
     """The policy that is learned."""
     value: ValueFunction
     """The value function that is learned with it."""
+    config: NPGConfig
+    """Hyperparameters."""
+    generator: torch.Generator
+    """The source of the noise and of the order of samples."""
     rollout: Rollout
     """The samples of the last iteration."""
-    seed: int
-    """Seed of new networks and of the noise."""
     count: int
     """Samples in an iteration, those of all processes."""
     segments: bool
     """Whether an iteration continues the episodes of the last one; False if it begins new ones."""
-    iteration: int
-    """Number of complete iterations."""
-    samples: int
-    """Samples in all iterations so far."""
 
     def __init__(
         self,
@@ -116,29 +112,17 @@ class NPG:
         check_kind("config of NPG", config, NPGConfig | None, "as lw.NPGConfig(samples=10000)")
         check_kind("value of NPG", value, ValueFunction | None, "as lw.load_value(run) returns it")
         if value is not None:
-            _check_value(value, env)
-        self.env, self.seed = env, seed
-        self.team = team = team or Team()
-        self.config = config = config or NPGConfig()
-        n, nworld = env.nworld, env.nworld * team.size
-        self._own = slice(team.rank * n, (team.rank + 1) * n)
-        if team.size > 1 and env.first_world != self._own.start:
-            raise ValueError(
-                f"process {team.rank} of {team.size} with {n} worlds needs an environment with "
-                f"first_world={self._own.start}, not {env.first_world}"
-            )
-        if not env.autoreset:
-            raise ValueError("NPG needs an environment that resets automatically: make it with autoreset=True")
-        for module in (policy, value):
-            if isinstance(module, torch.nn.Module) and not any(p.requires_grad for p in module.parameters()):
-                module.requires_grad_(True)  # lw.load freezes what it loads
+            check_value(trainable(value), env)
+        super().__init__(env, seed=seed, team=team)
         if policy is not None:
-            check_policy(policy, env)
+            check_policy(trainable(policy), env)
+        self.config = config = config or NPGConfig()
+        team, nworld = self.team, env.nworld * self.team.size
 
         # networks
         device = env.obs.device
         nobs, nact = env.obs_space.size, env.action_space.size
-        group = _value_group(env, config) if value is None else value.group
+        group = value_group(env, config.value_group) if value is None else value.group
         init = torch.Generator().manual_seed(seed)
         options: dict[str, Any] = dict(normalize=config.normalize, generator=init)
         self.policy = policy or GaussianPolicy(
@@ -175,7 +159,7 @@ class NPG:
 
         # parts
         self.fit = ValueFit(
-            self.value, self.count, n, rate=config.value_rate, epochs=config.value_epochs,
+            self.value, self.count, env.nworld, rate=config.value_rate, epochs=config.value_epochs,
             batch=config.value_batch or max(64, self.count // 256), team=team,
         )  # fmt: skip
         self._fisher_count = max(1, round(config.fisher_fraction * self.count))
@@ -186,15 +170,12 @@ class NPG:
         self._dense_policy: DensePolicy | None = None
         self._dense_value: DenseValue | None = None
 
-        self.iteration = self.samples = self._skipping = 0
+        self._skipping = 0
         self.rollout.restart()
         if self.segments:
             self.rollout.stagger(self.generator, team)
 
-    def __iter__(self) -> Iterator[Iteration]:
-        return self
-
-    def __next__(self) -> Iteration:
+    def __next__(self) -> NPGIteration:
         config, rollout, team = self.config, self.rollout, self.team
         timer = PhaseTimer(self.env.obs.device)
 
@@ -256,7 +237,7 @@ class NPG:
         if self.env.task.functions["success"] is None:
             statistics["success"], mean["mean_success"] = math.nan, None
         time_sample, time_gradient, time_solve, time_value, time_mean = timer.seconds()
-        return Iteration(
+        return NPGIteration(
             iteration=self.iteration,
             samples=self.samples,
             **statistics,
@@ -450,26 +431,14 @@ class NPG:
     def settings(self) -> dict[str, Any]:
         """The hyperparameters, with the sizes of the networks, as a run's config.json holds them."""
         config = fitted_config(self.config, self.policy.shape, self.value.shape)
-        if self.value.group != ("critic" if "critic" in self.env.obs_groups else "policy"):
+        if self.value.group != value_group(self.env, None):
             config = dataclasses.replace(config, value_group=self.value.group)
         return dataclasses.asdict(config) | {"samples": enough_samples(config, self.env.nworld * self.team.size)}
 
     def state_dict(self) -> dict[str, Any]:
-        """The state on which the next iteration depends, with the worlds of all processes.
-
-        All processes must call it. Any number of processes can continue from it.
-        """
-        state = {
-            "policy": self.policy.state_dict(),
-            "value": self.value.state_dict(),
-            "optimizer": self.fit.state_dict(),
-            "generator": self.generator.get_state(),
-            "env": self.team.gather(self.env.get_state()),
-            "returns": self.team.gather(self.rollout.running_return),
-            "iteration": self.iteration,
-            "samples": self.samples,
-        }
-        return copy.deepcopy(state)  # a module's own state_dict shares memory with its parameters
+        """The state on which the next iteration depends; see ``Learner``."""
+        own = {"optimizer": self.fit.state_dict(), "returns": self.team.gather(self.rollout.running_return)}
+        return super().state_dict() | copy.deepcopy(own)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken.
@@ -477,45 +446,6 @@ class NPG:
         Raises:
             ValueError: The state has another number of worlds, or does not fit for another reason.
         """
-        nworld = self.env.nworld * self.team.size
-        if len(state["env"]) != nworld:
-            raise ValueError(f"the state has {len(state['env'])} worlds, but the environment has {nworld}")
-        self.policy.load_state_dict(state["policy"])
-        self.value.load_state_dict(state["value"])
+        super().load_state_dict(state)
         self.fit.load_state_dict(state["optimizer"])
-        self.generator.set_state(state["generator"].cpu())
-        self.env.set_state(state["env"][self._own].to(self.env.obs.device))
         self.rollout.running_return.copy_(state["returns"][self._own])
-        self.iteration = state["iteration"]
-        self.samples = state["samples"]
-
-
-def _check_value(value: ValueFunction, env: Env) -> None:
-    """Check that a value function takes observations of an environment."""
-    name = env.task.name
-    if value.group not in env.obs_groups:
-        raise ValueError(
-            f"the value function takes the group {value.group!r} of observations, which the task {name!r} lacks: it "
-            f"has {', '.join(env.obs_groups)}"
-        )
-    size, wanted = value.shape["nobs"], env.obs_spaces[value.group].size
-    if size != wanted:
-        raise ValueError(
-            f"the value function takes {size} observations, but the group {value.group!r} of the task {name!r} has "
-            f"{wanted}"
-        )
-    for part, numbers in value.state_dict().items():
-        if not numbers.isfinite().all():
-            raise ValueError(f"the value function's {part!r} is not finite: leave it out for a new value function")
-
-
-def _value_group(env: Env, config: NPGConfig) -> str:
-    """The group of observations for a new value function."""
-    if config.value_group is None:
-        return "critic" if "critic" in env.obs_groups else "policy"
-    if config.value_group not in env.obs_groups:
-        raise ValueError(
-            f"the task {env.task.name!r} has no group {config.value_group!r} of observations for the value function: "
-            f"it has {', '.join(env.obs_groups)}"
-        )
-    return config.value_group

@@ -2,23 +2,26 @@
 
 import dataclasses
 import itertools
-import math
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import torch
 
-from lyceum_warp.algos.learner import LearnerIteration
-from lyceum_warp.algos.rollout_buffer import Rollout
+from lyceum_warp.algos.on_policy import (
+    EpisodeSums,
+    Moments,
+    OnPolicyIteration,
+    Scalar,
+    episode_statistics,
+    metric_means,
+    pooled,
+)
 from lyceum_warp.docstrings import document_attributes
-
-Scalar: TypeAlias = Any
-"""A tensor of one number on the device, or, after the copy to the host, a float."""
 
 
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Iteration(LearnerIteration):
+class NPGIteration(OnPolicyIteration):
     """Statistics of one iteration of NPG.
 
     Numbers about episodes cover those that ended in the iteration; they are nan where none ended.
@@ -84,29 +87,6 @@ class ValueSums(NamedTuple):
     """Sum of the squared deviations of the errors from their mean."""
 
 
-class EpisodeSums(NamedTuple):
-    """Sums over the episodes that ended in a process's worlds."""
-
-    episodes: Scalar
-    """Number of episodes."""
-    return_mean: Scalar
-    """Mean of their returns."""
-    return_square: Scalar
-    """Sum of the squared deviations of their returns from their mean."""
-    return_min: Scalar
-    """Smallest return; infinity where no episode ended."""
-    return_max: Scalar
-    """Largest return; minus infinity where no episode ended."""
-    length: Scalar
-    """Sum of their lengths."""
-    terminal_reward: Scalar
-    """Sum of their last rewards."""
-    eval: Scalar
-    """Sum of the evaluation metrics at their ends."""
-    success: Scalar
-    """Number of episodes that ended with the goal met."""
-
-
 class ProcessNumbers(NamedTuple):
     """The contribution of one process to the statistics of an iteration."""
 
@@ -132,49 +112,6 @@ class ProcessNumbers(NamedTuple):
         )
 
 
-class Moments(NamedTuple):
-    """Number, mean and sum of squared deviations from the mean of a set of numbers."""
-
-    n: float
-    mean: float
-    square: float
-
-
-def finished(rollout: Rollout) -> EpisodeSums:
-    """Sums over the episodes that ended within a rollout, scalar tensors on its device."""
-    ended = _ended(rollout)
-    returns = rollout.episode_return.double()
-    infinity = torch.inf
-
-    def total(part: torch.Tensor) -> torch.Tensor:
-        return part.double().masked_fill(~ended, 0.0).sum()
-
-    episodes = ended.sum().double()
-    mean = total(returns) / episodes.clamp_min(1.0)
-    return EpisodeSums(
-        episodes=episodes,
-        return_mean=mean,
-        return_square=total((returns - mean).square()),
-        return_min=returns.masked_fill(~ended, infinity).min(),
-        return_max=returns.masked_fill(~ended, -infinity).max(),
-        length=total(rollout.episode_length),
-        terminal_reward=total(rollout.reward),
-        eval=total(rollout.eval),
-        success=total(rollout.success),
-    )
-
-
-def finished_metrics(rollout: Rollout) -> tuple[torch.Tensor, ...]:
-    """Sums of the task's metrics over the episodes that ended within a rollout, scalar tensors on its device."""
-    ended = _ended(rollout)
-    return tuple(sums.double().masked_fill(~ended, 0.0).sum() for sums in rollout.episode_metrics.values())
-
-
-def _ended(rollout: Rollout) -> torch.Tensor:
-    """The last steps of the episodes that count, (steps, nworld) bool."""
-    return rollout.done & ~rollout.episode_return.isnan()
-
-
 def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums:
     """How well a value function predicted returns, scalar tensors on their device."""
     target, error = returns.double(), (returns - predicted).double()
@@ -187,7 +124,7 @@ def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums
 
 
 def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence[str] = ()) -> dict[str, Any]:
-    """Statistics of an iteration from the numbers of all processes, by their names in ``Iteration``.
+    """Statistics of an iteration from the numbers of all processes, by their names in ``NPGIteration``.
 
     Args:
         processes: The numbers of each process, as floats.
@@ -207,38 +144,10 @@ def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence
         "faults": round(sum(process.update.faults for process in processes)),
         "outliers": round(sum(process.update.outliers for process in processes)),
         "skipped_updates": (not update.finite) + (not update.fitted),
-        "metrics": metric_means(processes, metrics),
+        "metrics": metric_means(
+            sum(process.episodes.episodes for process in processes), [process.metrics for process in processes], metrics
+        ),
     }
-
-
-def metric_means(processes: Sequence[ProcessNumbers], names: Sequence[str]) -> dict[str, float]:
-    """Means of the task's metrics over the episodes of all processes; nan where none ended."""
-    episodes = sum(process.episodes.episodes for process in processes)
-    totals = (sum(sums) for sums in zip(*(process.metrics for process in processes), strict=True))
-    return {name: total / episodes if episodes else math.nan for name, total in zip(names, totals, strict=True)}
-
-
-def episode_statistics(sums: Sequence[EpisodeSums]) -> dict[str, float]:
-    """Statistics of finished episodes from the sums of all processes; nan where none ended."""
-    episodes, mean, square = pooled([Moments(part.episodes, part.return_mean, part.return_square) for part in sums])
-    if not episodes:
-        return dict.fromkeys(_EPISODE_STATISTICS, math.nan)
-    numbers = (
-        mean,
-        math.sqrt(square / episodes),
-        min(part.return_min for part in sums),
-        max(part.return_max for part in sums),
-        sum(part.length for part in sums) / episodes,
-        sum(part.terminal_reward for part in sums) / episodes,
-        sum(part.eval for part in sums) / episodes,
-        sum(part.success for part in sums) / episodes,
-    )
-    return dict(zip(_EPISODE_STATISTICS, numbers, strict=True))
-
-
-_EPISODE_STATISTICS = (
-    "return_mean", "return_std", "return_min", "return_max", "length_mean", "terminal_reward", "eval_mean", "success",
-)  # fmt: skip
 
 
 def value_statistics(sums: Sequence[ValueSums], samples: int) -> dict[str, float]:
@@ -250,10 +159,3 @@ def value_statistics(sums: Sequence[ValueSums], samples: int) -> dict[str, float
         "value_error": error / max(size, 1e-20 * n),
         "explained_variance": 1.0 - error_square / max(square, 1e-20 * n),
     }
-
-
-def pooled(parts: Sequence[Moments]) -> Moments:
-    """The moments of several sets of numbers together, from the moments of each."""
-    n = sum(part.n for part in parts)
-    mean = sum(part.n * part.mean for part in parts) / n if n else 0.0
-    return Moments(n, mean, sum(part.square + part.n * (part.mean - mean) ** 2 for part in parts))

@@ -1,8 +1,8 @@
 """Policies: a diagonal Gaussian around a small network."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeAlias
 
 import torch
 from torch import nn
@@ -93,6 +93,10 @@ class GaussianPolicy(nn.Module):
         """Mean actions, (..., nact)."""
         return self.network(self.normalizer(obs))
 
+    def act(self, obs: torch.Tensor) -> torch.Tensor:
+        """Actions without noise, (..., nact): the mean actions."""
+        return self(obs)
+
     @torch.no_grad()
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
         """Draw actions, without gradients.
@@ -104,20 +108,44 @@ class GaussianPolicy(nn.Module):
         """
         return torch.addcmul(self(obs), noise, self.log_std.exp(), out=out)
 
-    def observe(self, obs: torch.Tensor, team: Team | None = None) -> None:
+    def observe(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
         """Take observations into the normaliser's statistics, where it has one; this changes the mean actions.
 
         Args:
             obs: Observations, (..., nobs).
             team: The processes; each brings the same number of observations.
+            eps: Added to the standard deviations.
         """
         if isinstance(self.normalizer, Normalizer):
-            self.normalizer.update(obs, team)
+            self.normalizer.update(obs, team, eps=eps)
 
     def log_prob(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Log-density of actions, (...,)."""
-        z = (action - self(obs)) * torch.exp(-self.log_std)
-        return -0.5 * z.square().sum(-1) - self.log_std.sum() - 0.5 * action.shape[-1] * math.log(2 * math.pi)
+        return log_density(action, self(obs), self.log_std)
+
+
+def log_density(action: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor) -> torch.Tensor:
+    """Log-density of actions under a diagonal Gaussian, (...,)."""
+    z = (action - mean) * torch.exp(-log_std)
+    return -0.5 * z.square().sum(-1) - log_std.sum() - 0.5 * action.shape[-1] * math.log(2 * math.pi)
+
+
+def divergence(
+    old_mean: torch.Tensor, old_log_std: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor
+) -> torch.Tensor:
+    """KL divergence from one diagonal Gaussian to another, (...,)."""
+    square = (old_mean - mean).square() + torch.exp(2 * old_log_std)
+    return (log_std - old_log_std + 0.5 * square * torch.exp(-2 * log_std) - 0.5).sum(-1)
+
+
+Policy: TypeAlias = nn.Module | Callable[[torch.Tensor], torch.Tensor]
+"""A module with ``act``, or a function from observations to actions."""
+
+
+def acting(policy: Policy) -> Callable[[torch.Tensor], torch.Tensor]:
+    """The function from observations to actions without noise: a policy's ``act``, or a function itself."""
+    act: Callable[[torch.Tensor], torch.Tensor] = getattr(policy, "act", policy)
+    return act
 
 
 def _class_name(module: nn.Module) -> str:

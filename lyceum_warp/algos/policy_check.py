@@ -1,4 +1,4 @@
-"""A check of a policy that a user made, before NPG learns with it."""
+"""Check networks that a user gave, before an algorithm learns with them."""
 
 import torch
 from torch import nn
@@ -6,6 +6,7 @@ from torch import nn
 from lyceum_warp.algos.natural_gradient import FisherProduct, flatten
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
 from lyceum_warp.validate import described
 
@@ -13,16 +14,17 @@ _ROWS = 4
 """Observations that the policy is called with."""
 
 
-def check_policy(policy: object, env: Env) -> None:
-    """Check that NPG can learn a policy in an environment.
+def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
+    """Check that an algorithm can learn a policy in an environment.
 
     A policy is a ``GaussianPolicy``, with the package's network or one of the user's. Called with observations
     (..., nobs) it returns mean actions (..., nact), which depend on the observation in the same row alone, and which
-    are differentiable twice by the parameters that are learned.
+    are differentiable by the parameters that are learned.
 
     Args:
         policy: The policy.
         env: The environment; its worlds are left as they are.
+        twice: Whether the policy must be differentiable twice, as NPG needs it.
 
     Raises:
         ValueError: The policy breaks one of these rules.
@@ -43,7 +45,7 @@ def check_policy(policy: object, env: Env) -> None:
     noise = torch.randn(obs.shape, generator=torch.Generator().manual_seed(0))  # rows differ from each other
     obs = obs + 0.1 * noise.to(obs.device)
     _check_output(policy, obs)
-    _check_derivatives(policy, obs)
+    _check_derivatives(policy, obs, twice=twice)
 
 
 def _check_parameters(policy: GaussianPolicy) -> None:
@@ -92,7 +94,7 @@ def _called(policy: GaussianPolicy, obs: torch.Tensor) -> torch.Tensor:
     return mean
 
 
-def _check_derivatives(policy: GaussianPolicy, obs: torch.Tensor) -> None:
+def _check_derivatives(policy: GaussianPolicy, obs: torch.Tensor, *, twice: bool) -> None:
     named = [(name, p) for name, p in policy.named_parameters() if p.requires_grad and p is not policy.log_std]
     with torch.enable_grad():
         mean = policy(obs)
@@ -105,6 +107,8 @@ def _check_derivatives(policy: GaussianPolicy, obs: torch.Tensor) -> None:
                 f"the policy's mean actions do not depend on its parameter {unused[0]!r}: use it, without detach() or "
                 "no_grad(), or freeze it with requires_grad_(False)"
             )
+        if not twice:
+            return
         try:
             product = FisherProduct(policy, obs, 0.0)(
                 flatten(p.detach() for p in policy.parameters() if p.requires_grad)
@@ -116,6 +120,29 @@ def _check_derivatives(policy: GaussianPolicy, obs: torch.Tensor) -> None:
             ) from error
     if not product.isfinite().all():
         raise ValueError("the policy's derivatives are not finite")
+
+
+def check_value(value: ValueFunction, env: Env) -> None:
+    """Check that a value function takes observations of an environment.
+
+    Raises:
+        ValueError: It takes others, or a number of it is not finite.
+    """
+    name = env.task.name
+    if value.group not in env.obs_groups:
+        raise ValueError(
+            f"the value function takes the group {value.group!r} of observations, which the task {name!r} lacks: it "
+            f"has {', '.join(env.obs_groups)}"
+        )
+    size, wanted = value.shape["nobs"], env.obs_spaces[value.group].size
+    if size != wanted:
+        raise ValueError(
+            f"the value function takes {size} observations, but the group {value.group!r} of the task {name!r} has "
+            f"{wanted}"
+        )
+    for part, numbers in value.state_dict().items():
+        if not numbers.isfinite().all():
+            raise ValueError(f"the value function's {part!r} is not finite: leave it out for a new value function")
 
 
 def _first_line(error: BaseException) -> str:

@@ -11,9 +11,8 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.files import replaced
-from lyceum_warp.validate import check_kind
+from lyceum_warp.validate import described
 
 EXTRA = "pip install 'lyceum-warp[export]'"
 """Command that installs the packages for ONNX."""
@@ -21,11 +20,11 @@ EXTRA = "pip install 'lyceum-warp[export]'"
 _SUFFIXES = (".onnx", ".pt2")
 
 
-def export_policy(policy: GaussianPolicy, path: str | Path) -> Path:
-    """Write a policy to a file that runs without this package: observations in, mean actions out.
+def export_policy(policy: torch.nn.Module, path: str | Path) -> Path:
+    """Write a policy to a file that runs without this package: observations in, actions without noise out.
 
     The normaliser of observations is part of the file. The number of observations, (n, nobs) float32, is free. Actions
-    are those of ``policy(obs)``; an environment also clips controls to the ranges of the model's actuators.
+    are those of ``policy.act(obs)``; an environment also clips controls to the ranges of the model's actuators.
 
     ===========  ======================================================================================
     ``.onnx``    input ``obs``, output ``action``; for ONNX Runtime, TensorRT, OpenVINO, ...
@@ -38,7 +37,7 @@ def export_policy(policy: GaussianPolicy, path: str | Path) -> Path:
         >>> (action,) = session.run(["action"], {"obs": obs})  # NumPy arrays, (n, nobs) and (n, nact)
 
     Args:
-        policy: The policy, on any device.
+        policy: The policy, on any device: a module with the method ``act`` and the attribute ``nobs``.
         path: The file, which is replaced if it exists.
 
     Returns:
@@ -48,11 +47,13 @@ def export_policy(policy: GaussianPolicy, path: str | Path) -> Path:
         ImportError: The extra ``export``, which ``.onnx`` needs, is not installed.
         ValueError: The file has another suffix, or the policy's network cannot be exported.
     """
-    check_kind("policy", policy, GaussianPolicy, "as lw.load(run) returns it")
+    if not (isinstance(policy, torch.nn.Module) and hasattr(policy, "act") and hasattr(policy, "nobs")):
+        raise ValueError(f"policy must be a policy as lw.load(run) returns it, not {described(policy)}")
     path = Path(path)
     check_export(path)
-    alone = copy.deepcopy(policy).cpu().eval().requires_grad_(False)
-    example, shapes = (torch.zeros(2, policy.nobs),), ({0: torch.export.Dim("batch")},)
+    nobs: Any = policy.nobs
+    alone = _Acting(copy.deepcopy(policy)).cpu().eval().requires_grad_(False)
+    example, shapes = (torch.zeros(2, nobs),), ({0: torch.export.Dim("batch")},)
     try:
         with _quiet():
             program: Any = torch.export.export(alone, example, dynamic_shapes=shapes)
@@ -71,6 +72,18 @@ def export_policy(policy: GaussianPolicy, path: str | Path) -> Path:
             with temporary.open("wb") as file:
                 torch.export.save(program, file)
     return path
+
+
+class _Acting(torch.nn.Module):
+    """A policy whose ``forward`` is its ``act``: what torch exports."""
+
+    def __init__(self, policy: Any) -> None:
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        action: torch.Tensor = self.policy.act(obs)
+        return action
 
 
 def check_export(path: Path) -> None:

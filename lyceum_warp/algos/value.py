@@ -9,6 +9,7 @@ from torch import nn
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.networks import LIMIT, Activation, Normalizer, mlp
 from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.env import Env
 from lyceum_warp.validate import layer_sizes
 
 
@@ -98,15 +99,16 @@ class ValueFunction(nn.Module):
         """Predicted returns, (...,)."""
         return self.network(self.features(obs, step)).squeeze(-1) * self.scale.float() + self.shift.float()
 
-    def observe(self, obs: torch.Tensor, team: Team | None = None) -> None:
+    def observe(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
         """Take observations into the normaliser's statistics, where it has one; this changes the predictions.
 
         Args:
             obs: Observations, (..., nobs).
             team: The processes; each brings the same number of observations.
+            eps: Added to the standard deviations.
         """
         if isinstance(self.normalizer, Normalizer):
-            self.normalizer.update(obs, team)
+            self.normalizer.update(obs, team, eps=eps)
 
     @torch.no_grad()
     def rescale(self, returns: torch.Tensor, *, first: bool = False, team: Team | None = None) -> None:
@@ -156,3 +158,18 @@ class ValueFunction(nn.Module):
 
 BOUND = 10.0
 """How many scales a return or an advantage may lie away from the mean; what lies further is an outlier."""
+
+
+def value_group(env: Env, given: str | None) -> str:
+    """The group of observations for a new value function: the given one, else "critic" if there is one, or "policy".
+
+    Raises:
+        ValueError: The task has no such group.
+    """
+    group = given or ("critic" if "critic" in env.obs_groups else "policy")
+    if group not in env.obs_groups:
+        raise ValueError(
+            f"the task {env.task.name!r} has no group {group!r} of observations for the value function: it has "
+            f"{', '.join(env.obs_groups)}"
+        )
+    return group

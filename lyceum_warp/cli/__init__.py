@@ -4,20 +4,20 @@ import importlib.metadata
 import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
-from lyceum_warp.cli.bench import Bench, bench
-from lyceum_warp.cli.check import Check, check
-from lyceum_warp.cli.evaluate import Eval, evaluate_run
-from lyceum_warp.cli.export import Export, export
-from lyceum_warp.cli.list_tasks import Tasks, list_tasks
-from lyceum_warp.cli.new_task import New, new_task
-from lyceum_warp.cli.plan import Plan, plan
-from lyceum_warp.cli.train import Train, origin_options, resume, saved_options, train
-from lyceum_warp.cli.view import View, view_command
-from lyceum_warp.cli.warmup import Warmup, warm_up
+from lyceum_warp.cli.bench import Bench
+from lyceum_warp.cli.check import Check
+from lyceum_warp.cli.evaluate import Eval
+from lyceum_warp.cli.export import Export
+from lyceum_warp.cli.list_tasks import Tasks
+from lyceum_warp.cli.new_task import New
+from lyceum_warp.cli.plan import Plan
+from lyceum_warp.cli.train import Train
+from lyceum_warp.cli.view import View
+from lyceum_warp.cli.warmup import Warmup
 from lyceum_warp.interrupts import Interrupted, signals
 from lyceum_warp.viz.video import NoVideoError
 
@@ -62,30 +62,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv, rest = (argv[:2], argv[2:]) if argv[:1] == ["bench"] else (argv, [])
     try:
         with signals():
-            command = _parse(argv)
-            if isinstance(command, Bench):
-                return bench(command, rest)
-            if isinstance(command, Tasks):
-                return list_tasks(command)
-            if isinstance(command, New):
-                return new_task(command)
-            if isinstance(command, Check):
-                return check(command)
-            if isinstance(command, Eval):
-                return evaluate_run(command)
-            if isinstance(command, Export):
-                return export(command)
-            if isinstance(command, Plan):
-                return plan(command)
-            if isinstance(command, View):
-                return view_command(command)
-            if isinstance(command, Warmup):
-                return warm_up(command)
-            if command.from_run is not None:
-                command = _parse(argv, origin_options(command))
-            if command.resume is not None:
-                return resume(_parse(argv, saved_options(command.resume)), command.resume)
-            return train(command)
+            command = tyro.cli(
+                _Command, prog="lyceum-warp", description=_DESCRIPTION, args=argv,
+                config=(tyro.conf.OmitSubcommandPrefixes,),
+            )  # fmt: skip
+            return int(command.run(*rest))
     except (ValueError, FileNotFoundError, FloatingPointError, ImportError, NoVideoError) as error:
         text = "; ".join([str(error), *getattr(error, "__notes__", [])])
         print(f"lyceum-warp: {' '.join(text.split())}", file=sys.stderr)
@@ -97,17 +78,5 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     except OSError as error:  # as a full disk, or a folder that cannot be written
         text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-        print(f"lyceum-warp: {text}", file=sys.stderr)
+        print(f"lyceum-warp: {'; '.join([text, *getattr(error, '__notes__', [])])}", file=sys.stderr)
         return 2
-
-
-def _parse(argv: Sequence[str], default: Train | None = None) -> Any:
-    options = {} if default is None else {"default": default}
-    return tyro.cli(  # type: ignore[call-overload]
-        _Command,
-        prog="lyceum-warp",
-        description=_DESCRIPTION,
-        args=argv,
-        config=(tyro.conf.OmitSubcommandPrefixes,),
-        **options,
-    )

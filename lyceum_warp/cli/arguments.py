@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import types
 import typing
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
@@ -23,38 +24,40 @@ Class = TypeVar("Class")
 
 @typing.dataclass_transform(kw_only_default=True, frozen_default=True)
 def optional_flags(
-    options: type, *, omit: Collection[str] = (), default: str | None = None
+    *options: type, omit: Collection[str] = (), default: str | Callable[[str], str] | None = None
 ) -> Callable[[type[Class]], type[Class]]:
-    """Class decorator: add the fields of a dataclass as flags, with their docstrings as help texts.
+    """Class decorator: add the fields of dataclasses as flags, with their docstrings as help texts.
 
     The class itself declares the fields that need another type or another help text in a shell. It must declare those
     of more than one type. Values are checked when the dataclass is made of them, not before: the parser would print an
     error as several lines in a box.
 
     Args:
-        options: The dataclass.
+        options: The dataclasses. A field of several of them has the type and the help text of the first.
         omit: Fields that get no flag.
-        default: The default of a flag as its help text describes it. Flags that are not given then are None, but bools
-            keep their defaults. Without this text all flags have the defaults of the dataclass.
+        default: The default of a flag as its help text describes it, or a function that gives it for the name of a
+            field. Flags that are not given then are None. Without this text all flags have the defaults of the
+            dataclass.
     """
 
     def decorated(cls: type[Class]) -> type[Class]:
         own = dict(vars(cls).get("__annotations__", {}))
-        hints, docs = typing.get_type_hints(options), attribute_docs(options) | attribute_docs(cls)
         inherited = getattr(cls, "__dataclass_fields__", {})
         flags: dict[str, Any] = {}
-        for field in dataclasses.fields(options):
-            if field.name in omit or (field.name in inherited and field.name not in own):
-                continue
-            if field.name not in vars(cls):
-                unset = default is not None and not isinstance(field.default, bool)
-                setattr(cls, field.name, None if unset else field.default)
-            value = getattr(cls, field.name)
-            flag = own.pop(field.name, None) or (_optional(hints[field.name]) if value is None else hints[field.name])
-            # a docstring says what None stands for
-            hint = default or "" if value is None else None
-            text = " ".join(docs.get(field.name, "").split())
-            flags[field.name] = Annotated[flag, tyro.conf.arg(help=text, help_behavior_hint=hint)]
+        for kind in options:
+            hints, docs = typing.get_type_hints(kind), attribute_docs(kind) | attribute_docs(cls)
+            for field in dataclasses.fields(kind):
+                name = field.name
+                if name in omit or name in flags or (name in inherited and name not in own):
+                    continue
+                if name not in vars(cls):
+                    setattr(cls, name, field.default if default is None else None)
+                value = getattr(cls, name)
+                flag = own.pop(name, None) or (_optional(hints[name]) if value is None else hints[name])
+                # a docstring says what None stands for
+                text = default(name) if callable(default) else default or ""
+                help_text, hint = " ".join(docs.get(name, "").split()), text if value is None else None
+                flags[name] = Annotated[flag, tyro.conf.arg(help=help_text, help_behavior_hint=hint)]
         cls.__annotations__ = flags | own
         return dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
@@ -63,8 +66,12 @@ def optional_flags(
 
 def _optional(hint: Any) -> Any:
     """The annotation of a flag that may be left out, for a field of one type, or of one type and None."""
-    (kind,) = [kind for kind in typing.get_args(hint) if kind is not type(None)] or [hint]
-    return Annotated[kind | None, tyro.conf.arg(metavar=kind.__name__.upper())]
+    (kind,) = [kind for kind in typing.get_args(hint) if kind is not type(None)] if _is_union(hint) else [hint]
+    return Annotated[kind | None, tyro.conf.DisallowNone]
+
+
+def _is_union(hint: Any) -> bool:
+    return typing.get_origin(hint) in (typing.Union, types.UnionType)
 
 
 def given(flags: Any) -> dict[str, Any]:
@@ -88,17 +95,7 @@ class Placement:
     """cpu, or a CUDA device such as cuda:0."""
 
 
-@optional_flags(EnvOptions, omit=NO_FLAGS)
-class EnvFlags(Placement):
-    """Where the worlds run, and how their episodes go."""
-
-    @classmethod
-    def of(cls, options: EnvOptions) -> "EnvFlags":
-        """The flags that stand for options."""
-        return cls(**{field.name: getattr(options, field.name) for field in dataclasses.fields(cls)})
-
-
-@optional_flags(PhysicsOptions)
+@optional_flags(PhysicsOptions, default="")
 class Physics:
     """How the worlds are simulated. Options that are left out are those of the task or of its model."""
 
@@ -106,32 +103,22 @@ class Physics:
     """Another limit of the constraint solver than the model's, as iterations=4, ls_iterations=10 or
     noslip_iterations=0; may be given several times."""
 
-    @classmethod
-    def of(cls, options: PhysicsOptions) -> "Physics":
-        """The flags that stand for options."""
-        values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
-        limits = values.pop("solver") or {}
-        return cls(solver=tuple(f"{name}={limit}" for name, limit in limits.items()), **values)
+    def given(self) -> dict[str, Any]:
+        """The options that the flags stand for, by name.
+
+        Raises:
+            ValueError: A limit is written in another way.
+        """
+        limits = {"solver": dict(map(parameter, self.solver))} if self.solver else {}
+        return given(self) | limits
 
     def options(self) -> PhysicsOptions:
-        """The options that the flags stand for.
+        """The same, checked.
 
         Raises:
             ValueError: A value is not valid.
         """
-        return PhysicsOptions(**vars(self) | {"solver": dict(map(parameter, self.solver))})
-
-
-def run_options(config: Mapping[str, Any]) -> tuple[EnvOptions, dict[str, Any]]:
-    """The options of a run's environment, except nworld and seed, and the task's parameters, from its config.json.
-
-    Earlier releases accepted options as --param and stored them under "params", or had no "physics".
-
-    Raises:
-        ValueError: A value is not valid.
-    """
-    words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
-    return EnvOptions.split(words, EnvOptions(engine=config["engine"], device=config["device"]))
+        return PhysicsOptions(**self.given())
 
 
 def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str] | None = None) -> dict[str, Any]:
@@ -159,12 +146,6 @@ def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str]
 def _flag_names(command: Any) -> list[str]:
     nested = ([name] if not dataclasses.is_dataclass(v) else _flag_names(v) for name, v in vars(command).items())
     return [name for names in nested for name in names]
-
-
-def portable(task: str) -> str:
-    """A task's file with its whole path, so that a run can be used from another folder; a name stays as it is."""
-    path, colon, attribute = task.partition(":")
-    return f"{Path(path).resolve()}{colon}{attribute}" if path.endswith(".py") else task
 
 
 def parameter(text: str) -> tuple[str, Any]:
@@ -199,8 +180,3 @@ def _value(part: str, text: str) -> bool | int | float:
         return float(part)  # inf
     except ValueError:
         raise ValueError(f"the value in {text!r} must be a number, true or false") from None
-
-
-def spelled(value: Any) -> str:
-    """A value as `parameter` reads it."""
-    return ",".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)

@@ -6,7 +6,6 @@ import difflib
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -33,37 +32,37 @@ class Bench:
     name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")] = "overview"
     """A program of bench/, without .py."""
 
+    def run(self, *arguments: str) -> int:
+        """Run the command.
 
-def bench(options: Bench, arguments: Sequence[str]) -> int:
-    """Run the command.
+        Args:
+            arguments: What the program is given.
 
-    Args:
-        options: The program.
-        arguments: What the program is given.
+        Returns:
+            The program's exit code.
 
-    Returns:
-        The program's exit code.
-
-    Raises:
-        ValueError: There is no such program.
-        FileNotFoundError: The package does not lie in a checkout.
-    """
-    if not (FOLDER / "experiment.py").exists():
-        raise FileNotFoundError(f"the experiments belong to a checkout of the repository, and {FOLDER} is not there")
-    programs = [path.stem for path in sorted(FOLDER.glob("*.py")) if "__main__" in path.read_text()]
-    if options.name not in programs:
-        close = difflib.get_close_matches(options.name, programs, 1)
-        hint = f"did you mean {close[0]}?" if close else "lyceum-warp bench lists the experiments"
-        raise ValueError(f"there is no program {options.name!r} in bench/: {hint}")
-    path = os.pathsep.join([str(FOLDER.parent), *filter(None, [os.environ.get("PYTHONPATH")])])  # this very package
-    command = [sys.executable, str(FOLDER / f"{options.name}.py"), *arguments]
-    child = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path})
-    try:
-        code = child.wait()
-    except Interrupted:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            child.wait(3.0)  # a terminal's Ctrl-C has reached it, too
-        child.terminate()
-        child.wait()
-        raise
-    return code if code >= 0 else 128 - code
+        Raises:
+            ValueError: There is no such program.
+            FileNotFoundError: The package does not lie in a checkout.
+        """
+        if not (FOLDER / "experiment.py").exists():
+            raise FileNotFoundError(
+                f"the experiments belong to a checkout of the repository, and {FOLDER} is not there"
+            )
+        programs = [path.stem for path in sorted(FOLDER.glob("*.py")) if "__main__" in path.read_text()]
+        if self.name not in programs:
+            close = difflib.get_close_matches(self.name, programs, 1)
+            hint = f"did you mean {close[0]}?" if close else "lyceum-warp bench lists the experiments"
+            raise ValueError(f"there is no program {self.name!r} in bench/: {hint}")
+        path = os.pathsep.join([str(FOLDER.parent), *filter(None, [os.environ.get("PYTHONPATH")])])  # this very package
+        command = [sys.executable, str(FOLDER / f"{self.name}.py"), *arguments]
+        child = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path})
+        try:
+            code = child.wait()
+        except Interrupted:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(3.0)  # a terminal's Ctrl-C has reached it, too
+            child.terminate()
+            child.wait()
+            raise
+        return code if code >= 0 else 128 - code

@@ -40,21 +40,18 @@ class Check:
     env: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
-
-def check(options: Check) -> int:
-    """Run the command; returns the exit code."""
-    words = vars(options.env) | options.physics.options().given() | parameters(options.param, options)
-    checks = [_check(name) for name in options.rule] or CHECKS
-    console = make_console()
-    try:
-        report = check_task(
-            options.task, nworld=options.nworld, steps=options.steps, seed=options.seed, checks=checks, **words
-        )
-    except AssertionError as error:
-        console.print(str(error), soft_wrap=True, markup=False)
-        return 1
-    console.print(str(report), soft_wrap=True, markup=False)
-    return 0
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        words = vars(self.env) | self.physics.options().given() | parameters(self.param, self)
+        checks = [_check(name) for name in self.rule] or CHECKS
+        console = make_console()
+        try:
+            report = check_task(self.task, nworld=self.nworld, steps=self.steps, seed=self.seed, checks=checks, **words)
+        except AssertionError as error:
+            console.print(str(error), soft_wrap=True, markup=False)
+            return 1
+        console.print(str(report), soft_wrap=True, markup=False)
+        return 0
 
 
 def _check(rule: str) -> Callable[[Context], None]:

@@ -4,6 +4,7 @@ import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import rich.box
 import torch
@@ -11,13 +12,14 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from lyceum_warp.algos.learner import LearnerIteration
-from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp import training
+from lyceum_warp.algos.learner import Iteration, Learner
+from lyceum_warp.algos.policy import Policy
 from lyceum_warp.controllers.control_report import ControlReport
 from lyceum_warp.controllers.episode_collector import ControlProgress
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
 from lyceum_warp.viz.cameras import CameraChoice
 from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.policy_videos import one_line, policy_states
@@ -36,51 +38,65 @@ def note(line: str) -> None:
     print(f"lyceum-warp: {line}", file=sys.stderr)
 
 
-class Display:
+class Display(training.Display):
     """Progress of a training run: a live bar of at most 80 columns on a terminal, a line for each iteration elsewhere.
 
     Args:
         console: Where it is shown.
-        done: Complete iterations.
-        total: Iterations in all.
     """
 
-    def __init__(self, console: Console, done: int, total: int) -> None:
-        self.console, self.total, self.mean = console, total, math.nan
+    def __init__(self, console: Console) -> None:
+        self.console, self.total, self.mean = console, 0, math.nan
         self.other: LongWork | None = None
         self.progress = Progress(
             BarColumn(bar_width=8), MofNCompleteColumn(), TextColumn("{task.fields[text]}"),
             TimeElapsedColumn(), TimeRemainingColumn(compact=True), TextColumn("left"),
             console=console, disable=not console.is_terminal,
         )  # fmt: skip
-        self.bar = self.progress.add_task("", total=total, completed=done, text="")
 
-    def __enter__(self) -> "Display":
+    def begin(self, run: Run, learner: Learner, iterations: int) -> None:
+        """Show the task, its worlds and where the run goes."""
+        env, size = learner.env, learner.team.size
+        processes = f" each in {size} processes" if size > 1 else ""
+        self.console.print(
+            f"[bold]{env.task.name}[/]: {env.obs_space.size} observations, {env.action_space.size} actions; "
+            f"{env.nworld} worlds{processes}, {env.engine.name} engine on {env.options.device or 'cpu'}, "
+            f"{learner.algorithm}; run in {run.folder}", soft_wrap=True,
+        )  # fmt: skip
+        self.total = iterations
+        self.bar = self.progress.add_task("", total=iterations, completed=learner.iteration, text="")
         self.progress.start()
-        return self
 
-    def __exit__(self, *exception: object) -> None:
+    def end(self) -> None:
+        """Remove the bar."""
         self.progress.stop()
 
-    def __call__(self, it: LearnerIteration) -> None:
+    def note(self, line: str) -> None:
+        """Print a line to stderr."""
+        note(line)
+
+    def __call__(self, it: Iteration) -> None:
         """Show an iteration."""
         if it.mean_return is not None:
             self.mean = it.mean_return
         shown = self.mean if self.console.is_terminal else math.nan if it.mean_return is None else self.mean
-        # until an episode has ended, the reward shows how the policy does
-        result = f"reward {it.reward_mean:.3g} a step" if math.isnan(it.return_mean) else f"return {it.return_mean:.4g}"
-        mean = "" if math.isnan(shown) else f"(mean policy {shown:.4g})"
-        success = "" if math.isnan(it.success) else f"success {it.success:.0%}"
         row = it.row()
+        # until an episode has ended, the reward shows how the policy does
+        reward = "" if _missing(row, "reward_mean") else f"reward {row['reward_mean']:.3g} a step"
+        result = reward if _missing(row, "return_mean") else f"return {row['return_mean']:.4g}"
+        mean = "" if math.isnan(shown) else f"(mean policy {shown:.4g})"
+        success = "" if _missing(row, "success") else f"success {row['success']:.0%}"
         bad = [counted(row.get(column, 0), what) for column, what in _COUNTED.items()]
-        rate = f"{it.samples_per_second / 1000:.3g}k"
+        rate = "" if _missing(row, "samples_per_second") else f"{row['samples_per_second'] / 1000:.3g}k samples/s"
         if self.console.is_terminal:
-            most = [result, mean, success, *bad, f"{rate}/s"]
-            less = (most[:-1], [result, success, *bad], [result, *bad])
-            text = _first_that_fits([most, *less], self.console.width - _BAR_WIDTH)
+            most = [result, mean, success, *bad, rate.replace(" samples", "")]
+            for parts in (most, most[:-1], [result, success, *bad], [result, *bad]):
+                text = " ".join(filter(None, parts))
+                if len(text) <= self.console.width - _BAR_WIDTH:
+                    break
             self.progress.update(self.bar, completed=it.iteration, text=text)
         else:
-            text = _first_that_fits([[result, mean, success, *bad, f"{rate} samples/s"]], 1)
+            text = " ".join(filter(None, [result, mean, success, *bad, rate]))
             self.console.print(f"iteration {it.iteration:4d}/{self.total}  {text}", soft_wrap=True)
             sys.stdout.flush()
 
@@ -101,12 +117,6 @@ _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skippe
 
 _BAR_WIDTH = 36
 """Columns that the bar, the number of the iteration and the times take."""
-
-
-def _first_that_fits(lines: list[list[str]], width: int) -> str:
-    """The first of some lines, each given in parts, that fits into a width; the last one if none does."""
-    texts = [" ".join(part for part in parts if part) for parts in lines]
-    return next((text for text in texts if len(text) <= width), texts[-1])
 
 
 def counted(number: int, what: str) -> str:
@@ -147,36 +157,25 @@ def _spread(rows: list[dict[str, float | None]]) -> list[dict[str, float | None]
     """At most 15 rows, with the first and the last; where at least 5 have an evaluation, only those between them."""
     if sum(row.get("mean_return") is not None for row in rows) >= 5:
         ends = (0, len(rows) - 1)
-        rows = [row for i, row in enumerate(rows) if i in ends or row["mean_return"] is not None]
+        rows = [row for i, row in enumerate(rows) if i in ends or row.get("mean_return") is not None]
     if len(rows) <= _TABLE_ROWS:
         return rows
     return [rows[round(i * (len(rows) - 1) / (_TABLE_ROWS - 1))] for i in range(_TABLE_ROWS)]
 
 
-def tried(make: Callable[[], object]) -> str:
+def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
     """The path that a function returns, or "none" and the reason why there is none.
 
     For what is made of results that are saved: its failure must not look like theirs.
     """
     try:
-        return str(make())
+        return str(make(*args, **words))
     except Exception as error:
         return f"none: {one_line(error)}"
 
 
-def plotted(run: Run) -> str:
-    """Draw a run's learning curve; returns the picture's path, or the reason why there is none."""
-
-    def draw() -> Path:
-        from lyceum_warp.viz.learning_curve import learning_curve
-
-        return learning_curve(run)
-
-    return tried(draw)
-
-
-def policy_video(env: Env, policy: GaussianPolicy, path: Path, seed: int, *, camera: CameraChoice = None) -> str:
-    """Write a video of an episode under a policy; returns its path, or the reason why there is none.
+def policy_video(env: Env, policy: Policy, path: Path, seed: int, *, camera: CameraChoice = None) -> Path:
+    """Write a video of an episode under a policy; returns its path.
 
     Args:
         env: The policy's environment; the episode runs in a world of its own.
@@ -185,23 +184,15 @@ def policy_video(env: Env, policy: GaussianPolicy, path: Path, seed: int, *, cam
         seed: Seed of the initial state.
         camera: The camera; see ``write_video``.
     """
-
-    def make() -> str:
-        with LongWork("running an episode for the video", "steps", make_console()) as work:
-            one, states = policy_states(env, policy, seed, progress=work)
-        return states_video(one, states, path, camera=camera)
-
-    return tried(make)
+    with LongWork("running an episode for the video", "steps", make_console()) as work:
+        one, states = policy_states(env, policy, seed, progress=work)
+    return states_video(one, states, path, camera=camera)
 
 
-def states_video(env: Env, states: torch.Tensor, path: Path, *, camera: CameraChoice = None) -> str:
-    """Write a video of given states; returns its path, or the reason why there is none."""
-
-    def make() -> Path:
-        with LongWork("drawing the video", "frames", make_console()) as work:
-            return write_video(env, states, path, camera=camera, progress=work)
-
-    return tried(make)
+def states_video(env: Env, states: torch.Tensor, path: Path, *, camera: CameraChoice = None) -> Path:
+    """Write a video of given states; returns its path."""
+    with LongWork("drawing the video", "frames", make_console()) as work:
+        return write_video(env, states, path, camera=camera, progress=work)
 
 
 # plans
@@ -266,14 +257,3 @@ def report_table(report: ControlReport, *, success: bool = True) -> Table:
         if success or row[0] != "success":
             table.add_row(*row)
     return table
-
-
-def plotted_control(trajectories: list[Trajectory], path: Path) -> str:
-    """Draw trajectories; returns the picture's path, or the reason why there is none."""
-
-    def draw() -> Path:
-        from lyceum_warp.viz.control_plot import control_plot
-
-        return control_plot(trajectories, path)
-
-    return tried(draw)

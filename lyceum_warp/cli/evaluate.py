@@ -9,18 +9,19 @@ import tyro
 from rich.table import Table
 
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
-from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.checkpoints import check_sizes
-from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, Repeated, given, optional_flags, parameters, run_options
-from lyceum_warp.cli.display import make_console, note, policy_video
+from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, Repeated, given, optional_flags, parameters
+from lyceum_warp.cli.display import make_console, note, policy_video, tried
 from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.controllers.trajectory import source
 from lyceum_warp.engines.placement import options_for_few_worlds
 from lyceum_warp.env import Env
-from lyceum_warp.kept_task import run_env
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.runs import Run, load
+from lyceum_warp.runs.checkpoints import check_sizes
+from lyceum_warp.runs.configuration import Configuration
+from lyceum_warp.runs.folder import Run, load
+from lyceum_warp.runs.task_copy import note_changes, run_env
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.video import check_video
@@ -53,7 +54,7 @@ class Eval:
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 8 --episodes-to runs/hopper-episodes
     """
 
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     which: str = "last"
     """Which policy: last, best, or the number of an iteration that was kept."""
@@ -78,68 +79,71 @@ class Eval:
     """Folder, new or empty, for a file of each episode, as lyceum-warp plan writes them: episode-000.npz and so on."""
     env: tyro.conf.OmitArgPrefixes[OtherEnv] = dataclasses.field(default_factory=OtherEnv)
 
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        if self.episodes < 1 or self.nworld < 1:
+            raise ValueError(f"eval needs at least 1 episode and 1 world, not {self.episodes} and {self.nworld}")
+        camera = parsed_camera(self.camera)
+        if self.video:
+            check_video()
+        elif camera is not None:
+            raise ValueError("--camera has no effect without --video: give both, or leave out --camera")
+        if self.episodes_to is not None:
+            Run.check_free(self.episodes_to)
+        run = Run.open(self.folder)
+        nworld = min(self.nworld, self.episodes)
+        saved = Configuration.of(run)
+        known, params = saved.options.changed({"seed": 0}), dict(saved.params)
+        if self.task is not None and task_name(find_task(self.task)) != run.task_name:
+            known, params = EnvOptions(engine=known.engine, device=known.device, nthread=known.nthread), {}
+        params |= parameters(self.param, self)
+        known = known.changed({"nworld": nworld} | given(self.env))
+        if self.env.device is None:
+            known = known.changed(options_for_few_worlds(known.engine, known.device))
+        path = run.policy_file(self.which)
+        env = run_env(run, known, params, note=note, task=self.task)
+        if self.task is None:
+            note_changes(run, env, note=note)
+        find_camera(env.model, camera)
+        origin = _source(env, run)
+        if env.horizon == 0:
+            env = evaluation_worlds(env, nworld)
+        policy = load(run, which=self.which, device=env.obs.device)
+        check_sizes(policy, env, path)
+        with LongWork("evaluating the policy", "steps", make_console()) as work:
+            episodes = evaluate(env, policy, self.episodes, seed=self.seed, progress=work).first(self.episodes)
+        table = Table(box=rich.box.SIMPLE)
+        for heading in ("", "mean", "std", "min", "max"):
+            table.add_column(heading, justify="right" if heading else "left")
+        for name, values in (("return", episodes.returns), ("evaluation at the end", episodes.evals),
+                             ("last reward", episodes.rewards), ("length", episodes.lengths),
+                             *episodes.metrics.items()):  # fmt: skip
+            numbers = (values.mean(), values.std(correction=0), values.min(), values.max())
+            table.add_row(name, *(f"{number.item():.6g}" for number in numbers))
+        console = make_console()
+        which = "the mean policy" if self.which == "last" else f"the mean policy {self.which!r}"
+        console.print(f"{env.task.name}: {self.episodes} episodes of {which} in {self.folder}", soft_wrap=True)
+        console.print(table)
+        if env.task.functions["success"] is not None:
+            console.print(f"success: {episodes.success.mean().item():.0%}")
+        if self.episodes_to is not None:
+            paths = _save_episodes(env, policy, self, origin)
+            console.print(f"episodes: {paths}", soft_wrap=True, markup=False)
+        if self.video:
+            video = tried(
+                policy_video, env, policy, run.folder / "eval.mp4", evaluation_seed(self.seed), camera=camera
+            )  # fmt: skip
+            console.print(f"video: {video}", soft_wrap=True, markup=False)
+        return 0
 
-def evaluate_run(options: Eval) -> int:
-    """Run the command; returns the exit code."""
-    if options.episodes < 1 or options.nworld < 1:
-        raise ValueError(f"eval needs at least 1 episode and 1 world, not {options.episodes} and {options.nworld}")
-    camera = parsed_camera(options.camera)
-    if options.video:
-        check_video()
-    elif camera is not None:
-        raise ValueError("--camera has no effect without --video: give both, or leave out --camera")
-    if options.episodes_to is not None:
-        Run.check_free(options.episodes_to, resumable=False, command=False)
-    run = Run.open(options.run)
-    config = run.config
-    nworld = min(options.nworld, options.episodes)
-    known, params = run_options(config)
-    if options.task is not None and task_name(find_task(options.task)) != run.task_name:
-        known, params = EnvOptions(engine=known.engine, device=known.device, nthread=known.nthread), {}
-    params |= parameters(options.param, options)
-    known = known.changed({"nworld": nworld} | given(options.env))
-    if options.env.device is None:
-        known = known.changed(options_for_few_worlds(known.engine, known.device))
-    path = run.policy_file(options.which)
-    env = run_env(run, known, params, note=note, task=options.task)
-    find_camera(env.model, camera)
-    origin = _source(env, run)
-    if env.horizon == 0:
-        env = evaluation_worlds(env, nworld)
-    policy = load(run, which=options.which, device=env.obs.device)
-    check_sizes(policy, env, path)
-    with LongWork("evaluating the policy", "steps", make_console()) as work:
-        episodes = evaluate(env, policy, options.episodes, seed=options.seed, progress=work).first(options.episodes)
-    table = Table(box=rich.box.SIMPLE)
-    for heading in ("", "mean", "std", "min", "max"):
-        table.add_column(heading, justify="right" if heading else "left")
-    for name, values in (("return", episodes.returns), ("evaluation at the end", episodes.evals),
-                         ("last reward", episodes.rewards), ("length", episodes.lengths),
-                         *episodes.metrics.items()):  # fmt: skip
-        numbers = (values.mean(), values.std(correction=0), values.min(), values.max())
-        table.add_row(name, *(f"{number.item():.6g}" for number in numbers))
-    console = make_console()
-    which = "the mean policy" if options.which == "last" else f"the mean policy {options.which!r}"
-    console.print(f"{env.task.name}: {options.episodes} episodes of {which} in {options.run}", soft_wrap=True)
-    console.print(table)
-    if env.task.functions["success"] is not None:
-        console.print(f"success: {episodes.success.mean().item():.0%}")
-    if options.episodes_to is not None:
-        paths = _save_episodes(env, policy, options, origin)
-        console.print(f"episodes: {paths}", soft_wrap=True, markup=False)
-    if options.video:
-        video = policy_video(env, policy, run.folder / "eval.mp4", evaluation_seed(options.seed), camera=camera)
-        console.print(f"video: {video}", soft_wrap=True, markup=False)
-    return 0
 
-
-def _save_episodes(env: Env, policy: GaussianPolicy, options: Eval, source: dict[str, Any]) -> str:
+def _save_episodes(env: Env, policy: Policy, options: Eval, source: dict[str, Any]) -> str:
     """Run the same episodes again, and write a file of each; returns what names them all."""
     assert options.episodes_to is not None
-    whose = {"run": str(options.run.resolve()), "which": options.which}
+    whose = {"name": type(policy).__name__, "run": str(options.folder.resolve()), "which": options.which}
     with LongWork("running the episodes that are saved", "steps", make_console()) as work:
         episodes = policy_episodes(
-            env.replicate(autoreset=False), policy, options.episodes, seed=evaluation_seed(options.seed),
+            env.replicate(autoreset=False), acting(policy), options.episodes, seed=evaluation_seed(options.seed),
             controller=whose, progress=work,
         )  # fmt: skip
         for number, episode in enumerate(episodes):

@@ -8,7 +8,7 @@ import tyro
 
 from lyceum_warp.algos.policy_export import check_export, export_policy
 from lyceum_warp.cli.display import make_console
-from lyceum_warp.runs import Run, load
+from lyceum_warp.runs.folder import Run, load
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -22,20 +22,19 @@ class Export:
     $ lyceum-warp export runs/hopper-20260101-120000 --which best --to robot/policy.onnx
     """
 
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     to: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The file, .onnx or .pt2; policy.onnx in the run's folder by default. It is replaced if it exists."""
     which: str = "last"
     """Which policy: last, best, or the number of an iteration that was kept."""
 
-
-def export(options: Export) -> int:
-    """Run the command; returns the exit code."""
-    path = options.to or options.run / "policy.onnx"
-    check_export(path)
-    policy = load(Run.open(options.run), which=options.which)
-    export_policy(policy, path)
-    text = f"{path}: {policy.nobs} observations, {policy.nact} actions, {path.stat().st_size / 1e3:.1f} kB"
-    make_console().print(text, soft_wrap=True, markup=False)
-    return 0
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        path = self.to or self.folder / "policy.onnx"
+        check_export(path)
+        policy = load(Run.open(self.folder), which=self.which)
+        export_policy(policy, path)
+        text = f"{path}: {policy.nobs} observations, {policy.nact} actions, {path.stat().st_size / 1e3:.1f} kB"
+        make_console().print(text, soft_wrap=True, markup=False)
+        return 0

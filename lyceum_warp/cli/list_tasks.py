@@ -52,6 +52,38 @@ class Tasks:
     word: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="WORD")] = ""
     """Only tasks with this word in their name, their description or the source of their model."""
 
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        entries = [entry for entry in map(_entry, task_names()) if entry.found(self.word)]
+        if not entries:
+            raise ValueError(
+                f"no task has {self.word!r} in its name, description or model: lyceum-warp tasks lists all"
+            )
+        rows, notes = zip(*map(_row, entries), strict=True)
+        table = [_HEADINGS, *rows]
+        widths = [max(len(row[i]) for row in table) for i in range(len(_HEADINGS))]
+        sides: list[Callable[[str, int], str]] = [str.ljust] * len(_HEADINGS)
+        sides[_RIGHT] = [str.rjust] * len(sides[_RIGHT])
+        heading, *lines = (
+            "  ".join(side(*cell) for side, *cell in zip(sides, row, widths, strict=True)) for row in table
+        )
+        console = make_console()
+
+        def show(text: str, style: str = "", indent: str = "") -> None:
+            if indent:
+                text = textwrap.fill(text, min(console.width, _WIDTH), initial_indent=indent, subsequent_indent=indent)
+            console.print(escape(text.rstrip()), style=style, soft_wrap=True)
+
+        show(heading, "bold")
+        for line, entry, note in zip(lines, entries, notes, strict=True):
+            show(line)
+            show(entry.about or _UNKNOWN, "dim", "    ")
+            if note:
+                show(note, "yellow", "    ")
+        show("")
+        show(_LEGEND, "dim")
+        return 0
+
 
 @dataclasses.dataclass(frozen=True)
 class _Entry:
@@ -68,35 +100,6 @@ class _Entry:
     def found(self, word: str) -> bool:
         """Whether the entry has a word, in any case."""
         return word.lower() in " ".join((self.name, self.about, self.source)).lower()
-
-
-def list_tasks(options: Tasks) -> int:
-    """Run the command; returns the exit code."""
-    entries = [entry for entry in map(_entry, task_names()) if entry.found(options.word)]
-    if not entries:
-        raise ValueError(f"no task has {options.word!r} in its name, description or model: lyceum-warp tasks lists all")
-    rows, notes = zip(*map(_row, entries), strict=True)
-    table = [_HEADINGS, *rows]
-    widths = [max(len(row[i]) for row in table) for i in range(len(_HEADINGS))]
-    sides: list[Callable[[str, int], str]] = [str.ljust] * len(_HEADINGS)
-    sides[_RIGHT] = [str.rjust] * len(sides[_RIGHT])
-    heading, *lines = ("  ".join(side(*cell) for side, *cell in zip(sides, row, widths, strict=True)) for row in table)
-    console = make_console()
-
-    def show(text: str, style: str = "", indent: str = "") -> None:
-        if indent:
-            text = textwrap.fill(text, min(console.width, _WIDTH), initial_indent=indent, subsequent_indent=indent)
-        console.print(escape(text.rstrip()), style=style, soft_wrap=True)
-
-    show(heading, "bold")
-    for line, entry, note in zip(lines, entries, notes, strict=True):
-        show(line)
-        show(entry.about or _UNKNOWN, "dim", "    ")
-        if note:
-            show(note, "yellow", "    ")
-    show("")
-    show(_LEGEND, "dim")
-    return 0
 
 
 def _entry(name: str) -> _Entry:

@@ -50,35 +50,34 @@ class New:
     variable MENAGERIE_ROOT points; or gymnasium:FILE.xml or gymnasium_robotics:PATH, of these packages. A relative path
     is written relative to the task file."""
 
-
-def new_task(options: New) -> int:
-    """Run the command; returns the exit code."""
-    path = Path(options.task if options.task.endswith(".py") else f"{options.task}.py").expanduser()
-    class_name = _class_name(path)
-    if path.exists():
-        raise ValueError(f"{path} exists: choose another name, or remove it")
-    if not path.absolute().parent.is_dir():
-        raise ValueError(f"there is no folder {path.parent} for the task file: make it first")
-    source, title, spec = _model(options.model, path)
-    try:
-        model = compile_model(spec, ("sensordata",), PhysicsOptions())
-    except ValueError as error:
-        raise ValueError(f"{options.model}: {error}") from error
-    if model.nu == 0:
-        raise ValueError(f"the model {options.model} has no actuators, so there is nothing to act on: add some to it")
-    if model.nv == 0:
-        raise ValueError(f"the model {options.model} has no joints, so nothing in it moves: add some to it")
-    _write(path, task_text(path.name, class_name, source, title, model))
-    task = find_task(path)
-    console = make_console()
-    console.print(
-        f"{path}: {sum(task.obs.values())} observations, {model.nu} actions, "
-        f"{1000 * task.frame_skip * model.opt.timestep:.3g} ms in a step; check and train it with",
-        soft_wrap=True, markup=False,
-    )  # fmt: skip
-    for command in ("check", "train"):
-        console.print(f"  lyceum-warp {command} {path}", soft_wrap=True, markup=False)
-    return 0
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        path = Path(self.task if self.task.endswith(".py") else f"{self.task}.py").expanduser()
+        class_name = _class_name(path)
+        if path.exists():
+            raise ValueError(f"{path} exists: choose another name, or remove it")
+        if not path.absolute().parent.is_dir():
+            raise ValueError(f"there is no folder {path.parent} for the task file: make it first")
+        source, title, spec = _model(self.model, path)
+        try:
+            model = compile_model(spec, ("sensordata",), PhysicsOptions())
+        except ValueError as error:
+            raise ValueError(f"{self.model}: {error}") from error
+        if model.nu == 0:
+            raise ValueError(f"the model {self.model} has no actuators, so there is nothing to act on: add some to it")
+        if model.nv == 0:
+            raise ValueError(f"the model {self.model} has no joints, so nothing in it moves: add some to it")
+        _write(path, task_text(path.name, class_name, source, title, model))
+        task = find_task(path)
+        console = make_console()
+        console.print(
+            f"{path}: {sum(task.obs.values())} observations, {model.nu} actions, "
+            f"{1000 * task.frame_skip * model.opt.timestep:.3g} ms in a step; check and train it with",
+            soft_wrap=True, markup=False,
+        )  # fmt: skip
+        for command in ("check", "train"):
+            console.print(f"  lyceum-warp {command} {path}", soft_wrap=True, markup=False)
+        return 0
 
 
 def _class_name(path: Path) -> str:

@@ -13,7 +13,7 @@ import tyro
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.mppi_config import MPPIConfig
-from lyceum_warp.binding.registry import find_task, snake_case, task_name
+from lyceum_warp.binding.registry import find_task, snake_case, spelled_task, task_name
 from lyceum_warp.cli.arguments import (
     CameraWords,
     Physics,
@@ -22,9 +22,8 @@ from lyceum_warp.cli.arguments import (
     given,
     optional_flags,
     parameters,
-    portable,
 )
-from lyceum_warp.cli.display import PlanDisplay, make_console, plotted_control, report_table, states_video
+from lyceum_warp.cli.display import PlanDisplay, make_console, report_table, states_video, tried
 from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.controllers.control_report import control_report
 from lyceum_warp.controllers.loop import control
@@ -32,9 +31,10 @@ from lyceum_warp.controllers.real_time import control_async
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted
-from lyceum_warp.runs import Run, load_value
+from lyceum_warp.runs.folder import Run, load_value
 from lyceum_warp.validate import whole_number
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
+from lyceum_warp.viz.control_plot import control_plot
 
 
 @optional_flags(MPPIConfig, default="(default: the task's)")
@@ -128,44 +128,43 @@ class Plan:
     mppi: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
     planner_physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
-
-def plan(options: Plan) -> int:
-    """Run the command; returns the exit code."""
-    whole_number("episodes", options.episodes, low=1)
-    whole_number("seed", options.seed, low=0)
-    whole_number("seed of the last episode", options.seed + options.episodes - 1, low=0)
-    if options.rate is not None and not 0 < options.rate < float("inf"):
-        raise ValueError(f"rate must be a positive number of plans per second, not {options.rate}")
-    every = whole_number("replan_every", options.replan_every, low=1)
-    if every > 1 and options.real_time:
-        raise ValueError(
-            f"--replan-every {every} has no effect with --real-time, where plans follow one another without a break: "
-            "leave out one of them"
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        whole_number("episodes", self.episodes, low=1)
+        whole_number("seed", self.seed, low=0)
+        whole_number("seed of the last episode", self.seed + self.episodes - 1, low=0)
+        if self.rate is not None and not 0 < self.rate < float("inf"):
+            raise ValueError(f"rate must be a positive number of plans per second, not {self.rate}")
+        every = whole_number("replan_every", self.replan_every, low=1)
+        if every > 1 and self.real_time:
+            raise ValueError(
+                f"--replan-every {every} has no effect with --real-time, where plans follow one another without a "
+                "break: leave out one of them"
+            )
+        if self.value is not None:
+            _check_value_task(self.value, self.task)
+        out = self.out or Path(
+            "runs", f"plan-{task_name(find_task(self.task))}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         )
-    if options.value is not None:
-        _check_value_task(options.value, options.task)
-    out = options.out or Path(
-        "runs", f"plan-{task_name(find_task(options.task))}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    )
-    Run.check_free(out, resumable=False)
-    # every wrong option is found before the folder is made
-    camera = parsed_camera(options.camera)
-    if camera is not None and not options.video:
-        raise ValueError("--camera has no effect with --no-video: leave out one of them")
-    torch.set_num_threads(1)
-    params, planner_params = _parameters(options)
-    plant, planner = _worlds(options, params, planner_params)
-    CheckedController(planner, plant).check_horizon(planner.horizon, every)
-    find_camera(plant.model, camera)
-    config = {
-        "algorithm": planner.config.update, "task": portable(options.task), "params": params,
-        "planner": planner.settings, "planner_params": planner_params,
-        "planner_model": options.planner_model and str(_model(options.planner_model)),
-        "value": options.value and str(options.value.resolve()), **vars(options.planner),
-        "engine": planner.env.engine.name, "episodes": options.episodes, "steps": options.steps,
-        "replan_every": every, "seed": options.seed, "real_time": options.real_time, "rate": options.rate,
-    }  # fmt: skip
-    return _run(Run.create(out, config, device=options.planner.device), plant, planner, options)
+        Run.check_free(out)
+        # every wrong option is found before the folder is made
+        camera = parsed_camera(self.camera)
+        if camera is not None and not self.video:
+            raise ValueError("--camera has no effect with --no-video: leave out one of them")
+        torch.set_num_threads(1)
+        params, planner_params = _parameters(self)
+        plant, planner = _worlds(self, params, planner_params)
+        CheckedController(planner, plant).check_horizon(planner.horizon, every)
+        find_camera(plant.model, camera)
+        config = {
+            "algorithm": planner.config.update, "task": spelled_task(plant.task.task), "params": params,
+            "planner": planner.settings, "planner_params": planner_params,
+            "planner_model": self.planner_model and str(_model(self.planner_model)),
+            "value": self.value and str(self.value.resolve()), **vars(self.planner),
+            "engine": planner.env.engine.name, "episodes": self.episodes, "steps": self.steps,
+            "replan_every": every, "seed": self.seed, "real_time": self.real_time, "rate": self.rate,
+        }  # fmt: skip
+        return _run(Run.create(out, config, device=self.planner.device), plant, planner, self)
 
 
 def _check_value_task(run: Path, task: str) -> None:
@@ -301,9 +300,9 @@ def _report(run: Run, plant: Env, done: list[Trajectory], options: Plan) -> int:
     console.print(report_table(report, success=plant.task.functions["success"] is not None))
     paths = [("episodes", str(run.folder / "episode-*.npz")), ("report", str(run.folder / "report.json"))]
     if options.plot:
-        paths.append(("plot", plotted_control(done, run.folder / "plan.png")))
+        paths.append(("plot", tried(control_plot, done, run.folder / "plan.png")))
     if options.video:
-        paths.append(("video", states_video(plant, done[0].states, run.folder / "video.mp4", camera=camera)))
+        paths.append(("video", tried(states_video, plant, done[0].states, run.folder / "video.mp4", camera=camera)))
     for name, path in paths:
         console.print(f"{name + ':':<12}{path}", soft_wrap=True, markup=False)
     return 0

@@ -10,9 +10,7 @@ import tyro
 from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.checkpoints import check_sizes
-from lyceum_warp.cli.algorithms import ALGORITHMS
-from lyceum_warp.cli.arguments import NO_FLAGS, Repeated, given, optional_flags, parameters, run_options
+from lyceum_warp.cli.arguments import NO_FLAGS, Repeated, given, optional_flags, parameters
 from lyceum_warp.cli.display import note
 from lyceum_warp.cli.plan import Settings
 from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
@@ -20,9 +18,11 @@ from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.engines.placement import options_for_few_worlds
 from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted, signals
-from lyceum_warp.kept_task import run_env
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.runs import Run, load
+from lyceum_warp.runs.checkpoints import check_sizes
+from lyceum_warp.runs.configuration import Configuration
+from lyceum_warp.runs.folder import Run, load
+from lyceum_warp.runs.task_copy import note_changes, run_env
 from lyceum_warp.validate import whole_number
 from lyceum_warp.viewer.follow import Follower, Parent, wait_for_run
 from lyceum_warp.viewer.session import Watcher, check_world
@@ -97,51 +97,53 @@ class View:
     place: tyro.conf.OmitArgPrefixes[Place] = dataclasses.field(default_factory=Place)
     planner: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
 
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        return self.show()
 
-def view_command(options: View, parent: Parent | None = None) -> int:
-    """Run the command; returns the exit code.
+    def show(self, parent: Parent | None = None) -> int:
+        """Show it, until the viewer is closed; returns the exit code.
 
-    Args:
-        options: The command's arguments.
-        parent: The program that started this one, and ends it.
-    """
-    chosen_graphics(options.gfx)
-    _check(options)
-    torch.set_num_threads(1)
-    kind = _kind(options.what)
-    for flag, fits in (("follow", ("run",)), ("mppi", ("task", "run"))):
-        if getattr(options, flag) and kind not in fits:
-            raise ValueError(f"--{flag} needs a {' or a '.join(fits)}, and {options.what[0]} is not one: leave it out")
-    shown: dict[str, Any] = {
-        name: getattr(options, name) for name in ("world", "paused", "trace", "gfx", "host", "port", "browser", "fps")
-    }
-    watchers: list[Watcher] = [] if parent is None else [_Ends(parent)]
-    if kind == "episodes":
-        episodes = load_episodes(options.what)
-        env = _episodes_env(options, episodes)
-        unique = len({file.name for file in episodes}) == len(episodes)
-        named = {file.name if unique else str(file): episode for file, episode in episodes.items()}
-        view(env, episodes=named, watchers=watchers, **shown)
-        return 0
-    controllers: dict[str, Any] = {}
-    if kind == "run":
-        run = _run(options, parent)
-        env = _run_worlds(options, run)
-        if options.follow:
-            follower = Follower(run, device=env.obs.device)
-            check_sizes(follower.policy, env, run.policy_file())
-            controllers["policy"] = follower
-            watchers.append(follower.update)
+        Args:
+            parent: The program that started this one, and ends it.
+        """
+        chosen_graphics(self.gfx)
+        _check(self)
+        torch.set_num_threads(1)
+        kind = _kind(self.what)
+        for flag, fits in (("follow", ("run",)), ("mppi", ("task", "run"))):
+            if getattr(self, flag) and kind not in fits:
+                raise ValueError(f"--{flag} needs a {' or a '.join(fits)}, and {self.what[0]} is not one: leave it out")
+        shown: dict[str, Any] = {
+            name: getattr(self, name) for name in ("world", "paused", "trace", "gfx", "host", "port", "browser", "fps")
+        }
+        watchers: list[Watcher] = [] if parent is None else [_Ends(parent)]
+        if kind == "episodes":
+            episodes = load_episodes(self.what)
+            env = _episodes_env(self, episodes)
+            unique = len({file.name for file in episodes}) == len(episodes)
+            named = {file.name if unique else str(file): episode for file, episode in episodes.items()}
+            view(env, episodes=named, watchers=watchers, **shown)
+            return 0
+        controllers: dict[str, Any] = {}
+        if kind == "run":
+            run = _run(self, parent)
+            env = _run_worlds(self, run)
+            if self.follow:
+                follower = Follower(run, device=env.obs.device)
+                check_sizes(follower.policy, env, run.policy_file())
+                controllers["policy"] = follower
+                watchers.append(follower.update)
+            else:
+                policy = load(run, which=self.which, device=env.obs.device)
+                check_sizes(policy, env, run.policy_file(self.which))
+                controllers["policy"] = policy
         else:
-            policy = load(run, which=options.which, device=env.obs.device)
-            check_sizes(policy, env, run.policy_file(options.which))
-            controllers["policy"] = policy
-    else:
-        env = _task_worlds(options)
-    if options.mppi:
-        controllers["mppi"] = _planner(options, env)
-    view(env, controllers, seed=options.seed, watchers=watchers, **shown)
-    return 0
+            env = _task_worlds(self)
+        if self.mppi:
+            controllers["mppi"] = _planner(self, env)
+        view(env, controllers, seed=self.seed, watchers=watchers, **shown)
+        return 0
 
 
 def _check(options: View) -> None:
@@ -165,7 +167,7 @@ def _kind(what: tuple[str, ...]) -> str:
         if not (first / "config.json").is_file() and any(first.glob("*.npz")):
             return "episodes"
         run = Run.open(first)
-        kind = "run" if run.config.get("algorithm") in ALGORITHMS else "episodes"
+        kind = "episodes" if "planner" in run.config else "run"
     else:
         kind = "task"
     if len(what) > 1 and kind != "episodes":
@@ -216,7 +218,8 @@ def _run(options: View, parent: Parent | None) -> Run:
 
 def _run_worlds(options: View, run: Run) -> Env:
     """Worlds of a run's task, in the run's own physics; on the CPU unless a device is given."""
-    known, params = run_options(run.config)
+    saved = Configuration.of(run)
+    known, params = saved.options.changed({"seed": 0}), dict(saved.params)
     nworld = options.nworld or _RUN_WORLDS
     check_world(options.world, nworld)
     if options.task is not None and task_name(find_task(options.task)) != run.task_name:
@@ -225,7 +228,10 @@ def _run_worlds(options: View, run: Run) -> Env:
     known = known.changed({"nworld": nworld} | given(options.place))
     if options.place.device is None:
         known = known.changed(options_for_few_worlds(known.engine, known.device))
-    return run_env(run, known, params, note=note, task=options.task)
+    env = run_env(run, known, params, note=note, task=options.task)
+    if options.task is None:
+        note_changes(run, env, note=note)
+    return env
 
 
 # a viewer that another program started
@@ -249,7 +255,7 @@ def attached() -> None:
     job = parent.job
     try:
         with signals():
-            view_command(View(what=(job["folder"],), follow=True, **job["options"]), parent)
+            View(what=(job["folder"],), follow=True, **job["options"]).show(parent)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         if not parent.ended.is_set():
             note(f"the viewer of {job['folder']} ended: {' '.join(str(error).split())}")

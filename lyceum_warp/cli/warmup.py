@@ -43,31 +43,30 @@ class Warmup:
     env: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
-
-def warm_up(options: Warmup) -> int:
-    """Run the command; returns the exit code."""
-    more = options.physics.options().given() | parameters(options.param, options)
-    start, before = time.perf_counter(), cached()
-    env = Env(options.task, nworld=options.nworld, **vars(options.env), **more)
-    for _ in range(3):  # run directly, captured as graphs, replayed
-        env.step()
-    if options.npg:
-        next(NPG(env, config=NPGConfig(samples=2 * env.nworld, mean_every=0)))
-        env.replicate_few(1).step()  # evaluations of the mean policy
-    if options.plan:
-        # auto would depend on the number of samples, which is not known here
-        placement = vars(options.env) | {"engine": env.engine.name}
-        plan = MPPI(options.task, **placement, **more)
-        for _ in range(3):
-            plan(plan.state_of())
-    new = cached().keys() - before.keys()
-    seconds, megabytes = time.perf_counter() - start, sum(cached()[path] for path in new) / 1e6
-    console = make_console()
-    built = f"compiled {len(new)} modules of kernels ({megabytes:.1f} MB)" if new else "all kernels were cached"
-    console.print(f"{env.task.name} on {env.device.alias}: {built}, {seconds:.1f} s in all", soft_wrap=True)
-    text = f"memory: about {env.bytes_per_world / 1e3:.1f} kB a world"
-    most = most_worlds(env.bytes_per_world, env.device)
-    if most is not None:
-        text += f"; at most some {most:,d} worlds fit into the free memory"
-    console.print(text, soft_wrap=True)
-    return 0
+    def run(self) -> int:
+        """Run the command; returns the exit code."""
+        more = self.physics.options().given() | parameters(self.param, self)
+        start, before = time.perf_counter(), cached()
+        env = Env(self.task, nworld=self.nworld, **vars(self.env), **more)
+        for _ in range(3):  # run directly, captured as graphs, replayed
+            env.step()
+        if self.npg:
+            next(NPG(env, config=NPGConfig(samples=2 * env.nworld, mean_every=0)))
+            env.replicate_few(1).step()  # evaluations of the mean policy
+        if self.plan:
+            # auto would depend on the number of samples, which is not known here
+            placement = vars(self.env) | {"engine": env.engine.name}
+            plan = MPPI(self.task, **placement, **more)
+            for _ in range(3):
+                plan(plan.state_of())
+        new = cached().keys() - before.keys()
+        seconds, megabytes = time.perf_counter() - start, sum(cached()[path] for path in new) / 1e6
+        console = make_console()
+        built = f"compiled {len(new)} modules of kernels ({megabytes:.1f} MB)" if new else "all kernels were cached"
+        console.print(f"{env.task.name} on {env.device.alias}: {built}, {seconds:.1f} s in all", soft_wrap=True)
+        text = f"memory: about {env.bytes_per_world / 1e3:.1f} kB a world"
+        most = most_worlds(env.bytes_per_world, env.device)
+        if most is not None:
+            text += f"; at most some {most:,d} worlds fit into the free memory"
+        console.print(text, soft_wrap=True)
+        return 0

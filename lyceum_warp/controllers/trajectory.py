@@ -14,7 +14,7 @@ from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.done import Done
 from lyceum_warp.env import Env
 from lyceum_warp.files import newer_format, replaced
-from lyceum_warp.versions import versions
+from lyceum_warp.support.versions import versions
 
 FORMAT = 1
 """Format of the file. It is raised when an older release could no longer read the file."""

@@ -3,12 +3,13 @@
 import inspect
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 
 from lyceum_warp.algos.networks import moved
+from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.env import Env
 from lyceum_warp.validate import described
 
@@ -29,16 +30,16 @@ class PolicyControl:
 
     Args:
         name: Its name.
-        policy: Called with (nworld, nobs) observations; returns (nworld, nact) actions.
+        policy: Its ``act``, or else the policy itself, maps (nworld, nobs) observations to (nworld, nact) actions.
         env: The worlds.
 
     Raises:
         ValueError: It cannot be called with the observations, or returns other actions.
     """
 
-    def __init__(self, name: str, policy: Callable[[torch.Tensor], torch.Tensor], env: Env) -> None:
+    def __init__(self, name: str, policy: Policy, env: Env) -> None:
         self.name, self.seconds = name, float("nan")
-        self._policy, self._env = _on_device(policy, env), env
+        self._policy, self._env = acting(_on_device(policy, env)), env
         try:
             with torch.no_grad():
                 action = self._policy(env.obs)
@@ -273,7 +274,9 @@ def controls(given: Mapping[str, Any], env: Env) -> dict[str, Control]:
 
 def _is_policy(controller: Any) -> bool:
     """Whether a controller takes observations alone."""
-    function = controller.forward if isinstance(controller, torch.nn.Module) else controller
+    function = acting(controller)
+    if isinstance(function, torch.nn.Module):
+        function = function.forward
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):

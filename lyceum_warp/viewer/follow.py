@@ -16,9 +16,9 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.checkpoints import read_checkpoint
-from lyceum_warp.runs import Run, load
+from lyceum_warp.algos.policy import acting
+from lyceum_warp.runs.checkpoints import read_checkpoint
+from lyceum_warp.runs.folder import Run, load
 
 _NICE = 10  # how much the process of `RunViewer` gives way to the training
 
@@ -38,12 +38,12 @@ class Follower:
     def __init__(self, run: Run, *, device: str | torch.device = "cpu") -> None:
         self.run, self.device = run, device
         self._seen = self._stamp()
-        self.policy: GaussianPolicy = load(run, device=device)
+        self.policy = load(run, device=device)
         self.iteration = self._read()["iteration"]
 
     def __call__(self, obs: torch.Tensor) -> torch.Tensor:
         """Mean actions, (..., nact)."""
-        return self.policy(obs)
+        return acting(self.policy)(obs)
 
     def update(self) -> list[str]:
         """Take new weights if there are some; returns messages about it."""

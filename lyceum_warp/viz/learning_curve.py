@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from lyceum_warp.algos.learner import METRIC_COLUMN
-from lyceum_warp.metrics_table import read_metrics
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.metrics_table import read_metrics
 from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_png
 
 

@@ -8,12 +8,12 @@ from typing import TypeAlias
 import torch
 
 from lyceum_warp.algos.evaluation import evaluation_worlds
-from lyceum_warp.algos.learner import Learner, LearnerIteration
+from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.algos.networks import moved
-from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.policy import Policy
 from lyceum_warp.env import Env
-from lyceum_warp.tensorboard import TensorBoard
 from lyceum_warp.viz.cameras import CameraChoice
+from lyceum_warp.viz.tensorboard import TensorBoard
 from lyceum_warp.viz.video import Progress, episode, write_video
 
 log = logging.getLogger(__name__)
@@ -22,9 +22,7 @@ NamedProgress: TypeAlias = Callable[[str, str, int, int], object]
 """Called with what is done, the unit in which it is counted, how much is done, and how much there is in all."""
 
 
-def policy_states(
-    env: Env, policy: GaussianPolicy, seed: int, *, progress: Progress | None = None
-) -> tuple[Env, torch.Tensor]:
+def policy_states(env: Env, policy: Policy, seed: int, *, progress: Progress | None = None) -> tuple[Env, torch.Tensor]:
     """Run an episode of a policy in a world of its own; returns its environment, and the states for ``write_video``.
 
     Args:
@@ -34,7 +32,8 @@ def policy_states(
         progress: Called now and then with the number of steps so far and the horizon.
     """
     one = evaluation_worlds(env, 1, autoreset=False)
-    return one, episode(one, moved(policy, one), seed=seed, progress=progress)
+    policy = moved(policy, one) if isinstance(policy, torch.nn.Module) else policy
+    return one, episode(one, policy, seed=seed, progress=progress)
 
 
 class Videos:
@@ -62,7 +61,7 @@ class Videos:
         self.learner, self.folder, self.every, self.seed, self.board = learner, folder, every, seed, board
         self.camera, self.note, self.progress = camera, note, progress
 
-    def __call__(self, iteration: LearnerIteration) -> None:
+    def __call__(self, iteration: Iteration) -> None:
         """Write a video after an iteration, if it is time for one."""
         if not self.every or iteration.iteration % self.every:
             return

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.env import Env
 from lyceum_warp.validate import positive_number, whole_number
 from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
@@ -41,7 +42,7 @@ _KILLED = 5.0  # seconds that the thread gets to end after its process was kille
 @torch.no_grad()
 def episode(
     env: Env,
-    policy: Callable[[torch.Tensor], torch.Tensor],
+    policy: Policy,
     *,
     seed: int | None = None,
     progress: Progress | None = None,
@@ -50,7 +51,7 @@ def episode(
 
     Args:
         env: An environment of one world, made with ``autoreset=False`` so that the last state is kept.
-        policy: Called with observations, (1, nobs); returns actions, (1, nact).
+        policy: Its ``act``, or else the policy itself, maps observations, (1, nobs), to actions, (1, nact).
         seed: Seed of the initial state.
         progress: Called now and then with the number of steps so far and the horizon.
 
@@ -65,9 +66,9 @@ def episode(
     if env.horizon == 0:
         raise ValueError(f"episodes of {env.task.name!r} may never end without a horizon: make(..., horizon=1000)")
     env.rand_reset(seed)
-    states = [env.get_state()]
+    act, states = acting(policy), [env.get_state()]
     while not env.done.item():
-        env.action.copy_(policy(env.obs))
+        env.action.copy_(act(env.obs))
         env.step()
         states.append(env.get_state())
         if progress is not None and len(states) % 10 == 0:

@@ -15,6 +15,7 @@ from full_task import Full
 
 import lyceum_warp as lw
 from lyceum_warp.algos.dense import DensePolicy, DenseValue
+from lyceum_warp.algos.npg_statistics import NPGIteration
 
 SMALL = lw.NPGConfig(samples=320, hidden=(8, 8), value_hidden=(16,), mean_every=2, mean_episodes=2)
 
@@ -41,7 +42,7 @@ def test_a_run_is_reproducible_and_resumes_to_the_bit(env: lw.Env, rollout: str)
     if rollout == "segments":  # iterations shorter than an episode, between which worlds restart
         config = dataclasses.replace(config, samples=16 * 5, min_restarts=1.5)
 
-    def numbers(it: lw.Iteration) -> dict[str, object]:
+    def numbers(it: NPGIteration) -> dict[str, object]:
         skipped = {"samples_per_second", "faults"}
         values = dataclasses.asdict(it).items()
         return {k: v for k, v in values if not k.startswith("time_") and k not in skipped}
@@ -61,7 +62,7 @@ def test_a_run_is_reproducible_and_resumes_to_the_bit(env: lw.Env, rollout: str)
     np.testing.assert_equal([numbers(next(resumed)) for _ in range(2)], rest)
 
 
-def learned(env: lw.Env, iterations: int, change: Callable[[torch.Tensor, int], object]) -> list[lw.Iteration]:
+def learned(env: lw.Env, iterations: int, change: Callable[[torch.Tensor, int], object]) -> list[NPGIteration]:
     """Iterations of NPG whose rewards, (steps, nworld), are changed; the change gets the iteration's number, too."""
     env.rand_reset(3)
     config = dataclasses.replace(SMALL, value_epochs=20, value_rate=1e-2, mean_every=0)

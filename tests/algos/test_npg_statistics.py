@@ -11,19 +11,21 @@ from metered_task import Metered
 
 import lyceum_warp as lw
 from lyceum_warp.algos.npg_statistics import (
-    EpisodeSums,
-    Moments,
+    NPGIteration,
     ProcessNumbers,
     UpdateNumbers,
     ValueSums,
-    episode_statistics,
-    finished,
-    finished_metrics,
-    metric_means,
-    pooled,
     prediction_sums,
     summary,
     value_statistics,
+)
+from lyceum_warp.algos.on_policy import (
+    EpisodeSums,
+    Moments,
+    episode_statistics,
+    finished,
+    finished_metrics,
+    pooled,
 )
 
 NAMES = ("done", "episode_return", "episode_length", "reward", "eval", "success")
@@ -110,13 +112,14 @@ def test_metric_means_are_those_of_the_episodes_that_ended() -> None:
         sums = process(1.0, 0)._replace(episodes=finished(part), metrics=finished_metrics(part))
         return ProcessNumbers.unpack(sums.pack().tolist())
 
-    assert metric_means([numbers(slice(None))], list(expected)) == pytest.approx(expected, rel=1e-5)
+    whole = summary([numbers(slice(None))], 10, list(expected))
+    assert whole["metrics"] == pytest.approx(expected, rel=1e-5)
     parts = [numbers(slice(0, 1)), numbers(slice(1, None))]
     assert parts[0].episodes.episodes < parts[1].episodes.episodes
     both = summary(parts, 10, list(expected))
     assert both["metrics"] == pytest.approx(expected, rel=1e-5)
     none = [part._replace(episodes=EpisodeSums(*[0.0] * 9), metrics=(0.0, 0.0)) for part in parts]
-    assert all(math.isnan(mean) for mean in metric_means(none, list(expected)).values())
+    assert all(math.isnan(mean) for mean in summary(none, 10, list(expected))["metrics"].values())
 
 
 def test_a_row_of_metrics_has_a_column_for_each_metric() -> None:
@@ -150,13 +153,13 @@ def test_summary_sums_faults_and_outliers_and_sets_attributes_of_an_iteration() 
     both = summary([ProcessNumbers.unpack(process(*numbers).pack().tolist()) for numbers in ((1, 4), (3, 5))], 10)
     assert (both["faults"], both["outliers"]) == (9, 20)
     assert (both["kl"], both["step_norm"], both["return_max"]) == (2.0, 3.0, 21.0)
-    others = {"iteration", "samples", "samples_per_second"}
-    names = {field.name for field in dataclasses.fields(lw.Iteration)} - others
+    others = {"iteration", "samples", "samples_per_second", "numbers"}
+    names = {field.name for field in dataclasses.fields(NPGIteration)} - others
     assert both.keys() == {name for name in names if not name.startswith(("time_", "mean_"))}
 
 
 def test_help_describes_every_attribute_of_an_iteration() -> None:
-    assert all(f"    {field.name}: " in (lw.Iteration.__doc__ or "") for field in dataclasses.fields(lw.Iteration))
+    assert all(f"    {field.name}: " in (NPGIteration.__doc__ or "") for field in dataclasses.fields(NPGIteration))
 
 
 def test_the_mean_reward_covers_all_samples_also_where_no_episode_ended() -> None:

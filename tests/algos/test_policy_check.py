@@ -11,7 +11,8 @@ from torch import nn
 import lyceum_warp as lw
 from lyceum_warp.algos.networks import mlp
 from lyceum_warp.algos.policy_check import check_policy
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.checkpoints import policy_content
+from lyceum_warp.runs.folder import Run
 
 
 class Net(nn.Module):
@@ -145,7 +146,7 @@ def test_a_policy_with_a_network_of_the_users_own_is_saved_and_filled(tmp_path: 
     policy, obs = lw.GaussianPolicy(6, 2, network=Net(), normalize=True), torch.randn(5, 6)
     policy.normalizer.update(torch.randn(10, 6) + 3.0)
     run = Run.create(tmp_path / "run", {})
-    run.save(0, policy, {})
+    run.save(policy_content(0, policy), {})
     loaded = lw.load(run, policy=lw.GaussianPolicy(6, 2, network=Net(), normalize=True))
     assert torch.equal(loaded(obs), policy(obs))
     with pytest.raises(
@@ -164,7 +165,7 @@ def test_a_policy_of_the_users_own_class_is_not_loaded_as_another(tmp_path: Path
             return torch.tanh(super().forward(obs))
 
     run = Run.create(tmp_path / "run", {})
-    run.save(0, policy := Bounded(6, 2, (4,)), {})
+    run.save(policy_content(0, policy := Bounded(6, 2, (4,))), {})
     with pytest.raises(ValueError, match="of a class of its own, .*Bounded"):
         lw.load(run)
     obs = torch.randn(3, 6)

@@ -5,7 +5,8 @@ from pathlib import Path
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.checkpoints import policy_content
+from lyceum_warp.runs.folder import Run
 
 
 def test_a_value_function_has_the_discount_of_the_returns_that_it_was_fitted_to(tmp_path: Path) -> None:
@@ -16,7 +17,7 @@ def test_a_value_function_has_the_discount_of_the_returns_that_it_was_fitted_to(
     npg = lw.NPG(env, value=value, config=config)
     assert value.discount == lw.NPG(env, config=config).value.discount == 0.9
     run = Run.create(tmp_path, {}, device="cpu")
-    run.save(0, npg.policy, {}, value)
+    run.save(policy_content(0, npg.policy, value), {})
     assert lw.load_value(run).discount == 0.9
     content = torch.load(run.checkpoint)
     del content["value"]["shape"]["discount"]  # as older releases saved it

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import lyceum_warp as lw
-from lyceum_warp.checkpoints import policy_content, serialized
+from lyceum_warp.runs.checkpoints import policy_content, serialized
 
 BENCH = Path(__file__).parents[2] / "bench"
 

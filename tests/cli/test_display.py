@@ -1,51 +1,78 @@
 """Progress and tables on the terminal."""
 
+import contextlib
 import dataclasses
 import io
 import math
 import re
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 import lyceum_warp as lw
 from lyceum_warp.cli import display
+from lyceum_warp.runs.folder import Run
 
 
 @pytest.fixture(scope="module")
-def first() -> lw.Iteration:
-    """The first iteration on worlds whose episodes have not ended yet."""
+def npg() -> lw.NPG:
     config = lw.NPGConfig(samples=40, rollout="segments", hidden=(4,), value_hidden=(4,))
-    return next(lw.NPG(lw.make("half_cheetah", nworld=4), config=config))
+    return lw.NPG(lw.make("half_cheetah", nworld=4), config=config)
 
 
-def line(iteration: lw.Iteration, **changes: object) -> str:
+@pytest.fixture(scope="module")
+def first(npg: lw.NPG) -> lw.Iteration:
+    """The first iteration on worlds whose episodes have not ended yet."""
+    return next(npg)
+
+
+@contextlib.contextmanager
+def shown_on(console: Console, npg: lw.NPG, total: int = 10) -> Iterator[display.Display]:
+    """The display of a run, after its first line."""
+    shown = display.Display(console)
+    shown.begin(Run(Path("run"), {}), npg, total)
+    console.file.truncate(0)
+    console.file.seek(0)
+    yield shown
+    shown.end()
+
+
+def test_the_first_line_names_the_task_the_worlds_the_algorithm_and_the_folder(npg: lw.NPG) -> None:
+    console = Console(file=io.StringIO(), width=120, highlight=False)
+    display.Display(console).begin(Run(Path("run"), {}), npg, 10)
+    expected = "half_cheetah: 17 observations, 6 actions; 4 worlds, mujoco engine on cpu, npg; run in run\n"
+    assert console.file.getvalue() == expected
+
+
+def line(npg: lw.NPG, iteration: lw.Iteration, **changes: object) -> str:
     """What is shown of an iteration where there is no terminal."""
     console = Console(file=io.StringIO(), width=120, highlight=False)
-    with display.Display(console, 0, 10) as shown:
+    with shown_on(console, npg) as shown:
         shown(dataclasses.replace(iteration, samples_per_second=29_412.0, **changes))
     return console.file.getvalue()
 
 
-def test_the_first_line_shows_the_reward_where_no_episode_has_ended(first: lw.Iteration) -> None:
+def test_the_first_line_shows_the_reward_where_no_episode_has_ended(npg: lw.NPG, first: lw.Iteration) -> None:
     assert math.isnan(first.return_mean)
-    assert line(first, reward_mean=-0.8125) == "iteration    1/10  reward -0.812 a step 29.4k samples/s\n"
+    assert line(npg, first, reward_mean=-0.8125) == "iteration    1/10  reward -0.812 a step 29.4k samples/s\n"
 
 
-def test_a_line_shows_what_there_is(first: lw.Iteration) -> None:
+def test_a_line_shows_what_there_is(npg: lw.NPG, first: lw.Iteration) -> None:
     common = {"return_mean": 3072.4, "mean_return": 3117.2}
-    assert line(first, **common) == "iteration    1/10  return 3072 (mean policy 3117) 29.4k samples/s\n"
-    assert "(mean policy 3117) success 25% 29.4k" in line(first, **common, success=0.25)
-    assert "success" not in line(first, **common, success=math.nan)
-    assert "(mean policy 3117) 1 fault 1,200 outliers 29.4k" in line(first, **common, faults=1, outliers=1200)
-    assert "(mean policy 3117) 2 skipped updates 29.4k" in line(first, **common, skipped_updates=2)
+    assert line(npg, first, **common) == "iteration    1/10  return 3072 (mean policy 3117) 29.4k samples/s\n"
+    assert "(mean policy 3117) success 25% 29.4k" in line(npg, first, **common, success=0.25)
+    assert "success" not in line(npg, first, **common, success=math.nan)
+    assert "(mean policy 3117) 1 fault 1,200 outliers 29.4k" in line(npg, first, **common, faults=1, outliers=1200)
+    assert "(mean policy 3117) 2 skipped updates 29.4k" in line(npg, first, **common, skipped_updates=2)
 
 
 @pytest.mark.parametrize("changes", [{}, {"success": 0.25}, {"success": 1.0, "faults": 12_345, "outliers": 12_345}])
-def test_the_bar_fits_into_80_columns(first: lw.Iteration, changes: dict[str, object]) -> None:
+def test_the_bar_fits_into_80_columns(npg: lw.NPG, first: lw.Iteration, changes: dict[str, object]) -> None:
     console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system=None)
     last = dataclasses.replace(first, iteration=100, return_mean=-123.4567, mean_return=-123.4567, **changes)
-    with display.Display(console, 0, 100) as shown:
+    with shown_on(console, npg, 100) as shown:
         shown(last)
     lines = re.sub(r"\x1b\[[^a-zA-Z]*[a-zA-Z]", "", console.file.getvalue()).replace("\r", "\n").splitlines()
     assert max(len(text.rstrip()) for text in lines) <= 80
@@ -85,9 +112,9 @@ def test_the_table_counts_faults_and_outliers_of_all_iterations(first: lw.Iterat
     assert "fault" not in table([first.row(), {"iteration": 2.0}])  # a row of an earlier release
 
 
-def test_other_work_is_shown_between_iterations() -> None:
+def test_other_work_is_shown_between_iterations(npg: lw.NPG) -> None:
     console = Console(file=io.StringIO(), width=120, highlight=False)
-    with display.Display(console, 0, 10) as shown:
+    with shown_on(console, npg) as shown:
         shown.work("drawing the video", "frames", 1, 80)
         assert shown.other is not None
         shown.other.start -= 4.0
@@ -96,6 +123,6 @@ def test_other_work_is_shown_between_iterations() -> None:
         assert shown.other is None
     assert console.file.getvalue() == "drawing the video: 20 of 80 frames, 4 s\n"
     console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system=None)
-    with display.Display(console, 0, 10) as shown:
+    with shown_on(console, npg) as shown:
         shown.work("drawing the video", "frames", 20, 80)
     assert "drawing the video: 20/80 frames" in console.file.getvalue()

@@ -1,6 +1,5 @@
 """lyceum-warp train: new runs, resumed runs, refused ones, and runs that are interrupted."""
 
-import dataclasses
 import inspect
 import json
 import os
@@ -14,7 +13,6 @@ from typing import Any
 
 import mujoco
 import pytest
-import torch
 from conftest import TaskFile
 from training_runs import QUIET, TINY, interrupted, metrics, refused, train
 
@@ -23,9 +21,11 @@ from lyceum_warp import cli
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.cli import display
-from lyceum_warp.cli.arguments import EnvFlags
-from lyceum_warp.cli.train import NPGOptions, Train, _config, saved_options
-from lyceum_warp.runs import Run, load
+from lyceum_warp.cli.algorithms import Hyperparameters
+from lyceum_warp.cli.arguments import given
+from lyceum_warp.cli.train import EnvFlags, Train
+from lyceum_warp.runs.configuration import ALGORITHMS
+from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.viz import drawing
 
 
@@ -66,7 +66,7 @@ def test_a_task_file_is_trained_and_evaluated(
     for name, file in (("curve", out / "curve.png"), ("video", out / "video.mp4")):
         assert f"{name}:      {file if file.exists() else 'none: '}" in output
     config = Run.open(out).config
-    assert (config["task"], config["seed"]) == (str(mine.resolve()), 5)
+    assert (config["task"], config["seed"]) == (f"{mine.resolve()}:Mine", 5)
     assert config["params"] == {"success_distance": 0.1}
     assert config["npg"]["hidden"] == [8]
     rows = metrics(out)
@@ -101,30 +101,11 @@ def test_an_unknown_camera_is_refused_before_the_folder_is_made(
     for flags, message in (
         (["--camera", "side"], "there is no camera 'side': the model has "),
         (["--camera", "0", "--no-video"], "--camera has no effect with --no-video"),
-        (["--video-every", "-1"], "--video-every must be a whole number from 0"),
+        (["--video-every", "-1"], "video_every must be a whole number from 0"),
     ):
         assert cli.main(["train", "point_mass", "--out", str(tmp_path / "run"), *TINY, *flags]) == 2
         refused(capsys, message)
     assert not (tmp_path / "run").exists()
-
-
-def test_a_resumed_run_equals_an_uninterrupted_one(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "run"
-    assert train(out, "--iterations", "2") == 0
-    # an iteration whose checkpoint was never written
-    with (out / "metrics.csv").open("a") as file:
-        file.write(",".join(["3", *["1"] * 26]) + "\n4,")
-    assert cli.main(["train", "--resume", str(out), "--iterations", "4", *QUIET]) == 0
-    assert "iteration    3/4" in capsys.readouterr().out
-    assert metrics(out) == metrics(trained)
-    one, other = Run.open(out).read()["state"], Run.open(trained).read()["state"]
-    assert torch.equal(one["env"], other["env"])
-    assert torch.equal(one["generator"], other["generator"])
-    assert all(torch.equal(one["policy"][name], other["policy"][name]) for name in one["policy"])
-    assert all(torch.equal(one["value"][name], other["value"][name]) for name in one["value"])
-    assert Run.open(out).config == Run.open(trained).config
 
 
 def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -132,10 +113,14 @@ def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: py
     before = {path: path.read_bytes() for path in trained.iterdir()}
     for options, words in [
         (["--iterations", "4"], ["already has 4 iterations", "--iterations 8"]),
-        (["--iterations", "9", "--gamma", "0.9"], ["has gamma 0.995, not 0.9", "without --resume"]),
-        (["--iterations", "9", "--seed", "1"], ["has seed 0, not 1"]),
-        (["--iterations", "9", "--param", "success_distance=1"], ["has param"]),
-        (["--iterations", "9", "--out", str(tmp_path)], ["stays in its folder"]),
+        (["--iterations", "9", "--gamma", "0.9"], ["has gamma 0.995, not 0.9", "begin a new run in another folder"]),
+        (["--iterations", "9", "--nworld", "4"], ["has nworld 2, not 4"]),
+        (["--iterations", "9", "--param", "success_distance=1"], ["has success_distance None, not 1"]),
+        (["--iterations", "9", "--num-steps", "4"], ["--num-steps is a setting of ppo, not of npg"]),
+        (["--iterations", "9", "--seed", "0"], ["--seed has no effect with --resume", "leave it out"]),
+        (["--iterations", "9", "--algorithm", "npg"], ["--algorithm has no effect with --resume"]),
+        (["--iterations", "9", "--out", str(tmp_path)], ["--out has no effect with --resume"]),
+        (["--iterations", "9", "point_mass"], ["TASK has no effect with --resume"]),
     ]:
         assert cli.main([*resume, *options]) == 2
         refused(capsys, *words)
@@ -151,8 +136,8 @@ def test_a_resumed_run_shows_the_same(tmp_path: Path) -> None:
     resume = ["train", "--resume", str(out), *QUIET, "--iterations"]
     assert cli.main([*resume, "2"]) == 0
     assert len(list(out.glob("events.out.tfevents.*"))) == 2
-    saved = saved_options(out)
-    assert (saved.tensorboard, saved.video_every) == (True, 50)
+    config = Run.open(out).config
+    assert (config["tensorboard"], config["video_every"]) == (True, 50)
     assert cli.main([*resume, "3", "--no-tensorboard", "--video-every", "0"]) == 0
     assert len(list(out.glob("events.out.tfevents.*"))) == 2
     config = Run.open(out).config
@@ -186,7 +171,7 @@ def test_a_run_keeps_its_physics(tmp_path: Path, made_envs: list[lw.Env], capsys
         (["--no-deterministic"], "has deterministic True, not False"),
     ]:
         assert cli.main([*resume, "4", *other]) == 2
-        refused(capsys, words, "without --resume")
+        refused(capsys, words, "a run keeps its settings")
 
 
 def changed_config(trained: Path, folder: Path, change: Any) -> list[str]:
@@ -204,6 +189,7 @@ def test_a_run_without_saved_physics_has_that_of_the_model(
     resume = changed_config(trained, tmp_path / "run", lambda config: config.pop("physics"))
     assert cli.main([*resume, "--integrator", "rk4"]) == 2
     refused(capsys, "has integrator None, not rk4")
+    made_envs.clear()
     assert cli.main(resume) == 0
     assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2"]) == 0
     assert {physics(env) for env in made_envs} == {physics(lw.make("point_mass"))}
@@ -236,6 +222,7 @@ def test_a_run_with_options_among_its_parameters_resumes_and_is_evaluated(
     resume = changed_config(trained, tmp_path / "run", lambda config: config["params"].update(saved))
     assert cli.main([*resume, "--horizon", "9"]) == 2
     refused(capsys, "has horizon 256, not 9")
+    made_envs.clear()
     assert cli.main(resume) == 0
     assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2"]) == 0
     assert made_envs
@@ -244,22 +231,48 @@ def test_a_run_with_options_among_its_parameters_resumes_and_is_evaluated(
         assert env.options.physics.frame_skip == 5
 
 
-def test_every_hyperparameter_has_a_flag_with_its_default() -> None:
-    assert vars(NPGOptions()) == vars(lw.NPGConfig()) and NPGOptions().checked() == lw.NPGConfig()
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_every_hyperparameter_has_a_flag(algorithm: str) -> None:
+    _, config = ALGORITHMS[algorithm]
+    assert {*vars(config())} <= {*vars(Hyperparameters())}
+    assert given(Hyperparameters()) == {} and Hyperparameters().on_top_of(None, algorithm) == config()
+    changed = Hyperparameters(gamma=0.5, normalize=False)
+    assert changed.on_top_of(config(hidden=(3,)), algorithm) == config(hidden=(3,), gamma=0.5, normalize=False)
+
+
+def test_a_flag_of_the_other_algorithm_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, message in (
+        (
+            ["--learning-rate", "3"],
+            "--learning-rate is a setting of ppo, not of npg: leave it out, or give --algorithm",
+        ),
+        (["--no-stagger"], "--stagger is a setting of ppo, not of npg"),
+        (["--algorithm", "ppo", "--samples", "9"], "--samples is a setting of npg, not of ppo"),
+    ):
+        assert cli.main(["train", "hopper", *words]) == 2
+        refused(capsys, message)
+
+
+def test_hyperparameters_are_shown_by_help_with_their_algorithms(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for words in ("--whiten, --no-whiten", "(npg 0.995, ppo 0.99)", "(npg 64 64, ppo 512 256 128)", "(ppo 24)"):
+        assert words in shown
 
 
 @pytest.mark.parametrize("change, words", [
     (lambda config: config["npg"].update(fisher_fraction=0.0), "fisher_fraction must be greater than 0"),
     (lambda config: config["npg"].update(momentum=0.9), "momentum"),
     (lambda config: config.update(npg="defaults"), "npg"),
-    (lambda config: config.update(nworld="many"), "nworld is 'many'"),
+    (lambda config: config.update(nworld="many"), "not 'many'"),
     (lambda config: config.pop("params"), "'params'"),
 ])  # fmt: skip
 def test_a_configuration_that_does_not_fit_is_one_line(
     change: Any, words: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(changed_config(trained, tmp_path / "run", change)) == 2
-    refused(capsys, "config.json is not the configuration of an NPG run (", words)
+    refused(capsys, "config.json is not the configuration of a training run (", words)
 
 
 def test_a_configuration_of_an_earlier_release_has_the_defaults_of_newer_hyperparameters(
@@ -298,7 +311,7 @@ def test_a_broken_checkpoint_falls_back_to_the_one_before_it(
 def test_train_refuses_to_overwrite_a_run(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = {path: path.read_bytes() for path in trained.iterdir()}
     assert train(trained, "--iterations", "9") == 2
-    refused(capsys, str(trained), "--resume", "another --out")
+    refused(capsys, str(trained), "--resume", "give another folder")
     assert before == {path: path.read_bytes() for path in trained.iterdir()}
 
 
@@ -313,6 +326,7 @@ def test_train_refuses_to_overwrite_a_run(trained: Path, capsys: pytest.CaptureF
         ("point_mass", ["--threads", "0"], ["threads", "not 0"]),
         ("point_mass", ["--iterations", "0"], ["iterations", "not 0"]),
         ("point_mass", ["--seed", "-1"], ["seed", "-1"]),
+        ("point_mass", ["--algorithm", "rsl-rl"], ["no algorithm 'rsl-rl'", "npg or ppo"]),
         ("point_mass", ["--gamma", "1.5"], ["gamma must be", "from 0 to 1, not 1.5"]),
         ("point_mass", ["--log-std", "nan"], ["log_std must be", "not nan"]),
         ("point_mass", ["--hidden", "8", "0"], ["hidden must be", "not (8, 0)"]),
@@ -352,12 +366,11 @@ def test_a_return_that_is_too_small_exits_with_1(tmp_path: Path, capsys: pytest.
 
 
 def test_the_default_number_of_worlds_depends_on_the_device() -> None:
-    options = Train(task="hopper")
     found = []
-    for device, size, given in (("cpu", 2, None), ("cuda:0", 1, None), ("cuda", 2, None), ("cuda", 2, 96)):
-        config = _config(dataclasses.replace(options, env=EnvFlags(device=device), nworld=given), Team(0, size))
-        found.append((config["nworld"], config["npg"]["samples"]))
-    assert found == [(64, 10_000), (4096, 65_536), (8192, 131_072), (96, 10_000)]
+    for device, size, nworld in (("cpu", 2, None), ("cuda:0", 1, None), ("cuda", 2, None), ("cuda", 2, 96)):
+        options = Train(task="hopper", env=EnvFlags(device=device), nworld=nworld)
+        found.append(options.configuration(None, Team(0, size)).options.nworld)
+    assert found == [64, 4096, 8192, 96]
 
 
 # interruptions
@@ -370,7 +383,7 @@ def assert_continues(out: Path, output: str, trained: Path) -> None:
     assert f"lyceum-warp train --resume {out} --iterations 2000" in output
     rows = metrics(out)
     assert [int(row["iteration"]) for row in rows] == list(range(1, done + 1))
-    assert rows[:3] == metrics(trained)[: min(3, done)]  # of short iterations, the last few may be lost
+    assert done >= 3 and rows[:3] == metrics(trained)[:3]
     assert cli.main(["train", "--resume", str(out), "--iterations", str(done + 1), *QUIET]) == 0
     assert len(metrics(out)) == done + 1
 
@@ -392,20 +405,20 @@ def test_a_terminated_run_continues(trained: Path, tmp_path: Path) -> None:
     assert_continues(out, rest, trained)
 
 
-@pytest.mark.parametrize("moment", ["step", "move", "state_dict", "write", "save_state"])
-def test_an_interrupted_run_continues(
+@pytest.mark.parametrize("moment", ["step", "move", "state_dict", "save"])
+def test_an_interrupted_run_ends_after_the_iteration_and_continues(
     moment: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Within this process: while it samples, learns, or writes. The tests of plan interrupt a command from outside."""
     out = tmp_path / "run"
-    owner: Any = {"step": lw.Env, "move": lw.NPG, "state_dict": lw.NPG}.get(moment, Run)
+    owner: Any = {"step": lw.Env, "save": Run}.get(moment, lw.NPG)
     original, calls = getattr(owner, moment), []
 
     def interrupting(*args: Any, **words: Any) -> Any:
         result = original(*args, **words)
-        calls.append(moment)
         table = out / "metrics.csv"
-        if len(calls) % 4 == 0 and table.exists() and len(metrics(out)) >= 3:
+        if table.exists() and len(metrics(out)) >= 3 and not calls:
+            calls.append(moment)
             signal.raise_signal(signal.SIGINT)
         return result
 
@@ -414,6 +427,27 @@ def test_an_interrupted_run_continues(
     assert interrupted(argv) == 130
     monkeypatch.undo()
     assert_continues(out, capsys.readouterr().out, trained)
+
+
+def test_a_second_interrupt_ends_a_run_at_once_and_it_continues_from_its_last_save(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, steps = tmp_path / "run", []
+    step = lw.Env.step
+
+    def interrupting(env: lw.Env) -> None:
+        step(env)
+        if (out / "metrics.csv").exists() and len(metrics(out)) == 3:
+            steps.append(len(steps))
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(lw.Env, "step", interrupting)
+    argv = ["train", "point_mass", "--out", str(out), *TINY, *QUIET, "--iterations", "9", "--save-every", "2"]
+    assert interrupted(argv) == 130
+    monkeypatch.undo()
+    assert steps == [0, 1] and "interrupted by SIGINT after 2 of 9 iterations" in capsys.readouterr().out
+    assert cli.main(["train", "--resume", str(out), "--iterations", "4", *QUIET]) == 0
+    assert metrics(out) == metrics(trained)
 
 
 def test_a_killed_run_continues(trained: Path, tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ import torch
 from training_runs import train
 
 import lyceum_warp as lw
-from lyceum_warp.checkpoints import policy_content
-from lyceum_warp.runs import Run
+from lyceum_warp.runs.checkpoints import policy_content, write_content
+from lyceum_warp.runs.folder import Run
 from lyceum_warp.viewer.follow import Follower, wait_for_run
 
 # the package has a function of this name
@@ -31,7 +31,7 @@ def test_a_follower_takes_the_newest_policy(tmp_path: Path) -> None:
         if not followers:
             followers.append(Follower(Run.open(folder)))
         # short iterations are not saved at once
-        Run.open(folder).save_policy(policy_content(npg.iteration, npg.policy, npg.value))
+        write_content(folder / "policy.pt", policy_content(npg.iteration, npg.policy, npg.value))
         messages.extend(followers[0].update())
 
     lw.train(npg, folder, iterations=3, callback=callback)

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 import lyceum_warp as lw
-from lyceum_warp.tensorboard import TensorBoard
 from lyceum_warp.viz import drawing
 from lyceum_warp.viz.policy_videos import Videos
+from lyceum_warp.viz.tensorboard import TensorBoard
 
 SMALL = lw.NPGConfig(samples=12, hidden=(4,), value_hidden=(4,))
 

@@ -1,0 +1,80 @@
+"""A learner of your own that lw.train trains: augmented random search with a linear policy (Mania et al. 2018).
+
+    python examples/random_search.py
+    python examples/random_search.py --task hopper --nworld 64 --iterations 300 --video-every 100
+    lyceum-warp view runs/random-search
+
+The class has no code for files: lw.train writes the folder, with metrics, the best policy, checkpoints and videos.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import torch
+import tyro
+
+import lyceum_warp as lw
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchConfig:
+    """Hyperparameters."""
+
+    step: float = 1.0
+    """Length of a step along a direction whose two returns differ by a standard deviation of the returns."""
+    noise: float = 0.5
+    """Standard deviation of the weights' changes that are tried."""
+
+
+class RandomSearch(lw.Learner):
+    """Tries changes of a linear policy's weights in pairs of worlds, one change with both signs in each pair."""
+
+    algorithm = "random-search"
+
+    def __init__(self, env: lw.Env, config: SearchConfig | None = None, *, seed: int = 0) -> None:
+        super().__init__(env, seed=seed)
+        self.config = config or SearchConfig()
+        self.policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, hidden=(), normalize=True)
+        torch.nn.init.zeros_(self.policy.to(env.obs.device).network[0].weight)
+        self.generator = torch.Generator(env.obs.device).manual_seed(seed)
+
+    @torch.no_grad()
+    def __next__(self) -> lw.Iteration:
+        env, weight, normalizer = self.env, self.policy.network[0].weight, self.policy.normalizer
+        shape = env.nworld // 2, *weight.shape
+        change = torch.randn(shape, generator=self.generator, device=weight.device)
+        tried = weight + self.config.noise * torch.cat([change, -change])
+        env.rand_reset()
+        returns, going = torch.zeros_like(env.reward), torch.ones_like(env.done)
+        for _ in range(env.horizon):
+            env.step(torch.einsum("wao,wo->wa", tried, normalizer(env.obs)))
+            returns += env.reward * going  # the first episode of each world counts
+            going &= ~env.done
+        self.policy.observe(env.obs)
+        plus, minus = returns.chunk(2)
+        difference = (plus - minus) / (returns.std() + 1e-8)
+        weight += self.config.step * torch.einsum("w,wao->ao", difference, change) / len(change)
+        self.iteration += 1
+        self.samples += env.nworld * env.horizon
+        mean = lw.evaluate(env, self.policy, env.nworld).returns.mean().item()
+        return lw.Iteration(
+            iteration=self.iteration, samples=self.samples, return_mean=returns.mean().item(), mean_return=mean,
+            numbers={"weight_norm": weight.norm().item()},
+        )  # fmt: skip
+
+
+def main(
+    task: str = "inverted_pendulum", nworld: int = 32, iterations: int = 10, horizon: int = 200,
+    out: Path = Path("runs/random-search"), resume: bool = False, video_every: int = 0, seed: int = 0,
+) -> None:  # fmt: skip
+    """Train, or continue a run with --resume."""
+    learner = RandomSearch(lw.make(task, nworld=nworld, horizon=horizon, seed=seed), seed=seed)
+    run = lw.train(
+        learner, out, iterations=iterations, resume=resume, video_every=video_every,
+        callback=lambda it: print(f"iteration {it.iteration}: return {it.mean_return:.1f}"),
+    )  # fmt: skip
+    print(f"best policy: return {run.best_score()[1]:.1f} in {run.folder}")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,125 @@
+"""Run epochs of mini-batches; on a GPU an epoch is one CUDA graph, and nothing waits for the device."""
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Mapping
+
+import torch
+
+from lyceum_warp.algos.distributed import Team
+from lyceum_warp.graphs.capture import capturing
+
+Samples = Mapping[str, torch.Tensor]
+"""Samples by the names of their parts, each (samples, ...)."""
+
+_SURE = 6.0
+"""Standard deviations between the mean number of a process's samples in a mini-batch and the room for them."""
+
+
+class Minibatches:
+    """Shuffles the samples of a rollout once, and learns from the same mini-batches in every epoch.
+
+    The mini-batches are the same for any number of processes: each takes the samples of its own worlds, in a tensor of
+    fixed size whose other rows have the weight 0. A mini-batch in which a process has more samples than this size, six
+    standard deviations above its mean share, loses the excess.
+
+    On a GPU the first epoch runs directly, which allocates Adam's moments. The second one is captured, and replayed
+    from then on. A graph holds addresses: ``learn`` must change its tensors in place.
+
+    Args:
+        learn: Learns from the process's samples of a mini-batch, and from their weights, (samples,), whose sum over all
+            processes is 1.
+        steps: Steps of every world.
+        nworld: Worlds of this process.
+        count: Number of mini-batches.
+        team: The processes.
+        device: Device of the samples.
+    """
+
+    def __init__(
+        self, learn: Callable[[Samples, torch.Tensor], None], *, steps: int, nworld: int, count: int, team: Team,
+        device: torch.device,
+    ) -> None:  # fmt: skip
+        self.learn, self.nworld, self.count, self.team = learn, nworld, count, team
+        self.samples = steps * nworld * team.size
+        self.batch = self.samples // count
+        share = self.batch / team.size
+        self.room = min(self.batch, math.ceil(share + _SURE * math.sqrt(share)))
+        self.captures = device.type == "cuda" and team.captures
+        self.weight = torch.zeros(count, self.room, device=device)
+        self.order = torch.zeros(count * self.room, dtype=torch.long, device=device)
+        self._parts: dict[str, torch.Tensor] = {}
+        self.forget()
+
+    def forget(self) -> None:
+        """Drop the graph, after tensors behind it were replaced."""
+        self._warm = False
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    @torch.no_grad()
+    def shuffle(self, samples: Samples, generator: torch.Generator) -> dict[str, torch.Tensor]:
+        """Copy samples into mini-batches, at the same addresses each time.
+
+        Args:
+            samples: Samples of this process's worlds, each (steps, nworld, ...).
+            generator: Draws the order of the samples of all processes.
+
+        Returns:
+            The mini-batches, each (mini-batches, samples, ...).
+        """
+        order = torch.randperm(self.samples, generator=generator, device=self.weight.device)
+        places, own = self.team.locate(order[: self.count * self.batch].view(self.count, self.batch), self.nworld)
+        if self.room < self.batch:  # the own samples first
+            first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self.room]
+            places, own = places.gather(1, first), own.gather(1, first)
+        self.order.copy_(places.flatten())
+        torch.mul(own, 1.0 / self.batch, out=self.weight)
+        for name, part in samples.items():
+            rows = part.flatten(0, 1)
+            if name not in self._parts:
+                self._parts[name] = rows.new_empty(self.count, self.room, *rows.shape[1:])
+            torch.index_select(rows, 0, self.order, out=self._parts[name].flatten(0, 1))
+        return self._parts
+
+    def run(self, epochs: int) -> None:
+        """Learn from the shuffled samples in a number of epochs."""
+        for _ in range(epochs):
+            if self.captures:
+                with torch.cuda.device(self.weight.device):
+                    self._run_captured()
+            else:
+                self._epoch()
+
+    def _epoch(self) -> None:
+        for i in range(self.count):
+            self.learn({name: rows[i] for name, rows in self._parts.items()}, self.weight[i])
+
+    def _run_captured(self) -> None:
+        if not self._warm:
+            stream = torch.cuda.Stream()  # a capture needs another one than the default stream
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):
+                self._epoch()
+            torch.cuda.current_stream().wait_stream(stream)
+            self._warm = True
+            return
+        if self._graph is None:
+            graph = torch.cuda.CUDAGraph()
+            # other threads, such as NCCL's, call CUDA during the capture
+            with capturing(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
+                self._epoch()
+            if self.team.size > 1:
+                self.team.keep(graph)
+            self._graph = graph
+        self._graph.replay()
+
+
+@contextlib.contextmanager
+def precision(*, tf32: bool) -> Iterator[None]:
+    """A block in which matrix products on a GPU may use TensorFloat-32."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if tf32 else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)

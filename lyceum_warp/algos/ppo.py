@@ -1,0 +1,430 @@
+"""Proximal policy optimisation, in the order of its mathematics.
+
+Schulman et al. (2017, "Proximal Policy Optimization Algorithms"), with the choices of rsl_rl (Rudin et al. 2022,
+"Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement Learning"): a clipped value loss, a learning
+rate that follows the KL divergence, and the same mini-batches in every epoch.
+"""
+
+import collections
+import copy
+import dataclasses
+import math
+from typing import Any
+
+import torch
+import warp as wp
+from torch import nn
+
+from lyceum_warp.algos.distributed import Team
+from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
+from lyceum_warp.algos.learner import Learner, fitted_config
+from lyceum_warp.algos.minibatches import Minibatches, Samples, precision
+from lyceum_warp.algos.networks import initialize_as_torch, trainable
+from lyceum_warp.algos.on_policy import (
+    EpisodeSums,
+    OnPolicyIteration,
+    episode_statistics,
+    finished,
+    finished_metrics,
+    metric_means,
+)
+from lyceum_warp.algos.policy import GaussianPolicy, divergence, log_density
+from lyceum_warp.algos.policy_check import check_policy, check_value
+from lyceum_warp.algos.ppo_config import PPOConfig
+from lyceum_warp.algos.rollout_buffer import Rollout
+from lyceum_warp.algos.timing import PhaseTimer, one_thread
+from lyceum_warp.algos.value import ValueFunction, value_group
+from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.env import Env
+from lyceum_warp.kernels import returns
+from lyceum_warp.validate import check_kind
+
+RECENT = 100
+"""Episodes in ``return_recent``."""
+
+_EPS = 1e-2
+"""Added to the standard deviations that normalise observations, as in rsl_rl."""
+
+_SMALLEST_STD = 1e-6
+
+_SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
+"""Limits of the adaptive learning rate, and the factor by which it changes."""
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PPOIteration(OnPolicyIteration):
+    """Statistics of one iteration of PPO.
+
+    Numbers about episodes cover those that ended in the iteration; they are nan if none ended. The first episodes of
+    the worlds, which may begin at a random step, do not count.
+    """
+
+    return_recent: float
+    """Mean return of the last 100 episodes that ended, in this iteration or before."""
+    learning_rate: float
+    """Learning rate after the iteration."""
+    surrogate_loss: float
+    """Mean of the clipped surrogate loss over the mini-batches."""
+    entropy: float
+    """Mean entropy of the policy over the mini-batches."""
+    value_loss: float
+    """Mean of the value function's loss over the mini-batches."""
+    time_update: float
+    """Seconds of the update."""
+
+
+@document_attributes
+class PPO(Learner):
+    """Learns a policy by PPO; an endless iterator that yields a ``PPOIteration`` each time.
+
+    Example:
+        >>> for it in PPO(env, config=PPOConfig(hidden=(64, 64))):
+        ...     print(it.return_recent)
+
+    Args:
+        env: The environment; do not step it between iterations.
+        policy: The policy; a new one by default. ``GaussianPolicy(nobs, nact, network=...)`` has a network of your own.
+        value: The value function; a new one by default.
+        config: Hyperparameters.
+        seed: Seed of new networks and of the noise.
+        team: The processes that learn together, each with an environment of its share of the worlds. All of them must
+            make the same calls with the same arguments; all get the same numbers.
+
+    Raises:
+        ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy
+            cannot be learned (``lyceum_warp.algos.policy_check``).
+        FloatingPointError: A loss, or a parameter of a network, is not finite after an iteration.
+    """
+
+    algorithm = "ppo"
+    """The name of the algorithm in a run's config.json."""
+    policy: GaussianPolicy
+    """The policy that is learned."""
+    value: ValueFunction
+    """The value function that is learned with it."""
+    config: PPOConfig
+    """Hyperparameters."""
+    generator: torch.Generator
+    """The source of the noise and of the order of samples."""
+    rollout: Rollout
+    """The samples of the last iteration."""
+    rate: torch.Tensor
+    """The learning rate, on the device."""
+    count: int
+    """Samples in an iteration, those of all processes."""
+
+    def __init__(
+        self,
+        env: Env,
+        policy: GaussianPolicy | None = None,
+        value: ValueFunction | None = None,
+        config: PPOConfig | None = None,
+        *,
+        seed: int = 0,
+        team: Team | None = None,
+    ) -> None:
+        check_kind("env of PPO", env, Env, "as lw.make(...) makes it")
+        check_kind("config of PPO", config, PPOConfig | None, "as lw.PPOConfig(num_steps=24)")
+        check_kind("value of PPO", value, ValueFunction | None, "as lw.load_value(run) returns it")
+        super().__init__(env, seed=seed, team=team)
+        self.config = config = config or PPOConfig()
+        team, device, steps = self.team, env.obs.device, config.num_steps
+        self.count = steps * env.nworld * team.size
+        if config.minibatches > self.count:
+            raise ValueError(
+                f"{config.minibatches} mini-batches are more than the {self.count} samples: give more worlds, or make "
+                "minibatches smaller"
+            )
+        if value is not None:
+            check_value(trainable(value), env)
+        if policy is not None:
+            check_policy(trainable(policy), env, twice=False)
+
+        # networks
+        nobs, nact = env.obs_space.size, env.action_space.size
+        group = value_group(env, config.value_group) if value is None else value.group
+        init = torch.Generator().manual_seed(seed)
+        options: dict[str, Any] = dict(normalize=config.normalize, generator=init)
+        if config.normalize:
+            options["limit"] = math.inf
+        self.policy = policy or GaussianPolicy(
+            nobs, nact, config.hidden, activation=config.activation, log_std=config.log_std, **options
+        )
+        self.value = value or ValueFunction(
+            env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation, scale=1.0,
+            group=group, **options,
+        )  # fmt: skip
+        for given, module in ((policy, self.policy), (value, self.value)):
+            if given is None:  # a policy's last layer near zero, as NPG's, lets the adaptive rate begin much higher
+                initialize_as_torch(module, init)
+        self.value.discount = config.gamma
+        self.policy.to(device)
+        self.value.to(device)
+
+        # samples
+        self.rollout = Rollout(env, steps, groups=(group,))
+        self.noise = torch.empty(steps, env.nworld * team.size, nact, device=device)
+        self._mean = torch.empty_like(self.rollout.action)
+        self._advantage, self._return = (torch.empty_like(self.rollout.reward) for _ in range(2))
+        # a seed of its own: the same numbers should not make both the weights and the noise
+        self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
+
+        # the update
+        log_std = self.policy.log_std
+        self.std = log_std if config.std_type == "log" else nn.Parameter(log_std.detach().exp())
+        self.std.requires_grad_(log_std.requires_grad)
+        own = [self.std, *(p for p in self.policy.parameters() if p is not log_std)]
+        self._learned = [[p for p in group if p.requires_grad] for group in (own, self.value.parameters())]
+        self._parameters = [p for group in self._learned for p in group]
+        self.rate = torch.tensor(config.learning_rate, device=device)
+        self._cuda = device.type == "cuda"
+        self.optimizer = torch.optim.Adam(self._parameters, lr=self.rate, fused=True, capturable=self._cuda)
+        # gradients, KL divergence and losses are parts of one tensor, which the processes sum in one call
+        sizes = [p.numel() for p in self._parameters]
+        self._sums = self._parameters[0].new_zeros(sum(sizes) + 4)
+        for parameter, part in zip(self._parameters, self._sums[:-4].split(sizes), strict=True):
+            parameter.grad = part.view_as(parameter)
+        self._losses, self._entropy_coef = torch.zeros(3, device=device), torch.zeros((), device=device)
+        self._old_log_std = log_std.detach().clone()
+        self.minibatches = Minibatches(
+            self.learn, steps=steps, nworld=env.nworld, count=config.minibatches, team=team, device=device
+        )
+
+        self._recent: collections.deque[float] = collections.deque(maxlen=RECENT)
+        self._evaluate_mean = MeanPolicyEvaluation(env, config.mean_episodes, team)
+        self.rollout.restart()
+        if config.stagger:
+            self.rollout.stagger(self.generator, team)
+
+    def __next__(self) -> PPOIteration:
+        config, rollout, team = self.config, self.rollout, self.team
+        timer = PhaseTimer(self.env.obs.device)
+        with precision(tf32=config.tf32 and self._cuda):
+            # 1. Samples of the current policy.
+            self.sample()
+
+            # 2. Values and advantages, from the value function that was not yet fitted to these samples.
+            samples = self.evaluated_samples()
+            timer.mark()
+
+            # 3. Epochs of mini-batches: a step on the clipped surrogate, the value loss and the entropy in each.
+            self.update(samples)
+            kl = self.divergence()
+
+        # One copy brings the numbers of all processes to the host, and another one the returns.
+        losses = self._losses / (config.epochs * config.minibatches)
+        finite = torch.stack([numbers.isfinite().all() for numbers in (losses, *self._parameters)]).all()
+        numbers = [
+            *finished(rollout), *finished_metrics(rollout), rollout.reward.double().mean(), rollout.faults.sum(),
+            finite, kl, self.policy.log_std.detach().exp().mean(), self.rate, *losses,
+        ]  # fmt: skip
+        processes = team.gather(torch.stack([number.double() for number in numbers])[None]).tolist()
+        self._recent.extend(self._returns()[-RECENT:])
+        timer.mark()
+        split = len(EpisodeSums._fields)
+        episodes = [EpisodeSums(*process[:split]) for process in processes]
+        others = [process[split : split + len(self.env.metrics)] for process in processes]
+        sums = [process[split + len(self.env.metrics) :] for process in processes]
+        _, _, finite, kl, std, rate, value_loss, surrogate, entropy = sums[0]
+        if not finite:
+            raise FloatingPointError(
+                f"the update of iteration {self.iteration + 1} is not finite: make learning_rate, or the rewards, "
+                "smaller"
+            )
+
+        # 4. Every few iterations, the mean policy in whole episodes.
+        self.iteration += 1
+        self.samples += self.count
+        mean: dict[str, Any] = dict.fromkeys(MEAN_STATISTICS)
+        if config.mean_every and self.iteration % config.mean_every == 0:
+            mean = self._evaluate_mean(self.policy)
+        timer.mark()
+
+        statistics: dict[str, Any] = episode_statistics(episodes)
+        if self.env.task.functions["success"] is None:
+            statistics["success"], mean["mean_success"] = math.nan, None
+        time_sample, time_update, time_mean = timer.seconds()
+        return PPOIteration(
+            iteration=self.iteration,
+            samples=self.samples,
+            reward_mean=sum(process[0] for process in sums) / len(sums),
+            **statistics,
+            **mean,
+            kl=kl,
+            std_mean=std,
+            return_recent=sum(self._recent) / len(self._recent) if self._recent else math.nan,
+            learning_rate=rate,
+            surrogate_loss=surrogate,
+            entropy=entropy,
+            value_loss=value_loss,
+            faults=round(sum(process[1] for process in sums)),
+            time_sample=time_sample,
+            time_update=time_update,
+            time_mean=time_mean,
+            samples_per_second=self.count / time_sample,
+            metrics=metric_means(sum(part.episodes for part in episodes), others, list(self.env.metrics)),
+        )
+
+    @torch.no_grad()
+    def sample(self) -> None:
+        """Fill the rollout buffer with steps of the current policy under new noise.
+
+        The observations that each step leads to are taken into the statistics that normalise them. A step computes
+        nothing else but its actions: values and densities follow once for all steps.
+        """
+        env, rollout, std = self.env, self.rollout, self.policy.log_std.exp()
+        with one_thread():
+            self.noise.normal_(generator=self.generator)
+            noise = self.noise[:, self._own]
+            rollout.begin()
+            for t in range(rollout.steps):
+                self._mean[t] = self.policy(env.obs)
+                torch.addcmul(self._mean[t], noise[t], std, out=env.action)
+                rollout.store_inputs()
+                env.step()
+                rollout.store_outputs()
+                self.policy.observe(env.obs, self.team, eps=_EPS)
+                self.value.observe(env.obs_groups[self.value.group], self.team, eps=_EPS)
+
+    @torch.no_grad()
+    def evaluated_samples(self) -> dict[str, torch.Tensor]:
+        """The samples with what the update needs of the old networks, each (steps, nworld, ...).
+
+        At a time limit, after a fault and at the end of the rollout, the value of the final observation stands for the
+        rest of the episode. The value function's targets are its predictions plus the advantages.
+        """
+        rollout, config, team = self.rollout, self.config, self.team
+        obs, final_obs = rollout.obs_groups[self.value.group], rollout.final_obs_groups[self.value.group]
+        value, next_value = self.value(obs, rollout.step), self.value(final_obs, rollout.step + 1.0)
+        arrays = [rollout.reward, value, next_value, rollout.terminated, rollout.done]
+        inputs = [wp.from_torch(array) for array in arrays]
+        outputs = [wp.from_torch(self._advantage), wp.from_torch(self._return)]
+        args = [*inputs, config.gamma, config.lam, *outputs]
+        wp.launch(returns.advantages, self.env.nworld, args, device=self.env.device)
+        advantage, target = self._advantage, value + self._advantage
+        if not config.whiten_minibatches:
+            advantage = advantage - team.sum(advantage.sum()) / self.count
+            variance = team.sum(advantage.square().sum()) / max(self.count - 1, 1)
+            advantage = advantage / (variance.sqrt() + 1e-8)
+        self._old_log_std.copy_(self.policy.log_std)
+        return {
+            "obs": rollout.obs, "value_obs": obs, "step": rollout.step, "action": rollout.action, "mean": self._mean,
+            "log_prob": log_density(rollout.action, self._mean, self._old_log_std), "value": value, "target": target,
+            "advantage": advantage,
+        }  # fmt: skip
+
+    def update(self, samples: Samples) -> None:
+        """Learn from samples of ``evaluated_samples`` in epochs of mini-batches."""
+        config, team = self.config, self.team
+        parts = self.minibatches.shuffle(samples, self.generator)
+        if config.whiten_minibatches:
+            advantage, weight = parts["advantage"], self.minibatches.weight
+            advantage -= team.sum((weight * advantage).sum(1, keepdim=True))
+            variance = team.sum((weight * advantage.square()).sum(1, keepdim=True))
+            batch = self.minibatches.batch
+            advantage /= (variance * (batch / max(batch - 1, 1))).sqrt() + 1e-8
+        self._entropy_coef.fill_(config.entropy_weight(self.iteration + 1))
+        self._losses.zero_()
+        self.minibatches.run(config.epochs)
+        team.copy_leader(self._parameters)
+        self._apply_std()
+
+    def learn(self, samples: Samples, weight: torch.Tensor) -> None:
+        """One step of Adam on a mini-batch.
+
+        Args:
+            samples: This process's samples of the mini-batch, each (samples, ...).
+            weight: Their weights, (samples,), whose sum over all processes is 1.
+        """
+        config, clip = self.config, self.config.clip
+        mean, log_std = self.policy(samples["obs"]), self._log_std()
+        ratio = torch.exp(log_density(samples["action"], mean, log_std) - samples["log_prob"])
+        advantage = samples["advantage"]
+        surrogate = torch.max(-advantage * ratio, -advantage * ratio.clamp(1.0 - clip, 1.0 + clip))
+        value = self.value(samples["value_obs"], samples["step"])
+        error = (value - samples["target"]).square()
+        if config.clip_value_loss:
+            near = samples["value"] + (value - samples["value"]).clamp(-clip, clip)
+            error = torch.max(error, (near - samples["target"]).square())
+        entropy = (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
+        losses = torch.stack([(weight * error).sum(), (weight * surrogate).sum(), weight.sum() * entropy])
+        loss = config.value_coef * losses[0] + losses[1] - self._entropy_coef * losses[2]
+        # not backward(), whose sums of gradients belong to the stream of the first call
+        gradients = torch.autograd.grad(loss, self._parameters)
+
+        with torch.no_grad():
+            kl = (weight * divergence(samples["mean"], self._old_log_std, mean, log_std)).sum()
+            torch.cat([*(part.flatten() for part in gradients), kl[None], losses], out=self._sums)
+            self.team.sum(self._sums)
+            if config.schedule == "adaptive":
+                self._adapt(self._sums[-4])
+            for parameters in self._learned:
+                nn.utils.clip_grad_norm_(parameters, config.max_grad_norm)
+            self.optimizer.step()
+            self._losses += self._sums[-3:]
+
+    def _adapt(self, kl: torch.Tensor) -> None:
+        """Adapt the learning rate to a KL divergence, without waiting for the device."""
+        wanted = self.config.desired_kl
+        lower, higher = (self.rate / _FACTOR).clamp_min(_SLOWEST), (self.rate * _FACTOR).clamp_max(_FASTEST)
+        raised = torch.where((kl < wanted / 2.0) & (kl > 0.0), higher, self.rate)
+        self.rate.copy_(torch.where(kl > wanted * 2.0, lower, raised))
+
+    def _log_std(self) -> torch.Tensor:
+        """Logarithms of the standard deviations that Adam learns, (nact,)."""
+        if self.config.std_type == "log":
+            return self.std.clamp_min(math.log(_SMALLEST_STD))
+        return self.std.clamp_min(_SMALLEST_STD).log()
+
+    @torch.no_grad()
+    def _apply_std(self) -> None:
+        self.policy.log_std.copy_(self._log_std())
+
+    @torch.no_grad()
+    def divergence(self) -> torch.Tensor:
+        """KL divergence from the policy that sampled to the present one, averaged over the samples."""
+        kl = divergence(self._mean, self._old_log_std, self.policy(self.rollout.obs), self.policy.log_std).mean()
+        return self.team.sum(kl) / self.team.size
+
+    def _returns(self) -> list[float]:
+        """Returns of the episodes of all processes that ended in the iteration and count, in the order of the steps."""
+        ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
+        ended = self.team.gather(ended.T).T
+        found: list[float] = ended[~ended.isnan()].tolist()
+        return found
+
+    def settings(self) -> dict[str, Any]:
+        """The hyperparameters, with the sizes of the networks, as a run's config.json holds them."""
+        config = fitted_config(self.config, self.policy.shape, self.value.shape)
+        if self.value.group != value_group(self.env, None):
+            config = dataclasses.replace(config, value_group=self.value.group)
+        return dataclasses.asdict(config)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state on which the next iteration depends; see ``Learner``."""
+        own = {
+            "optimizer": self.optimizer.state_dict(),
+            "std": self.std.detach(),
+            "returns": self.team.gather(self.rollout.running_return),
+            "recent": list(self._recent),
+        }
+        return super().state_dict() | copy.deepcopy(own)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken.
+
+        Raises:
+            ValueError: The state has another number of worlds, or does not fit for another reason.
+        """
+        super().load_state_dict(state)
+        self.optimizer.load_state_dict(state["optimizer"])
+        for group in self.optimizer.param_groups:
+            self.rate.copy_(group["lr"])
+            group["lr"], group["capturable"] = self.rate, self._cuda
+        with torch.no_grad():
+            self.std.copy_(state["std"])
+        self.rollout.running_return.copy_(state["returns"][self._own])
+        self._recent.clear()
+        self._recent.extend(state["recent"])
+        self.minibatches.forget()  # its graph holds the addresses of the old moments

@@ -1,0 +1,1 @@
+"""A run: the files in its folder, its copy of the task, and when it is saved."""

@@ -1,0 +1,197 @@
+"""Read and write the content of checkpoints and of saved policies."""
+
+import io
+import pydoc
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.env import Env
+from lyceum_warp.files import newer_format, replaced
+
+FORMAT = 1
+"""Format of a run's folder and of its files. It is raised when an older release could no longer read them."""
+
+_FIX = "restore the file from a copy, or train again into another folder"
+
+PolicyContent = dict[str, Any]
+"""A policy and a value function as they are saved: ``iteration``, ``policy``, and ``value`` if there is one."""
+
+_CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": ValueFunction}
+"""The classes of networks whose files name none."""
+
+
+def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> PolicyContent:
+    """A copy of a policy and of a value function on the CPU.
+
+    Args:
+        iteration: Number of complete iterations.
+        policy: The policy.
+        value: The value function.
+    """
+    content: PolicyContent = {"lyceum_warp": FORMAT, "iteration": iteration}
+    for name, module in (("policy", policy), ("value", value)):
+        if module is not None:
+            kind = type(module)
+            own = {} if isinstance(module, _CLASSES[name]) else {"class": f"{kind.__module__}.{kind.__qualname__}"}
+            content[name] = {
+                **own,
+                "shape": getattr(module, "shape", None),
+                "state": {key: tensor.detach().cpu().clone() for key, tensor in module.state_dict().items()},
+            }
+    return content
+
+
+def serialized(content: Mapping[str, Any]) -> memoryview:
+    """The bytes of a file. Written by Python they raise OSError on a full disk, where torch has errors of its own."""
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    return buffer.getbuffer()
+
+
+def write_content(path: Path, content: PolicyContent) -> None:
+    """Replace a file of a policy."""
+    with replaced(path) as temporary:
+        temporary.write_bytes(serialized(content))
+
+
+def policy_of(content: PolicyContent, path: Path, given: nn.Module | None = None) -> nn.Module:
+    """The policy of a file.
+
+    Args:
+        content: The file's content.
+        path: The file, for messages.
+        given: A policy that takes the weights; a new one by default.
+
+    Raises:
+        ValueError: The file holds something else, or another policy than the given one.
+    """
+    return _filled(content, path, "policy", given)
+
+
+def value_of(content: PolicyContent, path: Path) -> nn.Module:
+    """The value function of a file.
+
+    Args:
+        content: The file's content.
+        path: The file, for messages.
+
+    Raises:
+        ValueError: The file holds none.
+    """
+    if "value" not in content:
+        raise ValueError(f"{path} holds no value function: the run's algorithm has none")
+    return _filled(content, path, "value", None)
+
+
+def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | None) -> nn.Module:
+    """A network with the weights of a file."""
+    try:
+        saved = content[name]
+        module = given if given is not None else _made(name, saved)
+        if different := _difference(module, saved["state"]):
+            fix = _FIX if given is None else "give one like that of the run"
+            raise ValueError(f"{path} holds a {name} of other parameters ({different}): {fix}")
+        module.load_state_dict(saved["state"])
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"{path} holds no {name} of lyceum_warp ({_first_sentence(error)}): {_FIX}") from error
+    return module
+
+
+def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
+    """A new network of the class and the shape that a file names. Only classes of the package are made."""
+    kind: Any = _CLASSES[name]
+    own = saved.get("class")
+    if own is not None:
+        kind = pydoc.locate(own) if own.startswith("lyceum_warp.") and saved["shape"] is not None else None
+        if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
+            fix = f": give one, as in lw.load(run, policy={own.rpartition('.')[2]}(...))" if name == "policy" else ""
+            raise ValueError(f"the {name} is of a class of its own, {own}{fix}")
+    return kind.like(saved["shape"]) if hasattr(kind, "like") else kind(**saved["shape"])
+
+
+def check_sizes(policy: Any, env: Env, path: Path) -> None:
+    """Refuse a policy that was trained on observations or actions of other sizes.
+
+    Args:
+        policy: The policy.
+        env: The environment that it is to act in.
+        path: Where it is from, for the message.
+
+    Raises:
+        ValueError: The sizes differ.
+    """
+    sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
+    if sizes != wanted:
+        raise ValueError(
+            f"the policy in {path} takes {sizes[0]} observations and gives {sizes[1]} actions, but the task "
+            f"{env.task.name!r} has {wanted[0]} and {wanted[1]}: use a task with the sizes that it was trained on"
+        )
+
+
+def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
+    """The first difference between a module's weights and saved ones; empty where there is none."""
+    own, saved = ({name: tuple(part.shape) for name, part in s.items()} for s in (module.state_dict(), state))
+    saved = {name: own[name] for name in getattr(module, "LATER", ())} | saved
+    for name in {**own, **saved}:
+        if own.get(name) != saved.get(name):
+            one, other = (f"{shape}" if shape is not None else "absent" for shape in (saved.get(name), own.get(name)))
+            return f"{name!r} is {one} in the file, and {other} in the network that takes it"
+    return ""
+
+
+def read_checkpoint(
+    path: Path, device: str | torch.device = "cpu", *, parts: tuple[str, ...] = ("iteration", "policy", "state")
+) -> dict[str, Any]:
+    """Read the content of a checkpoint, or of a saved policy. No code in the file is executed.
+
+    Args:
+        path: The file.
+        device: Device for its tensors.
+        parts: What it must hold.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ValueError: The checkpoint is broken, was not written by lyceum_warp, or was written by a newer release.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no checkpoint {path}: train the run first")
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+    except Exception as error:  # of many types, from torch
+        raise ValueError(
+            f"the checkpoint {path} is cut off, or was not written by lyceum_warp ({_first_sentence(error)}): {_FIX}"
+        ) from error
+    if not isinstance(content, dict) or "lyceum_warp" not in content:
+        raise ValueError(f"the checkpoint {path} was not written by lyceum_warp: {_FIX}")
+    check_format(path, content["lyceum_warp"])
+    if missing := set(parts) - content.keys():
+        raise ValueError(f"the checkpoint {path} lacks {', '.join(sorted(missing))}: {_FIX}")
+    return content
+
+
+def check_format(path: Path, number: Any) -> None:
+    """Refuse a file of another program, or of a newer release.
+
+    Args:
+        path: The file.
+        number: Its format.
+
+    Raises:
+        ValueError: The format is not known.
+    """
+    if not isinstance(number, int) or number < 1:
+        raise ValueError(f"{path} was not written by lyceum_warp: its format is {number!r}")
+    if number > FORMAT:
+        raise newer_format(path, number, FORMAT)
+
+
+def _first_sentence(error: BaseException) -> str:
+    """The first sentence of an error's message; torch's messages fill a page."""
+    text = str(error).strip() or type(error).__name__
+    return text.splitlines()[0].split(". ")[0][:200]

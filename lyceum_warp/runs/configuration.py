@@ -1,0 +1,185 @@
+"""Write a learner as the config.json of its run, and make the learner of one."""
+
+import dataclasses
+import logging
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lyceum_warp.algos.distributed import Team
+from lyceum_warp.algos.learner import Learner
+from lyceum_warp.algos.npg import NPG
+from lyceum_warp.algos.npg_config import NPGConfig
+from lyceum_warp.algos.ppo import PPO
+from lyceum_warp.algos.ppo_config import PPOConfig
+from lyceum_warp.binding.registry import spelled_task
+from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.engines.placement import engine_name
+from lyceum_warp.env import Env
+from lyceum_warp.machine import cpu_cores
+from lyceum_warp.options import EnvOptions
+from lyceum_warp.runs.checkpoints import policy_of, read_checkpoint, value_of
+from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.task_copy import given_params, run_env
+
+log = logging.getLogger(__name__)
+
+ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig)}
+"""The algorithms that the command line and config.json know by name: the class of the learner, and of its
+hyperparameters."""
+
+
+_RSL_RL = {
+    "num_steps_per_env": "num_steps", "num_learning_epochs": "epochs", "num_mini_batches": "minibatches",
+    "clip_param": "clip", "use_clipped_value_loss": "clip_value_loss", "value_loss_coef": "value_coef",
+    "normalize_advantage_per_mini_batch": "whiten_minibatches", "random_start": "stagger",
+}  # fmt: skip
+"""Hyperparameters of the former algorithm rsl-rl that ppo calls otherwise."""
+
+
+def algorithm_of(name: str) -> tuple[Any, Any]:
+    """The class of an algorithm, and of its hyperparameters.
+
+    Raises:
+        ValueError: There is no such algorithm.
+    """
+    if name not in ALGORITHMS:
+        raise ValueError(f"there is no algorithm {name!r}: use {' or '.join(ALGORITHMS)}")
+    return ALGORITHMS[name]
+
+
+def describe(learner: Learner) -> dict[str, Any]:
+    """The configuration of a run as config.json holds it, from which ``Configuration`` makes the same learner."""
+    env, options = learner.env, learner.env.options
+    names = ["horizon", "graphs"]
+    if learner.team.neighbours == 1:  # several processes of a machine share its cores, a later one has them all
+        names.append("nthread")
+    others = {name: value for name, value in options.given().items() if name in names}
+    others |= {name: list(names) for name in ("fields", "dynamics") if (names := getattr(options, name))}
+    if isinstance(options.model, str | Path):
+        others["model"] = str(Path(options.model).absolute()) if Path(options.model).is_file() else str(options.model)
+    seed = {} if learner.seed == options.seed else {f"{learner.algorithm}_seed": learner.seed}
+    return {
+        "algorithm": learner.algorithm,
+        "task": spelled_task(env.task.task),
+        "params": given_params(env),
+        "physics": options.physics.given(),
+        "engine": options.engine if isinstance(options.engine, str) else env.engine.name,
+        "device": options.device or "cpu",
+        "options": others,
+        "nworld": env.nworld * learner.team.size,
+        "threads": torch.get_num_threads(),
+        "seed": options.seed,
+        **seed,
+        learner.algorithm: learner.settings(),
+    }
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Configuration:
+    """What a run trains: a task in an environment, and an algorithm with its hyperparameters."""
+
+    task: str | None
+    """The task's name or file; None if it was defined in a notebook."""
+    params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """The task's parameters."""
+    options: EnvOptions
+    """Options of the environment, with the worlds of all processes."""
+    algorithm: str
+    """Name of the algorithm."""
+    hyperparameters: Any
+    """The algorithm's hyperparameters; None for an algorithm that is not in ``ALGORITHMS``."""
+    seed: int | None = None
+    """Seed of the algorithm; None for the environment's."""
+    threads: int = 1
+    """Threads of torch."""
+
+    @classmethod
+    def of(cls, run: Run) -> "Configuration":
+        """Read the configuration of a run. A run of the former algorithm rsl-rl is read as one of ppo.
+
+        Raises:
+            ValueError: A value is missing or not valid.
+        """
+        config = run.config
+        try:
+            # earlier releases accepted options as --param and stored them under "params", or had no "physics"
+            words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
+            base = EnvOptions(**{name: config[name] for name in ("engine", "device", "nworld", "seed")})
+            options, params = EnvOptions.split(words, base)
+            name: str = config["algorithm"]
+            entry: Any = config.get(name)
+            if name == "rsl-rl":  # of an earlier release
+                renamed = {_RSL_RL.get(old, old): value for old, value in entry.items()}
+                known = {field.name for field in dataclasses.fields(PPOConfig)}
+                init = {"log_std": math.log(entry.get("init_std", 1.0))}
+                name, entry = "ppo", {new: value for new, value in renamed.items() if new in known} | init
+            return cls(
+                task=config["task"], params=params, options=options, algorithm=name,
+                hyperparameters=ALGORITHMS[name][1](**entry) if name in ALGORITHMS else None,
+                seed=config.get(f"{name}_seed"), threads=config["threads"],
+            )  # fmt: skip
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            text = f"{run.folder / 'config.json'} is not the configuration of a training run ({error})"
+            raise ValueError(text) from error
+
+    def learner(
+        self,
+        team: Team,
+        *,
+        run: Run | None = None,
+        networks: tuple[Any, Any] = (None, None),
+        note: Callable[[str], None] = log.warning,
+    ) -> Learner:
+        """Make the learner.
+
+        Args:
+            team: The processes that learn together.
+            run: The run whose task it is; its copies stand in for files that have moved or changed.
+            networks: The policy and the value function that it begins with; None for new ones.
+            note: Called with lines about the task's files.
+
+        Raises:
+            ValueError: A value is not valid.
+            FileNotFoundError: The task or its model is missing.
+        """
+        learner, _ = algorithm_of(self.algorithm)
+        if self.threads < 1:
+            raise ValueError(f"threads must be at least 1, not {self.threads}")
+        torch.set_num_threads(self.threads)
+        nworld = team.share(self.options.nworld)
+        own = {"nworld": nworld, "first_world": team.rank * nworld, "device": team.device or self.options.device}
+        options = self.options.changed(own)
+        if options.nthread is None and team.neighbours > 1 and engine_name(options.engine, options.device) == "mujoco":
+            options = options.changed({"nthread": max(1, cpu_cores() // team.neighbours)})
+        if run is None:
+            assert self.task is not None
+            env = Env(self.task, options, **self.params)
+        else:
+            env = run_env(run, options, self.params, note=note)
+        seed = self.options.seed if self.seed is None else self.seed
+        return learner(env, *networks, self.hyperparameters, seed=seed, team=team)
+
+
+def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
+    """The policy and the value function with which a learner begins, and the number of their iteration.
+
+    Args:
+        run: The run that has them.
+        which: Which policy of the run; None if the run is continued. Its networks are None then, unless they are others
+            than those that its hyperparameters make: a run that began with another one's, or a policy with a limit.
+
+    Raises:
+        FileNotFoundError: The run has no such policy.
+        ValueError: The file cannot be read, or the policy is of a class of its own.
+    """
+    path = run.policy_file("last" if which is None else which)
+    content = read_checkpoint(path, parts=("iteration", "policy"))
+    if which is None and "from" not in run.config and "limit" not in (content["policy"]["shape"] or {}):
+        return None, None, content["iteration"]
+    value = value_of(content, path) if "value" in content else None
+    return policy_of(content, path), value, content["iteration"]

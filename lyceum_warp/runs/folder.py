@@ -1,0 +1,336 @@
+"""Read and write the folder of a training run."""
+
+import contextlib
+import json
+import logging
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.files import replaced
+from lyceum_warp.runs.checkpoints import (
+    FORMAT,
+    PolicyContent,
+    check_format,
+    policy_of,
+    read_checkpoint,
+    serialized,
+    value_of,
+    write_content,
+)
+from lyceum_warp.runs.metrics_table import read_metrics
+from lyceum_warp.support.versions import versions
+
+_CONFIG, _VERSIONS = "config.json", "versions.json"
+
+log = logging.getLogger(__name__)
+
+
+@document_attributes
+class Run:
+    """The folder of a training run.
+
+    =================== ======================================================================================
+    ``config.json``     the task, its parameters, the engine, its physics, the seed and all hyperparameters
+    ``versions.json``   versions of the packages and of Python, the machine, the commit
+    ``metrics.csv``     one row per iteration
+    ``policy.pt``       the last policy, and its value function
+    ``best.pt``         the policy with the best return
+    ``policies/``       the policies of every n-th iteration, if asked for
+    ``checkpoint.pt``   the complete state from which a run continues exactly, of the same iteration as ``policy.pt``
+    ``previous.pt``     the checkpoint before it
+    ``task/``           the task's file with modules beside it, and its model, where they are not the package's
+    =================== ======================================================================================
+
+    Args:
+        folder: The folder.
+        config: The content of ``config.json``.
+    """
+
+    metrics: Path
+    """Path of the table of iterations."""
+    checkpoint: Path
+    """Path of the checkpoint."""
+    previous: Path
+    """Path of the checkpoint before the last one."""
+    policy: Path
+    """Path of the last policy."""
+    best: Path
+    """Path of the best policy."""
+    task_folder: Path
+    """Path of the folder with the task's file and its model."""
+
+    def __init__(self, folder: Path, config: dict[str, Any]) -> None:
+        self.folder, self.config = folder, config
+        self.metrics, self.task_folder = folder / "metrics.csv", folder / "task"
+        self.checkpoint, self.previous = folder / "checkpoint.pt", folder / "previous.pt"
+        self.policy, self.best = folder / "policy.pt", folder / "best.pt"
+
+    @property
+    def task_name(self) -> str:
+        """Name of the run's task."""
+        task = self.config.get("kept", {}).get("name") or str(self.config.get("task"))
+        return Path(task.partition(":")[0]).stem
+
+    @staticmethod
+    def check_free(folder: str | Path) -> None:
+        """Check that a folder can be used for a new run.
+
+        Args:
+            folder: A folder, which need not exist.
+
+        Raises:
+            ValueError: The folder is not empty, or is a file.
+        """
+        folder = Path(folder)
+        if (folder / _CONFIG).exists():
+            raise ValueError(
+                f"{folder} holds a run: give another folder, or continue the run (train --resume {folder}, or "
+                "resume=True in Python)"
+            )
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise ValueError(f"{folder} exists and is not an empty folder: give another folder")
+
+    @classmethod
+    def create(
+        cls,
+        folder: str | Path,
+        config: Mapping[str, Any],
+        *,
+        device: str = "cpu",
+        files: Mapping[str, Path | bytes] | None = None,
+    ) -> "Run":
+        """Begin a run: make its folder, with the versions, the copy of the task, and the configuration.
+
+        If this fails, nothing is left in the folder.
+
+        Args:
+            folder: A new or empty folder.
+            config: The configuration, of values that JSON can hold.
+            device: Device of the run; see ``versions``.
+            files: What the folder ``task`` holds, by path: files to copy, or their contents.
+
+        Raises:
+            ValueError: The folder is not empty, or is a file.
+        """
+        folder = Path(folder)
+        cls.check_free(folder)
+        run = cls(folder, {"format": FORMAT, **config})
+        text = json.dumps(run.config, indent=2)  # before the folder is made, because it may fail
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / _VERSIONS).write_text(json.dumps(versions(device), indent=2))
+            for name, content in (files or {}).items():
+                path = run.task_folder / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(content if isinstance(content, bytes) else content.read_bytes())
+            (folder / _CONFIG).write_text(text)
+        except BaseException:  # a full disk, a folder that cannot be written, a signal
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        return run
+
+    @classmethod
+    def open(cls, folder: str | Path) -> "Run":
+        """Open the run in a folder.
+
+        Raises:
+            FileNotFoundError: There is no run in the folder.
+            ValueError: The configuration cannot be read, or was written by a newer release.
+        """
+        folder = Path(folder)
+        path = folder / _CONFIG
+        if not path.is_file():
+            raise FileNotFoundError(f"there is no run in {folder}: it has no {_CONFIG}")
+        try:
+            config = json.loads(path.read_text())
+            number = config["format"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} is not the configuration of a run of lyceum_warp ({error!r})") from error
+        check_format(path, number)
+        return cls(folder, config)
+
+    def amend(self, **changes: Any) -> None:
+        """Change entries of the configuration, here and in the file."""
+        self.config = {**self.config, **changes}
+        with replaced(self.folder / _CONFIG) as temporary:
+            temporary.write_text(json.dumps(self.config, indent=2))
+
+    def changed(self, now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+        """Compare versions with those that the run began with, and note the changes in ``versions.json``.
+
+        Args:
+            now: The present versions, as ``versions()`` returns them.
+
+        Returns:
+            The changed entries, as (then, now). They are noted under "resumed".
+        """
+        path = self.folder / _VERSIONS
+        try:
+            then = json.loads(path.read_text())
+        except (OSError, ValueError):
+            then = {}
+        changed = {name: (then.get(name), value) for name, value in now.items() if then.get(name) != value}
+        if changed:
+            then.setdefault("resumed", []).append({name: value for name, (_, value) in changed.items()})
+            with replaced(path) as temporary:
+                temporary.write_text(json.dumps(then, indent=2))
+        return changed
+
+    def rows(self) -> list[dict[str, float | None]]:
+        """Read the rows of the table. An empty cell is None.
+
+        Raises:
+            FileNotFoundError: The run has no table yet.
+            ValueError: The table cannot be read.
+        """
+        if not self.metrics.exists():
+            raise FileNotFoundError(f"there is no {self.metrics}: the run has no complete iteration")
+        return read_metrics(self.metrics)
+
+    # policies
+
+    def numbered(self, iteration: int) -> Path:
+        """Path of the policy of an iteration, if the run keeps it."""
+        return self.folder / "policies" / f"{iteration:06d}.pt"
+
+    def policy_file(self, which: str | int = "last") -> Path:
+        """Path of a saved policy.
+
+        Args:
+            which: "last", "best", or the number of an iteration.
+
+        Raises:
+            FileNotFoundError: The run has no such policy; the message lists those that it has.
+            ValueError: ``which`` is something else.
+        """
+        if which == "last":
+            # earlier releases kept the policy in the checkpoint alone
+            return self.policy if self.policy.is_file() else self.checkpoint
+        if which == "best":
+            path = self.best
+        elif isinstance(which, int | str) and str(which).isdigit():
+            path = self.numbered(int(which))
+        else:
+            raise ValueError(f"which must be 'last', 'best' or the number of an iteration, not {which!r}")
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"the run in {self.folder} has no policy {which!r}: it has {self._known_policies()}"
+            )
+        return path
+
+    def _known_policies(self) -> str:
+        known = ["'last'"] * self.policy_file().is_file() + ["'best'"] * self.best.is_file()
+        numbers = sorted(int(path.stem) for path in self.numbered(0).parent.glob("*.pt") if path.stem.isdigit())
+        return ", ".join([*known, *map(str, numbers)]) or "none yet"
+
+    def best_score(self) -> tuple[int, float] | None:
+        """The iteration and the score of the best policy; None if there is none."""
+        if not self.best.is_file():
+            return None
+        try:
+            content = read_checkpoint(self.best, parts=("iteration", "policy", "score"))
+        except ValueError:
+            return None
+        return content["iteration"], content["score"]["value"]
+
+    # the checkpoint
+
+    def save(self, content: PolicyContent, state: Mapping[str, Any]) -> None:
+        """Replace the last policy, and the checkpoint; the old checkpoint is kept as the previous one.
+
+        A reader finds the old files or the whole new ones.
+
+        Args:
+            content: The policy and the value function.
+            state: The state of the algorithm: tensors, numbers, strings and containers of them.
+        """
+        write_content(self.policy, content)
+        with replaced(self.checkpoint, durable=True, previous=self.previous) as temporary:
+            temporary.write_bytes(serialized({**content, "state": dict(state)}))
+
+    def read(self, device: str | torch.device = "cpu", *, note: Callable[[str], None] = log.warning) -> dict[str, Any]:
+        """Read the checkpoint: ``iteration``, ``policy``, ``state``, and ``value`` if there is one.
+
+        If it is broken or missing, and the one before it is whole, that one is read.
+
+        Args:
+            device: Device for its tensors.
+            note: Called with a line that says that the one before it is read.
+
+        Raises:
+            FileNotFoundError: The run has no checkpoint.
+            ValueError: The checkpoint is broken, was not written by lyceum_warp, or was written by a newer release.
+        """
+        try:
+            return read_checkpoint(self.checkpoint, device)
+        except (ValueError, FileNotFoundError) as error:
+            with contextlib.suppress(ValueError, FileNotFoundError):
+                content = read_checkpoint(self.previous, device)
+                cause = str(error).rpartition(": ")[0]
+                note(f"{cause}: {self.previous}, of iteration {content['iteration']}, is used instead")
+                return content
+            if isinstance(error, ValueError) and self.policy.is_file():
+                raise ValueError(f"{error}, or begin with the run's policy: train --from {self.folder}") from error
+            raise
+
+
+def load(
+    run: str | Path | Run,
+    *,
+    which: str | int = "last",
+    policy: Any = None,
+    device: str | torch.device = "cpu",
+) -> Any:
+    """Load the policy of a run, with its observation normaliser: ``action = policy.act(obs)`` has no noise.
+
+    A ``GaussianPolicy`` also returns its mean actions when it is called, ``policy(obs)``. The parameters are frozen;
+    ``NPG(env, policy=lw.load(RUN))`` trains them further.
+
+    Args:
+        run: A run's folder, or a file of it with a policy.
+        which: "last", "best" (see ``train``), or the number of an iteration that the run kept.
+        policy: A policy that takes the run's weights and is returned; necessary if its class or its network is your
+            own.
+        device: Device for its parameters.
+
+    Raises:
+        FileNotFoundError: There is no run, or it has no such policy.
+        ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release; or the
+            policy in it is of a class of its own and ``policy`` is not given, or does not fit.
+    """
+    content, path = _content(run, which, device)
+    return policy_of(content, path, policy).to(device).eval().requires_grad_(False)
+
+
+def load_value(run: str | Path | Run, *, which: str | int = "last", device: str | torch.device = "cpu") -> Any:
+    """Load the value function of a run, as a ``ValueFunction``: ``value(obs, step)`` predicts discounted returns.
+
+    Args:
+        run: A run's folder, or a file of it with a value function.
+        which: As for ``load``.
+        device: Device for its parameters.
+
+    Raises:
+        FileNotFoundError: There is no run, or it has no such file.
+        ValueError: The file holds no value function, is broken, was not written by lyceum_warp, or was written by a
+            newer release.
+    """
+    content, path = _content(run, which, device)
+    return value_of(content, path).to(device).eval().requires_grad_(False)
+
+
+def _content(run: str | Path | Run, which: str | int, device: str | torch.device) -> tuple[PolicyContent, Path]:
+    """A saved policy and its file."""
+    if isinstance(run, (str, Path)) and Path(run).is_file():
+        if which != "last":
+            raise ValueError(f"{run} is a file with one policy: give the run's folder to choose {which!r}")
+        path = Path(run)
+    else:
+        run = run if isinstance(run, Run) else Run.open(run)
+        path = run.policy_file(which)
+    return read_checkpoint(path, device, parts=("iteration", "policy")), path

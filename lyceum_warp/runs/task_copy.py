@@ -1,0 +1,327 @@
+"""Copy a run's task into its folder, and decide whether a later command uses the copy."""
+
+import hashlib
+import io
+import json
+import logging
+import os
+import warnings
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from lyceum_warp.binding.models import find_model
+from lyceum_warp.binding.registry import source_files
+from lyceum_warp.env import Env
+from lyceum_warp.model_files import ModelFile, read_spec
+from lyceum_warp.options import EnvOptions
+from lyceum_warp.runs.folder import Run
+
+log = logging.getLogger(__name__)
+
+Note = Callable[[str], None]
+
+Files = dict[Path, Path | bytes]
+"""Files with their contents, or with the paths to copy."""
+
+_MODEL, _TABLES = "model", "tables"
+_APART = 2
+"""A task's file lies at most this many folders below the common one of it and its model."""
+_LARGEST = 512 * 2**20
+"""Models with larger files than this, in bytes, are not copied."""
+_MOST_MODULES, _LARGEST_MODULES = 100, 8 * 2**20
+"""Modules that a task imports from its folder are not copied if they are more, or larger in bytes."""
+
+
+def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
+    """What a run's folder keeps of an environment's task.
+
+    The file and the model of a task of the package are not copied: the release, which versions.json holds, has them.
+
+    Returns:
+        The entry ``kept`` of config.json; and what the folder ``task`` will hold, by path.
+    """
+    task, given = env.task.task, env.options.model is not None
+    loaded, own = source_files(task), not task.__module__.startswith("lyceum_warp.")
+    file = next(iter(loaded), None)
+    kept: dict[str, Any] = {"name": env.task.name, "model_hash": _model_hash(env), "model_given": given}
+    files: dict[str, Path | bytes] = {}
+    if file is not None:
+        kept["source_hash"] = _digest(loaded[file])
+    if own or given:
+        sources = _sources(file, loaded) if own and file is not None else {}
+        main, model = _model_files(env)
+        modules = [path for path in sources if path != file]
+        names = _names_in_copy([*sources, *model], file, modules)
+        if own and file is not None:
+            kept["modules"] = {_beside(path, file): _digest(sources[path]) for path in modules}
+            kept["file"], kept["program"] = names[file], task.__module__ == "__main__"
+        if main is not None:
+            kept["model"] = names[main]
+        files = {names[path]: content for path, content in {**sources, **model}.items()}
+    for name, value in env.given_params.items():
+        if (table := _table(value)) is not None:
+            files[f"{_TABLES}/{name}.npy"] = table if isinstance(table, Path) else _npy(table)
+    return kept, files
+
+
+def given_params(env: Env) -> dict[str, Any]:
+    """The parameters that an environment was made with, as config.json holds them."""
+    return {name: _plain(name, value) for name, value in env.given_params.items()}
+
+
+def _plain(name: str, value: Any) -> Any:
+    if (table := _table(value)) is not None:
+        return str(value) if isinstance(value, str | Path) else f"{name}.npy" if table.size else []
+    if isinstance(value, bool | int | float | str):
+        return value
+    return np.asarray(value.cpu() if hasattr(value, "cpu") else value).tolist()
+
+
+def _table(value: Any) -> Any:
+    """The file or the array of a table, and None for other parameters."""
+    if isinstance(value, str | Path) and str(value).endswith(".npy"):
+        return Path(value)
+    array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
+    return array if array.dtype.kind in "fiu" and array.size > 64 else None
+
+
+def _npy(array: np.ndarray) -> bytes:
+    """The content of a file with an array."""
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
+
+
+def _sources(file: Path, loaded: Mapping[Path, bytes]) -> dict[Path, bytes]:
+    """A task's file, and the modules beside it unless they are too many or too large to copy."""
+    modules = {path: content for path, content in loaded.items() if path != file}
+    if len(modules) > _MOST_MODULES or sum(map(len, modules.values())) > _LARGEST_MODULES:
+        log.info("%s imports %d modules from its folder, too many or too large to copy", file, len(modules))
+        modules = {}
+    return {file: loaded[file], **modules}
+
+
+# what a later command uses
+
+
+def run_env(
+    run: Run, options: EnvOptions, params: Mapping[str, Any], *, note: Note = log.warning, task: str | None = None
+) -> Env:
+    """Make an environment of a run's task.
+
+    A file or a model that has moved or changed since the run began is replaced by the run's own copy, and ``note`` gets
+    a line that says so. A task of the package is taken as it is now.
+
+    Args:
+        run: The run.
+        options: Options of the environment.
+        params: Parameters of the task.
+        note: Called with each line.
+        task: Another task, which is taken as it is.
+
+    Raises:
+        ValueError: The task does not fit.
+        FileNotFoundError: The task or its model is missing, and the run has no copy.
+    """
+    if task is not None:
+        return Env(task, options, **params)
+    kept, chosen = run.config.get("kept", {}), _run_task(run, note)
+    params = run_params(run, params)
+    copy = run.task_folder / kept["model"] if "model" in kept else None
+    if copy is None or not copy.is_file():
+        return Env(chosen, options, **params)
+    if kept["model_given"] and not isinstance(options.model, str):  # it was made in Python
+        return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
+    try:
+        env = Env(chosen, options, **params)
+        if not _model_changed(run, env):
+            return env
+        reason = "has changed since the run began"
+    except FileNotFoundError:
+        reason = "is no longer where it was"
+    note(f"the model of the task {kept['name']!r} {reason}: the run's own copy is used, {copy}")
+    return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
+
+
+def _run_task(run: Run, note: Note) -> str:
+    """The task, by name or file, that stands for a run's."""
+    task, kept = run.config["task"], run.config.get("kept", {})
+    if task is None or kept.get("program"):
+        where = "a notebook" if task is None else task.partition(":")[0]
+        raise ValueError(
+            f"the task {kept['name']!r} of the run in {run.folder} was defined in {where}, which trained it: give a "
+            "file that only defines it (eval --task my_task.py, train my_task.py --from), or go on there (resume=True)"
+        )
+    path, colon, attribute = task.partition(":")
+    copy = run.task_folder / kept["file"] if "file" in kept else None
+    if copy is None or not copy.is_file():
+        return task
+    changes = _source_changes(Path(path), kept)
+    if not changes:
+        return task
+    new = f"; give {path} as the task to use the new version" if Path(path).is_file() else ""
+    note(f"{changes[0]}: the run's own copy is used, {copy}{new}")
+    return f"{copy}{colon}{attribute}"
+
+
+def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, bytes] | None = None) -> list[str]:
+    """What has happened to a task's file, and to the modules beside it, since the run began.
+
+    Args:
+        file: The task's file.
+        kept: What config.json says about it.
+        loaded: The files as they were loaded; by default, and for others, as they are now.
+    """
+    known = {file: kept.get("source_hash")} | {file.parent / name: h for name, h in kept.get("modules", {}).items()}
+    changes = []
+    for path, hashed in known.items():
+        content = (loaded or {}).get(path)
+        if content is None and not path.is_file():
+            changes.append(f"{path} does not exist any more")
+        elif hashed not in (None, _digest(path.read_bytes() if content is None else content)):
+            changes.append(f"{path} has changed since the run began")
+    return changes
+
+
+def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
+    """Note if an environment's task or its model is another than the run's; both are used as they are.
+
+    Args:
+        run: The run.
+        env: The environment.
+        note: Called with each line.
+    """
+    kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
+    file = next(iter(loaded), None)
+    hashed = None if kept.get("program") else kept.get("source_hash")  # a program that trains changes on its own
+    for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
+        note(f"{change}: it is used as it is now" if "changed" in change else change)
+    if _model_changed(run, env):
+        note(f"the model of the task {env.task.name!r} has changed since the run began: it is used as it is now")
+
+
+def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters of a run's task; a table that is not where it was is the run's own copy."""
+
+    def missing(value: Any) -> bool:
+        return isinstance(value, str) and value.endswith(".npy") and not Path(value).is_file()
+
+    copies = {name: run.task_folder / _TABLES / f"{name}.npy" for name, value in params.items() if missing(value)}
+    return {**params, **{name: str(copy) for name, copy in copies.items() if copy.is_file()}}
+
+
+def _model_changed(run: Run, env: Env) -> bool:
+    """Whether the model differs from the one that the run began with; False where MuJoCo is another version."""
+    try:
+        version = json.loads((run.folder / "versions.json").read_text())["mujoco"]
+    except (OSError, ValueError, KeyError):
+        return False
+    known = run.config.get("kept", {}).get("model_hash")
+    return version == mujoco.__version__ and known not in (None, _model_hash(env))
+
+
+# copies
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def _model_hash(env: Env) -> str:
+    """A hash of the compiled model, the same in every process and wherever its files lie."""
+    found = hashlib.sha256()
+    for owner in (env.task.model, env.task.model.opt):
+        for name in sorted(dir(owner)):
+            if name.startswith("_") or name.endswith("pathadr") or name in ("paths", "npaths", "nbuffer"):
+                continue
+            value = getattr(owner, name)
+            if isinstance(value, np.ndarray):
+                found.update(name.encode() + np.ascontiguousarray(value).tobytes())
+            elif isinstance(value, bytes | int | float):
+                found.update(f"{name}{value!r}".encode())
+    return found.hexdigest()[:16]
+
+
+def _beside(path: Path, file: Path) -> str:
+    """The path of a module relative to the folder of a task's file."""
+    return path.relative_to(file.parent).as_posix()
+
+
+def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collection[Path] = ()) -> dict[Path, str]:
+    """The paths in the folder ``task`` of a task's file, of the modules beside it, and of its model's files.
+
+    The files keep their places relative to each other, so that the copy of the task finds the copy of its model. Where
+    the task's file lies elsewhere than its model, each has a place of its own.
+    """
+    if not paths:
+        return {}
+    root = Path(os.path.commonpath([path.parent for path in paths]))
+    if file is not None and file in paths and len(file.parent.relative_to(root).parts) > _APART:
+        own = {path: _beside(path, file) for path in (file, *modules)}
+        rest = _names_in_copy([path for path in paths if path not in own], None)
+        return own | {path: f"{_MODEL}/{name}" for path, name in rest.items()}
+    return {path: path.relative_to(root).as_posix() for path in paths}
+
+
+def _model_files(env: Env) -> tuple[Path | None, Files]:
+    """The main file of a task's model, and all its files.
+
+    A model that was made in Python is written as MJCF; the files that it names are copied as they are.
+    """
+    task, given = env.task.task, env.options.model
+    source = given if given is not None else task.model
+    if isinstance(source, str | Path):
+        source = find_model(source, None if given is not None else task)
+    if isinstance(source, ModelFile):
+        source = source.path()
+    if isinstance(source, Path):
+        source = source.resolve()
+        files: Files = {path: path for path in (source, *_dependencies(source))}
+    else:
+        spec = env.task.spec.copy()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # they were logged when the environment was made
+                spec.compile()
+                text = spec.to_xml()
+        except (ValueError, mujoco.FatalError) as error:
+            log.info("the model of %s cannot be written as MJCF, so the run has no copy of it: %s", task, error)
+            return None, {}
+        folder = Path(spec.modelfiledir or ".").resolve()
+        source = folder / "model.xml"
+        files = {source: text.encode(), **{path: path for path in _spec_dependencies(spec, folder)}}
+        for name, content in env.task.spec.assets.items():
+            files.setdefault(folder / name, content)
+    if sum(path.stat().st_size for path in files.values() if isinstance(path, Path)) > _LARGEST:
+        log.info("the model of %s is larger than %d MiB, so the run has no copy of it", task, _LARGEST // 2**20)
+        return None, {}
+    return source, files
+
+
+def _dependencies(source: Path) -> list[Path]:
+    """The files that a model file names: included files, other models, meshes, textures, height fields."""
+    if source.suffix.lower() != ".urdf":
+        return [path for name in mujoco.mju_getXMLDependencies(str(source)) if (path := Path(name)) != source]
+    root = ET.parse(source).getroot()  # MuJoCo lists nothing for a URDF
+    folders = [source.parent / (compiler.get("meshdir") or "") for compiler in root.iter("compiler")]
+    names = [mesh.get("filename", "").removeprefix("package://") for mesh in root.iter("mesh")]
+    found = {
+        Path(os.path.normpath(folder / name)): None
+        for folder in (*folders, source.parent) for named in names for name in (named, Path(named).name)
+    }  # fmt: skip
+    return [path for path in found if path.is_file()]
+
+
+def _spec_dependencies(spec: mujoco.MjSpec, folder: Path) -> list[Path]:
+    """The files that a model made in Python names."""
+    parts = (*spec.meshes, *spec.hfields, *spec.skins)
+    names = [Path(spec.meshdir, part.file) for part in parts if part.file]
+    for texture in spec.textures:
+        names += [Path(spec.texturedir, name) for name in (texture.file, *texture.cubefiles) if name]
+    found = dict.fromkeys(Path(os.path.normpath(folder / name)) for name in names)
+    return [path for path in found if path.is_file()]

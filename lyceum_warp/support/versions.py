@@ -1,0 +1,61 @@
+"""The versions and the machine that a run's numbers depend on."""
+
+import functools
+import importlib.metadata
+import os
+import platform
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import torch
+
+_PACKAGES = ("lyceum-warp", "mujoco", "mujoco-warp", "warp-lang", "torch", "numpy", "gymnasium")
+
+
+def versions(device: str = "cpu") -> dict[str, Any]:
+    """Versions of the packages and of Python, the machine, and the commit in a git checkout.
+
+    Args:
+        device: Device of the run; a CUDA device adds the names of the GPU and of the CUDA version.
+    """
+    found: dict[str, Any] = {}
+    for package in _PACKAGES:
+        try:
+            found[package.replace("-", "_")] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package.replace("-", "_")] = None
+    found["torch"] = torch.__version__  # with the build, such as +cpu
+    found["python"] = platform.python_version()
+    found["platform"] = platform.platform()
+    found["cpu"] = _cpu_name()
+    found["cores"] = os.cpu_count()
+    if device.startswith("cuda") and torch.cuda.is_available():
+        found["gpu"] = torch.cuda.get_device_name(device)
+        found["cuda"] = torch.version.cuda
+    if commit := _commit():
+        found["commit"] = commit
+    return found
+
+
+def _cpu_name() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+@functools.cache
+def _commit() -> str | None:
+    root = Path(__file__).resolve().parent.parent.parent
+    git = shutil.which("git")
+    # an installed package may lie inside the checkout of another project, whose commit would be wrong
+    if git is None or not (root / ".git").exists():
+        return None
+    command = [git, "describe", "--always", "--dirty", "--abbrev=40"]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
+    return done.stdout.strip() or None

@@ -1,0 +1,102 @@
+"""The contract of a learner: what the base class brings, and that nothing outside an algorithm assumes more."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from conftest import SharedEnv
+from torch import nn
+
+import lyceum_warp as lw
+from lyceum_warp.algos.distributed import Team
+from lyceum_warp.cli.display import Display, curve_table, make_console
+from lyceum_warp.runs.folder import Run
+
+
+class Constant(nn.Module):
+    """A policy that is no Gaussian and cannot be called."""
+
+    nobs, nact = 6, 2
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("action", torch.zeros(2))
+
+    def act(self, obs: torch.Tensor) -> torch.Tensor:
+        return self.action.expand(*obs.shape[:-1], 2) + 0.0 * obs[..., :2]
+
+
+@dataclasses.dataclass(frozen=True)
+class DriftConfig:
+    size: float = 0.1
+
+
+class Drift(lw.Learner):
+    """Adds noise to a constant action, and reports the least that there is."""
+
+    algorithm = "drift"
+
+    def __init__(self, env: lw.Env, *, seed: int = 0) -> None:
+        super().__init__(env, seed=seed)
+        self.policy, self.config = Constant(), DriftConfig()
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def __next__(self) -> lw.Iteration:
+        self.policy.action += self.config.size * torch.randn(2, generator=self.generator)
+        self.env.step(self.policy.act(self.env.obs))
+        self.iteration += 1
+        self.samples += self.env.nworld
+        number = {"distance": self.policy.action.norm().item()}
+        return lw.Iteration(iteration=self.iteration, samples=self.samples, numbers=number)
+
+
+@pytest.fixture
+def env(shared_env: SharedEnv) -> lw.Env:
+    return shared_env("point_mass", nworld=2)
+
+
+def test_a_learner_of_few_lines_resumes_to_the_bit(env: lw.Env) -> None:
+    one = Drift(env)
+    next(one)
+    saved = one.state_dict()
+    rest = [next(one).row() for _ in range(3)]
+    state = env.get_state()
+    other = Drift(env, seed=5)
+    other.load_state_dict(saved)
+    assert [next(other).row() for _ in range(3)] == rest
+    assert torch.equal(env.get_state(), state) and rest[-1].keys() == {"iteration", "samples", "distance"}
+    with pytest.raises(ValueError, match="the state has 3 worlds, but the environment has 2"):
+        other.load_state_dict(saved | {"env": torch.zeros(3, 1)})
+
+
+def test_a_policy_that_is_no_gaussian_gets_a_run_videos_and_an_export(env: lw.Env, tmp_path: Path) -> None:
+    drift, shown = Drift(env), []
+    run = lw.train(drift, tmp_path / "run", iterations=2, callback=shown.append, display=Display(make_console()))
+    assert len(shown) == 2 and len(list(curve_table(run.rows()).columns)) == 2
+    assert run.config["drift"] == {"size": 0.1} and Run.open(run.folder).best_score() is None
+    again = lw.train(Drift(env), run.folder, iterations=4, resume=True)
+    assert [row["iteration"] for row in again.rows()] == [1, 2, 3, 4]
+    assert lw.evaluate(env, drift.policy, 2).lengths.tolist() == [256.0, 256.0]
+    path = lw.export_policy(drift.policy, tmp_path / "policy.pt2")
+    exported = torch.export.load(path).module()(torch.zeros(3, 6))
+    torch.testing.assert_close(exported, drift.policy.act(torch.zeros(3, 6)))
+    with pytest.raises(ValueError, match="policy must be a policy as lw.load"):
+        lw.export_policy(nn.Linear(6, 2), tmp_path / "policy.pt2")
+
+
+@pytest.mark.parametrize("config, best_by", [
+    (lw.NPGConfig(), "mean_return"), (lw.PPOConfig(mean_every=0), "return_mean"), (DriftConfig(), "mean_return"),
+])  # fmt: skip
+def test_a_run_goes_by_the_returns_that_its_learner_reports(config: Any, best_by: str, env: lw.Env) -> None:
+    drift = Drift(env)
+    drift.config = config
+    assert drift.best_by == best_by
+
+
+def test_environments_that_do_not_fit_are_refused(shared_env: SharedEnv) -> None:
+    with pytest.raises(ValueError, match="Drift needs an environment that resets automatically: make it with auto"):
+        Drift(shared_env("point_mass", nworld=2, autoreset=False))
+    with pytest.raises(ValueError, match="process 1 of 2 with 2 worlds needs an environment with first_world=2, not 0"):
+        lw.PPO(shared_env("point_mass", nworld=2), team=Team(1, 2))

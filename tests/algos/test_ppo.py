@@ -1,0 +1,276 @@
+"""PPO as a whole: it learns, bootstraps episodes that are cut off, follows its schedules, and resumes exactly."""
+
+import copy
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import SharedEnv
+from metered_task import Metered
+
+import lyceum_warp as lw
+from lyceum_warp.algos.networks import Normalizer
+from lyceum_warp.algos.ppo import PPOIteration
+
+SMALL = lw.PPOConfig(hidden=(8,), value_hidden=(8, 8), num_steps=12, mean_every=2, mean_episodes=2)
+
+
+@pytest.fixture
+def env(shared_env: SharedEnv) -> lw.Env:
+    return shared_env(Metered, nworld=4, horizon=10)
+
+
+def made(env: lw.Env, *, seed: int = 0, **changes: Any) -> lw.PPO:
+    return lw.PPO(env, config=dataclasses.replace(SMALL, **changes), seed=seed)
+
+
+def numbers(it: PPOIteration) -> dict[str, Any]:
+    """The numbers of an iteration without measured times."""
+    return {name: value for name, value in it.row().items() if "time" not in name and name != "samples_per_second"}
+
+
+def weights(ppo: lw.PPO) -> dict[str, torch.Tensor]:
+    return {**ppo.policy.state_dict(), **{f"value.{name}": part for name, part in ppo.value.state_dict().items()}}
+
+
+# learning
+
+
+def test_it_learns_for_a_fixed_seed() -> None:
+    """Returns of the mean policy are at most about 250; those of the first policies are negative."""
+    config = lw.PPOConfig(hidden=(32, 32), value_hidden=(32, 32), mean_every=40)
+    ppo = lw.PPO(lw.make("point_mass", nworld=32), config=config)
+    rows = [next(ppo) for _ in range(40)]
+    assert rows[-1].mean_return is not None and rows[-1].mean_return > 150.0
+    assert rows[-1].return_recent > rows[15].return_recent + 50.0
+    assert rows[-1].samples == 40 * 24 * 32
+
+
+@pytest.mark.parametrize("changes", [
+    {}, {"std_type": "log", "whiten_minibatches": True, "schedule": "fixed", "final_entropy_coef": 0.1,
+         "entropy_decay": (1, 3), "minibatches": 5, "stagger": False, "normalize": False},
+])  # fmt: skip
+def test_a_run_is_reproducible_and_resumes_to_the_bit(changes: dict[str, Any], env: lw.Env) -> None:
+    def fresh(seed: int) -> lw.PPO:
+        env.rand_reset(7)
+        return made(env, seed=seed, **changes)
+
+    torch.manual_seed(1)
+    ppo = fresh(1)
+    first = [numbers(next(ppo)) for _ in range(2)]
+    saved = ppo.state_dict()
+    rest = [numbers(next(ppo)) for _ in range(2)]
+    torch.manual_seed(2)  # torch's own generators are left alone
+    again = fresh(1)
+    np.testing.assert_equal([numbers(next(again)) for _ in range(4)], first + rest)
+    resumed = fresh(2)
+    next(resumed)
+    resumed.load_state_dict(saved)
+    np.testing.assert_equal([numbers(next(resumed)) for _ in range(2)], rest)
+    for name, part in weights(ppo).items():
+        assert torch.equal(part, weights(resumed)[name]), name
+
+
+def test_statistics_are_those_of_the_samples(shared_env: SharedEnv) -> None:
+    """Every episode has 10 steps; that of a world with a random start does not count."""
+    ppo = made(shared_env(Metered, nworld=4, horizon=10, far=1e3))
+    found: list[float] = []
+    for _ in range(3):
+        it, rollout = next(ppo), ppo.rollout
+        ended = rollout.episode_return[rollout.done].tolist()
+        found += [number for number in ended if number == number]
+        assert it.return_recent == pytest.approx(sum(found) / len(found))
+    assert it.samples == 3 * 48 == 3 * ppo.count and it.length_mean == 10.0 and it.faults == 0
+    assert it.reward_mean == pytest.approx(rollout.reward.mean().item())
+    effort = rollout.episode_metrics["effort"][rollout.done].mean().item()
+    assert it.row()["metrics/effort"] == pytest.approx(effort)
+    assert it.learning_rate == pytest.approx(ppo.rate.item())
+    old = torch.distributions.Normal(ppo._mean.double(), ppo._old_log_std.double().exp())
+    new = torch.distributions.Normal(ppo.policy(rollout.obs).double(), ppo.policy.log_std.double().exp())
+    assert it.kl == pytest.approx(torch.distributions.kl_divergence(old, new).sum(-1).mean().item(), rel=1e-4)
+
+
+# advantages
+
+
+def test_an_episode_that_is_cut_off_is_worth_the_value_of_its_final_observation(env: lw.Env) -> None:
+    """World 0 goes on, 1 reaches its time limit, 2 has a fault, 3 terminates; each in the first of the steps."""
+    ppo = made(env, num_steps=3, normalize=False, minibatches=1)
+    state = env.get_state()
+    for part, column in {"qpos": [0, 0, 0, 5], "qvel": [1, 2, 3, 4], "step": [0, 9, 0, 0]}.items():
+        state[:, env.state_space.parts[part].start] = torch.tensor(column, dtype=torch.float64)
+    env.set_state(state)
+    step = env.step
+
+    def faulty() -> None:
+        if env.episode_step[2] == 0 and not ppo.rollout.done.any():
+            env.action[2] = torch.nan
+        step()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(env, "step", faulty)
+        ppo.sample()
+    rollout, samples = ppo.rollout, ppo.evaluated_samples()
+    assert rollout.done[0].tolist() == [False, True, True, True]
+    assert rollout.terminated[0].tolist() == [False, False, False, True]
+    final = rollout.final_obs_groups["critic"]
+    assert final[0, 2, 1] == 3.0  # the last good observation
+    with torch.no_grad():
+        value, after = (ppo.value(obs, rollout.step) for obs in (rollout.obs_groups["critic"], final))
+    gamma, lam = SMALL.gamma, SMALL.lam
+    expected = torch.zeros(3, 4)
+    for world in range(4):
+        advantage = 0.0
+        for t in (2, 1, 0):
+            rest = 0.0 if rollout.terminated[t, world] else after[t, world].item()
+            advantage = 0.0 if rollout.done[t, world] else advantage
+            change = rollout.reward[t, world].item() + gamma * rest - value[t, world].item()
+            advantage = expected[t, world] = change + gamma * lam * advantage
+    torch.testing.assert_close(samples["target"] - samples["value"], expected, rtol=1e-4, atol=1e-5)
+    whitened = (expected - expected.mean()) / expected.std()
+    torch.testing.assert_close(samples["advantage"], whitened, rtol=1e-3, atol=1e-4)
+
+
+def test_every_step_updates_the_statistics_of_observations(env: lw.Env) -> None:
+    ppo, scales = made(env), []
+    normalizer = ppo.policy.normalizer
+    assert isinstance(normalizer, Normalizer)
+    ppo.policy.network.register_forward_pre_hook(lambda *_: scales.append(normalizer.scale.item()))
+    ppo.sample()
+    assert normalizer.count == 48 and len(set(scales)) == 12
+    seen = torch.cat([ppo.rollout.obs[1:], env.obs[None]]).double()
+    torch.testing.assert_close(normalizer.mean, seen.mean((0, 1)))
+    torch.testing.assert_close(1.0 / normalizer.scale.double(), seen.std((0, 1), correction=0) + 0.01)
+
+
+# schedules
+
+
+@pytest.mark.parametrize("changes, rate", [
+    ({"desired_kl": 1e-9}, 1e-5), ({"desired_kl": 1e6}, 1e-2), ({"schedule": "fixed", "desired_kl": 1e-9}, 1e-3),
+])  # fmt: skip
+def test_the_learning_rate_follows_the_kl_divergence(changes: dict[str, Any], rate: float, env: lw.Env) -> None:
+    assert next(made(env, **changes)).learning_rate == pytest.approx(rate)
+
+
+def test_the_weight_of_the_entropy_falls_linearly(env: lw.Env) -> None:
+    config = lw.PPOConfig(entropy_coef=0.02, final_entropy_coef=0.01, entropy_decay=(10, 20))
+    assert [config.entropy_weight(it) for it in (1, 10, 15, 20, 99)] == pytest.approx([0.02, 0.02, 0.015, 0.01, 0.01])
+    assert lw.PPOConfig(entropy_coef=0.02).entropy_weight(500) == 0.02
+    stds = []
+    for final in (0.0, 5.0):
+        env.rand_reset(0)
+        ppo = made(env, schedule="fixed", entropy_coef=0.0, final_entropy_coef=final, entropy_decay=(1, 3))
+        stds.append([next(ppo).std_mean for _ in range(3)])
+    assert stds[1][0] == pytest.approx(stds[0][0]) and stds[1][2] > stds[0][2] + 0.02
+
+
+# networks
+
+
+def test_it_goes_on_with_given_networks_and_a_network_of_the_users_own(env: lw.Env) -> None:
+    npg = lw.NPG(env, config=lw.NPGConfig(samples=80, hidden=(8,), value_hidden=(8,), time_orders=2, mean_every=0))
+    next(npg)
+    policy, value = copy.deepcopy(npg.policy).requires_grad_(False), copy.deepcopy(npg.value).requires_grad_(False)
+    ppo = lw.PPO(env, policy, value, SMALL)
+    assert next(ppo).kl > 0.0
+    assert not torch.equal(policy.network[0].weight, npg.policy.network[0].weight)
+    assert not torch.equal(value.network[0].weight, npg.value.network[0].weight)
+    assert ppo.settings()["activation"] == "tanh" and ppo.settings()["num_steps"] == 12
+
+    class Once(torch.autograd.Function):  # NPG would need a second derivative
+        @staticmethod
+        def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
+            return 1.0 * x
+
+        @staticmethod
+        @torch.autograd.function.once_differentiable
+        def backward(ctx: Any, gradient: torch.Tensor) -> torch.Tensor:
+            return gradient
+
+    class Net(torch.nn.Linear):
+        def forward(self, obs: torch.Tensor) -> torch.Tensor:
+            return Once.apply(super().forward(obs))
+
+    own = lw.GaussianPolicy(1, 1, network=Net(1, 1))
+    before = own.network.weight.detach().clone()
+    assert math.isfinite(next(lw.PPO(env, own, config=SMALL)).kl)
+    assert not torch.equal(own.network.weight, before)
+
+
+def test_what_a_graph_reads_and_writes_stays_in_its_place(env: lw.Env) -> None:
+    ppo = made(env)
+    kept: list[dict[str, int]] = []
+    learn = ppo.minibatches.learn
+
+    def keep(samples: Any, weight: torch.Tensor) -> None:
+        learn(samples, weight)
+        entries = enumerate(ppo.optimizer.state.values())
+        tensors = weights(ppo) | {f"{i}/{name}": part for i, entry in entries for name, part in entry.items()}
+        kept.append({name: part.data_ptr() for name, part in (tensors | dict(samples) | {"rate": ppo.rate}).items()})
+
+    ppo.minibatches.learn = keep
+    for _ in range(2):
+        next(ppo)
+    ppo.minibatches.learn = learn
+    each = SMALL.epochs * SMALL.minibatches
+    assert len(kept) == 2 * each and all(kept[i] == kept[i % SMALL.minibatches] for i in range(2 * each))
+    assert {"rate", "obs", "normalizer.scale", "0/exp_avg", "0/step"} <= kept[0].keys()
+
+
+# runs and errors
+
+
+def test_a_run_has_the_files_of_every_run_and_continues(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    for iterations, resume in ((2, False), (4, True)):
+        env = lw.make(Metered, nworld=4, horizon=10)
+        run = lw.train(made(env), folder, iterations=iterations, resume=resume)
+    assert run.config["algorithm"] == "ppo" and run.config["ppo"]["hidden"] == [8]
+    rows = run.rows()
+    assert [row["mean_return"] is not None for row in rows] == [False, True, False, True]
+    assert {"return_recent", "kl", "value_loss", "time_update", "metrics/effort"} <= rows[0].keys()
+    assert lw.load(run, which="best").nact == 1 and lw.load_value(run).group == "critic"
+    with pytest.raises(ValueError, match="has clip 0.2, not 0.1, and a run keeps its settings"):
+        lw.train(made(env, clip=0.1), folder, iterations=9, resume=True)
+
+
+@pytest.mark.parametrize("words, message", [
+    ({"num_steps": 0}, "num_steps must be a whole number from 1 "),
+    ({"gamma": 1.5}, "gamma must be a finite number from 0 to 1, not 1.5"),
+    ({"learning_rate": float("nan")}, "learning_rate must be a finite number"),
+    ({"hidden": (8, 0)}, "hidden must be the widths of the hidden layers"),
+    ({"activation": "sine"}, "activation must be one of 'tanh'"),
+    ({"schedule": "linear"}, "schedule must be 'adaptive' or 'fixed', not 'linear'"),
+    ({"std_type": "none"}, "std_type must be 'scalar' or 'log', not 'none'"),
+    ({"normalize": 1}, "normalize must be True or False, not 1"),
+    ({"final_entropy_coef": -1.0}, "final_entropy_coef must be a finite number of at least 0, not -1.0"),
+    ({"entropy_decay": 7}, r"entropy_decay must be two numbers of iterations, as in \(150, 200\), not 7"),
+    ({"entropy_decay": (5, 5)}, r"entropy_decay must end after it begins, not \(5, 5\)"),
+    ({"value_group": 3}, "value_group must be the name of a group of observations, not 3"),
+])  # fmt: skip
+def test_hyperparameters_that_are_not_valid_are_refused(words: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        lw.PPOConfig(**words)
+
+
+def test_arguments_that_do_not_fit_are_refused(env: lw.Env) -> None:
+    with pytest.raises(ValueError, match="200 mini-batches are more than the 48 samples: give more worlds, or make"):
+        made(env, minibatches=200)
+    with pytest.raises(ValueError, match="'metered' has no group 'actor' of observations .* it has policy, critic"):
+        made(env, value_group="actor")
+    with pytest.raises(ValueError, match="policy takes 2 observations and gives 1 actions, but the task 'metered' has"):
+        lw.PPO(env, lw.GaussianPolicy(2, 1))
+    with pytest.raises(ValueError, match="the value function takes 2 observations, but the group 'policy' .* has 1"):
+        lw.PPO(env, value=lw.ValueFunction(2))
+    with pytest.raises(ValueError, match="seed must be a whole number from 0 to 2147483647, not -1"):
+        made(env, seed=-1)
+
+
+def test_an_update_that_is_not_finite_ends_learning(env: lw.Env) -> None:
+    with pytest.raises(FloatingPointError, match="the update of iteration 1 is not finite: make learning_rate, or the"):
+        next(made(env, learning_rate=1e30, schedule="fixed"))

@@ -1,0 +1,81 @@
+"""PPO on a GPU: captured epochs beside direct ones, no waiting for the device, and runs that continue."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from metered_task import Metered
+from test_gpu import CUDA, nothing_waits
+
+import lyceum_warp as lw
+
+pytestmark = pytest.mark.gpu
+
+
+def made(**changes: Any) -> lw.PPO:
+    config: dict[str, Any] = {"hidden": (16, 8), "value_hidden": (8,), "num_steps": 12, "mean_every": 0, "tf32": False}
+    env = lw.make(Metered, nworld=64, horizon=10, device=CUDA)
+    return lw.PPO(env, config=lw.PPOConfig(**config | changes))
+
+
+@pytest.mark.parametrize("changes", [
+    {}, {"std_type": "log", "whiten_minibatches": True, "minibatches": 5, "clip_value_loss": False},
+])  # fmt: skip
+def test_captured_epochs_have_the_numbers_of_direct_ones(changes: dict[str, Any]) -> None:
+    """Over iterations with an entropy weight that changes, which the graph must read on the device."""
+    changes = {"schedule": "fixed", "final_entropy_coef": 0.1, "entropy_decay": (1, 4)} | changes
+    captured, direct = made(**changes), made(**changes)
+    direct.minibatches.captures = False
+    for _ in range(5):
+        one, other = next(captured), next(direct)
+        for name in ("kl", "std_mean", "surrogate_loss", "entropy", "value_loss"):
+            assert getattr(one, name) == pytest.approx(getattr(other, name), rel=2e-2, abs=2e-3), name
+        for module, same in ((captured.policy, direct.policy), (captured.value, direct.value)):
+            for name, part in module.state_dict().items():
+                torch.testing.assert_close(part, same.state_dict()[name], rtol=2e-2, atol=2e-3, msg=name)
+    assert captured.minibatches._graph is not None and direct.minibatches._graph is None
+
+
+def test_the_learning_rate_adapts_within_a_graph() -> None:
+    for wanted, rate in ((1e-9, 1e-5), (1e6, 1e-2)):
+        ppo = made(desired_kl=wanted)
+        assert [next(ppo).learning_rate for _ in range(3)] == pytest.approx([rate] * 3)
+
+
+def test_an_iteration_waits_for_the_device_only_at_its_end() -> None:
+    ppo = made()
+    for _ in range(2):  # kernels are loaded, graphs captured
+        next(ppo)
+    with nothing_waits():
+        ppo.sample()
+        samples = ppo.evaluated_samples()
+        ppo.update(samples)
+        ppo.divergence()
+
+
+def test_a_state_is_continued_after_other_graphs() -> None:
+    one = made()
+    for _ in range(3):
+        next(one)
+    other = made(learning_rate=0.5)
+    next(other)
+    next(other)  # its graph holds the addresses of moments that loading replaces
+    other.load_state_dict(one.state_dict())
+    for _ in range(3):
+        first, second = next(one), next(other)
+        assert second.learning_rate == pytest.approx(first.learning_rate)
+        assert second.value_loss == pytest.approx(first.value_loss, rel=2e-2, abs=1e-3)
+
+
+def test_a_run_continues_on_a_gpu(tmp_path: Path) -> None:
+    for iterations, resume in ((2, False), (4, True)):
+        run = lw.train(made(), tmp_path / "run", iterations=iterations, resume=resume)
+    assert [row["iteration"] for row in run.rows()] == [1, 2, 3, 4]
+
+
+def test_it_learns_on_a_gpu() -> None:
+    config = lw.PPOConfig(hidden=(32, 32), value_hidden=(32, 32), mean_every=60)
+    ppo = lw.PPO(lw.make("point_mass", nworld=64, device=CUDA), config=config)
+    rows = [next(ppo) for _ in range(60)]
+    assert rows[-1].mean_return is not None and rows[-1].mean_return > 150.0

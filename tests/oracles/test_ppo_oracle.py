@@ -1,0 +1,94 @@
+"""An update of PPO, against rsl_rl's from equal weights and samples."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from conftest import SharedEnv
+from metered_task import Metered
+from rsl_rl.runners import OnPolicyRunner
+from tensordict import TensorDict
+
+import lyceum_warp as lw
+from lyceum_warp.adapters.rsl_rl_config import runner_config
+from lyceum_warp.adapters.rsl_rl_env import RslRlVecEnv
+
+STEPS, N = 12, 8
+
+
+@pytest.fixture(autouse=True)
+def double() -> Iterator[None]:
+    """Adam in float32 would turn the rounding of tiny gradients into whole steps."""
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+def samples(ppo: lw.PPO) -> dict[str, torch.Tensor]:
+    """Samples near the policy and the value function, so that some ratios and values are clipped and some are not."""
+    env, generator = ppo.env, torch.Generator().manual_seed(1)
+
+    def drawn(*shape: int) -> torch.Tensor:
+        return torch.randn(STEPS, N, *shape, generator=generator)
+
+    obs, value_obs = drawn(env.obs_space.size), drawn(env.obs_spaces["critic"].size)
+    with torch.no_grad():
+        mean = ppo.policy(obs) + 0.05 * drawn(env.action_space.size)
+        value = ppo.value(value_obs, torch.zeros(STEPS, N)) + 0.3 * drawn()
+    action = mean + drawn(env.action_space.size)
+    log_prob = torch.distributions.Normal(mean, 1.0).log_prob(action).sum(-1)
+    advantage = drawn()
+    return {"obs": obs, "value_obs": value_obs, "step": torch.zeros(STEPS, N), "action": action, "mean": mean,
+            "log_prob": log_prob, "value": value, "target": value + advantage, "advantage": advantage}  # fmt: skip
+
+
+def theirs(ppo: lw.PPO, given: dict[str, torch.Tensor]) -> Any:
+    """rsl_rl's PPO with the same weights, and a storage with the samples."""
+    env = ppo.env
+    other = OnPolicyRunner(RslRlVecEnv(env), runner_config(env, ppo.config), None, "cpu").alg
+    for network in (other.actor, other.critic):
+        network.double()
+    other.actor.mlp.load_state_dict(ppo.policy.network.state_dict())
+    other.critic.mlp.load_state_dict(ppo.value.network.state_dict())
+    storage, parts = other.storage, {name: part.unsqueeze(-1) for name, part in given.items()}
+    groups = {"policy": given["obs"], "critic": given["value_obs"]}
+    storage.observations = TensorDict(groups, batch_size=[STEPS, N])
+    storage.actions = given["action"]
+    storage.distribution_params = (given["mean"], torch.ones_like(given["mean"]))
+    storage.actions_log_prob, storage.advantages = parts["log_prob"], parts["advantage"]
+    storage.values, storage.returns = parts["value"], parts["target"]
+    return other
+
+
+@pytest.mark.parametrize("changes", [
+    {}, {"desired_kl": 1e-4}, {"desired_kl": 1e3, "max_grad_norm": 0.01}, {"clip": 0.01, "entropy_coef": 0.3},
+    {"whiten_minibatches": True, "clip_value_loss": False, "std_type": "log"},
+    {"schedule": "fixed", "minibatches": 5, "epochs": 3, "value_coef": 0.5},
+])  # fmt: skip
+def test_an_update_gives_rsl_rls_parameters(
+    changes: dict[str, Any], shared_env: SharedEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = lw.PPOConfig(**{"hidden": (16, 8), "value_hidden": (8,), "num_steps": STEPS, "normalize": False} | changes)
+    ppo = lw.PPO(shared_env(Metered, nworld=N, horizon=10), config=config)
+    for module in (ppo.policy, ppo.value):  # last layers near zero have small gradients
+        torch.nn.init.xavier_uniform_(module.network[-1].weight, generator=torch.Generator().manual_seed(0))
+    given = samples(ppo)
+    other = theirs(ppo, given)
+    used = config.minibatches * ppo.minibatches.batch  # rsl_rl shuffles these alone
+    order = torch.randperm(used, generator=torch.Generator().manual_seed(0))
+    order = torch.cat([order, torch.arange(used, STEPS * N)])
+    monkeypatch.setattr(torch, "randperm", lambda count, **_: order[:count])
+    before = [p.detach().clone() for p in ppo.policy.network.parameters()]
+    ppo.update(given)
+    losses = other.update()
+    spread = other.actor.distribution
+    std = spread.std_param if config.std_type == "scalar" else spread.log_std_param.exp()
+    found = [*ppo.policy.network.parameters(), ppo.policy.log_std.exp(), *ppo.value.network.parameters()]
+    expected = [*other.actor.mlp.parameters(), std, *other.critic.mlp.parameters()]
+    for one, same in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, same, rtol=1e-5, atol=1e-7)
+    assert all((p - p0).abs().max() > 1e-5 for p, p0 in zip(ppo.policy.network.parameters(), before, strict=True))
+    assert ppo.rate.item() == pytest.approx(other.learning_rate, rel=1e-6)
+    means = ppo._losses / (config.epochs * config.minibatches)
+    assert means.tolist() == pytest.approx([losses[name] for name in ("value", "surrogate", "entropy")], rel=1e-6)

@@ -1,0 +1,101 @@
+"""Files with policies and states: those that are broken, foreign or missing."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.runs.checkpoints import FORMAT, policy_content, read_checkpoint
+from lyceum_warp.runs.folder import Run, load, load_value
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    run = Run.create(tmp_path / "run", {})
+    run.save(policy_content(0, GaussianPolicy(3, 2, (8, 4), normalize=True)), {"counter": 5})
+    return run
+
+
+class Mine(torch.nn.Module):
+    """A policy of a user's own, which has no shape."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gain = torch.nn.Parameter(torch.ones(2))
+
+    def act(self, obs: torch.Tensor) -> torch.Tensor:
+        return self.gain * obs
+
+
+class Foreign:
+    """A class whose instances a checkpoint must not contain."""
+
+
+@pytest.mark.parametrize("kind", ["empty", "truncated", "text", "foreign", "code", "list", "newer", "partial", "shape"])
+def test_broken_and_foreign_checkpoints_are_refused_in_one_line(run: Run, kind: str) -> None:
+    path, whole = run.policy, run.policy.read_bytes()
+    content = read_checkpoint(path, parts=("iteration", "policy"))
+    fix = "restore the file from a copy, or train again into another folder"
+    match kind:
+        case "empty":
+            path.write_bytes(b"")
+        case "truncated":
+            path.write_bytes(whole[: len(whole) // 2])
+        case "text":
+            path.write_text("weights: 1, 2, 3\n")
+        case "foreign":
+            torch.save({"model": torch.zeros(2)}, path)
+        case "code":
+            torch.save({"lyceum_warp": FORMAT, "policy": Foreign()}, path)
+        case "list":
+            torch.save([1, 2], path)
+        case "newer":
+            torch.save(content | {"lyceum_warp": FORMAT + 1}, path)
+            fix = "pip install --upgrade lyceum-warp"
+        case "partial":
+            del content["policy"]
+            torch.save(content, path)
+        case "shape":
+            content["policy"]["shape"]["nobs"] = 4
+            torch.save(content, path)
+    with pytest.raises(ValueError, match=fix) as caught:
+        load(run)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_checkpoint_is_reported(run: Run) -> None:
+    run.policy.unlink()
+    run.checkpoint.unlink()
+    with pytest.raises(FileNotFoundError, match=r"there is no checkpoint .*checkpoint\.pt: train the run first"):
+        load(run)
+
+
+def test_a_policy_of_any_class_is_saved_without_a_value_function(tmp_path: Path) -> None:
+    policy, run = Mine(), Run.create(tmp_path / "run", {})
+    torch.nn.init.constant_(policy.gain, 3.0)
+    run.save(policy_content(1, policy), {})
+    assert load(run, policy=Mine()).act(torch.ones(2)).tolist() == [3.0, 3.0]
+    with pytest.raises(ValueError, match=r"of a class of its own, test_checkpoints.Mine: .* policy=Mine\(...\)\)$"):
+        load(run)
+    with pytest.raises(ValueError, match="holds no value function"):
+        load_value(run)
+
+
+def test_a_module_of_the_package_is_made_again_by_its_class_and_its_shape(tmp_path: Path) -> None:
+    """A value function in the place of a policy stands for policies of later releases."""
+    run = Run.create(tmp_path / "run", {})
+    run.save(policy_content(1, ValueFunction(3, (4,))), {})
+    loaded = load(run)
+    assert isinstance(loaded, ValueFunction) and list(loaded.shape["hidden"]) == [4]
+
+
+@pytest.mark.parametrize("name", ["os.system", "lyceum_warp.cli.main", "lyceum_warp.runs.folder.Run"])
+def test_a_file_makes_nothing_but_modules_of_the_package(name: str, run: Run) -> None:
+    content = read_checkpoint(run.policy, parts=("iteration", "policy"))
+    content["policy"]["class"] = name
+    torch.save(content, run.policy)
+    with pytest.raises(ValueError, match=f"of a class of its own, {name}"):
+        load(run)

@@ -1,0 +1,136 @@
+"""The folder of a run: creation, its files, and what is refused."""
+
+import json
+import resource
+from pathlib import Path
+
+import pytest
+import torch
+
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.runs.checkpoints import FORMAT
+from lyceum_warp.runs.checkpoints import policy_content as content
+from lyceum_warp.runs.folder import Run, load
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    run = Run.create(tmp_path / "run", {"task": "hopper", "seed": 0, "scale": float("inf")})
+    run.save(content(0, GaussianPolicy(3, 2, (8, 4), normalize=True)), {"counter": 5, "tensor": torch.arange(3)})
+    return run
+
+
+def test_open_returns_the_configuration(run: Run) -> None:
+    assert Run.open(run.folder).config == {"format": FORMAT, "task": "hopper", "seed": 0, "scale": float("inf")}
+
+
+def test_create_writes_the_versions(run: Run) -> None:
+    versions = json.loads((run.folder / "versions.json").read_text())
+    assert versions["torch"] == torch.__version__
+    packages = {"lyceum_warp", "mujoco", "mujoco_warp", "warp_lang", "numpy"}
+    assert packages | {"python", "platform", "cpu"} <= versions.keys()
+
+
+def test_read_returns_the_saved_state(run: Run) -> None:
+    state = Run.open(run.folder).read()["state"]
+    assert state["counter"] == 5
+    assert state["tensor"].tolist() == [0, 1, 2]
+    assert {path.name for path in run.folder.iterdir()} == {
+        "config.json",
+        "versions.json",
+        "policy.pt",
+        "checkpoint.pt",
+    }
+
+
+def test_create_refuses_a_folder_with_content(run: Run, tmp_path: Path) -> None:
+    before = {path: path.read_bytes() for path in run.folder.iterdir()}
+    with pytest.raises(ValueError, match=r"holds a run: give another folder, or continue the run"):
+        Run.create(run.folder, {})
+    assert before == {path: path.read_bytes() for path in run.folder.iterdir()}
+    (tmp_path / "file").write_text("mine")
+    for place in (tmp_path, tmp_path / "file"):
+        with pytest.raises(ValueError, match="is not an empty folder: give another folder"):
+            Run.create(place, {})
+
+
+def test_create_leaves_no_folder_when_the_configuration_is_bad(tmp_path: Path) -> None:
+    with pytest.raises(TypeError):
+        Run.create(tmp_path / "run", {"task": object()})
+    assert not (tmp_path / "run").exists()
+
+
+def test_create_leaves_nothing_when_a_file_of_the_task_cannot_be_copied(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        Run.create(tmp_path / "run", {}, files={"task.py": b"x = 1", "robot.xml": tmp_path / "gone.xml"})
+    assert not (tmp_path / "run").exists()
+
+
+def test_open_of_an_empty_folder_finds_no_run(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"there is no run in .*: it has no config\.json"):
+        Run.open(tmp_path)
+
+
+def test_open_refuses_a_foreign_configuration(tmp_path: Path) -> None:
+    for text in ("{", "[]", "{}", '"text"'):
+        (tmp_path / "config.json").write_text(text)
+        with pytest.raises(ValueError, match=r"config\.json is not the configuration of a run"):
+            Run.open(tmp_path)
+    (tmp_path / "config.json").write_text('{"format": "one"}')
+    with pytest.raises(ValueError, match="was not written by lyceum_warp: its format is 'one'"):
+        Run.open(tmp_path)
+
+
+def test_open_refuses_a_run_of_a_newer_release(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(json.dumps({"format": FORMAT + 1}))
+    with pytest.raises(ValueError, match=r"newer lyceum_warp \(format 2, this one reads up to 1\): pip install --up"):
+        Run.open(tmp_path)
+
+
+def test_rows_before_the_first_iteration_are_missing(run: Run) -> None:
+    with pytest.raises(FileNotFoundError, match="the run has no complete iteration"):
+        run.rows()
+
+
+def test_load_returns_the_same_policy(run: Run) -> None:
+    policy = GaussianPolicy(3, 2, (8, 4), normalize=True)
+    policy.normalizer.update(3.0 + 2.0 * torch.randn(100, 3))  # type: ignore[operator]
+    run.save(content(1, policy), {})
+    for given in (run, run.folder, str(run.folder), run.checkpoint):
+        loaded = load(given)
+        obs = torch.randn(5, 3)
+        assert torch.equal(loaded(obs), policy(obs))
+        assert not loaded.training
+        assert not loaded(obs).requires_grad
+
+
+def test_a_failed_save_keeps_the_old_checkpoint(run: Run) -> None:
+    """As on a full disk: no file may grow beyond half of the checkpoint."""
+    before, limits = run.checkpoint.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            run.save(content(1, GaussianPolicy(3, 2)), {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert run.checkpoint.read_bytes() == before
+    assert not list(run.folder.glob("*.tmp"))
+
+
+def test_a_checkpoint_keeps_the_one_before_it(run: Run, caplog: pytest.LogCaptureFixture) -> None:
+    run.save(content(1, GaussianPolicy(3, 2)), {"counter": 6})
+    assert run.read()["iteration"] == 1
+    run.checkpoint.write_bytes(b"PK half")
+    assert run.read()["iteration"] == 0 and f"{run.previous}, of iteration 0, is used instead" in caplog.text
+    run.checkpoint.unlink()
+    assert run.read()["iteration"] == 0
+    run.previous.write_bytes(b"PK half")
+    with pytest.raises(FileNotFoundError, match=r"there is no checkpoint .*checkpoint\.pt"):
+        run.read()
+
+
+def test_changed_versions_are_returned_and_noted(run: Run) -> None:
+    now = json.loads((run.folder / "versions.json").read_text())
+    assert run.changed(now) == {}
+    assert run.changed(now | {"torch": "9.9"}) == {"torch": (torch.__version__, "9.9")}
+    assert json.loads((run.folder / "versions.json").read_text())["resumed"] == [{"torch": "9.9"}]

@@ -1,0 +1,71 @@
+"""The table of a run's iterations."""
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from lyceum_warp.runs.metrics_table import append_row, cut_rows, read_metrics
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    return tmp_path / "metrics.csv"
+
+
+def test_a_new_column_is_empty_in_earlier_rows(table: Path) -> None:
+    """As after an update of the task, or of the package; the order of a row's names does not matter."""
+    append_row(table, {"iteration": 1, "kl": 0.5})
+    append_row(table, {"iteration": 2, "kl": None, "metrics/forward, m": 1.5})
+    append_row(table, {"metrics/forward, m": 2.5, "iteration": 3})
+    assert read_metrics(table) == [
+        {"iteration": 1, "kl": 0.5, "metrics/forward, m": None},
+        {"iteration": 2, "kl": None, "metrics/forward, m": 1.5},
+        {"iteration": 3, "kl": None, "metrics/forward, m": 2.5},
+    ]
+
+
+def test_rows_come_back_with_every_digit(table: Path) -> None:
+    rows = [{"iteration": i, "value": i / 3, "mean": None if i % 2 else 1e-30, "bad": float("nan")} for i in (1, 2, 3)]
+    for row in rows:
+        append_row(table, row)
+    with table.open(newline="") as file:
+        cells = list(csv.reader(file))
+    assert cells[0] == ["iteration", "value", "mean", "bad"]
+    assert cells[1] == ["1", repr(1 / 3), "", "nan"]
+    read = read_metrics(table)
+    assert [row["value"] for row in read] == [row["value"] for row in rows]
+    assert [row["mean"] for row in read] == [None, 1e-30, None]
+
+
+def test_cut_counts_iterations_and_not_rows(table: Path) -> None:
+    for i in (4, 5, 6):
+        append_row(table, {"value": 0.5, "iteration": i})
+    cut_rows(table, 5)
+    assert [row["iteration"] for row in read_metrics(table)] == [4, 5]
+
+
+def test_cut_drops_rows_without_a_checkpoint(table: Path) -> None:
+    cut_rows(table, 2)  # without a table
+    for i in (1, 2, 3):
+        append_row(table, {"iteration": i, "value": 0.5})
+    with table.open("a") as file:
+        file.write("4,0.")  # a row that was cut off when the process ended
+    whole = table.read_text()
+    cut_rows(table, 2)
+    assert [row["iteration"] for row in read_metrics(table)] == [1, 2]
+    table.write_text(whole)
+    cut_rows(table, 9)
+    assert [row["iteration"] for row in read_metrics(table)] == [1, 2, 3]
+    cut_rows(table, 0)
+    append_row(table, {"iteration": 1, "value": 0.5})
+    assert [row["iteration"] for row in read_metrics(table)] == [1]
+
+
+def test_a_table_of_another_kind_is_refused(table: Path) -> None:
+    table.write_text("iteration,value\n1,apple\n")
+    with pytest.raises(ValueError, match=r"metrics\.csv is not a table of metrics: line 2"):
+        read_metrics(table)
+    table.write_text("iteration,value\n1,2,3\n")
+    with pytest.raises(ValueError, match="line 2"):
+        read_metrics(table)

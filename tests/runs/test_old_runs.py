@@ -1,0 +1,133 @@
+"""Runs of earlier releases load, are evaluated and resume."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from training_runs import refused
+
+import lyceum_warp as lw
+from lyceum_warp.cli import main
+from lyceum_warp.runs.folder import Run
+
+DATA = Path(__file__).parent.parent / "data"
+OLD = DATA / "old_run"
+RSL_RL = DATA / "rsl_rl_run"
+QUIET = ["--no-video", "--no-plot"]
+
+
+@pytest.fixture
+def old_run(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(OLD, tmp_path / "run"))
+
+
+def test_the_policy_and_the_value_function_of_an_old_run_load(old_run: Path) -> None:
+    policy, value = lw.load(old_run), lw.load_value(old_run)
+    assert policy(torch.zeros(2, policy.nobs)).shape == (2, 3)
+    assert value(torch.zeros(2, policy.nobs), torch.zeros(2)).shape == (2,)
+    assert value.discount == 0.995
+
+
+def test_an_old_run_is_evaluated_in_its_own_physics(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eval", str(old_run), "--episodes", "2"]) == 0
+    assert "hopper: 2 episodes of the mean policy" in capsys.readouterr().out
+
+
+def test_an_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["train", "--resume", str(old_run), "--iterations", "3", *QUIET]
+    assert main(arguments) == 0
+    assert [row["iteration"] for row in Run.open(old_run).rows()] == [1, 2, 3]
+    out = capsys.readouterr().out
+    assert "4 worlds, mujoco engine on cpu" in out
+
+
+@pytest.mark.parametrize("gamma", [0.9, 0.995])
+def test_the_value_function_of_an_old_run_keeps_its_scale(gamma: float, old_run: Path) -> None:
+    """Its file lacks the scale, which was 1 / (1 - gamma)."""
+    content = torch.load(old_run / "checkpoint.pt", weights_only=True)
+    content["value"]["shape"] |= {"scale": 1.0 / (1.0 - gamma), "discount": gamma}
+    torch.save(content, old_run / "checkpoint.pt")
+    run = Run.open(old_run)
+    saved = run.config["npg"] | {"gamma": gamma, "hidden": (8,), "value_hidden": (8,)}
+    run.amend(npg=saved)
+    npg = lw.NPG(lw.make("hopper", nworld=4, integrator="euler"), config=lw.NPGConfig(**saved))
+    npg.load_state_dict(run.read()["state"])
+    obs, step = torch.linspace(-1.0, 1.0, 22).view(2, 11), torch.zeros(2)
+    torch.testing.assert_close(npg.value(obs, step), lw.load_value(old_run)(obs, step))
+    # before the release that scales to the returns, a prediction was the network's output times this factor
+    plain = npg.value.network(obs).squeeze(-1) / (1.0 - gamma)
+    torch.testing.assert_close(npg.value(obs, step), plain)
+
+
+@pytest.fixture(params=["command", "python", "task_file"])
+def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A run of two iterations of release 0.1: of the command, of Python with a model of its own, and of a task's file
+    with a model, a mesh and a table, which are only in the run's copy."""
+    return Path(shutil.copytree(DATA / "runs_0_1" / request.param, tmp_path / "run"))
+
+
+def test_a_run_of_0_1_loads_and_is_evaluated(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    policy = lw.load(run)
+    assert policy.act(torch.zeros(2, policy.nobs)).shape == (2, policy.nact)
+    assert lw.load_value(run).discount == 0.995
+    assert main(["eval", str(run), "--episodes", "2"]) == 0
+    assert "2 episodes of the mean policy" in capsys.readouterr().out
+
+
+def test_a_run_of_0_1_resumes_and_another_begins_with_it(run: Path, tmp_path: Path) -> None:
+    before = Run.open(run)
+    assert main(["train", "--resume", str(run), "--iterations", "4", *QUIET]) == 0
+    after = Run.open(run)
+    assert [row["iteration"] for row in after.rows()] == [1, 2, 3, 4] and after.read()["iteration"] == 4
+    assert after.config["npg"] == before.config["npg"]
+    out = tmp_path / "out"
+    assert main(["train", "--from", str(run), "--out", str(out), "--iterations", "1", *QUIET]) == 0
+    config = Run.open(out).config
+    assert config["npg"] == before.config["npg"] and config["from"]["iteration"] == 4
+
+
+def test_a_run_of_0_1_resumes_in_python(tmp_path: Path) -> None:
+    run = Path(shutil.copytree(DATA / "runs_0_1" / "command", tmp_path / "run"))
+    config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=2, mean_episodes=2)
+    npg = lw.NPG(lw.make("point_mass", nworld=2, success_distance=0.1), config=config)
+    assert [row["iteration"] for row in lw.train(npg, run, iterations=3, resume=True).rows()] == [1, 2, 3]
+
+
+@pytest.fixture
+def rsl_rl_run(tmp_path: Path) -> Path:
+    """A run of the former algorithm rsl-rl, by rsl_rl's PPO."""
+    return Path(shutil.copytree(RSL_RL, tmp_path / "rsl_rl"))
+
+
+def test_a_run_of_rsl_rl_loads_is_evaluated_and_exported(rsl_rl_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    policy, value = lw.load(rsl_rl_run), lw.load_value(rsl_rl_run)
+    obs = torch.linspace(-9.0, 9.0, 12).view(2, 6)
+    assert policy.act(obs).shape == (2, 2) and value(obs, torch.zeros(2)).shape == (2,)
+    assert policy.normalizer.count == 96 and value.discount == 0.99
+    assert main(["eval", str(rsl_rl_run), "--episodes", "2"]) == 0
+    assert "point_mass: 2 episodes of the mean policy" in capsys.readouterr().out
+    assert main(["export", str(rsl_rl_run), "--to", str(rsl_rl_run / "policy.pt2")]) == 0
+    exported = torch.export.load(rsl_rl_run / "policy.pt2").module()
+    torch.testing.assert_close(exported(obs), policy(obs))
+
+
+def test_ppo_begins_with_a_run_of_rsl_rl(rsl_rl_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With its settings, by their new names."""
+    out = tmp_path / "new"
+    assert main(["train", "--from", str(rsl_rl_run), "--iterations", "1", "--out", str(out), *QUIET]) == 0
+    run = Run.open(out)
+    assert run.config["algorithm"] == "ppo" and run.config["from"]["iteration"] == 2
+    settings = run.config["ppo"]
+    assert (settings["num_steps"], settings["hidden"], settings["log_std"], settings["epochs"]) == (12, [8], 0.0, 5)
+    new, old = lw.load(out), lw.load(rsl_rl_run)
+    assert new.normalizer.count == 96 + 48
+    change = (new.network[0].weight - old.network[0].weight).abs().max()
+    assert 0.0 < change < 0.1
+    ppo = lw.PPO(lw.make("point_mass", nworld=4), old, lw.load_value(rsl_rl_run), lw.PPOConfig(num_steps=12))
+    assert next(ppo).kl > 0.0  # in Python, too
+
+
+def test_a_run_of_rsl_rl_is_not_resumed(rsl_rl_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "--resume", str(rsl_rl_run), "--iterations", "5"]) == 2
+    refused(capsys, "was trained by rsl-rl, which ppo has replaced", f"train --from {rsl_rl_run}")

@@ -1,0 +1,115 @@
+"""When a run is saved, and what is left of it if its folder cannot be written."""
+
+import os
+import resource
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import SharedEnv
+from training_runs import QUIET, algorithm, metrics, refused, six_iterations
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.saving import SAVE_SECONDS, SHARE, Saver
+
+
+@pytest.fixture
+def npg(shared_env: SharedEnv) -> lw.NPG:
+    return algorithm(shared_env("point_mass", nworld=2))
+
+
+@pytest.fixture(scope="module")
+def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return six_iterations(tmp_path_factory.mktemp("runs") / "six")
+
+
+@pytest.mark.parametrize("seconds, wait", [(0.02, SHARE * 0.02), (1.0, SAVE_SECONDS)])
+def test_saves_take_a_small_share_of_the_time(seconds: float, wait: float, npg: lw.NPG, tmp_path: Path) -> None:
+    saver = Saver(Run.create(tmp_path / "run", {}), npg)
+    saver.save()
+    assert saver.saved == 0 and not saver.due()
+    saver._seconds = seconds  # as it takes with more worlds
+    saver._when -= 0.9 * wait
+    assert not saver.due()
+    saver._when -= 0.2 * wait
+    assert saver.due()
+
+
+def test_a_run_is_saved_after_each_so_many_iterations(npg: lw.NPG, tmp_path: Path) -> None:
+    saver = Saver(Run.create(tmp_path / "run", {}), npg, save_every=2)
+    due = []
+    for _ in range(4):
+        next(npg)
+        due.append(saver.due())
+    assert due == [False, True, False, True]
+
+
+# folders that cannot be written
+
+
+def trained_with(folder: Path, at_three: Callable[[], Any]) -> OSError:
+    """Train while something happens to the folder after the third iteration."""
+
+    def callback(iteration: lw.Iteration) -> None:
+        if iteration.iteration == 3:
+            at_three()
+
+    with pytest.raises(OSError) as raised:
+        lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, callback=callback, save_every=2)
+    return raised.value
+
+
+def test_a_file_that_cannot_be_written_ends_the_run_and_leaves_its_last_save(six: Path, tmp_path: Path) -> None:
+    """As on a full disk: no file may grow beyond the policy's size, so the complete state is not saved."""
+    folder, limits = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
+    size = 2 * os.path.getsize(six / "policy.pt")
+    assert size < os.path.getsize(six / "checkpoint.pt")
+    try:
+        error = trained_with(folder, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1])))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert error.strerror == "File too large" and error.filename == str(folder / "checkpoint.pt")
+    assert error.__notes__ == [f"the run in {folder} is saved up to iteration 2"]
+    assert not list(folder.rglob("*.tmp")) and Run.open(folder).read()["iteration"] == 2
+    assert cli.main(["train", "--resume", str(folder), "--iterations", "6", *QUIET]) == 0
+    assert metrics(folder) == metrics(six)
+
+
+def test_a_row_that_was_written_in_part_does_not_stop_a_resumed_run(six: Path, tmp_path: Path) -> None:
+    folder, limits = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def limit() -> None:
+        size = (folder / "metrics.csv").stat().st_size + 9
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+
+    try:
+        assert trained_with(folder, limit).strerror == "File too large"
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not (folder / "metrics.csv").read_text().endswith("\n")
+    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
+    assert metrics(folder) == metrics(six)
+
+
+def test_a_command_reports_a_folder_that_cannot_be_written_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("mine")
+    arguments = ["train", "point_mass", "--samples", "512", "--nworld", "2", "--hidden", "8", "--iterations", "4"]
+    assert cli.main([*arguments, "--out", str(tmp_path / "file" / "run"), *QUIET]) == 2
+    refused(capsys, f"{tmp_path / 'file'}", "Not a directory")
+    folder, write = tmp_path / "run", Saver.write
+
+    def deleting(saver: Saver, iteration: lw.Iteration) -> float | None:
+        score = write(saver, iteration)
+        if iteration.iteration == 2:
+            shutil.rmtree(folder)
+        return score
+
+    monkeypatch.setattr(Saver, "write", deleting)
+    assert cli.main([*arguments, "--out", str(folder), *QUIET, "--save-every", "100"]) == 2
+    refused(capsys, str(folder), "No such file or directory", f"the run in {folder} is saved up to iteration 0")

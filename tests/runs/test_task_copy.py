@@ -1,0 +1,360 @@
+"""A run's copies of its task: what is kept, and what later commands use after files have moved or changed."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from training_runs import QUIET, TINY, metrics, refused
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.env import Env
+from lyceum_warp.runs.configuration import Configuration
+from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.task_copy import run_env, task_copy
+
+SOURCE = """
+import warp as wp
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    qvel: Row[float]
+
+@wp.struct
+class Params:
+    dt: float
+    goal: wp.array[float] = [0.1, 0.2]
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    obs[0] = s.qpos[0]
+    obs[1] = s.qvel[0]
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    return -wp.abs(s1.qpos[0] - p.goal[0])
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    s.qpos[0] = lw.uniform(rng, -1.0, 1.0)
+
+class Slide(lw.Task):
+    model, horizon, obs = "robot/scene.xml", 20, {"x": 1, "v": 1}
+"""
+SCENE = """
+<mujoco>
+  <compiler meshdir="../meshes"/>
+  <include file="parts/block.xml"/>
+  <asset><mesh name="block" file="block.obj"/></asset>
+  <actuator><motor joint="x" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+PART = """
+<mujocoinclude>
+  <worldbody><body><joint name="x" type="slide" axis="1 0 0"/><geom type="mesh" mesh="block"/></body></worldbody>
+</mujocoinclude>
+"""
+BLOCK = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+SMALL = lw.NPGConfig(samples=40, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2)
+
+
+@pytest.fixture
+def folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
+    """A folder with a task, at the same path in every run of the tests, so that Warp finds compiled kernels."""
+    cache = getattr(pytestconfig, "cache", None)
+    folder = Path(cache.mkdir("kept_task")) if cache else tmp_path
+    shutil.rmtree(folder)
+    for name, text in {"mine/slide.py": SOURCE, "mine/robot/scene.xml": SCENE, "mine/robot/parts/block.xml": PART,
+                       "mine/meshes/block.obj": BLOCK}.items():  # fmt: skip
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    np.save(folder / "mine" / "goal.npy", np.array([0.3, 0.4]))
+    return folder
+
+
+def trained(folder: Path) -> Path:
+    """A run of two iterations."""
+    out, table = folder / "run", folder / "mine" / "goal.npy"
+    arguments = ["train", str(folder / "mine" / "slide.py"), "--out", str(out), "--param", f"goal={table}", *TINY]
+    assert cli.main([*arguments, *QUIET, "--iterations", "2"]) == 0
+    return out
+
+
+def env_of(folder: Path) -> Env:
+    """An environment as a run has it."""
+    run = Run.open(folder)
+    saved = Configuration.of(run)
+    return run_env(run, saved.options, saved.params)
+
+
+def returns(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The line of returns that eval prints."""
+    capsys.readouterr()
+    assert cli.main(["eval", *arguments, "--episodes", "2"]) == 0
+    output = capsys.readouterr()
+    print(output.err)  # for ``refused``, which reads it
+    return next(line for line in output.out.splitlines() if line.strip().startswith("return"))
+
+
+def test_a_run_goes_on_after_its_task_has_moved(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The model's includes, its meshes and the tables have moved with it."""
+    out = trained(folder)
+    before = returns(capsys, str(out))
+    assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
+    expected = metrics(out)
+    shutil.rmtree(out)
+    trained(folder)
+    (folder / "mine").rename(folder / "moved")
+    try:
+        assert returns(capsys, str(out)) == before
+        assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
+        gone, copy = folder / "mine" / "slide.py", out / "task" / "slide.py"
+        refused(capsys, f"{gone} does not exist any more: the run's own copy is used, {copy}")
+        assert metrics(out) == expected
+        warm = ["train", "--from", str(out), "--out", str(folder / "warm"), "--iterations", "1", *QUIET]
+        assert cli.main(warm) == 0
+        assert Run.open(folder / "warm").config["from"]["run"] == str(out)
+    finally:
+        shutil.rmtree(folder / "moved")
+
+
+def test_the_copies_are_the_files_byte_for_byte(folder: Path) -> None:
+    mine = folder / "mine"
+    (mine / "robot" / "scene.xml").write_bytes(SCENE.replace("\n", "\r\n").encode() + b"<!-- 1e0 == 1.000 -->")
+    env = lw.make(str(mine / "slide.py"), nworld=1, goal=mine / "goal.npy")
+    run = Run.create(folder / "run", {}, files=task_copy(env)[1])
+    copies = {path.relative_to(run.task_folder).as_posix(): path.read_bytes() for path in run.task_folder.rglob("*.*")}
+    names = ("slide.py", "robot/scene.xml", "robot/parts/block.xml", "meshes/block.obj")
+    assert copies == {name: (mine / name).read_bytes() for name in names} | {
+        "tables/goal.npy": (mine / "goal.npy").read_bytes()
+    }
+
+
+URDF = """<robot name="arm"><mujoco><compiler meshdir="../meshes" strippath="true"/></mujoco>
+<link name="base"/><link name="tip"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>
+</inertial><collision><geometry><mesh filename="package://arm/block.obj"/></geometry></collision></link>
+<joint name="x" type="prismatic"><parent link="base"/><child link="tip"/><axis xyz="1 0 0"/>
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+
+
+@pytest.mark.parametrize("kind", ["attached", "urdf", "python"])
+def test_all_files_of_a_model_are_copied(kind: str, folder: Path) -> None:
+    """Of a model that attaches another one, of a URDF, and of one that was made in Python."""
+    robot = folder / "mine" / "robot"
+    (robot / "arm.urdf").write_text(URDF)
+    (robot / "whole.xml").write_text(
+        '<mujoco><asset><model name="a" file="scene.xml"/></asset><worldbody><frame>'
+        '<attach model="a" body="slider" prefix="a_"/></frame></worldbody></mujoco>'
+    )
+    (robot / "parts" / "block.xml").write_text(PART.replace("<body>", '<body name="slider">'))
+    given: Any = {"attached": robot / "whole.xml", "urdf": robot / "arm.urdf"}.get(kind)
+    if kind == "python":
+        given = mujoco.MjSpec.from_file(str(robot / "scene.xml"))
+    motor = """
+    @staticmethod
+    def edit_model(spec):
+        for joint in spec.joints[: not spec.actuators]:
+            spec.add_actuator(target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+"""
+    (folder / "mine" / "slide.py").write_text(f"import mujoco\n{SOURCE}{motor}")
+    kept, files = task_copy(lw.make(str(folder / "mine" / "slide.py"), nworld=1, model=given))
+    names = {
+        "attached": {"robot/whole.xml", "robot/scene.xml", "robot/parts/block.xml"},
+        "urdf": {"robot/arm.urdf"},
+        "python": {"robot/model.xml"},
+    }[kind]
+    assert files.keys() == names | {"meshes/block.obj", "slide.py"}
+    assert kept["model"] == {"attached": "robot/whole.xml", "urdf": "robot/arm.urdf", "python": "robot/model.xml"}[kind]
+
+
+def test_an_edited_task_is_named_and_the_runs_own_copy_used(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = trained(folder)
+    before = returns(capsys, str(out))
+    file = folder / "mine" / "slide.py"
+    file.write_text(SOURCE.replace("-wp.abs(", "7.0 - wp.abs("))
+    capsys.readouterr()
+    assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
+    refused(
+        capsys,
+        f"{file} has changed since the run began: the run's own copy is used",
+        f"give {file} as the task to use the new version",
+    )
+    assert returns(capsys, str(out)) == before
+    assert returns(capsys, str(out), "--task", str(file)) != before
+    assert capsys.readouterr().err == ""
+
+
+def test_modules_that_a_task_imports_are_kept_with_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mine = folder / "mine"
+    source = SOURCE.replace("import warp as wp\n", "import warp as wp\nfrom slide_terms.goal import miss\n", 1)
+    source = source.replace("-wp.abs(s1.qpos[0] - p.goal[0])", "-miss(s1.qpos[0], p.goal[0])")
+    terms = "import warp as wp\n\n@wp.func\ndef miss(x: float, goal: float) -> float:\n    return wp.abs(x - goal)\n"
+    (mine / "slide_terms").mkdir()
+    (mine / "slide.py").write_text(source)
+    (mine / "slide_terms" / "goal.py").write_text(terms)
+    out = trained(folder)
+    before = returns(capsys, str(out))
+    assert capsys.readouterr().err == ""
+    (mine / "slide_terms" / "goal.py").write_text(terms.replace("wp.abs", "7.0 - wp.abs"))
+    assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
+    refused(capsys, f"{mine / 'slide_terms' / 'goal.py'} has changed since the run began: the run's own copy is used")
+    assert returns(capsys, str(out)) == before
+    assert returns(capsys, str(out), "--task", str(mine / "slide.py")) != before
+    mine.rename(folder / "moved")
+    try:
+        assert returns(capsys, str(out)) == before
+        assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
+        assert not list(out.rglob("__pycache__"))
+    finally:
+        shutil.rmtree(folder / "moved")
+
+
+def test_too_many_modules_are_not_copied(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "mine" / "slide_goal.py").write_text("GOAL = 0.1\n")
+    (folder / "mine" / "slide.py").write_text(f"import slide_goal\n{SOURCE}")
+    env = lw.make(str(folder / "mine" / "slide.py"), nworld=1)
+    assert "slide_goal.py" in task_copy(env)[1]
+    monkeypatch.setattr("lyceum_warp.runs.task_copy._LARGEST_MODULES", 5)
+    assert "slide.py" in task_copy(env)[1] and "slide_goal.py" not in task_copy(env)[1]
+
+
+def test_an_edited_model_is_named_and_the_runs_own_copy_used(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = trained(folder)
+    before = returns(capsys, str(out))
+    (folder / "mine" / "robot" / "parts" / "block.xml").write_text(
+        PART.replace('type="slide"', 'type="slide" damping="9"')
+    )
+    capsys.readouterr()
+    assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
+    refused(capsys, "the model of the task 'slide' has changed since the run began: the run's own copy is used")
+    assert returns(capsys, str(out)) == before
+    assert returns(capsys, str(out), "--task", str(folder / "mine" / "slide.py")) != before
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_run_that_begins_with_another_uses_its_copy_of_the_model(
+    moved: bool, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, robot, warm = trained(folder), folder / "mine" / "robot", folder / "warm"
+    masses = Env(str(folder / "mine" / "slide.py")).model.body_mass
+    if moved:
+        robot.rename(folder / "mine" / "other")
+        line = "the model of the task 'slide' is no longer where it was"
+    else:
+        part = robot / "parts" / "block.xml"
+        part.write_text(PART.replace('type="mesh"', 'type="mesh" mass="9"'))
+        line = "the model of the task 'slide' has changed since the run began"
+    capsys.readouterr()
+    arguments = ["train", "--from", str(out), "--out", str(warm), *QUIET, "--iterations"]
+    assert cli.main([*arguments, "1"]) == 0
+    refused(capsys, f"{line}: the run's own copy is used, {out / 'task' / 'robot' / 'scene.xml'}")
+    env = env_of(warm)
+    assert np.array_equal(env.model.body_mass, masses)
+    assert cli.main(["train", "--resume", str(warm), "--iterations", "2", *QUIET]) == 0
+    if not moved:  # a task that is named is used as it is now
+        arguments[4] = str(folder / "new")
+        assert cli.main([*arguments, "1", str(folder / "mine" / "slide.py")]) == 0
+        env = env_of(folder / "new")
+        assert env.model.body_mass[-1] == 9.0
+
+
+def test_a_run_of_python_keeps_a_model_that_was_made_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spec = lw.gymnasium_model("hopper.xml").spec()
+    spec.option.gravity = [0.0, 0.0, -30.0]
+    env = lw.make("hopper", nworld=2, model=spec, horizon=20)
+    lw.train(lw.NPG(env, config=SMALL), tmp_path / "run", iterations=1)
+    before = returns(capsys, str(tmp_path / "run"))
+    assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2", "--task", "hopper"]) == 0
+    assert before not in capsys.readouterr().out
+    assert cli.main(["train", "--resume", str(tmp_path / "run"), "--iterations", "2", *QUIET]) == 0
+
+
+def test_python_names_a_task_and_a_model_that_have_changed(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The algorithm is made of them, so they are used as they are."""
+    file, table, out = folder / "mine" / "slide.py", folder / "mine" / "goal.npy", folder / "run"
+
+    def train(iterations: int, **words: Any) -> None:
+        env = lw.make(str(file), nworld=2, goal=table, horizon=10)
+        lw.train(lw.NPG(env, config=SMALL), out, iterations=iterations, **words)
+
+    train(1)
+    assert Run.open(out).config["params"] == {"goal": str(table)}
+    train(2, resume=True)
+    assert not caplog.messages
+    part = folder / "mine" / "robot" / "parts" / "block.xml"
+    part.write_text(PART.replace('type="slide"', 'type="slide" damping="9"'))
+    file.write_text(SOURCE.replace("-wp.abs(", "7.0 - wp.abs("))
+    train(3, resume=True)
+    changed = "has changed since the run began: it is used as it is now"
+    assert caplog.messages == [f"{file} {changed}", f"the model of the task 'slide' {changed}"]
+
+
+def test_a_task_of_a_program_is_evaluated_with_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its file may train when it is run."""
+    lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=SMALL), tmp_path / "run", iterations=1)
+    Run.open(tmp_path / "run").amend(task=None)  # as for a class of a notebook
+    assert cli.main(["eval", str(tmp_path / "run")]) == 2
+    refused(
+        capsys,
+        "the task 'point_mass'",
+        "was defined in a notebook",
+        "give a file that only defines it (eval --task my_task.py",
+    )
+    assert cli.main(["eval", str(tmp_path / "run"), "--task", "point_mass", "--episodes", "2"]) == 0
+
+
+LOCAL = """
+import warp as wp
+
+@wp.func
+def squared(x: float) -> float:
+    return x * x
+"""
+EDITED = SOURCE.replace("import warp as wp", "import warp as wp\nfrom slide_terms import squared", 1).replace(
+    "-wp.abs(s1.qpos[0] - p.goal[0])", "-squared(s1.qpos[0] - p.goal[0])"
+)
+EDITS = [
+    lambda text: "# a new first line\n" * 7 + text,
+    lambda text: text[: len(text) // 2],
+    lambda text: f"{text}\nthis is not Python",
+    lambda text: "",
+    None,
+]
+"""What happens to a task's files while it trains; None is that they are deleted."""
+
+
+def test_a_run_keeps_to_the_source_that_it_was_started_with(folder: Path) -> None:
+    mine = folder / "mine"
+    original = {mine / "slide.py": EDITED, mine / "slide_terms.py": LOCAL}
+    for file, text in original.items():
+        file.write_text(text)
+
+    def run(name: str, edits: list[Any]) -> list[dict[str, str]]:
+        env = lw.make(str(mine / "slide.py"), nworld=2)
+        pending = iter(edits)
+
+        def edit(*_: Any) -> None:
+            for change in [next(pending)] if edits else []:
+                for file, text in original.items():
+                    file.unlink(missing_ok=True) if change is None else file.write_text(change(text))
+            if edits:
+                env.replicate(nworld=1).step()
+
+        edit()
+        lw.train(lw.NPG(env, config=SMALL), folder / name, iterations=len(EDITS) - 1, callback=edit)
+        for file, text in original.items():
+            assert (folder / name / "task" / file.name).read_text() == text
+        return metrics(folder / name)
+
+    edited = run("edited", EDITS)
+    for file, text in original.items():
+        file.write_text(text)
+    assert edited == run("unedited", [])
