@@ -6,16 +6,15 @@ if _wp.config.log_level == _wp.LOG_INFO:  # Warp's default, at which it greets a
     _wp.config.log_level = _wp.LOG_WARNING
 
 from lyceum_warp.actuators import follow_velocity
-from lyceum_warp.algos.cem import CEM
 from lyceum_warp.algos.evaluation import Episodes, evaluate
-from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_config import MPPIConfig
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig
 from lyceum_warp.algos.npg_statistics import Iteration
+from lyceum_warp.algos.plan_update import PlanSamples, PlanUpdate
+from lyceum_warp.algos.planner import CEM, MPPI, Planner, PredictiveSampling
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.policy_export import export_policy
-from lyceum_warp.algos.predictive_sampling import PredictiveSampling
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.binding.registry import register, task_names
@@ -105,6 +104,9 @@ __all__ = [
     "NPGConfig",
     "OpenLoop",
     "PhysicsOptions",
+    "PlanSamples",
+    "PlanUpdate",
+    "Planner",
     "Planning",
     "PlanningController",
     "PredictiveSampling",

@@ -10,9 +10,9 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.mppi_config import MPPIConfig
+from lyceum_warp.algos.planner import MPPI
 from lyceum_warp.binding.registry import find_task, snake_case, task_name
 from lyceum_warp.cli.arguments import (
     CameraWords,
@@ -158,7 +158,7 @@ def plan(options: Plan) -> int:
     CheckedController(planner, plant).check_horizon(planner.horizon, every)
     find_camera(plant.model, camera)
     config = {
-        "algorithm": planner.config.update, "task": portable(options.task), "params": params,
+        "algorithm": planner.settings["update"], "task": portable(options.task), "params": params,
         "planner": planner.settings, "planner_params": planner_params,
         "planner_model": options.planner_model and str(_model(options.planner_model)),
         "value": options.value and str(options.value.resolve()), **vars(options.planner),
@@ -271,7 +271,8 @@ def _rate(options: Plan, episode: Trajectory) -> float | None:
 
 
 def _planner_name(planner: MPPI) -> str:
-    return {"mppi": "MPPI", "cem": "CEM", "predictive_sampling": "predictive sampling"}[planner.config.update]
+    update = planner.settings["update"]
+    return {"mppi": "MPPI", "cem": "CEM", "predictive_sampling": "predictive sampling"}.get(update, update)
 
 
 def _left(run: Run, whole: int, aborted: list[Trajectory], path: Path | None) -> str:
