@@ -9,18 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lyceum_warp.actuators import follow_velocity
-    from lyceum_warp.algos.cem import CEM
     from lyceum_warp.algos.evaluation import Episodes, evaluate
     from lyceum_warp.algos.learner import Iteration, Learner
-    from lyceum_warp.algos.mppi import MPPI
     from lyceum_warp.algos.mppi_config import MPPIConfig
     from lyceum_warp.algos.npg import NPG
     from lyceum_warp.algos.npg_config import NPGConfig
+    from lyceum_warp.algos.plan_update import PlanSamples, PlanUpdate
+    from lyceum_warp.algos.planner import CEM, MPPI, Planner, PredictiveSampling
     from lyceum_warp.algos.policy import GaussianPolicy
     from lyceum_warp.algos.policy_export import export_policy
     from lyceum_warp.algos.ppo import PPO
     from lyceum_warp.algos.ppo_config import PPOConfig
-    from lyceum_warp.algos.predictive_sampling import PredictiveSampling
     from lyceum_warp.algos.rollout_buffer import Rollout
     from lyceum_warp.algos.value import ValueFunction
     from lyceum_warp.binding.registry import register, task_names
@@ -100,18 +99,17 @@ __version__ = "0.1.0"
 
 _NAMES = {
     "actuators": "follow_velocity",
-    "algos.cem": "CEM",
     "algos.evaluation": "Episodes evaluate",
     "algos.learner": "Iteration Learner",
-    "algos.mppi": "MPPI",
     "algos.mppi_config": "MPPIConfig",
     "algos.npg": "NPG",
     "algos.npg_config": "NPGConfig",
+    "algos.plan_update": "PlanSamples PlanUpdate",
+    "algos.planner": "CEM MPPI Planner PredictiveSampling",
     "algos.policy": "GaussianPolicy",
     "algos.policy_export": "export_policy",
     "algos.ppo": "PPO",
     "algos.ppo_config": "PPOConfig",
-    "algos.predictive_sampling": "PredictiveSampling",
     "algos.rollout_buffer": "Rollout",
     "algos.value": "ValueFunction",
     "binding.registry": "register task_names",
@@ -178,6 +176,9 @@ __all__ = [
     "OpenLoop",
     "PPOConfig",
     "PhysicsOptions",
+    "PlanSamples",
+    "PlanUpdate",
+    "Planner",
     "Planning",
     "PlanningController",
     "PredictiveSampling",

@@ -27,7 +27,8 @@ from lyceum_warp.options import OPTION_DOCS, EnvOptions, signature_of_options
 from lyceum_warp.spaces import Space
 from lyceum_warp.task import Task
 from lyceum_warp.validate import check_kind, check_tensor, described, whole_number
-from lyceum_warp.worlds import Worlds, own_bytes_per_world
+from lyceum_warp.world_arrays import own_bytes_per_world
+from lyceum_warp.worlds import Worlds
 
 _BUFFERS = (*steps.OUTCOMES, "obs", "final_obs", "action")
 

@@ -15,7 +15,7 @@ from lyceum_warp.graphs.capture import Calls, Phase
 from lyceum_warp.kernels import planning, state
 from lyceum_warp.task import MEMORIES
 from lyceum_warp.validate import whole_number
-from lyceum_warp.worlds import own_parts
+from lyceum_warp.world_arrays import own_parts
 
 
 @document_attributes

@@ -1,14 +1,12 @@
-"""Worlds: the arrays of an environment, and the phases of a step, a reset, and a state that is read or restored.
+"""Run the phases of a step, a reset, and a state that is read or restored, in every world of an environment.
 
 The order of a step is the list in ``Worlds.step_phases``, and stands nowhere else.
 """
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import partial
-from typing import Any
 
-import numpy as np
 import torch
 import warp as wp
 
@@ -18,21 +16,17 @@ from lyceum_warp.arrays import (
     launch_parts,
     launch_rows,
     launch_worlds,
-    shared_rows,
     torch_view,
-    with_memory,
 )
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.fields import Stage
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.graphs.workers import Workers
 from lyceum_warp.kernels import random, rows, state, steps
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.spaces import Space, action_space, control_ranges, control_scale, state_space
 from lyceum_warp.task import MEMORIES
-from lyceum_warp.validate import check_tensor
+from lyceum_warp.world_arrays import WorldArrays
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,24 +41,7 @@ class Programs:
     restore_state: Calls
 
 
-def own_bytes_per_world(task: BoundTask) -> int:
-    """An estimate of the memory that ``Worlds`` takes for each world beside its engine, in bytes."""
-    snapshots = [field for field in task.fields if field.snapshot]
-    state_size = state_space(task.model, snapshots, task.dynamics, own_parts(task)).size
-    copies = sum(field.size for field in task.fields)
-    observations = sum(sum(layout.values()) for layout in task.obs_layouts.values())
-    return 4 * copies + 8 * state_size + 8 * observations + 300
-
-
-def own_parts(task: BoundTask) -> dict[str, int]:
-    """The parts of a state that ``Worlds`` keeps beside the counters, and their sizes."""
-    form = task.task
-    sizes = {name: getattr(form, name) for name in MEMORIES}
-    sizes |= {"metrics": len(form.metrics), "success_steps": int(form.success_steps > 1)}
-    return {name: size for name, size in sizes.items() if size}
-
-
-class Worlds:
+class Worlds(WorldArrays):
     """Many worlds of one task on one engine: arrays of fixed address, and the phases that work on them.
 
     Every method that a phase names launches the same kernels on the same arrays each time.
@@ -76,103 +53,13 @@ class Worlds:
     """
 
     def __init__(self, task: BoundTask, engine: Engine, options: EnvOptions) -> None:
-        self.task, self.engine, self.device, self.nworld = task, engine, engine.device, engine.nworld
+        super().__init__(task, engine)
         self.first_world = options.first_world
-        with wp.ScopedDevice(self.device):
-            self._allocate()
         self._nvtx = options.nvtx
         self._workers = self._make_workers()
         self._programs: dict[tuple[int, bool, bool], Programs] = {}
         horizon = task.task.horizon if options.horizon is None else options.horizon
         self.configure(horizon=horizon, autoreset=options.autoreset, graphs=options.graphs)
-
-    def _allocate(self) -> None:
-        """Make every array; a step, a reset or a restored state makes no other."""
-        n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
-        self.memory = wp.zeros((n, task.memory), dtype=float)
-        self.lasting_memory = wp.zeros((n, task.lasting_memory), dtype=float)
-        self._lasting_before = wp.zeros((n, task.lasting_memory), dtype=float)
-        self.metric_sums = wp.zeros((n, len(task.metrics)), dtype=float)
-        """Sums of the metrics over the episode so far."""
-        self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
-        """Steps in a row with the goal met, up to ``success_steps``; without a column where one step is enough."""
-        own = ("memory", "lasting_memory", "metric_sums", "success_counts")
-        self._clearable = {name: getattr(self, name) for name in own}
-        self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}
-        self._zeros = wp.zeros(max(array.shape[1] for array in self._clearable.values()), dtype=float)
-        # the fields of the state that a step leads to, live, and copies of those of the state before
-        self.after, self.before = kernels.Batch(), kernels.Batch()
-        self._copies: dict[str, wp.array] = {}
-        constant = {f.name: shared_rows(f.value(model), f.dtype, n, self.device) for f in self.task.constants}
-        varied = [field.name for field in self.task.dynamics]
-        for name in self.task.types:
-            live: Any = getattr(self, name) if name in MEMORIES else constant.get(name, self.engine.arrays.get(name))
-            self.task.check_field(name, live)
-            live = with_memory(live)
-            setattr(self.after, name, live)
-            if live.size and name not in constant and name not in varied:  # no step changes the model
-                self._copies[name] = wp.zeros_like(live)
-            setattr(self.before, name, self._copies.get(name, live))
-        self.fields = {**self.engine.arrays, **constant}
-        """The arrays of all fields of the engine and the model, (nworld, ...), by name."""
-        drawn = [f.name for f in self.task.dynamics if f.name in self.task.writes.get("event", ())]
-        self._model_copies = {name: wp.zeros_like(self.engine.arrays[name]) for name in drawn}
-        self.params = self.task.parameters.array(self.device)
-
-        self.action_space = action_space(model, task.action_range, task.actions)
-        self.obs_spaces = {group: Space.of(layout) for group, layout in self.task.obs_layouts.items()}
-        self.state_space = state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
-
-        self.outcome = steps.Outcome()
-        self.buffers: dict[str, torch.Tensor] = {}
-        for name, dtype in steps.OUTCOMES.items():
-            setattr(self.outcome, name, wp.zeros(n, dtype=dtype))
-            self.buffers[name] = torch_view(getattr(self.outcome, name))
-        self.metrics: wp.array = wp.zeros((n, len(task.metrics)), dtype=float)
-        """The metrics of the last step, (nworld, number of metrics)."""
-        self.episode_metrics: wp.array = wp.zeros_like(self.metrics)
-        """Their sums over the episode of that step."""
-        self.outcome.metrics = self.metrics  # type: ignore[assignment]
-        self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
-        parts = int(steps.OBSERVE_FIRST) + len(self.obs_spaces)
-        self._judging = parts if self.device.is_cuda else 1  # threads that judge a world
-        self._found = steps.Findings()
-        self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)
-        self._found.terminated, self._found.success = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
-        self._found.fault = wp.zeros((parts, n), dtype=int)  # type: ignore[assignment]
-        self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
-        self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)
-        self._observing = len(self.obs_spaces) if self.device.is_cuda else 1  # threads that observe a world
-        self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
-        self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
-        naction = self.action_space.size
-        self.action, self.safe_action = wp.zeros((n, naction), dtype=float), wp.zeros((n, naction), dtype=float)
-        self.buffers["action"] = torch_view(self.action)
-        ranges, scale = control_ranges(model), np.zeros((model.nu, 2))
-        if self.task.functions["control"] is None:
-            scale = control_scale(model, task.action_range)
-        self.ranges: wp.array = wp.array(ranges, dtype=float)
-        self.scale: wp.array = wp.array(scale, dtype=float)
-
-        self.counters = steps.Counters()
-        self.counters.step, self.counters.episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
-        self.counters.key = wp.zeros(n, dtype=wp.uint32)
-        self.counters.rng = wp.zeros((len(self.obs_spaces) * n, 1), dtype=wp.uint32)  # type: ignore[assignment]
-        self._seed = wp.zeros(1, dtype=int)
-        self._action_fault, self._no_fault, self._judged = (wp.zeros(n, dtype=int) for _ in range(3))
-        self.fault_count = wp.zeros((n, int(FAULTS).bit_length()), dtype=int)
-        self.everyone, self.mask = wp.full(n, True, dtype=bool), wp.zeros(n, dtype=bool)
-        self.restarting, self._drawing = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
-        self._going_on, self._moved, self.changed, self._stale = (wp.zeros(n, dtype=bool) for _ in range(4))
-        self.changed_view = torch_view(self.changed)
-        """The worlds that the events of the last step changed, (nworld,) bool."""
-        self.state = wp.zeros((n, self.state_space.size), dtype=wp.float64)
-        self.mask_view, self.state_view = torch_view(self.mask), torch_view(self.state)
-
-    def _allocate_groups(self, into: Any) -> dict[str, torch.Tensor]:
-        for group, space in self.obs_spaces.items():
-            setattr(into, group, wp.zeros((self.nworld, space.size), dtype=float))
-        return {group: torch_view(getattr(into, group)) for group in self.obs_spaces}
 
     def configure(self, *, horizon: int, autoreset: bool, graphs: bool) -> None:
         """Choose the horizon, whether episodes restart automatically, and whether launches become graphs.
@@ -231,7 +118,7 @@ class Worlds:
             *self._transition_phases(),
             self._only_for(self.restarting, restart),
             *events,
-            *([self._only_for(self._moved, moved)] if moved else []),
+            *([self._only_for(self._physics_changed, moved)] if moved else []),
             *([self._only_for(self.restarting, show[0])] if show[0] else []),
             *show[1],
         ]
@@ -257,9 +144,9 @@ class Worlds:
     def physics_phases(self) -> list[Phase]:
         """The substeps of a step."""
         skip = self.task.frame_skip
-        if self.task.kernels.substep_memory is None:
+        if (kernel := self.task.kernels.substep_memory) is None:
             return self.engine.step_phases(skip)
-        substep = [*self.engine.step_phases(1), Phase("substep", self._substep, by_world=True)]
+        substep = [*self.engine.step_phases(1), Phase("substep", partial(self._substep, kernel), by_world=True)]
         return substep * skip
 
     def reset_phases(self, *, randomly: bool) -> list[Phase]:
@@ -275,30 +162,31 @@ class Worlds:
         phases = [Phase("restart", partial(self._restart, mask, randomly=randomly), by_world=True)]
         if self.task.reset_dynamics:
             phases.append(Phase("dynamics", partial(self.engine.apply_model, mask), engine=True))
-        if randomly and self.task.kernels.reject_worlds is not None:
-            phases.append(Phase("redraw", partial(self._redraw, mask), engine=True))
+        if randomly and (kernel := self.task.kernels.reject_worlds) is not None:
+            phases.append(Phase("redraw", partial(self._redraw, kernel, mask), engine=True))
         if settle := self.task.task.settle:
             phases.append(Phase("settle", partial(self.engine.settle, mask, settle), engine=True))
         return phases
 
     def _event_phases(self) -> list[Phase]:
         """What happens between two steps, in worlds that go on."""
-        return [] if self.task.kernels.run_events is None else [Phase("event", self._event)]
+        kernel = self.task.kernels.run_events
+        return [] if kernel is None else [Phase("event", partial(self._event, kernel))]
 
     def _moved_phases(self) -> list[Phase]:
         """What follows in the worlds whose physics an event changed."""
         if self.task.kernels.run_events is None:
             return []
-        phases = []
+        phases, changed = [], self._physics_changed
         if any(field.name in self.task.writes["event"] for field in self.task.dynamics):
-            phases.append(Phase("event dynamics", partial(self.engine.apply_model, self._moved), engine=True))
+            phases.append(Phase("event dynamics", partial(self.engine.apply_model, changed), engine=True))
         if self.engine.stage > Stage.NONE:
-            phases.append(Phase("event refresh", partial(self.engine.refresh_current, self._moved), engine=True))
+            phases.append(Phase("event refresh", partial(self.engine.refresh_current, changed), engine=True))
         return phases
 
     def _observe_phases(self) -> list[Phase]:
         """Observations of the worlds that changed since they were judged."""
-        changed = self.restarting if self.task.kernels.run_events is None else self._stale
+        changed = self.restarting if self.task.kernels.run_events is None else self._outdated
         return [Phase("observe", partial(self._observe, changed), by_world=True)]
 
     def _refresh_phases(self, mask: wp.array) -> list[Phase]:
@@ -315,7 +203,7 @@ class Worlds:
         engine_columns = self.state[:, : self.engine.state_size]
         return [
             Phase("restore engine", partial(self.engine.set_state, engine_columns, self.mask), engine=True),
-            Phase("restore counters", self._restore_counters),
+            Phase("restore counters", self.unpack_state),
             Phase("judge", partial(self._judge_state, keep_reason=True), by_world=True),
         ]
 
@@ -342,9 +230,9 @@ class Worlds:
         if (check_model := self.task.kernels.check_model) is not None:
             launch_lanes(check_model, self.nworld, [self.after, self._action_fault], self.device)
 
-    def _substep(self) -> None:
+    def _substep(self, kernel: wp.Kernel) -> None:
         args = [self.after, self.params]
-        launch_worlds(self.task.kernels.substep_memory, self.nworld, args, self.device)
+        launch_worlds(kernel, self.nworld, args, self.device)
 
     def _judge_step(self) -> None:
         """Find faults, advance task memory, and judge the transition."""
@@ -405,38 +293,39 @@ class Worlds:
         for name in names:
             launch_rows(state.fill_rows, mask, flat(self.engine.nominal[name])[0], flat(self.engine.arrays[name]))
 
-    def _redraw(self, mask: wp.array) -> None:
+    def _redraw(self, kernel: wp.Kernel, mask: wp.array) -> None:
         """Draw initial states of the masked worlds again while the task rejects them."""
-        wp.copy(self._drawing, mask)
+        wp.copy(self._rejected, mask)
         for _ in range(self.task.task.draws - 1):
             # on a device that runs behind, the launches go on with an empty mask instead
-            if not self.engine.capturable and not self._drawing.numpy().any():
+            if not self.engine.capturable and not self._rejected.numpy().any():
                 return
-            self.engine.refresh(self._drawing)
-            args = [self._drawing, self.after, self.params, self._drawing]
-            launch_worlds(self.task.kernels.reject_worlds, self.nworld, args, self.device)
-            self._restart(self._drawing, randomly=True, again=True)
+            self.engine.refresh(self._rejected)
+            args = [self._rejected, self.after, self.params, self._rejected]
+            launch_worlds(kernel, self.nworld, args, self.device)
+            self._restart(self._rejected, randomly=True, again=True)
             if self.task.reset_dynamics:
-                self.engine.apply_model(self._drawing)
+                self.engine.apply_model(self._rejected)
 
-    def _event(self) -> None:
+    def _event(self, kernel: wp.Kernel) -> None:
         """Run the events, and find the worlds that they changed: their physics, or anything."""
         written = self.task.writes["event"]
         live = {name: getattr(self.after, name) for name in self._copies if name in written}
         drawn = {name: self.engine.arrays[name] for name in self._model_copies}
         for name, array in (live | drawn).items():
             wp.copy(self._before_event(name), array)
-        launch_worlds(self.task.kernels.run_events, self.nworld, [
-            self.restarting, self.after, self.params, self.counters, self._going_on, self._moved, self.changed,
-            self._stale,
+        launch_worlds(kernel, self.nworld, [
+            self.restarting, self.after, self.params, self.counters, self._continuing, self._physics_changed,
+            self._changed, self._outdated,
         ], self.device)  # fmt: skip
         for name, array in (live | drawn).items():
             self._mark_changes(self._before_event(name), array, physics=name not in MEMORIES)
-        self.engine.commit(self._moved, [name for name in live if name not in MEMORIES])
+        self.engine.commit(self._physics_changed, [name for name in live if name not in MEMORIES])
 
     def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
         """Mark the worlds that go on and in which a field changed: it is physics, or the task's memory."""
-        args = [self._going_on, flat(before), flat(after), physics, self._moved, self.changed, self._stale]
+        found = [self._physics_changed, self._changed, self._outdated]
+        args = [self._continuing, flat(before), flat(after), physics, *found]
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _before_event(self, name: str) -> wp.array:
@@ -460,35 +349,10 @@ class Worlds:
         self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)
 
     def _read_state(self) -> None:
-        size = self.engine.state_size
-        self.engine.get_state(self.state[:, :size])
         # with automatic resets an end is over with its step, without them it stays
-        ended = self._no_fault if self.autoreset else self.outcome.done_reason
-        own = self.counters
-        counters = [own.step, own.key, own.episode, ended, self.state[:, size:]]
-        wp.launch(state.pack_counters, self.nworld, counters, device=self.device)
-        for array, columns in self._own_parts():
-            launch_rows(state.widen, self.everyone, array, columns)
-
-    def _restore_counters(self) -> None:
-        self.restore_counters(self.mask, self.state[:, self.engine.state_size :])
-        for array, columns in self._own_parts():
-            launch_rows(state.narrow, self.mask, columns, array)
-
-    def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
-        """Arrays that belong to the state beside the engine's and the counters, with their columns."""
-        arrays = {name: getattr(self, name) for name in MEMORIES}
-        arrays |= {"metrics": self.metric_sums, "success_steps": self.success_counts}
-        for name in own_parts(self.task):
-            yield arrays[name], self.state[:, self.state_space.parts[name]]
+        self.pack_state(self._no_fault if self.autoreset else self.outcome.done_reason)
 
     # parts of phases, and preparations, for environments and open-loop rollouts
-
-    def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
-        """Set the masked worlds' counters from columns of states."""
-        own = self.counters
-        counters = [mask, columns, own.step, own.key, own.episode, self.outcome.done_reason]
-        wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)
 
     def judge_transition(self, action: torch.Tensor) -> None:
         """Judge the transition from ``before`` to the current state under some actions, without looking for faults."""
@@ -508,14 +372,6 @@ class Worlds:
             launch_worlds(self.task.kernels.start_worlds, self.nworld, args, self.device)
         if self.task.dynamics:
             self.engine.apply_model(self.mask)
-
-    def set_mask(self, mask: torch.Tensor | None) -> None:
-        """Choose the worlds that the next reset or restored state concerns; None for all."""
-        if mask is None:
-            self.mask_view.fill_(True)
-        else:
-            check_tensor(mask, "a mask", self.mask_view)
-            self.mask_view.copy_(mask)
 
     def update_params(self) -> None:
         """Bring the parameters of the task into the array that kernels read."""

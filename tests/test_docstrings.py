@@ -23,7 +23,7 @@ def test_help_of_task_shows_every_function_and_every_attribute() -> None:
 
 
 @pytest.mark.parametrize("kind", [lw.Env, lw.Task, lw.NPGConfig, lw.Iteration, lw.OpenLoop, lw.Trajectory,
-                                  lw.MPPI, lw.MPPIConfig, lw.Planning])  # fmt: skip
+                                  lw.Planner, lw.MPPIConfig, lw.PlanSamples, lw.PlanUpdate, lw.Planning])  # fmt: skip
 def test_help_shows_every_attribute_docstring(kind: type) -> None:
     docs, text = attribute_docs(kind), " ".join(page(kind).replace("|", " ").split())
     assert docs

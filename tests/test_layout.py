@@ -22,19 +22,23 @@ LEVELS = {
     "actuators": 1, "fields": 1, "kernels": 1, "model_fields": 1, "options": 1, "task": 1,
     "graphs": 2, "spaces": 2,
     "binding": 3, "engines": 3,
-    "worlds": 4,
-    "env": 5,
-    "openloop": 6,
-    "algos": 7, "controllers": 7, "testing": 7,
-    "runs": 8,
-    "viz": 10,
-    "training": 11,
-    "adapters": 12, "viewer": 12,
-    "cli": 13, "gym": 13,
+    "world_arrays": 4,
+    "worlds": 5,
+    "env": 6,
+    "openloop": 7,
+    "algos": 8, "controllers": 8, "testing": 8,
+    "runs": 9,
+    "viz": 11,
+    "training": 12,
+    "adapters": 13, "viewer": 13,
+    "cli": 14, "gym": 14,
 }  # fmt: skip
 """The floor of every room: a room imports from lower floors, or from itself."""
 
-TESTED_BY = {"done": "test_faults.py", "forks": "test_env.py", "testing": "conformance", "support": "runs"}
+TESTED_BY = {
+    "done": "test_faults.py", "forks": "test_env.py", "support": "runs", "testing": "conformance",
+    "world_arrays": "test_worlds.py",
+}  # fmt: skip
 """Tests of rooms that have none of their own name."""
 
 NAMEDTUPLE = {"_fields", "_asdict", "_replace", "_make"}
@@ -171,6 +175,41 @@ PUBLIC = {
     for alias in node.names
 }
 """The public names and their modules, as type checkers see them."""
+
+
+UPSTREAM = "lyceum_warp.support.upstream"
+
+
+def private_names_of_others(tree: ast.AST) -> Iterator[str]:
+    """Private modules of other packages that a module imports, and private attributes of other packages' modules."""
+    modules = set()
+    for node in ast.walk(tree):
+        found = []
+        if isinstance(node, ast.Import):
+            found = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            found = [f"{node.module}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            found = [ast.unparse(node.args[0]).strip("'")]
+        for name in found:
+            if name.partition(".")[0] not in {"lyceum_warp", *sys.stdlib_module_names}:
+                if isinstance(node, ast.Import):
+                    modules |= {alias.asname or alias.name for alias in node.names}
+                if any(map(is_private, name.split("."))):
+                    yield name
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and is_private(node.attr) and ast.unparse(node.value) in modules:
+            yield ast.unparse(node)
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if name != UPSTREAM])
+def test_no_module_but_upstream_uses_private_names_of_other_packages(name: str) -> None:
+    found = list(private_names_of_others(TREES[name]))
+    assert not found, f"{name} uses {', '.join(found)}: reach it in {UPSTREAM}"
+
+
+def test_private_names_in_upstream_are_found() -> None:
+    assert set(private_names_of_others(TREES[UPSTREAM])) == {"wp._src", "mujoco_warp._src.collision_sdf"}
 
 
 def test_public_names_are_the_same_for_type_checkers_and_at_run_time() -> None:

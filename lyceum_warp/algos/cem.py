@@ -1,6 +1,6 @@
 """The cross-entropy method (CEM): planning by a normal distribution that is fitted to the best samples.
 
-The planner is that of ``mppi.py`` with another update. Its noise has a standard deviation s_t for each number of the
+The planner is that of ``planner.py`` with another update. Its noise has a standard deviation s_t for each number of the
 plan. From the n best samples (the elites) u_t^1, ..., u_t^n
 
     u_t = 1/n sum_k u_t^k,    s_t = max(sqrt(1/n sum_k (u_t^k - u_t)^2), min_noise)
@@ -12,27 +12,92 @@ over time, s_t is that of the noise before smoothing: the spread of the elites i
 a standard deviation of 1.
 """
 
-from lyceum_warp.algos.mppi import MPPI
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import warp as wp
+
+from lyceum_warp.algos.plan_update import PlanSamples, PlanUpdate, by_sample, launch_blocks
+from lyceum_warp.kernels import planning
 
 
-class CEM(MPPI):
-    """The cross-entropy method: ``lw.CEM(task, ...)`` is ``lw.MPPI(task, update="cem", ...)``.
+class EliteWeights(PlanUpdate):
+    """Equal weights of the best samples, and none of the others.
 
-    The new plan is the mean of the best samples, and their standard deviation becomes that of the noise, which is kept
-    between calls and starts again with ``reset``. In the names of other packages:
-
-    ============= =============== ========================
-    here          hydrax          judo
-    ============= =============== ========================
-    ``samples``   num_samples     num_rollouts
-    ``elites``    num_elites      num_elites
-    ``noise``     sigma_start     at most sigma_max
-    ``min_noise`` sigma_min       sigma_min
-    ``knots``     num_knots       num_nodes
-    ``spline``    spline_type     spline_order
-    ============= =============== ========================
-
-    Its arguments are those of ``lw.MPPI``, except ``update``.
+    Args:
+        elites: Number of the best samples.
     """
 
-    _update = "cem"
+    capturable = True
+
+    def __init__(self, elites: int) -> None:
+        self.elites = elites
+
+    def prepare(self, samples: PlanSamples) -> None:
+        """Allocate the samples' ranks."""
+        self._rank = torch.zeros_like(samples.returns, dtype=torch.int32)
+
+    def weigh(self, samples: PlanSamples) -> None:
+        """Weigh the best samples that did not fail."""
+        returns, weights, rank = (by_sample(rows) for rows in (samples.returns, samples.weights, self._rank))
+        plants, count = samples.returns.shape
+        wp.launch(planning.rank, plants * count, [returns, count, rank], device=returns.device)
+        args = [returns, rank, self.elites, weights, wp.from_torch(samples.summary)]
+        launch_blocks(planning.weigh_elites, plants, args)
+
+
+class CrossEntropy(EliteWeights):
+    """The update of CEM.
+
+    Args:
+        elites: Number of the best samples.
+        min_noise: The smallest standard deviation, as one number or one for each action.
+        smoothing: The weights that smooth the noise over time.
+    """
+
+    adapts_noise = True
+
+    def __init__(self, elites: int, min_noise: float | Sequence[float], smoothing: tuple[float, float, float]) -> None:
+        super().__init__(elites)
+        self.min_noise, self.smoothing = min_noise, smoothing
+
+    def prepare(self, samples: PlanSamples) -> None:
+        """Allocate the ranks, the smallest deviations and what smoothing leaves of a deviation.
+
+        Raises:
+            ValueError: ``min_noise`` is not for the task's actions.
+        """
+        super().prepare(samples)
+        count, _, nact = samples.plan.shape
+        smallest = np.asarray(self.min_noise)
+        if smallest.shape not in ((), (nact,)):
+            raise ValueError(f"min_noise must be a standard deviation or {nact} of them, not {self.min_noise!r}")
+        self._smallest, self._spread = (
+            torch.as_tensor(row, dtype=torch.float32, device=samples.plan.device)
+            for row in (np.full(nact, smallest), spread(self.smoothing, count))
+        )
+
+    def fit(self, samples: PlanSamples) -> None:
+        """Fit the standard deviations of the noise to the elites."""
+        weights, actions = by_sample(samples.weights), by_sample(samples.actions)
+        plan, before, after = samples.plan, samples.nominal_deviation, samples.deviation
+        assert before is not None and after is not None
+        rest = [wp.from_torch(t) for t in (plan, self._spread, self._smallest, before, samples.summary, after)]
+        launch_blocks(planning.fit_deviation, plan.numel(), [weights, actions, *rest])
+
+
+def spread(smoothing: tuple[float, float, float], count: int) -> np.ndarray:
+    """The standard deviation that smoothing gives standard normal noise, (count,) from the first step on.
+
+    For e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) the variances v_t and the covariances c_t of e_t and e_(t-1) follow
+    v_t = b0^2 + b1^2 v_(t-1) + b2^2 v_(t-2) + 2 b1 b2 c_(t-1) and c_t = b1 v_(t-1) + b2 c_(t-1).
+    """
+    b0, b1, b2 = smoothing
+    variance, covariance = [1.0, 1.0], 0.0
+    for _ in range(2, count):
+        new = b0 * b0 + b1 * b1 * variance[-1] + b2 * b2 * variance[-2] + 2 * b1 * b2 * covariance
+        covariance = b1 * variance[-1] + b2 * covariance
+        variance.append(new)
+    # a spread of 0 would divide by it
+    return np.sqrt(np.maximum(variance[:count], np.finfo(np.float32).tiny))

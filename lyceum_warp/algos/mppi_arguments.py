@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import torch
 
 from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig
+from lyceum_warp.algos.plan_update import PlanUpdate
 from lyceum_warp.binding.bound_task import task_spec
 from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.registry import task_name
@@ -93,7 +95,7 @@ def planner_arguments(
             raise ValueError(f"the task {name!r} has no parameter {word!r}: {_hint(word, known)}")
     place = place_samples(
         options.engine, options.device, nthread=options.nthread, samples=config.samples * config.models * plants,
-        has_noslip=lambda: _has_noslip(task, options),
+        spec=partial(task_spec, task, options.model), solver=options.physics.solver,
     )  # fmt: skip
     return config, options.changed(place), dict(planning.params if value is None else {}) | rest
 
@@ -156,6 +158,8 @@ def plain(value: Any) -> Any:
         return [plain(part) for part in value]
     if isinstance(value, mujoco.MjSpec):
         return f"MjSpec {value.modelname!r}"
+    if isinstance(value, PlanUpdate):
+        return repr(value)
     if isinstance(value, Path) or callable(value):
         return getattr(value, "__name__", str(value))
     return (value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)).tolist()
@@ -175,15 +179,6 @@ def _check_options(options: Mapping[str, Any]) -> None:
     for name in options:
         if name in _OWN_OPTIONS:
             raise ValueError(f"a planner takes no option {name}: {_OWN_OPTIONS[name]}")
-
-
-def _has_noslip(task: type[Task], options: EnvOptions) -> bool:
-    solver = options.physics.solver or {}
-    if "noslip_iterations" in solver:
-        return solver["noslip_iterations"] > 0
-    if options.model is None and not hasattr(task, "model"):
-        return False  # the environment reports what is missing
-    return task_spec(task, options.model).option.noslip_iterations > 0
 
 
 def _hint(word: str, known: Sequence[str]) -> str:

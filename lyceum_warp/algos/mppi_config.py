@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import torch
 
+from lyceum_warp.algos.plan_update import PlanUpdate
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.kernels.knots import ORDERS
 from lyceum_warp.spaces import Space
@@ -32,9 +33,9 @@ class MPPIConfig:
     """Steps of a plan."""
     samples: int = 64
     """Samples for each improvement of the plan; each is rolled out in a world of its own for each model."""
-    update: Literal["mppi", "cem", "predictive_sampling"] = "mppi"
+    update: Literal["mppi", "cem", "predictive_sampling"] | PlanUpdate = "mppi"
     """How samples become the new plan: their mean with weights exp(return / temperature) ("mppi"), the mean of the best
-    ones ("cem", the cross-entropy method), or the best one ("predictive_sampling")."""
+    ones ("cem", the cross-entropy method), the best one ("predictive_sampling"), or an object of your own."""
     temperature: float = 0.1
     """Temperature of MPPI's weights, in units of reward: a low one follows the best sample, a high one averages all."""
     elites: int | None = None
@@ -47,7 +48,7 @@ class MPPIConfig:
     tenth of ``noise``."""
     include_plan: bool | None = None
     """Whether the first sample is the plan itself, without noise. None is True where there are several samples, except
-    for CEM."""
+    for CEM and other updates that adapt the noise."""
     smoothing: tuple[float, float, float] = (0.25, 0.8, 0.0)
     """Weights (b0, b1, b2) that smooth the noise n over time: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) from the third
     step on. (1, 0, 0) is white noise. Noise of knots is not smoothed."""
@@ -90,6 +91,8 @@ class MPPIConfig:
         checked["fill"] = _fill(self.fill)
         for name, words in _WORDS.items():
             _one_of(name, getattr(self, name), words)
+        if not isinstance(self.update, PlanUpdate):
+            _one_of("update", self.update, UPDATES, ", or an object of a subclass of lw.PlanUpdate")
         if not isinstance(self.nominal_model, bool):
             raise ValueError(f"nominal_model must be True or False, not {self.nominal_model!r}")
         if self.include_plan is not None and not isinstance(self.include_plan, bool):
@@ -132,13 +135,16 @@ class MPPIConfig:
             ValueError: A setting does not apply to the update.
         """
         discount = getattr(value, "discount", None)
+        adapts = self.update.adapts_noise if isinstance(self.update, PlanUpdate) else self.update == "cem"
         chosen: dict[str, Any] = {
             "discount": 1.0 if discount is None else discount,
-            "include_plan": self.update != "cem" and self.samples > 1,
+            "include_plan": not adapts and self.samples > 1,
         }
+        if adapts and np.ndim(self.noise) == 2:
+            raise ValueError(
+                f"noise of update={self.update!r} must be standard deviations, not a covariance {self.noise!r}"
+            )
         if self.update == "cem":
-            if np.ndim(self.noise) == 2:
-                raise ValueError(f"noise of update='cem' must be standard deviations, not a covariance {self.noise!r}")
             chosen["elites"] = min(self.samples, max(2, self.samples // 10))
             chosen["min_noise"] = _tuples(0.1 * np.asarray(self.noise))
         else:
@@ -165,30 +171,10 @@ class MPPIConfig:
             f"not {self.noise!r}"
         )
 
-    def smallest_noise(self, nact: int) -> np.ndarray:
-        """The smallest standard deviation of CEM's noise for each action, (nact,).
-
-        Raises:
-            ValueError: ``min_noise`` is not for ``nact`` actions.
-        """
-        smallest = np.asarray(self.min_noise)
-        if smallest.shape not in ((), (nact,)):
-            raise ValueError(f"min_noise must be a standard deviation or {nact} of them, not {self.min_noise!r}")
-        return np.broadcast_to(smallest, nact)
-
-    def spread(self, count: int) -> np.ndarray:
-        """The standard deviation that smoothing gives standard normal noise, (count,) from the first step on.
-
-        For e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) the variances v_t and the covariances c_t of e_t and e_(t-1) follow
-        v_t = b0^2 + b1^2 v_(t-1) + b2^2 v_(t-2) + 2 b1 b2 c_(t-1) and c_t = b1 v_(t-1) + b2 c_(t-1).
-        """
-        b0, b1, b2 = (1.0, 0.0, 0.0) if self.knots is not None else self.smoothing
-        variance, covariance = [1.0, 1.0], 0.0
-        for _ in range(2, count):
-            new = b0 * b0 + b1 * b1 * variance[-1] + b2 * b2 * variance[-2] + 2 * b1 * b2 * covariance
-            covariance = b1 * variance[-1] + b2 * covariance
-            variance.append(new)
-        return np.sqrt(np.maximum(variance[:count], _SMALLEST))
+    @property
+    def noise_smoothing(self) -> tuple[float, float, float]:
+        """The weights that smooth the noise: ``smoothing``, or none for knots."""
+        return self.smoothing if self.knots is None else (1.0, 0.0, 0.0)
 
     def fill_action(self, space: Space) -> np.ndarray:
         """The action that fills the end of a plan and the whole first plan, within bounds, (nu,).
@@ -202,8 +188,11 @@ class MPPIConfig:
         return np.clip(np.broadcast_to(fill, space.size), space.low, space.high)
 
 
+UPDATES = ("mppi", "cem", "predictive_sampling")
+"""The names of the updates."""
+
 _WORDS = {
-    "update": ("mppi", "cem", "predictive_sampling"), "termination": ("stop", "ignore"), "spline": tuple(ORDERS),
+    "termination": ("stop", "ignore"), "spline": tuple(ORDERS),
     "risk": ("mean", "worst"),
 }  # fmt: skip
 """The values of the settings that are words."""
@@ -241,10 +230,10 @@ def _tuples(array: np.ndarray) -> Any:
     return array.item() if array.ndim == 0 else tuple(map(_tuples, array))
 
 
-def _one_of(name: str, value: Any, words: Sequence[str]) -> None:
+def _one_of(name: str, value: Any, words: Sequence[str], others: str = "") -> None:
     if not isinstance(value, str) or value not in words:
-        *others, last = map(repr, words)
-        raise ValueError(f"{name} must be {', '.join(others)} or {last}, not {value!r}")
+        *first, last = map(repr, words)
+        raise ValueError(f"{name} must be {', '.join(first)} or {last}{others}, not {value!r}")
 
 
 def _deviations(name: str, value: Any) -> Any:

@@ -33,7 +33,7 @@ _SPELLED = {
 _MOST_SUCCESS_STEPS = 2**24
 """Up to here a float32, as counts are kept, holds every whole number."""
 
-_MISSING = {"obs": 'the parts of its observation, as obs = {"position": 5}', "model": 'a model, as model = "robot.xml"'}
+_PARTS = 'the parts of its observation, as obs = {"position": 5}'
 
 
 def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSpec:
@@ -45,6 +45,9 @@ def _read_spec(task: type[Task], model: ModelSource | None) -> mujoco.MjSpec:
     """The model before the task's ``edit_model``."""
     if model is not None:
         return models.load_spec(model)
+    if not hasattr(task, "model"):
+        name = task_name(task)
+        raise ValueError(f'the task {name!r} has no model: add a model, as model = "robot.xml" to its class')
     return models.load_spec(task.model() if callable(task.model) else task.model, task)
 
 
@@ -88,7 +91,7 @@ def obs_layouts(task: type[Task], params: Mapping[str, Any]) -> dict[str, dict[s
     name = task_name(task)
     given = task.obs(SimpleNamespace(**params)) if callable(task.obs) else task.obs
     if not isinstance(given, Mapping) or not given:
-        raise ValueError(f"obs of the task {name!r} is {given!r}: add {_MISSING['obs']}")
+        raise ValueError(f"obs of the task {name!r} is {given!r}: add {_PARTS}")
     grouped = [isinstance(part, Mapping) for part in given.values()]
     if not any(grouped):
         given = {"policy": given}
@@ -146,7 +149,7 @@ class BoundTask:
         self.source = TaskSource(task, self.name)
         self.functions = self.source.functions
         self.types = {name: variable.type for name, variable in self.source.world.vars.items()}
-        self._check_class(model)
+        self._check_class()
         named = [name for name in dict.fromkeys([*self.types, *fields]) if name not in MEMORIES]
         for name in named:
             check_field_name(name)
@@ -251,7 +254,7 @@ class BoundTask:
             self.parameters.values = previous
             raise ValueError(f"{', '.join(params)} would change the observation's parts: make a new environment")
 
-    def _check_class(self, model: ModelSource | None) -> None:
+    def _check_class(self) -> None:
         task = self.task
         for name in MEMORIES:
             size = whole_number(f"{name} of the task {self.name!r}", getattr(task, name), low=0)
@@ -269,9 +272,8 @@ class BoundTask:
             for name in getattr(task, kind):
                 if name not in self.types:
                     raise ValueError(f"the task {self.name!r} wants {name!r} {kind} but does not list it in World")
-        for name in ("obs", "model"):
-            if not hasattr(task, name) and (name == "obs" or model is None):
-                raise ValueError(f"the task {self.name!r} has no {name}: add {_MISSING[name]} to its class")
+        if not hasattr(task, "obs"):
+            raise ValueError(f"the task {self.name!r} has no obs: add {_PARTS} to its class")
         whole_number(f"horizon of the task {self.name!r}", task.horizon, low=0)
         self._check_success_steps()
         if task.action_range is not None:

@@ -4,11 +4,11 @@ The functions of a task see one world. The generated source is the batch around 
 one more axis, a view of world w in it, and default functions. It is text, because Warp compiles source.
 """
 
+import dataclasses
 import linecache
 import re
 import threading
 from collections.abc import Mapping
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -76,12 +76,12 @@ def valid_model(s: World, lane: int, lanes: int) -> bool:
     return valid
 """
 
-_kernels: dict[Any, Any] = {}
+_kernels: dict[Any, steps.Kernels] = {}
 _MAKING = threading.RLock()
 _module_names: list[str] = []
 
 
-def kernels_of(source: TaskSource, groups: Mapping[str, wp.Function]) -> Any:
+def kernels_of(source: TaskSource, groups: Mapping[str, wp.Function]) -> steps.Kernels:
     """The kernels of a task, made once for the same functions and structs; see ``kernels.steps.make_kernels``.
 
     Args:
@@ -94,8 +94,9 @@ def kernels_of(source: TaskSource, groups: Mapping[str, wp.Function]) -> Any:
             scope = _generated(source, groups)
             functions = {name: function or scope[f"no_{name}"] for name, function in source.functions.items()}
             written = [name for name, function in source.functions.items() if function is not None]
-            module = _module_name(source.task)
-            _kernels[key] = steps.make_kernels(SimpleNamespace(**scope), functions, written, module=module)
+            given: dict[str, Any] = {"module": _module_name(source.task), "functions": functions, "written": written}
+            names = [field.name for field in dataclasses.fields(steps.TaskCode) if field.name not in given]
+            _kernels[key] = steps.make_kernels(steps.TaskCode(**given, **{name: scope[name] for name in names}))
         return _kernels[key]
 
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import warp as wp
 
+from lyceum_warp.support.upstream import builtin_functions
+
 
 class FunctionSource:
     """The source of a ``wp.func`` as it was when the function was made, even if its file has changed since.
@@ -95,7 +97,7 @@ def name_of(function: wp.Function) -> str:
 
 def builtin(name: str) -> Any:
     """Warp's builtin of a name, which may not be an attribute of the module, or Python's; None if there is none."""
-    return _BUILTINS.get(name) or getattr(wp, name, None) or getattr(builtins, name, None)
+    return builtin_functions().get(name) or getattr(wp, name, None) or getattr(builtins, name, None)
 
 
 def overloads(function: wp.Function) -> list[wp.Function]:
@@ -105,9 +107,6 @@ def overloads(function: wp.Function) -> list[wp.Function]:
     found = [*function.user_overloads.values(), *function.user_templates.values()]
     # without those that Warp made from a generic one
     return [overload for overload in found if overload.generic_parent is None] or [function]
-
-
-_BUILTINS: dict[str, Any] = wp._src.context.builtin_functions  # wp.tid and others are only here
 
 
 def _scope(function: Any) -> dict[str, Any]:

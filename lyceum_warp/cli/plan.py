@@ -10,9 +10,9 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.mppi_config import MPPIConfig
+from lyceum_warp.algos.planner import MPPI
 from lyceum_warp.binding.registry import find_task, snake_case, spelled_task, task_name
 from lyceum_warp.cli.arguments import (
     CameraWords,
@@ -157,7 +157,7 @@ class Plan:
         CheckedController(planner, plant).check_horizon(planner.horizon, every)
         find_camera(plant.model, camera)
         config = {
-            "algorithm": planner.config.update, "task": spelled_task(plant.task.task), "params": params,
+            "algorithm": planner.settings["update"], "task": spelled_task(plant.task.task), "params": params,
             "planner": planner.settings, "planner_params": planner_params,
             "planner_model": self.planner_model and str(_model(self.planner_model)),
             "value": self.value and str(self.value.resolve()), **vars(self.planner),
@@ -270,7 +270,8 @@ def _rate(options: Plan, episode: Trajectory) -> float | None:
 
 
 def _planner_name(planner: MPPI) -> str:
-    return {"mppi": "MPPI", "cem": "CEM", "predictive_sampling": "predictive sampling"}[planner.config.update]
+    update = planner.settings["update"]
+    return {"mppi": "MPPI", "cem": "CEM", "predictive_sampling": "predictive sampling"}.get(update, update)
 
 
 def _left(run: Run, whole: int, aborted: list[Trajectory], path: Path | None) -> str:

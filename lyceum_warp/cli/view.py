@@ -7,8 +7,8 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.mppi_arguments import task_config
+from lyceum_warp.algos.planner import MPPI
 from lyceum_warp.binding.registry import find_task, task_name
 from lyceum_warp.cli.arguments import NO_FLAGS, Repeated, given, optional_flags, parameters
 from lyceum_warp.cli.display import note

@@ -6,9 +6,9 @@ from typing import Annotated
 
 import tyro
 
-from lyceum_warp.algos.mppi import MPPI
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig
+from lyceum_warp.algos.planner import MPPI
 from lyceum_warp.cli.arguments import Physics, Placement, Repeated, parameters
 from lyceum_warp.cli.display import make_console
 from lyceum_warp.engines.memory import most_worlds

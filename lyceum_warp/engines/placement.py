@@ -2,7 +2,7 @@
 
 import importlib
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import mujoco
@@ -155,7 +155,8 @@ def place_samples(
     *,
     nthread: int | None,
     samples: int,
-    has_noslip: Callable[[], bool],
+    spec: Callable[[], mujoco.MjSpec],
+    solver: Mapping[str, int | float] | None = None,
 ) -> dict[str, Any]:
     """The options to change for a planner's worlds: engine="auto" on a GPU chooses by the number of samples.
 
@@ -164,13 +165,19 @@ def place_samples(
         device: The device that was asked for.
         nthread: Threads that the C engine would have, None for all cores.
         samples: Number of samples, one a world.
-        has_noslip: Says whether the planner's model has the noslip solver; only called where that decides.
+        spec: Reads the planner's model; only called if its noslip solver decides.
+        solver: The option ``solver`` of its physics.
 
     Raises:
         ValueError: This machine has no such device.
     """
     if engine != "auto" or not find_device(device).is_cuda:
         return {}
+
+    def has_noslip() -> bool:
+        given = (solver or {}).get("noslip_iterations")
+        return (spec().option.noslip_iterations if given is None else given) > 0
+
     enough = _SAMPLES_PER_CORE * min(_MOST_CORES, nthread or cpu_cores())
     if samples >= enough and (samples >= _NOSLIP * enough or not has_noslip()):
         return {"engine": "warp", "nthread": None}

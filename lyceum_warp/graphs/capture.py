@@ -16,13 +16,13 @@ import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import Any
 
 import torch
 import warp as wp
 
 from lyceum_warp.arrays import part_of_worlds
 from lyceum_warp.graphs.workers import Workers
+from lyceum_warp.support.upstream import separate_captures
 
 Calls = tuple[Callable[[], None], ...]
 """The result of ``Graphs.sequence``: functions to call in order."""
@@ -110,25 +110,7 @@ TIMED = 8
 """Calls of which the shortest counts: other programs interrupt some."""
 _CAPTURING = threading.RLock()
 """One capture at a time: controllers and viewers have environments in threads of their own."""
-
-
-class _PerThread(threading.local):
-    """An attribute of Warp's runtime that each thread has for itself, None at first."""
-
-    value: Any = None
-
-    def __get__(self, runtime: object, owner: type) -> Any:
-        return self.value
-
-    def __set__(self, runtime: object, value: Any) -> None:
-        self.value = value
-
-
-# Warp's library records launches on the CPU for the thread that began a capture, but its Python code takes the capture
-# for that of every thread: loops of other threads would become part of the graph, and their launches would replace the
-# arguments of its own.
-for _name in ("_apic_capture", "_apic_graph"):
-    setattr(wp._src.context.Runtime, _name, _PerThread())
+separate_captures()
 
 
 @contextlib.contextmanager

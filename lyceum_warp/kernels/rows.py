@@ -36,19 +36,19 @@ def mark_changes(
     before_in: wp.array2d[float],
     after_in: wp.array2d[float],
     physics: bool,
-    moved_inout: wp.array[bool],
+    physics_changed_inout: wp.array[bool],
     changed_inout: wp.array[bool],
-    stale_inout: wp.array[bool],
+    outdated_inout: wp.array[bool],
     lanes: int,
     first: int,
 ):
-    """Mark the masked worlds whose rows differ, as moved only where they are physics; launched over (nworld, lanes)."""
+    """Mark the masked worlds whose rows differ, apart where they are physics; launched over (nworld, lanes)."""
     k, lane = wp.tid()
     w = first + k
     if mask_in[w]:
         for i in range(lane, after_in.shape[1], lanes):
             if before_in[w, i] != after_in[w, i]:
                 if physics:
-                    moved_inout[w] = True
+                    physics_changed_inout[w] = True
                 changed_inout[w] = True
-                stale_inout[w] = True
+                outdated_inout[w] = True

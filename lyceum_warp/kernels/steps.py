@@ -1,7 +1,7 @@
 """The kernels of one step, around the functions of a task."""
 
+import dataclasses
 from collections.abc import Callable, Collection, Mapping
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -106,61 +106,85 @@ def hold_success(
         success_inout[w] = success_inout[w] and count_inout[w, 0] >= float(needed)
 
 
-def make_kernels(
-    generated: SimpleNamespace,
-    functions: Mapping[str, wp.Function],
-    written: Collection[str],
-    *,
-    module: str,
-) -> SimpleNamespace:
-    """Fuse a task's functions into the kernels of a step.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TaskCode:
+    """A task's structs and functions, with those that are generated around them for all worlds.
 
     Args:
-        generated: ``World`` and ``Params``, the structs of the task; ``Batch``, a struct of the task's fields for all
-            worlds, ``view``, the function from (batch, world) to ``World``, and ``copy_state``, which copies what steps
-            change; ``Observations``, a struct of the groups of observations, with ``observe_group``, ``finite_group``
-            and ``copy_observations``; ``finite_memory`` and ``valid_model``, which look for faults in what the task
-            itself wrote; ``has_state``, ``has_memory`` and ``checks_model``, whether these have anything to do.
+        module: Name of the Warp module that the kernels are compiled into, one for each task.
         functions: The task's functions by name, with defaults for those that it does not have.
         written: Names of the functions that the task has. Without ``control`` a scale and an offset map actions to
             controls; without ``evaluate`` the evaluation is the reward; without ``advance`` memory stays as it is.
-        module: Name of the Warp module that the kernels are compiled into, one for each task.
+        World: The task's struct of one world's fields.
+        Params: The task's struct of parameters.
+        Batch: A struct of the task's fields for all worlds.
+        Observations: A struct of the groups of observations.
+        view: The function from (batch, world) to ``World``.
+        copy_state: Copies what steps change.
+        observe_group: Writes a group of observations.
+        finite_group: Whether a group of observations is finite.
+        copy_observations: Copies all groups.
+        finite_memory: Whether the task's memory is finite.
+        valid_model: Whether the model fields that the task writes are valid.
+        has_state: Whether ``copy_state`` has anything to do.
+        has_memory: Whether ``finite_memory`` has.
+        checks_model: Whether ``valid_model`` has.
     """
-    Batch, Params, Observations = generated.Batch, generated.Params, generated.Observations  # noqa: N806
-    World = generated.World  # noqa: N806
-    view, observe_group = generated.view, generated.observe_group
-    finite_group, copy_observations = generated.finite_group, generated.copy_observations
-    finite_memory, valid_model = generated.finite_memory, generated.valid_model
-    copy_state = generated.copy_state
-    control, reward, measure = functions["control"], functions["reward"], functions["measure"]
-    evaluate, terminated, success = functions["evaluate"], functions["terminated"], functions["success"]
-    initialize, randomize, startup = functions["initialize"], functions["randomize"], functions["startup"]
-    reject, event = functions["reject"], functions["event"]
-    advance, substep = functions["advance"], functions["substep"]
-    has_control, has_evaluate, has_measure = (name in written for name in ("control", "evaluate", "measure"))
 
-    def kernel_if(needed: bool) -> Callable[[Any], Any]:
-        """Decorator: a kernel, or None for tasks that do not need it."""
-        return wp.kernel(module=module, enable_backward=False) if needed else lambda body: None
+    module: str
+    functions: Mapping[str, wp.Function]
+    written: Collection[str]
+    World: Any
+    Params: Any
+    Batch: Any
+    Observations: Any
+    view: wp.Function
+    copy_state: wp.Function
+    observe_group: wp.Function
+    finite_group: wp.Function
+    copy_observations: wp.Function
+    finite_memory: wp.Function
+    valid_model: wp.Function
+    has_state: bool
+    has_memory: bool
+    checks_model: bool
 
-    def kernel_for(function: str) -> Callable[[Any], Any]:
+    def kernel(self, needed: bool = True) -> Callable[[Any], Any]:
+        """Decorator: a kernel of the task's module, or None for tasks that do not need it."""
+        return wp.kernel(module=self.module, enable_backward=False) if needed else lambda body: None
+
+    def kernel_for(self, function: str) -> Callable[[Any], Any]:
         """Decorator: a kernel for tasks that have a function, and None for the others."""
-        return kernel_if(function in written)
+        return self.kernel(function in self.written)
 
-    @wp.func
-    def observe(group: int, s: World, p: Params, out: Observations, w: int, counters: Counters):
-        """Write a group of observations; its noise is a function of the counters alone."""
-        base = substream(stream(counters.key[w], counters.episode[w], counters.step[w]), OBSERVE)
-        observe_group(group, s, p, out, w, base, counters.rng[group * counters.step.shape[0] + w])
 
-    @kernel_if(generated.has_state)
+@dataclasses.dataclass(frozen=True)
+class ActKernels:
+    """From an action to controls, substeps and the task's memory."""
+
+    keep_before: wp.Kernel | None
+    act: wp.Kernel
+    check_model: wp.Kernel | None
+    control_worlds: wp.Kernel | None
+    substep_memory: wp.Kernel | None
+    advance_memory: wp.Kernel | None
+
+
+def act_kernels(task: TaskCode) -> ActKernels:
+    """Make the kernels of ``ActKernels`` around a task's functions."""
+    Batch, Params = task.Batch, task.Params  # noqa: N806
+    view, copy_state, valid_model = task.view, task.copy_state, task.valid_model
+    control, advance, substep = (task.functions[name] for name in ("control", "advance", "substep"))
+    has_control = "control" in task.written
+
+    @task.kernel(task.has_state)
     def keep_before(after: Batch, before_out: Batch, lanes: int, first: int):
         """Copy the fields that a step changes; launched over (nworld, lanes)."""
         k, lane = wp.tid()
         w = first + k
         copy_state(after, before_out, w, lane, lanes)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @task.kernel()
     def act(
         batch: Batch,
         params: wp.array[Params],
@@ -194,7 +218,7 @@ def make_kernels(
             ctrl_out[w, i] = wp.clamp(ctrl_out[w, i], range_in[i, 0], range_in[i, 1])
         counters.step[w] = counters.step[w] + 1
 
-    @kernel_if(generated.checks_model)
+    @task.kernel(task.checks_model)
     def check_model(batch: Batch, fault_inout: wp.array[int], lanes: int, first: int):
         """Find faults of the model fields that the task writes; launched over (nworld, lanes)."""
         k, lane = wp.tid()
@@ -202,7 +226,21 @@ def make_kernels(
         if not valid_model(view(batch, w), lane, lanes):
             fault_inout[w] = fault_inout[w] | MODEL
 
-    @kernel_for("advance")
+    @task.kernel_for("control")
+    def control_worlds(
+        batch: Batch, params: wp.array[Params], action_in: wp.array2d[float], ctrl_out: wp.array2d[float], first: int
+    ):
+        """Turn actions into controls and inputs, and nothing else; launched over (nworld,)."""
+        w = first + wp.tid()
+        control(view(batch, w), action_in[w], params[w % params.shape[0]], ctrl_out[w])
+
+    @task.kernel_for("substep")
+    def substep_memory(batch: Batch, params: wp.array[Params], first: int):
+        """Advance the task's memory by one substep; launched over (nworld,)."""
+        w = first + wp.tid()
+        substep(view(batch, w), params[w % params.shape[0]])
+
+    @task.kernel_for("advance")
     def advance_memory(
         before: Batch,
         after: Batch,
@@ -217,13 +255,39 @@ def make_kernels(
         p = params[w % params.shape[0]]
         advance(view(before, w), action_in[w], view(after, w), p, counters.rng[w])
 
-    @kernel_for("substep")
-    def substep_memory(batch: Batch, params: wp.array[Params], first: int):
-        """Advance the task's memory by one substep; launched over (nworld,)."""
-        w = first + wp.tid()
-        substep(view(batch, w), params[w % params.shape[0]])
+    return ActKernels(keep_before, act, check_model, control_worlds, substep_memory, advance_memory)
 
-    @kernel_if(generated.has_memory)
+
+@dataclasses.dataclass(frozen=True)
+class JudgeKernels:
+    """Transitions and states: rewards, ends, metrics and observations."""
+
+    check_memory: wp.Kernel | None
+    judge: wp.Kernel
+    conclude: wp.Kernel
+    observe_worlds: wp.Kernel
+    replace_observations: wp.Kernel
+    measure_worlds: wp.Kernel | None
+
+
+def judge_kernels(task: TaskCode) -> JudgeKernels:
+    """Make the kernels of ``JudgeKernels`` around a task's functions."""
+    Batch, Params, Observations, World = task.Batch, task.Params, task.Observations, task.World  # noqa: N806
+    view, finite_memory = task.view, task.finite_memory
+    finite_group, copy_observations = task.finite_group, task.copy_observations
+    reward, measure, evaluate, terminated, success = (
+        task.functions[name] for name in ("reward", "measure", "evaluate", "terminated", "success")
+    )
+    has_evaluate, has_measure = "evaluate" in task.written, "measure" in task.written
+    observe_group = task.observe_group
+
+    @wp.func
+    def observe(group: int, s: World, p: Params, out: Observations, w: int, counters: Counters):
+        """Write a group of observations; its noise is a function of the counters alone."""
+        base = substream(stream(counters.key[w], counters.episode[w], counters.step[w]), OBSERVE)
+        observe_group(group, s, p, out, w, base, counters.rng[group * counters.step.shape[0] + w])
+
+    @task.kernel(task.has_memory)
     def check_memory(
         mask_in: wp.array[bool], before: Batch, after: Batch, fault_inout: wp.array[int], lanes: int, first: int
     ):
@@ -233,7 +297,7 @@ def make_kernels(
         if mask_in[w] and not finite_memory(view(before, w), view(after, w), lane, lanes):
             fault_inout[w] = fault_inout[w] | NAN
 
-    @wp.kernel(module=module, enable_backward=False)
+    @task.kernel()
     def judge(
         mask_in: wp.array[bool],
         before: Batch,
@@ -288,7 +352,7 @@ def make_kernels(
                         found = OBSERVATION
             found_out.fault[part, w] = found
 
-    @wp.kernel(module=module, enable_backward=False)
+    @task.kernel()
     def conclude(
         mask_in: wp.array[bool],
         before: Batch,
@@ -369,73 +433,7 @@ def make_kernels(
             if fault != 0:
                 faults.count_faults(fault, fault_count_inout[w])
 
-    @wp.kernel(module=module, enable_backward=False)
-    def restart(
-        mask_in: wp.array[bool],
-        random: bool,
-        again: bool,
-        batch: Batch,
-        params: wp.array[Params],
-        counters: Counters,
-        first: int,
-    ):
-        """Begin an episode in the masked worlds, or draw its initial state again; launched over (nworld,).
-
-        The engine has already put them into the fixed initial state. A further draw goes on in the stream of the last.
-        """
-        w = first + wp.tid()
-        if not mask_in[w]:
-            return
-        if not again:
-            counters.step[w] = 0
-            counters.episode[w] = counters.episode[w] + 1
-            counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], 0)
-        p = params[w % params.shape[0]]
-        s = view(batch, w)
-        initialize(s, p)
-        if random:
-            randomize(s, p, counters.rng[w])
-
-    @kernel_for("reject")
-    def reject_worlds(
-        mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], again_out: wp.array[bool], first: int
-    ):
-        """Find the masked worlds whose initial state must be drawn again; launched over (nworld,)."""
-        w = first + wp.tid()
-        again_out[w] = mask_in[w] and reject(view(batch, w), params[w % params.shape[0]])
-
-    @kernel_for("startup")
-    def start_worlds(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], counters: Counters, first: int):
-        """Draw the model fields of the masked worlds once; launched over (nworld,)."""
-        w = first + wp.tid()
-        if mask_in[w]:
-            counters.rng[w, 0] = stream(counters.key[w], STARTUP, 0)
-            startup(view(batch, w), params[w % params.shape[0]], counters.rng[w])
-
-    @kernel_for("event")
-    def run_events(
-        restarting_in: wp.array[bool],
-        batch: Batch,
-        params: wp.array[Params],
-        counters: Counters,
-        mask_out: wp.array[bool],
-        moved_out: wp.array[bool],
-        changed_out: wp.array[bool],
-        stale_out: wp.array[bool],
-        first: int,
-    ):
-        """Run the events of the worlds that do not restart, ``mask_out``; launched over (nworld,)."""
-        w = first + wp.tid()
-        mask_out[w] = not restarting_in[w]
-        moved_out[w] = False
-        changed_out[w] = False
-        stale_out[w] = restarting_in[w]
-        if not restarting_in[w]:
-            at = stream(counters.key[w], counters.episode[w], counters.step[w])
-            counters.rng[w, 0] = substream(at, EVENT)
-            event(view(batch, w), params[w % params.shape[0]], counters.rng[w])
-
-    @wp.kernel(module=module, enable_backward=False)
+    @task.kernel()
     def observe_worlds(
         mask_in: wp.array[bool],
         batch: Batch,
@@ -462,7 +460,7 @@ def make_kernels(
             if parts == 1 and not finite:
                 copy_observations(good_in, obs_out, w, 0, 1)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @task.kernel()
     def replace_observations(
         mask_in: wp.array[bool],
         finite_in: wp.array2d[bool],
@@ -484,15 +482,7 @@ def make_kernels(
             if not finite:
                 copy_observations(good_in, obs_inout, w, lane, lanes)
 
-    @kernel_for("control")
-    def control_worlds(
-        batch: Batch, params: wp.array[Params], action_in: wp.array2d[float], ctrl_out: wp.array2d[float], first: int
-    ):
-        """Turn actions into controls and inputs, and nothing else; launched over (nworld,)."""
-        w = first + wp.tid()
-        control(view(batch, w), action_in[w], params[w % params.shape[0]], ctrl_out[w])
-
-    @kernel_for("measure")
+    @task.kernel_for("measure")
     def measure_worlds(
         batch: Batch, params: wp.array[Params], action_in: wp.array2d[float], metrics_out: wp.array2d[float], first: int
     ):
@@ -501,10 +491,115 @@ def make_kernels(
         s = view(batch, w)
         measure(s, action_in[w], s, params[w % params.shape[0]], metrics_out[w])
 
-    # An open-loop rollout keeps its fields for all steps: row t * nworld + w is world w after t steps. The
-    # transition of that row leads to the one nworld further, so `before` and `after` are the same arrays, shifted.
+    return JudgeKernels(check_memory, judge, conclude, observe_worlds, replace_observations, measure_worlds)
 
-    @wp.kernel(module=module, enable_backward=False)
+
+@dataclasses.dataclass(frozen=True)
+class BeginKernels:
+    """New episodes, and what is drawn in them or happens between two steps."""
+
+    restart: wp.Kernel
+    reject_worlds: wp.Kernel | None
+    start_worlds: wp.Kernel | None
+    run_events: wp.Kernel | None
+
+
+def begin_kernels(task: TaskCode) -> BeginKernels:
+    """Make the kernels of ``BeginKernels`` around a task's functions."""
+    Batch, Params = task.Batch, task.Params  # noqa: N806
+    view = task.view
+    initialize, randomize, startup, reject, event = (
+        task.functions[name] for name in ("initialize", "randomize", "startup", "reject", "event")
+    )
+
+    @task.kernel()
+    def restart(
+        mask_in: wp.array[bool],
+        random: bool,
+        again: bool,
+        batch: Batch,
+        params: wp.array[Params],
+        counters: Counters,
+        first: int,
+    ):
+        """Begin an episode in the masked worlds, or draw its initial state again; launched over (nworld,).
+
+        The engine has already put them into the fixed initial state. A further draw goes on in the stream of the last.
+        """
+        w = first + wp.tid()
+        if not mask_in[w]:
+            return
+        if not again:
+            counters.step[w] = 0
+            counters.episode[w] = counters.episode[w] + 1
+            counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], 0)
+        p = params[w % params.shape[0]]
+        s = view(batch, w)
+        initialize(s, p)
+        if random:
+            randomize(s, p, counters.rng[w])
+
+    @task.kernel_for("reject")
+    def reject_worlds(
+        mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], again_out: wp.array[bool], first: int
+    ):
+        """Find the masked worlds whose initial state must be drawn again; launched over (nworld,)."""
+        w = first + wp.tid()
+        again_out[w] = mask_in[w] and reject(view(batch, w), params[w % params.shape[0]])
+
+    @task.kernel_for("startup")
+    def start_worlds(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], counters: Counters, first: int):
+        """Draw the model fields of the masked worlds once; launched over (nworld,)."""
+        w = first + wp.tid()
+        if mask_in[w]:
+            counters.rng[w, 0] = stream(counters.key[w], STARTUP, 0)
+            startup(view(batch, w), params[w % params.shape[0]], counters.rng[w])
+
+    @task.kernel_for("event")
+    def run_events(
+        restarting_in: wp.array[bool],
+        batch: Batch,
+        params: wp.array[Params],
+        counters: Counters,
+        continuing_out: wp.array[bool],
+        physics_changed_out: wp.array[bool],
+        changed_out: wp.array[bool],
+        outdated_out: wp.array[bool],
+        first: int,
+    ):
+        """Run the events of the worlds that do not restart, ``continuing_out``; launched over (nworld,)."""
+        w = first + wp.tid()
+        continuing_out[w] = not restarting_in[w]
+        physics_changed_out[w] = False
+        changed_out[w] = False
+        outdated_out[w] = restarting_in[w]
+        if not restarting_in[w]:
+            at = stream(counters.key[w], counters.episode[w], counters.step[w])
+            counters.rng[w, 0] = substream(at, EVENT)
+            event(view(batch, w), params[w % params.shape[0]], counters.rng[w])
+
+    return BeginKernels(restart, reject_worlds, start_worlds, run_events)
+
+
+@dataclasses.dataclass(frozen=True)
+class RolloutKernels:
+    """Open-loop rollouts, which keep their fields for all steps."""
+
+    judge_rows: wp.Kernel
+    advance_rows: wp.Kernel | None
+
+
+def rollout_kernels(task: TaskCode) -> RolloutKernels:
+    """Make the kernels of ``RolloutKernels`` around a task's functions.
+
+    Row t * nworld + w is world w after t steps. The transition of that row leads to the one nworld further, so
+    ``before`` and ``after`` are the same arrays, shifted.
+    """
+    Batch, Params = task.Batch, task.Params  # noqa: N806
+    view = task.view
+    reward, terminated, advance = (task.functions[name] for name in ("reward", "terminated", "advance"))
+
+    @task.kernel()
     def judge_rows(
         before: Batch,
         after: Batch,
@@ -521,7 +616,7 @@ def make_kernels(
         reward_out[row] = reward(view(before, row), action_in[row], s1, p)
         terminated_out[row] = terminated(s1, p)
 
-    @kernel_for("advance")
+    @task.kernel_for("advance")
     def advance_rows(
         before: Batch,
         after: Batch,
@@ -543,25 +638,19 @@ def make_kernels(
             counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], counters.step[w] + t + 1)
             advance(view(before, row), action_in[row], view(after, row), p, counters.rng[w])
 
-    return SimpleNamespace(
-        Batch=Batch,
-        Observations=Observations,
-        keep_before=keep_before,
-        act=act,
-        check_model=check_model,
-        substep_memory=substep_memory,
-        advance_memory=advance_memory,
-        check_memory=check_memory,
-        judge=judge,
-        conclude=conclude,
-        start_worlds=start_worlds,
-        restart=restart,
-        reject_worlds=reject_worlds,
-        run_events=run_events,
-        observe_worlds=observe_worlds,
-        replace_observations=replace_observations,
-        control_worlds=control_worlds,
-        measure_worlds=measure_worlds,
-        judge_rows=judge_rows,
-        advance_rows=advance_rows,
-    )
+    return RolloutKernels(judge_rows, advance_rows)
+
+
+@dataclasses.dataclass(frozen=True)
+class Kernels(ActKernels, JudgeKernels, BeginKernels, RolloutKernels):
+    """The kernels of a step, and the structs of their arrays. None stands for a kernel that the task does not need."""
+
+    Batch: Any
+    Observations: Any
+
+
+def make_kernels(task: TaskCode) -> Kernels:
+    """Fuse a task's functions into the kernels of a step."""
+    parts = (make(task) for make in (act_kernels, judge_kernels, begin_kernels, rollout_kernels))
+    kernels = {name: kernel for part in parts for name, kernel in vars(part).items()}
+    return Kernels(**kernels, Batch=task.Batch, Observations=task.Observations)

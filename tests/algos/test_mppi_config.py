@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from plain_mppi import smoothed
 
 import lyceum_warp as lw
 from lyceum_warp import MPPI, MPPIConfig
@@ -74,15 +73,6 @@ def test_a_setting_out_of_range_is_refused_by_name(name: str, wrong: list[Any], 
 def test_drawn_models_exclude_the_nominal_one() -> None:
     with pytest.raises(ValueError, match="models=4 draws model fields, and nominal_model=True does not: leave out one"):
         MPPIConfig(models=4, nominal_model=True)
-
-
-@pytest.mark.parametrize("betas", [(0.25, 0.8, 0.0), (1.0, 0.0, 0.0), (0.5, 0.3, 0.2), (0.5, -0.9, -0.3)])
-@pytest.mark.parametrize("count", [1, 2, 12])
-def test_spread_is_what_smoothing_leaves_of_standard_normal_noise(betas: tuple[float, ...], count: int) -> None:
-    answers = smoothed(np.eye(count), betas)  # the answer of every step to an impulse at every other
-    spread = MPPIConfig(smoothing=betas).spread(count)  # type: ignore[arg-type]
-    np.testing.assert_allclose(spread, np.sqrt((answers**2).sum(1)))
-    assert (MPPIConfig(smoothing=betas, knots=4).spread(count) == 1).all()  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("smoothing", [(0.25, 0.8, 0.3), (1, 1, 0), (1, 0, 1), (1, 0, -1), (1, -1.5, 0), (1, 1.9, -1)])

@@ -130,9 +130,16 @@ def test_place_samples_chooses_by_the_number_of_samples(gpu: Any) -> None:
     """With engine="auto" on a GPU; an engine that was chosen stays."""
 
     def chosen(
-        samples: int, engine: str = "auto", device: str = "cuda:0", nthread: int = 2, noslip: bool = False
+        samples: int,
+        engine: str = "auto",
+        device: str = "cuda:0",
+        nthread: int = 2,
+        noslip: bool = False,
+        solver: dict[str, int | float] | None = None,
     ) -> Any:
-        return place_samples(engine, device, nthread=nthread, samples=samples, has_noslip=lambda: noslip)
+        spec = mujoco.MjSpec()
+        spec.option.noslip_iterations = 3 if noslip else 0
+        return place_samples(engine, device, nthread=nthread, samples=samples, spec=lambda: spec, solver=solver)
 
     on_gpu = {"engine": "warp", "nthread": None}
     assert [chosen(n) for n in (79, 80)] == [ON_CPU, on_gpu]
@@ -140,6 +147,8 @@ def test_place_samples_chooses_by_the_number_of_samples(gpu: Any) -> None:
     assert chosen(640, nthread=128) == on_gpu, "more than 16 cores were not measured"
     assert chosen(4096, device="cpu") == {}
     assert [chosen(n, noslip=True) for n in (160, 479, 480)] == [ON_CPU, ON_CPU, on_gpu]
+    assert chosen(160, noslip=True, solver={"noslip_iterations": 0}) == on_gpu
+    assert chosen(160, solver={"noslip_iterations": 3}) == ON_CPU
 
 
 def test_the_c_engine_refuses_a_gpu(model: mujoco.MjModel, gpu: Any) -> None:

@@ -9,7 +9,6 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
-from mujoco_warp._src import collision_sdf
 
 from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
@@ -26,6 +25,7 @@ from lyceum_warp.fields import Field, Stage, early_sensor_columns
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_columns, copy_rows, fill_rows, narrow, widen, zero_columns
 from lyceum_warp.model_fields import ModelField
+from lyceum_warp.support.upstream import has_sdf_functions
 from lyceum_warp.validate import whole_number
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
@@ -386,7 +386,7 @@ def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> muj
 
 def _check_sdf_plugins(model: mujoco.MjModel) -> None:
     """Refuse SDF plugins unless their distance function was registered with MuJoCo Warp, which has none itself."""
-    if (model.geom_plugin >= 0).any() and collision_sdf.user_sdf.func.__module__ == collision_sdf.__name__:
+    if (model.geom_plugin >= 0).any() and not has_sdf_functions():
         raise NotImplementedError("it has no functions of SDF plugins")
 
 

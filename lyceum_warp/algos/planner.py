@@ -1,0 +1,582 @@
+"""Planning by random rollouts: model predictive path integral control (MPPI), and two other updates of its plan.
+
+Each call improves a plan, a sequence of actions u_t, from the state that it is given:
+
+1. shift: the plan of the last call moves forward in time, and its end is filled;
+2. perturb: sample k adds smoothed noise e_t^k to the plan and is clipped to the actions' bounds; it gets a random
+   stream of its own, for what the task draws in it;
+3. roll out: each sample earns the return R_k, its discounted rewards and the value of the state where it ends; in
+   several models, the mean or the smallest of its returns;
+4. weigh: w_k = exp((R_k - max R) / temperature), divided by their sum;
+5. average: the new plan is u_t = sum_k w_k u_t^k.
+
+The formulation is that of Williams et al. (2017, "Information theoretic MPC for model-based reinforcement learning")
+without a cost on the controls, as in Lyceum (Summers et al. 2020) and in trajopt, which also is the source of the
+smoothing. Returns are divided by the temperature: the 5 of Summers et al. for their arm, an inverse, is 0.2 here.
+
+With several plants every plant has a plan, and the samples of all plans are rolled out together: a plan of few samples
+leaves most of a GPU, or most threads, without work.
+
+``update`` chooses other weights in step 4; the weights above are those of MPPI (``mppi.py``). CEM (``cem.py``) weighs
+the best samples equally, and fits the noise to them afterwards. Predictive sampling (``predictive_sampling.py``) takes
+the best sample. An update of a user's own does the same two things (``plan_update.py``): it weighs, and it fits. With
+knots all of this happens to the knots of a spline, from which the actions of steps 3 and 5 are interpolated
+(``kernels/knots.py``).
+"""
+
+import copy
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+import warp as wp
+
+from lyceum_warp.algos.cem import CrossEntropy
+from lyceum_warp.algos.mppi import ExponentialWeights
+from lyceum_warp.algos.mppi_arguments import explained_worlds, plain, planner_arguments, plant_seeds, words_of_update
+from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig
+from lyceum_warp.algos.networks import moved
+from lyceum_warp.algos.plan_update import PlanSamples, PlanUpdate, launch_blocks
+from lyceum_warp.algos.planner_state import checked_state, state_from_parts
+from lyceum_warp.algos.predictive_sampling import BestSample
+from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.arrays import flat, torch_view
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.env import Env
+from lyceum_warp.graphs.capture import Calls, Phase
+from lyceum_warp.kernels import knots, planning
+from lyceum_warp.openloop import OpenLoop
+from lyceum_warp.task import Task
+from lyceum_warp.validate import described, whole_number
+
+_BUFFERS = (
+    "actions", "nominal", "knot_actions", "standard_noise", "adapted_noise", "sampled", "model_returns", "returns",
+    "weights", "model_fields",
+)  # fmt: skip
+_MODELS = 0x6D6F64656C73  # "models": makes other seeds of the planner's
+_DRAWING = ("startup", "initialize", "randomize")
+"""The functions of a task that can draw model fields for a planner."""
+
+Value: TypeAlias = ValueFunction | wp.Function | Callable[[torch.Tensor], torch.Tensor]
+
+
+@document_attributes
+class Planner:
+    """A controller that plans again at every step: ``action = plan(state)``.
+
+    The planner simulates in worlds of its own, one for each sample. It controls a plant: an environment, with
+    ``plan(env.get_state()[0])``, or a robot, with ``plan(plan.state_of(qpos=..., qvel=..., time=...))``. The plant's
+    model, time step and parameters may differ from the planner's. Randomness is counted: a plan depends on the seed,
+    on the number of plans before it, and on the plan to start from. A task's functions draw from streams of each
+    sample's own, seeded by the planner: a plan cannot know what the plant will draw.
+
+    ``plants=n`` plans for n plants at a time, as ``env.step(plan(env.get_state()))`` in an environment with n worlds.
+    Plant i has the noise of the seed ``seed + i``, and so the plan that a planner with this seed makes on the same
+    engine; with ``models``, all plants have those of the first seed. The buffers, except ``model_fields``, then have an
+    axis for the plants: the second one where the first counts steps or knots, otherwise the first.
+
+    A task's ``planning`` (see ``lw.Planning``) gives settings of the planner, and options and parameters of its
+    worlds. Arguments replace what the task gives.
+
+    Args:
+        task: Name of a task, a file with one, or its class.
+        config: Settings in place of the task's.
+        value: Adds the value of the state where a sample ends to its return: a ``ValueFunction``, or a function from
+            (nworld, nobs) observations to (nworld,) values, or a Warp function of one observation,
+            ``value(obs: Row[float]) -> float``, which becomes part of the graph on the Warp engine. With a value the
+            parameters in ``planning`` do not apply, because the value function was fitted to the task's own rewards.
+        seed: Seed of the noise. With several plants, that of the first one, or a list with one for each.
+        plants: Number of plants to plan for.
+        params: Parameters of the task, for names that are also settings.
+        words: Single settings, by the names of ``lw.MPPIConfig`` (None leaves one as it is), and ``update`` may be an
+            object of your own, see ``lw.PlanUpdate``; options of the planner's worlds, as for ``lw.make``; and
+            parameters of the task. (One value for each world: the worlds of a sample, one for each model, follow one
+            another, and so do the samples of a plant.) With a CUDA device and engine="auto", the C engine on the CPU
+            rolls out few samples, because it is faster there; plans then lie on the CPU.
+
+    Raises:
+        ValueError: An argument is unknown, ambiguous or not valid, or the samples do not fit into memory.
+        FileNotFoundError: A model or task file is missing.
+    """
+
+    config: MPPIConfig
+    """The settings in force."""
+    plants: int
+    """Number of plants."""
+    settings: dict[str, Any]
+    """The same settings with the options and parameters of the planner's worlds, as JSON can hold them."""
+    actions: torch.Tensor
+    """The plan, (horizon, nact); the first row is what the last call returned. To start from another plan, write into
+    it; with knots, into ``knot_actions``."""
+    nominal: torch.Tensor
+    """The plan that the last improvement started from, (horizon, nact)."""
+    knot_actions: torch.Tensor
+    """The plan's knots, (nknot, nact), some of which lie beyond the horizon; without knots, ``actions``."""
+    standard_noise: torch.Tensor
+    """The last improvement's standard normal numbers, (horizon, samples, nact), or (nknot, samples, nact)."""
+    adapted_noise: torch.Tensor | None
+    """The standard deviations that CEM adapted for the next improvement, (horizon, nact) or (nknot, nact), before
+    smoothing. None for updates that adapt none."""
+    sampled: torch.Tensor
+    """The last improvement's actions, (horizon, samples, nact)."""
+    model_fields: dict[str, torch.Tensor]
+    """The model fields of each model, (models, size) float64; empty with one model. A call reads them."""
+    model_returns: torch.Tensor
+    """The samples' returns in each model, (samples, models); minus infinity for those that failed."""
+    returns: torch.Tensor
+    """The samples' returns, (samples,); minus infinity for those that failed."""
+    weights: torch.Tensor
+    """The samples' weights, (samples,)."""
+
+    _only_update: str | None = None  # of a subclass: the only update that it has
+
+    def __init__(
+        self,
+        task: str | type[Task],
+        config: MPPIConfig | None = None,
+        *,
+        value: Value | None = None,
+        seed: int | Sequence[int] = 0,
+        plants: int = 1,
+        params: Mapping[str, Any] | None = None,
+        **words: Any,
+    ) -> None:
+        if value is not None and not callable(value):
+            raise ValueError(f"value must be a function of observations, or None, not {described(value)}")
+        self.plants = whole_number("plants", plants, low=1)
+        seeds = plant_seeds(seed, self.plants)
+        task = find_task(task)
+        words = words_of_update(self._only_update, words)
+        self.config, options, own_params = planner_arguments(task, config, words, params, value, self.plants)
+        self.horizon, self.samples, self.iterations = self.config.horizon, self.config.samples, self.config.iterations
+        self.temperature, self.discount = self.config.temperature, self.config.discount
+        self.termination = self.config.termination
+
+        self.settings = plain(options.given() | own_params | vars(self.config))
+        nworld = self.plants * self.samples * self.config.models
+        with explained_worlds(self.config, self.plants):
+            self.env = Env(task, options, nworld=nworld, autoreset=False, horizon=0, **own_params)
+        drawn = self._drawn_fields()
+        self.env.reset()
+        self.timestep = self.env.timestep
+        self._initial = self.env.get_state()[0]
+        for name, row in self.env.engine.nominal.items():  # a robot has the nominal model, not one that startup drew
+            self._initial[self.env.state_space.parts[name]] = torch_view(flat(row))[0].double()
+        if "lasting_memory" in self.env.task.writes.get("startup", ()):
+            self._initial[self.env.state_space.parts["lasting_memory"]] = 0.0
+        with wp.ScopedDevice(self.env.device):
+            self._keys = wp.zeros(nworld, dtype=wp.uint32)
+            shapes = {name: (self.config.models, self.env.state_space.parts[name]) for name in drawn}
+            fields = {
+                n: wp.zeros((rows, part.stop - part.start), dtype=wp.float64) for n, (rows, part) in shapes.items()
+            }
+        self.model_fields = {name: torch_view(rows) for name, rows in fields.items()}
+        with explained_worlds(self.config, self.plants):
+            self._loop = OpenLoop(
+                self.env, self.horizon, keys=self._keys, nominal_model=self.config.nominal_model, models=fields,
+                states=self.plants,
+            )  # fmt: skip
+        self._update = _update_of(self.config)
+        self._allocate()
+        self._update.prepare(self._arrays)
+        self._take_value(value)
+        first, others = self._program(first=True), self._program(first=False)
+        self._calls = first + others * (self.iterations - 1)
+        self.reset(seeds)
+        self._made = True
+
+    def _drawn_fields(self) -> list[str]:
+        """Names of the model fields that differ between the planner's models."""
+        if self.config.models == 1:
+            return []
+        bound = self.env.task
+        written = frozenset().union(*(bound.writes.get(name, frozenset()) for name in _DRAWING))
+        if not (drawn := [field.name for field in bound.dynamics if field.name in written]):
+            raise ValueError(
+                f"models={self.config.models} needs a task that draws model fields, and {bound.name!r} draws none: "
+                "write them in its startup or randomize, as s.body_mass[1] = s.body_mass[1] * lw.uniform(rng, 0.8, 1.2)"
+            )
+        return drawn
+
+    def _take_value(self, value: Value | None) -> None:
+        """Take the value function, and check that it fits the task's observations."""
+        self.value = value
+        self._value_kernel, self._value_in_torch = None, False
+        group = getattr(value, "group", "policy") if isinstance(value, ValueFunction) else "policy"
+        if group not in self._loop.final_obs_groups:
+            groups = ", ".join(map(repr, self._loop.final_obs_groups))
+            raise ValueError(
+                f"value takes the observations {group!r}, and the task {self.env.task.name!r} has {groups}: give a "
+                "value function that was trained on this task"
+            )
+        self._value_obs = self._loop.final_obs_groups[group]
+        if isinstance(value, ValueFunction):
+            self.value = moved(value, self.env)
+            wanted, found = value.shape["nobs"], self._value_obs.shape[1]
+            if wanted != found:
+                raise ValueError(
+                    f"value takes {wanted} observations, and the task {self.env.task.name!r} has {found}: give a value "
+                    "function that was trained on this task"
+                )
+        if isinstance(value, wp.Function):
+            self._value_kernel = planning.value_kernel(value)
+        elif value is not None:
+            self._value_in_torch = True
+            try:
+                self._torch_values()
+            except RuntimeError as error:  # its weights lie elsewhere, or it takes other observations
+                observations = described(self._value_obs)
+                raise ValueError(f"value cannot take observations {observations}: {error}") from error
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if "_made" in self.__dict__:
+            if name in (*SETTINGS, "config", "value", "seed", "plants"):
+                raise AttributeError(
+                    f"{name} is part of the planner's graphs: make another {type(self).__name__} with {name}={value!r}"
+                )
+            if name in _BUFFERS:
+                raise AttributeError(
+                    f"plan.{name} is a buffer of fixed address: write into it, as plan.{name}.copy_(...)"
+                )
+        super().__setattr__(name, value)
+
+    def _allocate(self) -> None:
+        config, space, loop = self.config, self.env.action_space, self._loop
+        nact, nworld, plants = space.size, self.env.nworld, self.plants
+        self._nsample = plants * self.samples
+        factor = config.noise_factor(nact)
+        self._diagonal = not np.tril(factor, -1).any()
+        self._repeat = config.fill == "repeat"
+        self._smoothing = wp.vec3(*config.noise_smoothing)
+        with wp.ScopedDevice(self.env.device):
+            self._low: wp.array = wp.array(space.low, dtype=float)
+            self._high: wp.array = wp.array(space.high, dtype=float)
+            self._fill: wp.array = wp.array(config.fill_action(space), dtype=float)
+            self._scale: wp.array = wp.array(factor, dtype=float)
+            self._first_deviation: wp.array = wp.array(np.diag(factor), dtype=float)
+            self._terminal, self._world_return = (wp.zeros(nworld, dtype=float) for _ in range(2))
+            self._weight: Any = wp.zeros(self._nsample, dtype=float)
+            self._summary: Any = wp.zeros((plants, 4), dtype=float)
+            self._seed, self._count, self._shift, self._phase = (wp.zeros(plants, dtype=int) for _ in range(4))
+            shape = (self.horizon, plants, nact)
+            self._actions, self._nominal_actions = (wp.zeros(shape, dtype=float) for _ in range(2))
+            self._world_actions: Any = wp.from_torch(loop.actions)
+            # the rows of plans and samples: knots, or without them the actions themselves
+            if config.knots:
+                self._spline = config.knots, knots.ORDERS[config.spline]
+                rows = knots.knot_count(self.horizon, config.knots, config.spline)
+                self._plan: Any = wp.zeros((rows, plants, nact), dtype=float)
+                self._nominal: Any = wp.zeros_like(self._plan)
+                self._passed = wp.zeros(plants, dtype=int)
+            else:
+                self._spline, rows = (self.horizon, 0), self.horizon
+                self._plan, self._nominal, self._passed = self._actions, self._nominal_actions, self._shift
+            self._noise = wp.zeros((rows, self._nsample, nact), dtype=float)
+            self._samples: Any = self._world_actions
+            if config.knots or config.models > 1:
+                self._samples = wp.zeros((rows, self._nsample, nact), dtype=float)
+            self._return: Any = self._world_return if config.models == 1 else wp.zeros(self._nsample, dtype=float)
+            self._deviation, self._nominal_deviation = (
+                wp.zeros_like(self._plan) if self._update.adapts_noise else None for _ in range(2)
+            )
+        self._earned = [wp.from_torch(buffer) for buffer in (loop.reward, loop.terminated, loop.fault)]
+        by_plant = plants, self.samples
+        self._arrays = PlanSamples(
+            returns=torch_view(self._return).view(by_plant), weights=torch_view(self._weight).view(by_plant),
+            actions=torch_view(self._samples).unflatten(1, by_plant), nominal=torch_view(self._nominal),
+            plan=torch_view(self._plan), summary=torch_view(self._summary),
+            nominal_deviation=_view(self._nominal_deviation), deviation=_view(self._deviation),
+        )  # fmt: skip
+        self.actions, self.nominal, self.knot_actions = (
+            self._by_plant(torch_view(plan), 1) for plan in (self._actions, self._nominal_actions, self._plan)
+        )
+        self.standard_noise = self._by_plant(torch_view(self._noise).unflatten(1, by_plant), 1)
+        self.sampled = self._by_plant(loop.actions[:, :: config.models].unflatten(1, by_plant), 1)
+        deviation = self._arrays.deviation
+        self.adapted_noise = None if deviation is None else self._by_plant(deviation, 1)
+        model_returns = torch_view(self._world_return).view(*by_plant, config.models)
+        self.returns, self.weights, self.model_returns = (
+            self._by_plant(rows, 0) for rows in (self._arrays.returns, self._arrays.weights, model_returns)
+        )
+        self._action = self.actions[0]
+        self._terminal_view, self._shift_view = torch_view(self._terminal), torch_view(self._shift)
+
+    def _by_plant(self, rows: torch.Tensor, axis: int) -> torch.Tensor:
+        """A buffer with an axis for the plants, which it has only if there are several."""
+        return rows.squeeze(axis) if self.plants == 1 else rows
+
+    @torch.no_grad()
+    def __call__(self, state: torch.Tensor, obs: torch.Tensor | None = None, *, shift: int = 1) -> torch.Tensor:
+        """Improve the plan from a state, or the plans from one state each.
+
+        Args:
+            state: (state_space.size,) float64, or one row of states: from ``get_state`` of an environment of the same
+                task, on either engine, or from ``state_of``. With several plants (plants, state_space.size).
+            obs: Not used; every controller is called with observations.
+            shift: Steps since the last call's states.
+
+        Returns:
+            The action to take now, (nu,), or with several plants (plants, nu), on the states' device.
+
+        Raises:
+            ValueError: The state has another shape or type, or is not finite.
+        """
+        self.env.check_process()
+        self._loop.state.copy_(checked_state(self.env, state, self._loop.state))
+        self._shift_view.fill_(whole_number("shift", shift, low=0))
+        for call in self._calls:
+            call()
+        return self._action.to(state.device, copy=True)
+
+    def _program(self, *, first: bool) -> Calls:
+        """The calls of one improvement, of which ``first`` moves the plan forward in time."""
+        parts: list[Phase | Callable[[], None]] = [Phase("perturb", partial(self._perturb, first)), *self._loop.phases]
+        if self._value_in_torch:
+            parts.append(self._evaluate)
+        if self._update.capturable:
+            parts += [Phase("weigh", self._weigh), Phase("average", self._average)]
+        else:
+            parts += [
+                Phase("returns", self._add_up), self._weigh_in_torch, Phase("average", self._average_samples),
+                self._fit_in_torch,
+            ]  # fmt: skip
+        return self._sequence(parts)
+
+    def _sequence(self, parts: Iterable[Phase | Callable[[], None]]) -> Calls:
+        """The calls that run some phases, in as few graphs as possible, and functions of torch between them."""
+        calls: list[Any] = []
+        for is_phase, group in itertools.groupby(parts, lambda part: isinstance(part, Phase)):
+            some: Any = list(group)
+            calls += self._loop.sequence(some) if is_phase else some
+        return tuple(calls)
+
+    def _perturb(self, first: bool) -> None:
+        """The plans to start from, and the samples around them."""
+        device = self.env.device
+        if first and self._passed is not self._shift:
+            passed = [self._shift, self.horizon, self._spline[0], self._phase, self._passed]
+            wp.launch(knots.pass_knots, self.plants, passed, device=device)
+        self._shifted(first, self._plan, self._fill, self._repeat, self._nominal)
+        self._interpolate(self._nominal, self._nominal_actions)
+        dim = (self._nsample, self._plan.shape[2])
+        wp.launch(planning.draw_noise, dim, [self._seed, self._count, self._noise], device=device)
+        wp.launch(planning.draw_keys, self.env.nworld, [self._seed, self._count, self._keys], device=device)
+        wp.launch(planning.count_up, self.plants, [self._count], device=device)
+        bounds = [self._smoothing, bool(self.config.include_plan), self._low, self._high, self._samples]
+        if self._deviation is not None and self._nominal_deviation is not None:
+            self._shifted(first, self._deviation, self._first_deviation, False, self._nominal_deviation)
+            around = [self._nominal, self._noise, self._nominal_deviation, *bounds]
+            wp.launch(planning.perturb_adapted, dim, around, device=device)
+        else:
+            around = [self._nominal, self._noise, self._scale, self._diagonal, *bounds]
+            wp.launch(planning.perturb, dim, around, device=device)
+        self._interpolate(self._samples, self._world_actions)
+
+    def _shifted(self, first: bool, rows: wp.array, fill: wp.array, repeat: bool, target: wp.array) -> None:
+        """Rows of a plan, moved forward in time by the first improvement."""
+        if first:
+            shifted = [rows, self._passed, fill, repeat, target]
+            wp.launch(planning.shift_plan, rows.shape, shifted, device=self.env.device)
+        else:
+            wp.copy(target, rows)
+
+    def _interpolate(self, rows: wp.array, actions: wp.array) -> None:
+        """The actions of plans or samples, unless both are one array."""
+        if rows is not actions:
+            args = [rows, self._phase, *self._spline, self._low, self._high, actions]
+            wp.launch(knots.interpolate, actions.shape, args, device=self.env.device)
+
+    def _add_up(self) -> None:
+        """Returns of the samples that were rolled out."""
+        config, device = self.config, self.env.device
+        if self._value_kernel is not None:
+            values = [wp.from_torch(self._value_obs), self._terminal]
+            wp.launch(self._value_kernel, self.env.nworld, values, device=device)
+        returns = [*self._earned, self._terminal, self.discount, self.termination == "stop", self._world_return]
+        wp.launch(planning.add_up, self.env.nworld, returns, device=device)
+        if config.models > 1:
+            combined = [self._world_return, config.risk == "worst", self._return]
+            wp.launch(planning.combine_models, self._nsample, combined, device=device)
+
+    def _weigh(self) -> None:
+        """Returns of the samples that were rolled out, and their weights."""
+        self._add_up()
+        self._update.weigh(self._arrays)
+
+    def _average_samples(self) -> None:
+        """The new plan, the weighted mean of the samples."""
+        plan = [self._weight, self._samples, self._nominal, self._summary, self._plan]
+        launch_blocks(planning.average, self._plan.size, plan)
+
+    def _average(self) -> None:
+        """The new plan, and what the update fits to the samples."""
+        self._average_samples()
+        self._update.fit(self._arrays)
+        self._interpolate(self._plan, self._actions)
+
+    def _weigh_in_torch(self) -> None:
+        """The weights of an update that is not capturable, and the summary."""
+        arrays = self._arrays
+        if (returned := self._update.weigh(arrays)) is not None:
+            raise ValueError(
+                f"weigh of {type(self._update).__name__} must write into samples.weights and return None, not "
+                f"{described(returned)}"
+            )
+        good = torch.isfinite(arrays.returns)
+        earned = torch.where(good, arrays.returns, 0.0).sum(1) / good.sum(1)
+        effective = 1 / arrays.weights.square().sum(1)
+        columns = arrays.returns.amax(1), earned, effective, (~good).sum(1).float()
+        torch.stack(columns, 1, out=arrays.summary)
+
+    def _fit_in_torch(self) -> None:
+        self._update.fit(self._arrays)
+        self._interpolate(self._plan, self._actions)
+
+    def _evaluate(self) -> None:
+        self._terminal_view.copy_(self._torch_values())
+
+    def _torch_values(self) -> torch.Tensor:
+        """Values of the states where the samples end, (nworld,)."""
+        obs, nworld = self._value_obs, self.env.nworld
+        if isinstance(self.value, ValueFunction):
+            steps = self._loop.states[:, self.env.state_space.parts["step"]] + self.horizon
+            values = self.value(obs, steps.float().expand(-1, nworld // self.plants).reshape(nworld))
+        else:
+            values = self.value(obs)  # type: ignore[misc]
+        if not isinstance(values, torch.Tensor) or values.numel() != nworld:
+            raise ValueError(
+                f"value must return {nworld} numbers for {tuple(obs.shape)} observations, not {described(values)}"
+            )
+        return values.view(nworld)
+
+    def reset(self, seed: int | Sequence[int] | None = None, *, where: torch.Tensor | None = None) -> None:
+        """Forget the plan and the adapted noise, and start the noise again.
+
+        Args:
+            seed: Another seed, also of the models that the planner draws. With several plants, plant i gets the seed
+                ``seed + i``; a list has a seed for each. Models are drawn with the first seed.
+            where: The plants whose plans to forget, (plants,) bool; by default all. The others keep their seeds, and
+                the planner its models.
+
+        Raises:
+            ValueError: A seed is not a whole number from 0, or ``where`` has another shape or type.
+        """
+        if where is not None:
+            if not isinstance(where, torch.Tensor) or (where.shape, where.dtype) != ((self.plants,), torch.bool):
+                raise ValueError(f"where must be a bool tensor of shape ({self.plants},), not {described(where)}")
+            where = where.to(self.actions.device)
+        if seed is not None:
+            seeds = plant_seeds(seed, self.plants)
+            _put(torch_view(self._seed), torch.tensor(seeds, dtype=torch.int32, device=self.actions.device), where)
+            if where is None and self.model_fields:
+                self._draw_models(seeds[0])
+        for counter in (torch_view(self._count), torch_view(self._phase)):
+            _put(counter, torch.zeros_like(counter), where)
+        rows = None if where is None else where[:, None]
+        for plan in (self._plan, self._actions):
+            _put(torch_view(plan), torch_view(self._fill), rows)
+        if self._arrays.deviation is not None:
+            _put(self._arrays.deviation, torch_view(self._first_deviation), rows)
+
+    @property
+    def seeds(self) -> list[int]:
+        """Seed of each plant's noise."""
+        return [int(seed) for seed in self._seed.numpy()]
+
+    def _draw_models(self, seed: int) -> None:
+        """Draw the planner's models with the task's functions, from streams that no plant of this seed has."""
+        self.env.rand_reset(int(np.random.SeedSequence([seed, _MODELS]).generate_state(1)[0]) >> 1)
+        states = self.env.get_state()[: self.config.models]
+        for name, rows in self.model_fields.items():
+            rows.copy_(states[:, self.env.state_space.parts[name]])
+
+    def state_of(self, **parts: Any) -> torch.Tensor:
+        """A state from its parts, as a robot knows them; the rest is as the task's fixed reset leaves it.
+
+        Model fields have their nominal values unless they are given, as ``body_mass=...``.
+
+        The rest includes fields that a task reads as the last substep left them: they affect only the first transition
+        of a plan. A ``time`` sets the step counter, too, unless ``step`` is given.
+
+        Args:
+            parts: Values for parts of ``env.state_space``: qpos, qvel, time, mocap_pos, ...
+
+        Returns:
+            (state_space.size,) float64.
+
+        Raises:
+            ValueError: A part is unknown, or its value has another size or is not a number.
+        """
+        return state_from_parts(self.env, self._initial, parts)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Best and mean return, effective number and failures of the last improvement's samples.
+
+        Numbers, or with several plants (plants,) float32 on the CPU.
+        """
+        names = ("best_return", "mean_return", "effective_samples", "failed_samples")
+        columns = self._summary.numpy().T
+        if self.plants == 1:
+            return dict(zip(names, columns[:, 0].tolist(), strict=True))
+        return {name: torch.tensor(column) for name, column in zip(names, columns, strict=True)}
+
+
+def _view(array: Any) -> torch.Tensor | None:
+    return None if array is None else torch_view(array)
+
+
+def _put(target: torch.Tensor, values: torch.Tensor, where: torch.Tensor | None) -> None:
+    """Write values, which may be one for all, into the rows of a mask; without a mask, into all rows."""
+    target.copy_(values.expand_as(target) if where is None else torch.where(where, values, target))
+
+
+def _update_of(config: MPPIConfig) -> PlanUpdate:
+    """The update that a planner's settings name, or a copy of the object that they hold."""
+    if isinstance(config.update, PlanUpdate):
+        return copy.copy(config.update)
+    if config.update == "cem":
+        assert config.elites is not None and config.min_noise is not None
+        return CrossEntropy(config.elites, config.min_noise, config.noise_smoothing)
+    return ExponentialWeights(config.temperature) if config.update == "mppi" else BestSample()
+
+
+class MPPI(Planner):  # noqa: D101
+    __doc__ = f"Model predictive path integral control, or with ``update`` another planner.\n\n{Planner.__doc__}"
+
+
+class CEM(MPPI):
+    """The cross-entropy method: ``lw.CEM(task, ...)`` is ``lw.MPPI(task, update="cem", ...)``.
+
+    The new plan is the mean of the best samples, and their standard deviation becomes that of the noise, which is kept
+    between calls and starts again with ``reset``. In the names of other packages:
+
+    ============= =============== ========================
+    here          hydrax          judo
+    ============= =============== ========================
+    ``samples``   num_samples     num_rollouts
+    ``elites``    num_elites      num_elites
+    ``noise``     sigma_start     at most sigma_max
+    ``min_noise`` sigma_min       sigma_min
+    ``knots``     num_knots       num_nodes
+    ``spline``    spline_type     spline_order
+    ============= =============== ========================
+
+    Its arguments are those of ``lw.MPPI``, except ``update``.
+    """
+
+    _only_update = "cem"
+
+
+class PredictiveSampling(MPPI):
+    """Predictive sampling: ``lw.MPPI`` with ``update="predictive_sampling"``.
+
+    The best sample is the new plan. Howell et al. (2022), hydrax, judo and MuJoCo MPC plan with knots: give ``knots``
+    and ``spline``. The arguments are those of ``lw.MPPI``, except ``update``.
+    """
+
+    _only_update = "predictive_sampling"

@@ -1,0 +1,200 @@
+"""Allocate the arrays of an environment's worlds, and convert between them and rows of states."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from lyceum_warp.arrays import flat, launch_rows, shared_rows, torch_view, with_memory
+from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.done import FAULTS
+from lyceum_warp.engines.base import Engine
+from lyceum_warp.kernels import state, steps
+from lyceum_warp.spaces import Space, action_space, control_ranges, control_scale, state_space
+from lyceum_warp.task import MEMORIES
+from lyceum_warp.validate import check_tensor
+
+
+def own_bytes_per_world(task: BoundTask) -> int:
+    """An estimate of the memory that ``Worlds`` takes for each world beside its engine, in bytes."""
+    snapshots = [field for field in task.fields if field.snapshot]
+    state_size = state_space(task.model, snapshots, task.dynamics, own_parts(task)).size
+    copies = sum(field.size for field in task.fields)
+    observations = sum(sum(layout.values()) for layout in task.obs_layouts.values())
+    return 4 * copies + 8 * state_size + 8 * observations + 300
+
+
+def own_parts(task: BoundTask) -> dict[str, int]:
+    """The parts of a state that ``Worlds`` keeps beside the counters, and their sizes."""
+    form = task.task
+    sizes = {name: getattr(form, name) for name in MEMORIES}
+    sizes |= {"metrics": len(form.metrics), "success_steps": int(form.success_steps > 1)}
+    return {name: size for name, size in sizes.items() if size}
+
+
+class WorldArrays:
+    """The arrays of many worlds of one task on one engine; a step, a reset or a restored state makes no other.
+
+    Args:
+        task: The task, bound to its model and parameters.
+        engine: Its physics, which keeps the task's fields.
+    """
+
+    def __init__(self, task: BoundTask, engine: Engine) -> None:
+        self.task, self.engine, self.device, self.nworld = task, engine, engine.device, engine.nworld
+        with wp.ScopedDevice(self.device):
+            self._allocate_fields()
+            self._allocate_outcome()
+            self._allocate_actions()
+            self._allocate_counters()
+            self._allocate_masks()
+            self.state = wp.zeros((self.nworld, self.state_space.size), dtype=wp.float64)
+        self.state_view = torch_view(self.state)
+
+    def _allocate_fields(self) -> None:
+        """The fields of the state that a step leads to and of the state before, and the task's memory."""
+        n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
+        self.memory = wp.zeros((n, task.memory), dtype=float)
+        self.lasting_memory = wp.zeros((n, task.lasting_memory), dtype=float)
+        self._lasting_before = wp.zeros((n, task.lasting_memory), dtype=float)
+        self.metric_sums = wp.zeros((n, len(task.metrics)), dtype=float)
+        """Sums of the metrics over the episode so far."""
+        self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
+        """Steps in a row with the goal met, up to ``success_steps``; without a column where one step is enough."""
+        own = ("memory", "lasting_memory", "metric_sums", "success_counts")
+        self._clearable = {name: getattr(self, name) for name in own}
+        self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}
+        self._zeros = wp.zeros(max(array.shape[1] for array in self._clearable.values()), dtype=float)
+        # the fields of the state that a step leads to, live, and copies of those of the state before
+        self.after, self.before = kernels.Batch(), kernels.Batch()
+        self._copies: dict[str, wp.array] = {}
+        constant = {f.name: shared_rows(f.value(model), f.dtype, n, self.device) for f in self.task.constants}
+        varied = [field.name for field in self.task.dynamics]
+        for name in self.task.types:
+            live: Any = getattr(self, name) if name in MEMORIES else constant.get(name, self.engine.arrays.get(name))
+            self.task.check_field(name, live)
+            live = with_memory(live)
+            setattr(self.after, name, live)
+            if live.size and name not in constant and name not in varied:  # no step changes the model
+                self._copies[name] = wp.zeros_like(live)
+            setattr(self.before, name, self._copies.get(name, live))
+        self.fields = {**self.engine.arrays, **constant}
+        """The arrays of all fields of the engine and the model, (nworld, ...), by name."""
+        drawn = [f.name for f in self.task.dynamics if f.name in self.task.writes.get("event", ())]
+        self._model_copies = {name: wp.zeros_like(self.engine.arrays[name]) for name in drawn}
+        self.params = self.task.parameters.array(self.device)
+        self.action_space = action_space(model, task.action_range, task.actions)
+        self.obs_spaces = {group: Space.of(layout) for group, layout in self.task.obs_layouts.items()}
+        self.state_space = state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
+
+    def _allocate_outcome(self) -> None:
+        """Rewards, ends, metrics and observations."""
+        n, task, kernels = self.nworld, self.task.task, self.task.kernels
+        self.outcome = steps.Outcome()
+        self.buffers: dict[str, torch.Tensor] = {}
+        for name, dtype in steps.OUTCOMES.items():
+            setattr(self.outcome, name, wp.zeros(n, dtype=dtype))
+            self.buffers[name] = torch_view(getattr(self.outcome, name))
+        self.metrics: wp.array = wp.zeros((n, len(task.metrics)), dtype=float)
+        """The metrics of the last step, (nworld, number of metrics)."""
+        self.episode_metrics: wp.array = wp.zeros_like(self.metrics)
+        """Their sums over the episode of that step."""
+        self.outcome.metrics = self.metrics  # type: ignore[assignment]
+        self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
+        parts = int(steps.OBSERVE_FIRST) + len(self.obs_spaces)
+        self._judging = parts if self.device.is_cuda else 1  # threads that judge a world
+        self._found = steps.Findings()
+        self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)
+        self._found.terminated, self._found.success = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
+        self._found.fault = wp.zeros((parts, n), dtype=int)  # type: ignore[assignment]
+        self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
+        self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)
+        self._observing = len(self.obs_spaces) if self.device.is_cuda else 1  # threads that observe a world
+        self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
+        self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
+
+    def _allocate_actions(self) -> None:
+        n, model, task = self.nworld, self.task.model, self.task.task
+        naction = self.action_space.size
+        self.action, self.safe_action = wp.zeros((n, naction), dtype=float), wp.zeros((n, naction), dtype=float)
+        self.buffers["action"] = torch_view(self.action)
+        ranges, scale = control_ranges(model), np.zeros((model.nu, 2))
+        if self.task.functions["control"] is None:
+            scale = control_scale(model, task.action_range)
+        self.ranges: wp.array = wp.array(ranges, dtype=float)
+        self.scale: wp.array = wp.array(scale, dtype=float)
+
+    def _allocate_counters(self) -> None:
+        """Counters, random streams and faults."""
+        n = self.nworld
+        self.counters = steps.Counters()
+        self.counters.step, self.counters.episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
+        self.counters.key = wp.zeros(n, dtype=wp.uint32)
+        self.counters.rng = wp.zeros((len(self.obs_spaces) * n, 1), dtype=wp.uint32)  # type: ignore[assignment]
+        self._seed = wp.zeros(1, dtype=int)
+        self._action_fault, self._no_fault, self._judged = (wp.zeros(n, dtype=int) for _ in range(3))
+        self.fault_count = wp.zeros((n, int(FAULTS).bit_length()), dtype=int)
+
+    def _allocate_masks(self) -> None:
+        """Masks of worlds, (nworld,) bool each, by what is true of the worlds in them."""
+        n = self.nworld
+        self.everyone = wp.full(n, True, dtype=bool)
+        self.mask = wp.zeros(n, dtype=bool)
+        """Chosen for the next reset or restored state; see ``set_mask``."""
+        self.restarting = wp.zeros(n, dtype=bool)
+        """Their episodes ended with this step."""
+        self._rejected = wp.zeros(n, dtype=bool)
+        """The task rejects their initial states, which are drawn again."""
+        self._continuing = wp.zeros(n, dtype=bool)
+        """They do not restart, and had events."""
+        self._physics_changed = wp.zeros(n, dtype=bool)
+        """Events of this step changed their physics."""
+        self._changed = wp.zeros(n, dtype=bool)
+        """Events of this step changed their physics or the task's memory."""
+        self._outdated = wp.zeros(n, dtype=bool)
+        """They changed since they were observed: they restart, or events changed them."""
+        self.mask_view, self.changed_view = torch_view(self.mask), torch_view(self._changed)
+
+    def _allocate_groups(self, into: Any) -> dict[str, torch.Tensor]:
+        for group, space in self.obs_spaces.items():
+            setattr(into, group, wp.zeros((self.nworld, space.size), dtype=float))
+        return {group: torch_view(getattr(into, group)) for group in self.obs_spaces}
+
+    def set_mask(self, mask: torch.Tensor | None) -> None:
+        """Choose the worlds that the next reset or restored state concerns; None for all."""
+        if mask is None:
+            self.mask_view.fill_(True)
+        else:
+            check_tensor(mask, "a mask", self.mask_view)
+            self.mask_view.copy_(mask)
+
+    def pack_state(self, ended: wp.array) -> None:
+        """Write every world's state into ``state``; ``ended`` holds the reasons of ends that last, (nworld,)."""
+        size = self.engine.state_size
+        self.engine.get_state(self.state[:, :size])
+        own = self.counters
+        counters = [own.step, own.key, own.episode, ended, self.state[:, size:]]
+        wp.launch(state.pack_counters, self.nworld, counters, device=self.device)
+        for array, columns in self._own_parts():
+            launch_rows(state.widen, self.everyone, array, columns)
+
+    def unpack_state(self) -> None:
+        """Set the masked worlds' counters, memory and sums from ``state``."""
+        self.restore_counters(self.mask, self.state[:, self.engine.state_size :])
+        for array, columns in self._own_parts():
+            launch_rows(state.narrow, self.mask, columns, array)
+
+    def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
+        """Arrays that belong to the state beside the engine's and the counters, with their columns."""
+        arrays = {name: getattr(self, name) for name in MEMORIES}
+        arrays |= {"metrics": self.metric_sums, "success_steps": self.success_counts}
+        for name in own_parts(self.task):
+            yield arrays[name], self.state[:, self.state_space.parts[name]]
+
+    def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
+        """Set the masked worlds' counters from columns of states."""
+        own = self.counters
+        counters = [mask, columns, own.step, own.key, own.episode, self.outcome.done_reason]
+        wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)

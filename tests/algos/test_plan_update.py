@@ -1,0 +1,162 @@
+"""Updates of a plan that a user writes, in torch and in Warp, beside those of the package."""
+
+from typing import Any
+
+import pytest
+import torch
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp.algos.cem import CrossEntropy, spread
+
+POINT: dict[str, Any] = dict(task="point_mass", horizon=6, samples=12, noise=1.0, seed=3)
+ENGINES = ["mujoco", "warp"]
+
+
+class EliteMean(lw.PlanUpdate):
+    """The mean of the best samples, with noise that stays as it is."""
+
+    def __init__(self, elites: int) -> None:
+        self.elites = elites
+
+    def weigh(self, samples: lw.PlanSamples) -> None:
+        best = samples.returns.topk(self.elites).indices
+        samples.weights.zero_().scatter_(1, best, 1 / self.elites)
+
+
+class TorchCEM(EliteMean):
+    """CEM by its formulas in torch."""
+
+    adapts_noise = True
+
+    def __init__(self, elites: int, min_noise: float, smoothing: tuple[float, float, float]) -> None:
+        super().__init__(elites)
+        self.min_noise, self.smoothing = min_noise, smoothing
+
+    def prepare(self, samples: lw.PlanSamples) -> None:
+        self._left = torch.as_tensor(spread(self.smoothing, len(samples.plan)))[:, None, None]
+
+    def fit(self, samples: lw.PlanSamples) -> None:
+        assert samples.deviation is not None
+        distance = samples.actions - samples.plan[:, :, None]
+        variance = torch.einsum("ps,tpsa->tpa", samples.weights, distance.square())
+        samples.deviation.copy_((variance.sqrt() / self._left).clamp(min=self.min_noise))
+
+
+class HalfWay(EliteMean):
+    """A step from the last plan to the mean of the best samples, half as long."""
+
+    def fit(self, samples: lw.PlanSamples) -> None:
+        samples.plan.lerp_(samples.nominal, 0.5)
+
+
+@wp.kernel
+def weigh_first(returns: wp.array2d[float], weights: wp.array2d[float], summary: wp.array2d[float]):
+    p = wp.tid()
+    weights[p, 0] = 1.0
+    summary[p, 0] = returns[p, 0]
+
+
+class First(lw.PlanUpdate):
+    """The first sample, in a Warp kernel."""
+
+    capturable = True
+
+    def weigh(self, samples: lw.PlanSamples) -> None:
+        args = [wp.from_torch(rows) for rows in (samples.returns, samples.weights, samples.summary)]
+        wp.launch(weigh_first, len(samples.returns), args, device=args[0].device)
+
+
+def compare(one: lw.Planner, other: lw.Planner, calls: int = 4) -> None:
+    state = one.state_of(qpos=[0.1, 0.2, -0.5, 0.3])
+    states = state if one.plants == 1 else torch.stack([one.state_of(qpos=[0.1 * i] * 4) for i in range(one.plants)])
+    for call in range(calls):
+        torch.testing.assert_close(one(states, shift=call), other(states, shift=call))
+        for name in ("actions", "knot_actions", "sampled", "returns", "weights"):
+            torch.testing.assert_close(getattr(one, name), getattr(other, name))
+        for name, value in one.summary.items():
+            torch.testing.assert_close(torch.as_tensor(value), torch.as_tensor(other.summary[name]))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_elite_mean_of_a_user_gives_the_first_plan_of_cem(engine: str) -> None:
+    """Before CEM adapts its noise; noise of 1 is the same number before and after smoothing."""
+    own = lw.Planner(engine=engine, update=EliteMean(3), include_plan=False, **POINT)
+    compare(own, lw.CEM(engine=engine, elites=3, **POINT), calls=1)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("more", [{}, {"knots": 3}, {"plants": 2, "iterations": 2}, {"graphs": False}])
+def test_cem_that_a_user_writes_in_torch_gives_the_plans_of_cem(more: dict[str, Any], engine: str) -> None:
+    smoothing = lw.MPPIConfig(knots=more.get("knots")).noise_smoothing
+    own = lw.Planner(engine=engine, update=TorchCEM(3, 0.05, smoothing), **POINT, **more)
+    compare(own, cem := lw.CEM(engine=engine, elites=3, min_noise=0.05, **POINT, **more))
+    assert own.adapted_noise is not None and cem.adapted_noise is not None
+    torch.testing.assert_close(own.adapted_noise, cem.adapted_noise)
+    assert own.config.include_plan is False
+    first = own.adapted_noise.clone()
+    own.reset()
+    assert (own.adapted_noise == 1.0).all() and not torch.equal(own.adapted_noise, first)
+
+
+@pytest.mark.parametrize("knots", [None, 3])
+def test_a_fit_may_change_the_plan(knots: int | None) -> None:
+    half, whole = (lw.Planner(update=kind(3), knots=knots, **POINT) for kind in (HalfWay, EliteMean))
+    state = half.state_of(qpos=[0.1, 0.2, -0.5, 0.3])
+    torch.testing.assert_close(half(state), 0.5 * whole(state))  # the first plan was zero
+    torch.testing.assert_close(half.actions, 0.5 * whole.actions)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_update_of_warp_launches_belongs_to_the_graph(engine: str) -> None:
+    plan = lw.Planner(engine=engine, update=First(), include_plan=False, **POINT)
+    for _ in range(3):  # direct, captured, replayed
+        plan(plan.state_of())
+        assert torch.equal(plan.actions, plan.sampled[:, 0])
+    assert plan.summary["best_return"] == plan.returns[0]
+
+
+def test_a_plan_stays_where_all_samples_of_a_users_update_fail() -> None:
+    plan = lw.Planner(update=EliteMean(3), value=lambda obs: torch.full((len(obs),), torch.nan), **POINT)
+    plan.actions.fill_(0.25)
+    plan(plan.state_of(), shift=0)
+    assert (plan.actions == 0.25).all() and plan.summary["failed_samples"] == 12
+
+
+def test_planners_with_one_update_object_do_not_share_buffers() -> None:
+    update = CrossEntropy(3, 0.05, (1.0, 0.0, 0.0))
+    one, other = (lw.Planner(update=update, smoothing=(1, 0, 0), **POINT) for _ in range(2))
+    assert vars(update).keys() == {"elites", "min_noise", "smoothing"}
+    compare(one, other)
+
+
+def test_settings_show_a_users_update_with_its_attributes() -> None:
+    plan = lw.Planner(update=EliteMean(3), **POINT)
+    assert plan.settings["update"] == "EliteMean(elites=3)"
+    assert plan.config.update is not None and type(plan).__name__ == "Planner"
+
+
+class Returning(EliteMean):
+    """Returns its weights instead of writing them."""
+
+    def weigh(self, samples: lw.PlanSamples) -> Any:
+        return torch.softmax(samples.returns, 1)
+
+
+def test_weights_that_are_returned_are_refused() -> None:
+    plan = lw.Planner(update=Returning(3), **POINT)
+    with pytest.raises(ValueError, match=r"weigh of Returning must write into samples.weights and return None, not a "):
+        plan(plan.state_of())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"update": EliteMean}, "update must be 'mppi', 'cem' or 'predictive_sampling', or an object of a subclass of"),
+        ({"update": EliteMean(3), "elites": 4}, r"elites=4 is a setting of update='cem', not of EliteMean\(elites=3\)"),
+        ({"update": TorchCEM(3, 0.1, (1, 0, 0)), "noise": [[1, 0], [0, 1]]}, "must be standard deviations, not"),
+    ],
+)  # fmt: skip
+def test_a_users_update_that_does_not_fit_is_refused(words: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        lw.Planner(**(POINT | words))
