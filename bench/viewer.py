@@ -36,8 +36,8 @@ from rich.table import Table
 
 import lyceum_warp as lw
 from lyceum_warp.viewer.protocol import Command, Frame
-from lyceum_warp.viewer.session import Session
-from lyceum_warp.viewer.window import Window
+from lyceum_warp.viewer.session.clock import Session
+from lyceum_warp.viewer.session.window_process import Window
 
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _FLAGS = (

@@ -9,8 +9,8 @@ from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.viewer.link import Graphics
 from lyceum_warp.viewer.protocol import Scene
-from lyceum_warp.viewer.session import Session, Watcher
-from lyceum_warp.viewer.window import Window
+from lyceum_warp.viewer.session.clock import Session, Watcher
+from lyceum_warp.viewer.session.window_process import Window
 
 
 def has_display() -> bool:

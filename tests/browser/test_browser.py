@@ -23,7 +23,7 @@ from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
 import lyceum_warp as lw
 from lyceum_warp.viewer.protocol import Perturb, Reset, Seek, SetBackwards, SetMode, SetPaused
-from lyceum_warp.viewer.session import Session
+from lyceum_warp.viewer.session.clock import Session
 
 pytestmark = pytest.mark.browser
 

@@ -7,7 +7,7 @@ from test_gpu import nothing_waits
 
 import lyceum_warp as lw
 from lyceum_warp.viewer.protocol import SetController, SetGhosts, SetPaused, SetWorld, StepBy
-from lyceum_warp.viewer.session import Session
+from lyceum_warp.viewer.session.clock import Session
 
 pytestmark = pytest.mark.gpu
 

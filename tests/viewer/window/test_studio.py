@@ -11,7 +11,7 @@ from mujoco.studio import launch_native, launch_thread, launch_web, messages, vi
 from mujoco.studio.web import web_server
 
 import lyceum_warp
-from lyceum_warp.viewer import studio
+from lyceum_warp.viewer.window import studio
 
 ROOT = Path(lyceum_warp.__file__).parent
 NAMES = {"imgui": studio.imgui, "implot": studio.implot, "ux": studio.ux, "inputs": studio.inputs}
@@ -28,7 +28,7 @@ def used_names(path: Path) -> set[str]:
     return found
 
 
-USED = sorted(used_names(ROOT / "viewer" / "panel.py"))
+USED = sorted(used_names(ROOT / "viewer" / "window" / "panel.py"))
 
 
 def test_only_one_file_imports_studio() -> None:

@@ -18,9 +18,9 @@ import warp as wp
 
 from lyceum_warp.arrays import flat, torch_view
 from lyceum_warp.env import Env
-from lyceum_warp.viewer.controllers import MOST_SAMPLES, PlanView
-from lyceum_warp.viewer.live import pose
 from lyceum_warp.viewer.protocol import Pose
+from lyceum_warp.viewer.session.drivers import MOST_SAMPLES, PlanView
+from lyceum_warp.viewer.session.live import pose
 
 SHARE = 0.15
 """The share of a core that the thread takes at most: after t seconds of work it rests for t / SHARE."""

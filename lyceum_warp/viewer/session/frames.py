@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 
 from lyceum_warp.env import Env
-from lyceum_warp.viewer.live import Live, Rows, pose
-from lyceum_warp.viewer.playback import Playback, reasons
 from lyceum_warp.viewer.protocol import Frame, Ghost, SetGhosts, Status
-from lyceum_warp.viewer.traces import Traces
+from lyceum_warp.viewer.session.live import Live, Rows, pose
+from lyceum_warp.viewer.session.playback import Playback, reasons
+from lyceum_warp.viewer.session.traces import Traces
 
 _COLOURS = (
     (0.20, 0.55, 0.95), (0.95, 0.60, 0.15), (0.35, 0.75, 0.35), (0.75, 0.40, 0.85), (0.90, 0.80, 0.20),

@@ -24,10 +24,6 @@ from lyceum_warp.control.trajectory import Trajectory
 from lyceum_warp.engines.placement import options_for_plant
 from lyceum_warp.env import Env
 from lyceum_warp.validate import check_kind, positive_number, whole_number
-from lyceum_warp.viewer.controllers import Control, ControllerError, PolicyControl, WorldControl, controls
-from lyceum_warp.viewer.frames import FrameMaker, model_bytes, past_text
-from lyceum_warp.viewer.live import PLANT_HISTORY_BYTES, Live
-from lyceum_warp.viewer.playback import Playback, episodes_of
 from lyceum_warp.viewer.protocol import (
     MOST_BURST,
     MOST_GHOSTS,
@@ -52,8 +48,12 @@ from lyceum_warp.viewer.protocol import (
     Status,
     StepBy,
 )
-from lyceum_warp.viewer.traces import Traces, TraceThread, rollouts_for, trace_point
-from lyceum_warp.viewer.videos import VideoTaker
+from lyceum_warp.viewer.session.drivers import Control, ControllerError, PolicyControl, WorldControl, controls
+from lyceum_warp.viewer.session.frames import FrameMaker, model_bytes, past_text
+from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
+from lyceum_warp.viewer.session.playback import Playback, episodes_of
+from lyceum_warp.viewer.session.traces import Traces, TraceThread, rollouts_for, trace_point
+from lyceum_warp.viewer.session.videos import VideoTaker
 from lyceum_warp.viz.drawing import NoVideoError
 
 SLOWEST, FASTEST = 1 / 16, 16.0

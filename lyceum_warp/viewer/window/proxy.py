@@ -39,7 +39,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.viewer.requests import (
+from lyceum_warp.viewer.window.requests import (
     HOST,
     PROTECTION,
     STATUS,
@@ -56,7 +56,7 @@ from lyceum_warp.viewer.requests import (
     same,
     with_script,
 )
-from lyceum_warp.viewer.sockets import public_sockets, route_address
+from lyceum_warp.viewer.window.sockets import public_sockets, route_address
 
 HEAD_BYTES = 16 * 1024
 """Largest head of a request."""

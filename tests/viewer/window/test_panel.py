@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 from headless_screen import Bench, frame_of, pose_of, robot, scene_of, status_of
 
-from lyceum_warp.viewer import panel as panels
-from lyceum_warp.viewer import studio
-from lyceum_warp.viewer.keys import Key, key_table
 from lyceum_warp.viewer.link import Opened
-from lyceum_warp.viewer.panel import numbers, speed_name
 from lyceum_warp.viewer.protocol import (
     Camera,
     Ghost,
@@ -27,6 +23,10 @@ from lyceum_warp.viewer.protocol import (
     SetWorld,
     StepBy,
 )
+from lyceum_warp.viewer.window import panel as panels
+from lyceum_warp.viewer.window import studio
+from lyceum_warp.viewer.window.keys import Key, key_table
+from lyceum_warp.viewer.window.panel import numbers, speed_name
 
 KEYS = {key.name: key for key in key_table()}
 

@@ -23,10 +23,10 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.sync.server import ServerConnection, serve
 
-from lyceum_warp.viewer import front as module
-from lyceum_warp.viewer import sockets as sockets_module
-from lyceum_warp.viewer.front import Front
-from lyceum_warp.viewer.sockets import private_socket
+from lyceum_warp.viewer.window import proxy as module
+from lyceum_warp.viewer.window import sockets as sockets_module
+from lyceum_warp.viewer.window.proxy import Front
+from lyceum_warp.viewer.window.sockets import private_socket
 
 KEY = "dGhlIHNhbXBsZSBub25jZQ=="
 

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import mujoco
 
 from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.studio import imgui, ux
+from lyceum_warp.viewer.window.studio import imgui, ux
 
 Panel: TypeAlias = Any
 """A ``Panel``, whose module imports this one."""

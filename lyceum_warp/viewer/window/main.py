@@ -30,7 +30,7 @@ END_TIME = 3.0
 
 def load_only_viewer() -> None:
     """Make ``lyceum_warp.viewer`` importable without running ``lyceum_warp/__init__.py``."""
-    folder = Path(__file__).resolve().parents[1]
+    folder = Path(__file__).resolve().parents[2]
     for name, place in (("lyceum_warp", folder), ("lyceum_warp.viewer", folder / "viewer")):
         module = types.ModuleType(name)
         module.__path__ = [str(place)]
@@ -111,11 +111,11 @@ def run(end: WindowEnd) -> None:
     """Run studio with the panel."""
     import mujoco
 
-    from lyceum_warp.viewer import studio
-    from lyceum_warp.viewer.front import Front
     from lyceum_warp.viewer.link import Failed, Opened
-    from lyceum_warp.viewer.panel import Panel
-    from lyceum_warp.viewer.sockets import private_socket
+    from lyceum_warp.viewer.window import studio
+    from lyceum_warp.viewer.window.panel import Panel
+    from lyceum_warp.viewer.window.proxy import Front
+    from lyceum_warp.viewer.window.sockets import private_socket
 
     opening = end.first()
     front = sock = None

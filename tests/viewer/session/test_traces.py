@@ -9,8 +9,8 @@ import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-from lyceum_warp.viewer.controllers import WorldControl
-from lyceum_warp.viewer.traces import TraceThread, rollouts_for, trace_point
+from lyceum_warp.viewer.session.drivers import WorldControl
+from lyceum_warp.viewer.session.traces import TraceThread, rollouts_for, trace_point
 
 ARM = """<mujoco><worldbody><body name="base"><body name="upper"><joint name="a" axis="0 1 0"/><geom size=".1"/>
 <body name="hand" pos="0 0 1"><joint name="b" axis="0 1 0"/><geom size=".1"/>{site}</body></body></body>

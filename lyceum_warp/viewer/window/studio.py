@@ -19,7 +19,7 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 from mujoco.studio.web import state_payload, web_server
 
-from lyceum_warp.viewer.sockets import private_socket
+from lyceum_warp.viewer.window.sockets import private_socket
 
 __all__ = [
     "MAX_GEOMS", "NATIVE_GEOMS", "Gui", "Plugin", "Screen", "Started", "Update", "handler", "imgui", "implot",

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.model_values import ModelValues
-from lyceum_warp.viewer.studio import ux
+from lyceum_warp.viewer.window.model_values import ModelValues
+from lyceum_warp.viewer.window.studio import ux
 
 
 class ViewCameras:

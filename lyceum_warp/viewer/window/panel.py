@@ -14,15 +14,16 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
-from lyceum_warp.viewer import protocol, studio
-from lyceum_warp.viewer.curves import Curves
-from lyceum_warp.viewer.extra_geoms import Drawn, ExtraGeoms
-from lyceum_warp.viewer.keys import MANY_STEPS, OTHER_KEYS, key_table
+from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.link import Opened, Reply
-from lyceum_warp.viewer.model_values import ModelValues
 from lyceum_warp.viewer.protocol import MAX_GHOSTS, Frame, Scene, Status
-from lyceum_warp.viewer.studio import imgui, implot, inputs, ux
-from lyceum_warp.viewer.view_cameras import ViewCameras
+from lyceum_warp.viewer.window import studio
+from lyceum_warp.viewer.window.curves import Curves
+from lyceum_warp.viewer.window.keys import MANY_STEPS, OTHER_KEYS, key_table
+from lyceum_warp.viewer.window.model_values import ModelValues
+from lyceum_warp.viewer.window.scene import Drawn, ExtraGeoms
+from lyceum_warp.viewer.window.studio import imgui, implot, inputs, ux
+from lyceum_warp.viewer.window.view_cameras import ViewCameras
 
 SPEEDS = tuple(2.0**power for power in range(-4, 5))
 """Wanted speeds to choose from, simulated seconds per second."""

@@ -16,7 +16,6 @@ from memory_window import MemoryWindow
 from toy_controllers import towards
 
 import lyceum_warp as lw
-from lyceum_warp.viewer.live import HISTORY_BYTES, PLANT_HISTORY_BYTES, Live
 from lyceum_warp.viewer.protocol import (
     MOST_BURST,
     MOST_GHOSTS,
@@ -37,7 +36,8 @@ from lyceum_warp.viewer.protocol import (
     SetWorld,
     StepBy,
 )
-from lyceum_warp.viewer.session import Session
+from lyceum_warp.viewer.session.clock import Session
+from lyceum_warp.viewer.session.live import HISTORY_BYTES, PLANT_HISTORY_BYTES, Live
 from lyceum_warp.viewer.show import chosen_graphics
 from lyceum_warp.viz.video import Recorder
 

@@ -68,7 +68,7 @@ class Window:
         with theirs:
             self._process = subprocess.Popen(
                 # -P: the script's folder is not searched for modules
-                [sys.executable, "-P", str(Path(__file__).with_name("window_process.py")), str(theirs.fileno())],
+                [sys.executable, "-P", str(Path(__file__).parents[1] / "window" / "main.py"), str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,

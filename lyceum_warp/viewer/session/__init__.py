@@ -1,0 +1,1 @@
+"""The session: this process, with torch, Warp and the worlds."""
