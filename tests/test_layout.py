@@ -1,6 +1,10 @@
 """Who may import whom, what is private to whom, and where tests lie."""
 
 import ast
+import importlib
+import subprocess
+import sys
+import textwrap
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +26,7 @@ LEVELS = {
     "worlds": 4,
     "env": 5,
     "openloop": 6,
-    "algos": 7, "control": 7, "testing": 7,
+    "algos": 7, "controllers": 7, "testing": 7,
     "checkpoints": 8, "tensorboard": 8,
     "runs": 9,
     "keeper": 10, "kept_task": 10, "viz": 10,
@@ -160,9 +164,59 @@ def test_no_module_uses_private_attributes_of_another_modules_objects(name: str)
     assert not found, f"{name} uses private attributes: {'; '.join(found)}"
 
 
-def test_each_public_name_is_there_and_listed_in_order() -> None:
-    assert all(hasattr(lw, name) for name in lw.__all__)
-    assert len(set(lw.__all__)) == len(lw.__all__)
+PUBLIC = {
+    alias.name: str(node.module)
+    for block in TREES["lyceum_warp"].body
+    if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+    for node in ast.walk(block)
+    if isinstance(node, ast.ImportFrom)
+    for alias in node.names
+}
+"""The public names and their modules, as type checkers see them."""
+
+
+def test_public_names_are_the_same_for_type_checkers_and_at_run_time() -> None:
+    assert sorted(lw.__all__) == sorted(PUBLIC)
+    for name, module in PUBLIC.items():
+        assert getattr(lw, name) is getattr(importlib.import_module(module), name)
+
+
+def in_new_process(program: str) -> str:
+    result = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert "Warp" not in result.stderr + result.stdout
+    return result.stdout
+
+
+def test_public_names_stay_when_every_module_is_imported() -> None:
+    """A submodule becomes an attribute of the package, which would hide a function of its name."""
+    program = f"""
+        import importlib, types
+        for name in {[name for name in MODULES if not name.endswith("__main__")]}:
+            importlib.import_module(name)
+        import lyceum_warp as lw
+        print([name for name in lw.__all__ if isinstance(getattr(lw, name), types.ModuleType)])
+    """
+    assert in_new_process(program) == "[]\n"
+
+
+def test_the_import_alone_loads_neither_torch_nor_warp_nor_mujoco() -> None:
+    program = """
+        import sys, lyceum_warp
+        print([name for name in ("torch", "warp", "mujoco", "numpy") if name in sys.modules])
+    """
+    assert in_new_process(program) == "[]\n"
+
+
+@pytest.mark.parametrize("first", ["import warp as wp", "import lyceum_warp as lw", "from lyceum_warp import Row"])
+def test_warp_is_quiet_in_whatever_order_a_task_file_imports(first: str) -> None:
+    program = f"""
+        {first}
+        import warp as wp
+        import lyceum_warp as lw
+        print(lw.make("point_mass", nworld=1).nworld)
+    """
+    assert in_new_process(program) == "1\n"
 
 
 # tests

@@ -13,9 +13,9 @@ from rich.table import Table
 
 from lyceum_warp.algos.learner import LearnerIteration
 from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.control.control_report import ControlReport
-from lyceum_warp.control.episode_collector import ControlProgress
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.control_report import ControlReport
+from lyceum_warp.controllers.episode_collector import ControlProgress
+from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs import Run
 from lyceum_warp.viz.cameras import CameraChoice

@@ -4,9 +4,9 @@ import time
 
 import torch
 
-from lyceum_warp.control.checked_controller import CheckedController
-from lyceum_warp.control.controller import Controller
-from lyceum_warp.control.episode_collector import (
+from lyceum_warp.controllers.checked_controller import CheckedController
+from lyceum_warp.controllers.controller import Controller
+from lyceum_warp.controllers.episode_collector import (
     EpisodeCollector,
     OnAbort,
     OnStep,
@@ -15,7 +15,7 @@ from lyceum_warp.control.episode_collector import (
     first_step,
     step_limit,
 )
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.validate import whole_number
 

@@ -9,10 +9,10 @@ import torch
 from toy_controllers import SamplingPlanner, StepPlanner
 
 import lyceum_warp as lw
-from lyceum_warp.control.checked_controller import CheckedController
-from lyceum_warp.control.loop import control
-from lyceum_warp.control.real_time import control_async
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.checked_controller import CheckedController
+from lyceum_warp.controllers.loop import control
+from lyceum_warp.controllers.real_time import control_async
+from lyceum_warp.controllers.trajectory import Trajectory
 
 Run = Callable[..., Trajectory]
 BOTH = pytest.mark.parametrize("run", [control, control_async])

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.control.controller import Controller
+from lyceum_warp.controllers.controller import Controller
 from lyceum_warp.env import Env
 from lyceum_warp.validate import described, positive_number
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import torch
 
-from lyceum_warp.control.checked_controller import CheckedController
-from lyceum_warp.control.trajectory import Trajectory, provenance
+from lyceum_warp.controllers.checked_controller import CheckedController
+from lyceum_warp.controllers.trajectory import Trajectory, provenance
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
 from lyceum_warp.validate import whole_number
