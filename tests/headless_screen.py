@@ -6,8 +6,7 @@ import mujoco
 import numpy as np
 from mujoco.studio import launch_thread, messages, ux, viewer_protocol
 
-from lyceum_warp.viewer.link import Opened, Reply
-from lyceum_warp.viewer.protocol import Frame, Pose, Scene, Status
+from lyceum_warp.viewer.protocol import Frame, Opened, Pose, Reply, Scene, Status
 from lyceum_warp.viewer.window.panel import Panel
 from lyceum_warp.viewer.window.studio import Screen, imgui, implot
 

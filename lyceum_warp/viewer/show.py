@@ -7,8 +7,7 @@ from typing import Any
 
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
-from lyceum_warp.viewer.link import Graphics
-from lyceum_warp.viewer.protocol import Scene
+from lyceum_warp.viewer.protocol import Graphics, Scene
 from lyceum_warp.viewer.session.clock import Session, Watcher
 from lyceum_warp.viewer.session.window_process import Window
 

@@ -11,8 +11,7 @@ from typing import Any
 import mujoco
 
 from lyceum_warp.interrupts import obeyed
-from lyceum_warp.viewer.protocol import Camera, Frame
-from lyceum_warp.viewer.window.scene import BEST_COLOUR, TRACE_COLOUR
+from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Camera, Frame
 from lyceum_warp.viz.drawing import NoVideoError
 from lyceum_warp.viz.video import Recorder
 

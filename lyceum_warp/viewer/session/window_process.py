@@ -1,4 +1,4 @@
-"""A window, or a page in a browser, that runs in a process of its own."""
+"""Start the window process, send it frames, and collect its commands."""
 
 import contextlib
 import os
@@ -14,8 +14,19 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.viewer.link import Failed, Graphics, Opened, Opening, Reply, Taken, latest
-from lyceum_warp.viewer.protocol import Close, Command, Frame, Scene
+from lyceum_warp.viewer.protocol import (
+    Close,
+    Command,
+    Failed,
+    Frame,
+    Graphics,
+    Opened,
+    Opening,
+    Reply,
+    Scene,
+    Taken,
+    latest,
+)
 
 FRAME_TIME = 1 / 60
 """Seconds between two frames at least."""
@@ -23,6 +34,13 @@ OPENING_TIME = 60.0
 """Seconds in which the process must report that the window runs."""
 CLOSING_TIME = 5.0
 """Seconds in which it must end."""
+
+_PROGRAM = """
+import sys
+sys.path.append(sys.argv[2])  # for a package that is not installed
+from lyceum_warp.viewer.window.main import main
+main(int(sys.argv[1]))
+"""
 
 
 class Window:
@@ -39,8 +57,8 @@ class Window:
         browser: Whether to open the page in this machine's browser.
 
     Raises:
-        ValueError: if the port is out of range or in use, or the address is not one of this machine.
-        RuntimeError: if the window cannot be opened; the message holds the reason.
+        ValueError: The port is out of range or in use, or the address is not one of this machine.
+        RuntimeError: The window cannot be opened; the message holds the reason.
     """
 
     def __init__(
@@ -67,8 +85,8 @@ class Window:
         self._connection = Connection(os.dup(self._socket.fileno()))
         with theirs:
             self._process = subprocess.Popen(
-                # -P: the script's folder is not searched for modules
-                [sys.executable, "-P", str(Path(__file__).parents[1] / "window" / "main.py"), str(theirs.fileno())],
+                # -P: the current folder is not searched for modules
+                [sys.executable, "-P", "-c", _PROGRAM, str(theirs.fileno()), str(Path(__file__).parents[3])],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,

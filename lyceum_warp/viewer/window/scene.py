@@ -1,21 +1,35 @@
-"""Ghosts and traces as geoms that are drawn beside the model."""
+"""Draw what studio's scene lacks: ghosts and traces, the model of one world, and the choice of the camera."""
 
+import copy
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
 
-from lyceum_warp.viewer.protocol import Ghost, Pose
+from lyceum_warp.viewer import protocol
+from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Ghost, Pose
+from lyceum_warp.viewer.window.studio import ux
 
-TRACE_COLOUR = (0.6, 0.65, 0.75, 0.5)
-BEST_COLOUR = (0.1, 0.75, 0.3, 1.0)
 LINE_WIDTH = 3.0  # pixels
 MAX_LINES = 160
 """Lines of all traces. A browser is sent all geoms 60 times a second, with about 600 bytes for each."""
 FEWEST_SEGMENTS = 4
 """Segments of a trace where there are too few geoms for all its points."""
+SEEN = (
+    "geom_size", "geom_pos", "geom_quat", "geom_rgba", "geom_matid", "geom_dataid", "geom_group", "site_", "body_pos",
+    "body_quat", "jnt_pos", "jnt_axis", "qpos0", "mat_", "tendon_rgba", "tendon_width", "cam_", "light_", "hfield_",
+    "mesh_", "skin_", "flex_",
+)  # fmt: skip
+"""What the names of fields begin with that change the picture."""
+
+LISTED = 8
+"""Elements of a field that are listed."""
+
+
+# ghosts and traces
 
 
 @dataclasses.dataclass
@@ -190,3 +204,157 @@ class _Placed:
 
 
 _ZERO, _UNIT = np.zeros(3), np.eye(3).ravel()
+
+
+# the model of the world that is shown
+
+
+class ModelValues:
+    """A model with the values of one world.
+
+    Args:
+        nominal: The model without them, which is copied.
+
+    """
+
+    def __init__(self, nominal: mujoco.MjModel) -> None:
+        self._nominal = nominal
+        self._values: dict[str, np.ndarray] = {}
+        self.model = copy.deepcopy(nominal)
+        """The model with them."""
+        self.differences: list[tuple[str, str]] = []
+        """What differs from the nominal model: an element's name and its value, with the nominal one."""
+
+    def differ(self, values: Mapping[str, np.ndarray]) -> bool:
+        """Whether other values than those now are given."""
+        return values.keys() != self._values.keys() or any(
+            not np.array_equal(values[name], self._values[name]) for name in values
+        )
+
+    def set(self, values: Mapping[str, np.ndarray]) -> bool:
+        """Take a world's values; whether the picture changes, and not just masses, for example."""
+        seen = any(
+            name.startswith(SEEN)
+            and not (name in values and name in self._values and np.array_equal(values[name], self._values[name]))
+            for name in {*values, *self._values}
+        )
+        self._values = {name: np.array(value) for name, value in values.items()}
+        self.model = copy.deepcopy(self._nominal)
+        self.copy_to(self.model)
+        self.differences = self._described()
+        return seen
+
+    def copy_to(self, model: mujoco.MjModel) -> None:
+        """Set the values in another copy of the model, and what follows from them."""
+        for name in self._values:
+            field(model, name)[...] = self._values[name].reshape(field(model, name).shape)
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+
+    def _described(self) -> list[tuple[str, str]]:
+        lines = []
+        for name, values in self._values.items():
+            nominal = np.array(field(self._nominal, name))
+            values = values.reshape(nominal.shape)
+            rows = [i for i in range(len(nominal)) if not np.array_equal(values[i], nominal[i])]
+            for i in rows[:LISTED]:
+                lines.append((f"{name} {self._element(name, i)}", f"{short(values[i])} ({short(nominal[i])})"))
+            if len(rows) > LISTED:
+                lines.append((name, f"and {len(rows) - LISTED} others"))
+        return lines
+
+    def _element(self, name: str, i: int) -> str:
+        """The name of a field's element, or its number."""
+        kind = {"dof": "", "jnt": "joint", "mat": "material"}.get(name.partition("_")[0], name.partition("_")[0])
+        accessor = getattr(self._nominal, kind, None) if kind else None
+        return (accessor(i).name if callable(accessor) else "") or str(i)
+
+
+def field(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """A field of a model or of its options, as an array that can be written to."""
+    owner = model if hasattr(model, name) else model.opt
+    return np.atleast_1d(getattr(owner, name))
+
+
+def short(value: np.ndarray) -> str:
+    """A value in few characters."""
+    return " ".join(f"{number:.4g}" for number in np.ravel(value))
+
+
+# cameras
+
+
+class ViewCameras:
+    """Chooses the camera of the view.
+
+    Args:
+        viewer: Studio's viewer, whose camera is set. Its model may come later.
+        values: The model that is shown, which has the cameras.
+
+    """
+
+    def __init__(self, viewer: Any, values: ModelValues) -> None:
+        self.viewer, self.values = viewer, values
+        self.state = ux.UxState()
+        """What studio keeps of the choice."""
+
+    def choose(self, index: int) -> None:
+        """Choose studio's free, flying or tracking camera, or a camera of the model."""
+        self.state.camera_index = ux.set_camera(self.values.model, self.viewer.camera, index)
+
+    def change(self, by: int) -> None:
+        """Go to the next camera, or to one before."""
+        indices = self.indices()
+        self.choose(indices[(indices.index(self.state.camera_index) + by) % len(indices)])
+
+    def indices(self) -> list[int]:
+        """The cameras that can be chosen, in the order of the panel."""
+        return [ux.TUMBLE_CAMERA_IDX, ux.FREE_CAMERA_IDX, ux.TRACKING_CAMERA_IDX, *range(self.values.model.ncam)]
+
+    def name(self, index: int) -> str:
+        """What the panel calls a camera."""
+        fixed = {ux.TUMBLE_CAMERA_IDX: "free", ux.FREE_CAMERA_IDX: "flying", ux.TRACKING_CAMERA_IDX: "tracking"}
+        return fixed.get(index) or self.values.model.camera(index).name or f"camera {index}"
+
+    def reset(self) -> None:
+        """Look at the whole model; follow the body that a camera of the model follows."""
+        model, camera = self.values.model, self.viewer.camera
+        mujoco.mjv_defaultFreeCamera(model, camera)
+        self.state.camera_index = ux.TUMBLE_CAMERA_IDX
+        tracking = (int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
+        for mode, body in zip(model.cam_mode, model.cam_bodyid, strict=True):
+            if int(mode) in tracking:
+                self.track(int(body))
+                camera.elevation = -20
+                camera.distance = 3 * self.size_of(int(body))
+                return
+
+    def size_of(self, body: int) -> float:
+        """The size of a body with all that is attached to its root, metres."""
+        model, data = self.values.model, mujoco.MjData(self.values.model)
+        mujoco.mj_kinematics(model, data)
+        moving = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
+        if not moving.any():
+            return float(model.stat.extent)
+        sizes = model.geom_rbound[moving, None]
+        low, high = (data.geom_xpos[moving] - sizes).min(0), (data.geom_xpos[moving] + sizes).max(0)
+        return float(np.linalg.norm(high - low))
+
+    def track(self, body: int) -> None:
+        """Follow a body."""
+        self.choose(ux.TRACKING_CAMERA_IDX)
+        self.viewer.camera.type = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
+        self.viewer.camera.trackbodyid = body
+        self.viewer.camera.fixedcamid = -1
+
+    def view(self) -> protocol.Camera:
+        """The camera of the view."""
+        camera = self.viewer.camera
+        x, y, z = (float(value) for value in camera.lookat)
+        return protocol.Camera(
+            lookat=(x, y, z),
+            distance=float(camera.distance),
+            azimuth=float(camera.azimuth),
+            elevation=float(camera.elevation),
+            tracked_body=int(camera.trackbodyid) if camera.type == mujoco.mjtCamera.mjCAMERA_TRACKING else -1,
+            fixed=int(camera.fixedcamid) if camera.type == mujoco.mjtCamera.mjCAMERA_FIXED else -1,
+        )

@@ -16,10 +16,9 @@ from memory_window import MemoryWindow
 
 from lyceum_warp.interrupts import Interrupted, signals
 from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import Camera, Command, Frame
+from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Camera, Command, Frame
 from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viewer.session.videos import VideoTaker
-from lyceum_warp.viewer.window.scene import BEST_COLOUR, TRACE_COLOUR
 from lyceum_warp.viz import drawing
 from lyceum_warp.viz.video import NoVideoError, check_video
 

@@ -18,12 +18,11 @@ from headless_screen import frame_of, robot, scene_of
 
 import lyceum_warp
 from lyceum_warp.viewer import show
-from lyceum_warp.viewer.link import latest
+from lyceum_warp.viewer.protocol import latest
 from lyceum_warp.viewer.session.window_process import Window
-from lyceum_warp.viewer.window.requests import SCRIPT
+from lyceum_warp.viewer.window.proxy import SCRIPT
 
 MODEL = robot()
-VIEWER = Path(lyceum_warp.__file__).parent / "viewer" / "window"
 DATA = mujoco.MjData(MODEL)
 
 
@@ -238,9 +237,7 @@ def test_ctrl_c_does_not_end_the_window(window: Window) -> None:
 PROGRAM = """
 import os, signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-sys.path[:0] = {tests!r}, {viewer!r}
-from main import load_only_viewer
-load_only_viewer()  # quicker
+sys.path[:0] = [{tests!r}]
 from headless_screen import robot, scene_of
 from lyceum_warp.viewer.session.window_process import Window
 
@@ -258,7 +255,7 @@ time.sleep(60)
 def test_window_ends_with_the_session(number: int, fork: bool, tmp_path: Path) -> None:
     """A fork of the session holds the connection open."""
     program = tmp_path / "program.py"
-    program.write_text(PROGRAM.format(tests=str(Path(__file__).parents[2]), viewer=str(VIEWER), fork=fork))
+    program.write_text(PROGRAM.format(tests=str(Path(__file__).parents[2]), fork=fork))
     with subprocess.Popen([sys.executable, str(program)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as session:
         assert session.stdout is not None
         pid = int(session.stdout.readline())

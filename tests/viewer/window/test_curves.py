@@ -1,6 +1,6 @@
 import numpy as np
 
-from lyceum_warp.viewer.window.curves import Curves
+from lyceum_warp.viewer.window.windows import Curves
 
 
 def ramp(begin: int, end: int) -> np.ndarray:

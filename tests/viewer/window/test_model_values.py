@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from headless_screen import robot
 
-from lyceum_warp.viewer.window.model_values import ModelValues
+from lyceum_warp.viewer.window.scene import ModelValues
 
 
 def test_values_of_a_world_are_set_and_taken_back() -> None:

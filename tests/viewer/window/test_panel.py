@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from headless_screen import Bench, frame_of, pose_of, robot, scene_of, status_of
 
-from lyceum_warp.viewer.link import Opened
 from lyceum_warp.viewer.protocol import (
     Camera,
     Ghost,
+    Opened,
     Perturb,
     Reset,
     SetBackwards,
@@ -23,10 +23,9 @@ from lyceum_warp.viewer.protocol import (
     SetWorld,
     StepBy,
 )
-from lyceum_warp.viewer.window import panel as panels
 from lyceum_warp.viewer.window import studio
-from lyceum_warp.viewer.window.keys import Key, key_table
-from lyceum_warp.viewer.window.panel import numbers, speed_name
+from lyceum_warp.viewer.window.actions import SPEEDS, Key, key_table
+from lyceum_warp.viewer.window.windows import WINDOWS, numbers, speed_name
 
 KEYS = {key.name: key for key in key_table()}
 
@@ -54,7 +53,7 @@ def test_panel_draws_before_the_first_frame(bench: Bench) -> None:
 
 @pytest.mark.parametrize("mode", ["passive", "controller", "playback"])
 def test_panel_draws_every_mode_with_all_windows_open(bench: Bench, mode: str) -> None:
-    bench.panel.windows |= set(panels.WINDOWS)
+    bench.panel.actions.windows |= set(WINDOWS)
     frame = frame_of(
         bench.model, bench.data, status_of(mode=mode, episode=1, video="video.mp4", seekable=(0, 20)),
         samples=np.array([[0.0, 1.0, np.nan], [0.1, 2.0, 3.0]]), messages=("world 3: terminated",),
@@ -67,7 +66,7 @@ def test_scene_with_one_world_and_no_curves_draws() -> None:
     model = robot()
     scene = scene_of(model, nworld=1, modes=("passive",), controllers=(), episodes=(), curves=())
     bench = Bench(model, scene)
-    bench.panel.windows |= set(panels.WINDOWS)
+    bench.panel.actions.windows |= set(WINDOWS)
     bench.draw(frame_of(model, bench.data, status_of(controller=None, world=0)))
 
 
@@ -88,7 +87,7 @@ def test_state_that_is_not_finite_leaves_the_pose_before(bench: Bench) -> None:
 def test_messages_of_frames_are_kept_in_order(bench: Bench) -> None:
     bench.draw(frame_of(bench.model, bench.data, messages=("one", "two")))
     bench.draw(frame_of(bench.model, bench.data, messages=("three",)))
-    assert list(bench.panel.messages) == ["one", "two", "three"]
+    assert list(bench.panel.actions.messages) == ["one", "two", "three"]
 
 
 def ghost_beside(data: mujoco.MjData) -> Ghost:
@@ -112,7 +111,7 @@ def test_ghosts_that_are_not_drawn_are_reported() -> None:
     bench = Bench(model, scene_of(model), limit=3)
     bench.draw(frame_of(model, bench.data, ghosts=(ghost_beside(bench.data),) * 2))
     assert len(bench.viewer.extra_geoms) == 1  # the goal stands still
-    assert bench.panel.dropped() == [("ghosts", "1 of 2 drawn: 3 shapes at most")]
+    assert bench.panel.windows.dropped() == [("ghosts", "1 of 2 drawn: 3 shapes at most")]
 
 
 def test_window_without_extra_geoms_draws_the_world_alone() -> None:
@@ -122,7 +121,7 @@ def test_window_without_extra_geoms_draws_the_world_alone() -> None:
         frame_of(model, bench.data, ghosts=(Ghost(pose_of(bench.data), (1, 0, 0, 0.3)),), traces=np.zeros((2, 5, 3)))
     )
     assert bench.viewer.extra_geoms == []
-    assert bench.panel.dropped() == [
+    assert bench.panel.windows.dropped() == [
         ("ghosts", "0 of 1 drawn: only a browser draws them"), ("traces", "0 of 2 drawn: only a browser draws them"),
     ]  # fmt: skip
 
@@ -131,7 +130,7 @@ def test_dropped_model_is_refused_with_a_message(bench: Bench) -> None:
     shown(bench)
     bench.viewer.dropped = "/tmp/mujoco_drop_1/other.xml"
     assert bench.draw() == []
-    assert bench.panel.messages[-1].startswith("other.xml was not loaded")
+    assert bench.panel.actions.messages[-1].startswith("other.xml was not loaded")
 
 
 # keys
@@ -162,19 +161,19 @@ def test_dropped_model_is_refused_with_a_message(bench: Bench) -> None:
     ],
 )
 def test_key_sends_its_command(bench: Bench, key: str, command: object) -> None:
-    KEYS[key].action(shown(bench).panel)
+    KEYS[key].action(shown(bench).panel.actions)
     assert bench.sent == [command]
 
 
 def test_up_and_down_choose_episodes_in_a_playback(bench: Bench) -> None:
-    KEYS["Down"].action(shown(bench, mode="playback", episode=1).panel)
+    KEYS["Down"].action(shown(bench, mode="playback", episode=1).panel.actions)
     assert bench.sent == [SetEpisode(0)]
 
 
 @pytest.mark.parametrize("name", [name for name in KEYS if name not in ("Ctrl+V",)])
 def test_every_key_acts_in_every_mode(bench: Bench, name: str) -> None:
     for mode in ("passive", "controller", "playback"):
-        KEYS[name].action(shown(bench, mode=mode).panel)
+        KEYS[name].action(shown(bench, mode=mode).panel.actions)
         bench.draw()
 
 
@@ -191,9 +190,9 @@ def test_key_with_two_modifiers_is_read() -> None:
 
 
 def test_speed_stays_within_its_limits(bench: Bench) -> None:
-    shown(bench, speed=16.0).panel.change_speed(1)
+    shown(bench, speed=16.0).panel.actions.change_speed(1)
     shown_at = bench.sent[-1]
-    shown(bench, speed=1 / 16).panel.change_speed(-1)
+    shown(bench, speed=1 / 16).panel.actions.change_speed(-1)
     assert [shown_at, bench.sent[-1]] == [SetSpeed(16.0), SetSpeed(1 / 16)]
 
 
@@ -201,12 +200,12 @@ def test_speed_stays_within_its_limits(bench: Bench) -> None:
 
 
 def test_video_begins_from_the_camera_of_the_view_and_ends(bench: Bench) -> None:
-    shown(bench).panel.toggle_video()
+    shown(bench).panel.actions.toggle_video()
     (command,) = bench.sent
     assert command.on
     assert isinstance(command.camera, Camera)
     assert command.camera.tracked_body == bench.model.body("ball").id
-    shown(bench, video="video.mp4").panel.toggle_video()
+    shown(bench, video="video.mp4").panel.actions.toggle_video()
     assert bench.sent == [SetVideo(False)]
 
 
@@ -216,12 +215,12 @@ def test_camera_that_tracks_a_body_is_the_first_one(bench: Bench) -> None:
 
 
 def test_fixed_camera_of_the_model_can_be_chosen(bench: Bench) -> None:
-    panel = shown(bench).panel
-    names = [panel.cameras.name(index) for index in panel.cameras.indices()]
+    actions = shown(bench).panel.actions
+    names = [actions.cameras.name(index) for index in actions.cameras.indices()]
     assert names == ["free", "flying", "tracking", "side", "track"]
-    panel.cameras.choose(0)
+    actions.cameras.choose(0)
     bench.draw()
-    assert panel.cameras.view().fixed == 0
+    assert actions.cameras.view().fixed == 0
     assert bench.viewer.camera_index == 0
 
 
@@ -241,15 +240,15 @@ def drag(bench: Bench, body: str, kind: mujoco.mjtPertBit) -> None:
 def test_dragged_body_is_pushed_until_it_is_left(bench: Bench) -> None:
     shown(bench)
     drag(bench, "ball", mujoco.mjtPertBit.mjPERT_TRANSLATE)
-    bench.panel.push_body(paused=False)
+    bench.panel.mouse.drag(bench.viewer, paused=False)
     (command,) = bench.sent
     assert isinstance(command, Perturb)
     assert command.forces[bench.model.body("ball").id, 0] > 0
     assert command.qpos is None
     assert command.mocap_pos is None
     bench.viewer.perturb.active = 0
-    bench.panel.push_body(paused=False)
-    bench.panel.push_body(paused=False)
+    bench.panel.mouse.drag(bench.viewer, paused=False)
+    bench.panel.mouse.drag(bench.viewer, paused=False)
     assert len(bench.sent) == 2
     assert not bench.sent[1].forces.any()
 
@@ -257,7 +256,7 @@ def test_dragged_body_is_pushed_until_it_is_left(bench: Bench) -> None:
 def test_dragged_body_is_placed_while_paused(bench: Bench) -> None:
     shown(bench, paused=True)
     drag(bench, "ball", mujoco.mjtPertBit.mjPERT_TRANSLATE)
-    bench.panel.push_body(paused=True)
+    bench.panel.mouse.drag(bench.viewer, paused=True)
     (command,) = bench.sent
     assert isinstance(command, Perturb)
     np.testing.assert_allclose(command.qpos[0], 0.5)
@@ -269,18 +268,18 @@ def test_push_ends_when_its_person_has_left(bench: Bench, paused: bool) -> None:
     """A browser that is closed in the middle of a drag never lets go of the button."""
     shown(bench)
     drag(bench, "ball", mujoco.mjtPertBit.mjPERT_TRANSLATE)
-    bench.panel.push_body(paused)
-    bench.panel.let_go()  # of another thread; nothing is drawn from here on
-    bench.panel.let_go()
+    bench.panel.mouse.drag(bench.viewer, paused=paused)
+    bench.panel.mouse.let_go()  # of another thread; nothing is drawn from here on
+    bench.panel.mouse.let_go()
     assert len(bench.sent) == 2
     assert isinstance(bench.sent[1], Perturb)
     assert not bench.sent[1].forces.any()
     assert bench.sent[1].qpos is None
-    bench.panel.push_body(paused)  # the next browser
+    bench.panel.mouse.drag(bench.viewer, paused=paused)  # the next browser
     assert len(bench.sent) == 2
     assert not bench.viewer.perturb.active
     drag(bench, "ball", mujoco.mjtPertBit.mjPERT_TRANSLATE)
-    bench.panel.push_body(paused)
+    bench.panel.mouse.drag(bench.viewer, paused=paused)
     assert len(bench.sent) == 3
 
 
@@ -288,12 +287,12 @@ def test_body_that_is_held_still_while_paused_is_placed_once(bench: Bench) -> No
     shown(bench, paused=True)
     drag(bench, "ball", mujoco.mjtPertBit.mjPERT_TRANSLATE)
     for _ in range(5):
-        bench.panel.push_body(paused=True)
+        bench.panel.mouse.drag(bench.viewer, paused=True)
         bench.data.qpos[:] = bench.viewer.data.qpos
         bench.panel.take(frame_of(bench.model, bench.data, status_of(paused=True)))
     assert len(bench.sent) == 1
     bench.viewer.perturb.refpos = bench.viewer.perturb.refpos + np.array([0.0, 0.1, 0])
-    bench.panel.push_body(paused=True)
+    bench.panel.mouse.drag(bench.viewer, paused=True)
     assert len(bench.sent) == 2
     assert isinstance(bench.sent[1], Perturb)
     np.testing.assert_allclose(bench.sent[1].qpos[:2], [0.5, 0.1])
@@ -303,7 +302,7 @@ def test_body_that_is_held_still_while_paused_is_placed_once(bench: Bench) -> No
 def test_dragged_mocap_body_is_placed(bench: Bench, paused: bool) -> None:
     shown(bench)
     drag(bench, "goal", mujoco.mjtPertBit.mjPERT_TRANSLATE)
-    bench.panel.push_body(paused)
+    bench.panel.mouse.drag(bench.viewer, paused=paused)
     (command,) = bench.sent
     np.testing.assert_allclose(command.mocap_pos, [[1.5, 0, 1]])
 
@@ -319,7 +318,7 @@ def test_world_of_another_size_gets_a_model_of_its_own(bench: Bench) -> None:
     assert model.geom("ball").size[0] == pytest.approx(0.3)
     assert bench.model.geom("ball").size[0] == pytest.approx(0.1)
     assert bench.panel.values.differences == [("geom_size ball", "0.3 0 0 (0.1 0 0)")]
-    bench.panel.swapped = 0.0
+    bench.panel._swapped = 0.0
     bench.draw(frame_of(bench.model, bench.data))
     assert bench.models[1].geom("ball").size[0] == pytest.approx(0.1)
 
@@ -336,7 +335,7 @@ def test_world_of_another_mass_keeps_the_picture(bench: Bench) -> None:
 
 
 def test_speeds_are_named_as_fractions() -> None:
-    assert [speed_name(speed) for speed in panels.SPEEDS] == ["1/16", "1/8", "1/4", "1/2", "1", "2", "4", "8", "16"]
+    assert [speed_name(speed) for speed in SPEEDS] == ["1/16", "1/8", "1/4", "1/2", "1", "2", "4", "8", "16"]
 
 
 def test_numbers_and_ranges_are_read_once_each() -> None:

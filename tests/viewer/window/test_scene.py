@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from headless_screen import robot
 
-from lyceum_warp.viewer.protocol import Ghost, Pose
-from lyceum_warp.viewer.window.scene import BEST_COLOUR, ExtraGeoms
+from lyceum_warp.viewer.protocol import BEST_COLOUR, Ghost, Pose
+from lyceum_warp.viewer.window.scene import ExtraGeoms
 
 MODEL = robot()
 MOCAP = np.array([[1.0, 0, 1]]), np.array([[1.0, 0, 0, 0]])

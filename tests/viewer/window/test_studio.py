@@ -28,7 +28,7 @@ def used_names(path: Path) -> set[str]:
     return found
 
 
-USED = sorted(used_names(ROOT / "viewer" / "window" / "panel.py"))
+USED = sorted(set().union(*map(used_names, (ROOT / "viewer" / "window").glob("*.py"))))
 
 
 def test_only_one_file_imports_studio() -> None:
@@ -45,7 +45,9 @@ def test_studio_has_every_name_that_the_panel_uses(name: str) -> None:
     module, *attributes = name.split(".")
     thing = NAMES[module]
     for attribute in attributes:
-        assert hasattr(thing, attribute), f"mujoco.studio {mujoco.__version__} has no {name} any more: see panel.py"
+        assert hasattr(thing, attribute), (
+            f"mujoco.studio {mujoco.__version__} has no {name} any more: see viewer/window"
+        )
         thing = getattr(thing, attribute)
 
 
