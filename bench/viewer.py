@@ -131,7 +131,7 @@ def page(address: str, shown: bool) -> Iterator[None]:
 
 def shown(session: Session, options: Options) -> Timed:
     """Run a session whose page is open."""
-    window = Window(session.scene, "web")
+    window = Window(session.stage.scene, "web")
     with page(window.address, options.browser):
         timed = Timed(window, _LOADING if options.browser else 1.0, options.seconds)
         session.run(timed)

@@ -1,8 +1,6 @@
 """Who may import whom, what is private to whom, and where tests lie."""
 
 import ast
-import subprocess
-import sys
 import importlib
 import subprocess
 import sys

@@ -25,7 +25,8 @@ from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs import Run, load
 from lyceum_warp.validate import whole_number
 from lyceum_warp.viewer.follow import Follower, Parent, wait_for_run
-from lyceum_warp.viewer.session.clock import Watcher, check_world
+from lyceum_warp.viewer.session.clock import Watcher
+from lyceum_warp.viewer.session.stage import check_world
 from lyceum_warp.viewer.show import chosen_graphics, view
 
 _RUN_WORLDS = 16

@@ -96,7 +96,7 @@ def view(
         title=title, watchers=watchers, on_trajectory=on_trajectory,
     )  # fmt: skip
     try:
-        window = opened(session.scene, graphics, host=host, port=port, browser=browser)
+        window = opened(session.stage.scene, graphics, host=host, port=port, browser=browser)
         session.run(window)
     finally:
         session.close()

@@ -74,7 +74,7 @@ class Viewer:
 
     def __init__(self, session: Session) -> None:
         self.session = session
-        self.window = WatchedWindow(session.scene)
+        self.window = WatchedWindow(session.stage.scene)
         self.error: BaseException | None = None
         self.thread = threading.Thread(target=self.run, daemon=True)
         self.thread.start()

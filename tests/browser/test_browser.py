@@ -121,14 +121,14 @@ def test_keys_and_buttons_pause_and_go_on(tab: Tab) -> None:
 
 def test_keys_step_forwards_and_back(tab: Tab) -> None:
     viewer = tab.viewer
-    before = viewer.session.env.get_state()
+    before = viewer.session.stage.env.get_state()
     tab.press("Shift+ArrowRight", until=lambda: viewer.status.step >= 50)
     tab.press("ArrowRight", until=lambda: viewer.status.step >= 51)
     tab.press("ArrowLeft")
     while viewer.status.step:
         step = viewer.status.step
         tab.press("Shift+ArrowLeft", until=lambda: viewer.status.step < step)  # noqa: B023
-    assert torch.equal(viewer.session.env.get_state(), before)
+    assert torch.equal(viewer.session.stage.env.get_state(), before)
 
 
 def test_controllers_are_switched_and_the_picture_follows(tab: Tab) -> None:
@@ -164,7 +164,7 @@ def test_a_body_is_pushed_by_dragging(tab: Tab) -> None:
         tab.page.keyboard.down("Control")
         tab.frames(2)
         tab.drag(MIDDLE, (x + 150, y), "right")
-    tab.wait(lambda: viewer.session.env.get_obs()[0, 0] > 0.2)
+    tab.wait(lambda: viewer.session.stage.env.get_obs()[0, 0] > 0.2)
     assert place(tab.silhouette()) > middle + 0.02
     tab.release()
     tab.wait(lambda: not viewer.window.given[-1].forces.any())  # type: ignore[union-attr]

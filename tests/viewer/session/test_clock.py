@@ -82,41 +82,41 @@ def test_going_on_after_stepping_back_gives_the_same_numbers_to_the_bit(shared_e
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=1)
     states = [env.get_state()]
     for _ in range(40):  # some episodes end on the way
-        session.advance()
+        session.stage.advance()
         states.append(env.get_state())
     session.obey(StepBy(-15))
-    assert torch.equal(env.get_state(), states[25]) and session.live.past.ahead == 15
+    assert torch.equal(env.get_state(), states[25]) and session.stage.live.past.ahead == 15
     for k in range(26, 41):
         session.obey(StepBy(1))
         assert torch.equal(env.get_state(), states[k])
-    assert session.live.past.ahead == 0
+    assert session.stage.live.past.ahead == 0
     session.obey(StepBy(-40))
     assert torch.equal(env.get_state(), states[0])
     session.obey(StepBy(40))
     assert torch.equal(env.get_state(), states[40])
-    session.advance()  # a new step, which the policy chooses
-    assert session.live.past.behind == 41
+    session.stage.advance()  # a new step, which the policy chooses
+    assert session.stage.live.past.behind == 41
 
 
 def test_steps_that_were_taken_back_are_repeated_with_resets_and_pushes(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True, seed=2)
-    session.advance(3)
+    session.stage.advance(3)
     session.obey(Reset(random=True))
     after_reset = env.get_state()
-    session.advance(2)
+    session.stage.advance(2)
     force = np.zeros((env.model.nbody, 6))
     force[1, 0] = 50.0
     session.obey(Perturb(force))
-    session.advance(2)
+    session.stage.advance(2)
     session.obey(Perturb(0 * force))
-    session.advance(2)
-    last, returns = env.get_state(), session.live.returns.clone()
+    session.stage.advance(2)
+    last, returns = env.get_state(), session.stage.live.returns.clone()
     session.obey(StepBy(-6))
     assert torch.equal(env.get_state(), after_reset)
     session.obey(StepBy(-1))
     session.obey(StepBy(7))
-    assert torch.equal(env.get_state(), last) and torch.equal(session.live.returns, returns)
+    assert torch.equal(env.get_state(), last) and torch.equal(session.stage.live.returns, returns)
 
 
 def test_a_planners_steps_are_repeated_with_its_actions(shared_env: SharedEnv) -> None:
@@ -124,7 +124,7 @@ def test_a_planners_steps_are_repeated_with_its_actions(shared_env: SharedEnv) -
     session = Session(env, controllers={"mppi": lw.MPPI("point_mass", **PLANNER)}, paused=True, seed=0)
     states = [env.get_state()]
     for _ in range(6):
-        session.advance()
+        session.stage.advance()
         states.append(env.get_state())
     session.obey(StepBy(-4))
     assert torch.equal(env.get_state(), states[2])
@@ -135,13 +135,13 @@ def test_a_planners_steps_are_repeated_with_its_actions(shared_env: SharedEnv) -
 def test_the_past_is_bounded_and_a_message_says_where_it_ends(shared_env: SharedEnv) -> None:
     env = shared_env("hopper")
     session = Session(env, paused=True)
-    past = session.live.past
+    past = session.stage.live.past
     assert past.bytes <= 256 * 2**20 and past.length <= 2000
-    session.advance(past.length + 20)
+    session.stage.advance(past.length + 20)
     assert past.behind == past.length - 1
     session.obey(StepBy(-past.length - 5))
     assert past.behind == 0 and past.ahead == past.length - 1
-    assert "the past ends here" in session.frame().messages[0]
+    assert "the past ends here" in session.stage.frame().messages[0]
     session.obey(Reset(random=False))
     assert past.ahead == 0
 
@@ -149,21 +149,21 @@ def test_the_past_is_bounded_and_a_message_says_where_it_ends(shared_env: Shared
 def test_seeking_shows_a_step_of_the_episode(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, seed=0)
-    session.advance(8)
+    session.stage.advance(8)
     session.obey(Seek(3))
-    frame = session.frame()
+    frame = session.stage.frame()
     assert frame.status.step == 3 and frame.status.paused and frame.status.seekable == (0, 8)
     session.obey(Seek(100))
-    assert session.frame().status.step == 8
+    assert session.stage.frame().status.step == 8
 
 
 def test_another_controller_acts_after_steps_back(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, controllers={"a": pushing, "b": lambda obs: 0.5 * pushing(obs)}, paused=True, seed=1)
-    session.advance(6)
+    session.stage.advance(6)
     session.obey(StepBy(-4))
     session.obey(SetController("b"))
-    assert session.live.past.ahead == 0 and session.live.past.behind == 2
+    assert session.stage.live.past.ahead == 0 and session.stage.live.past.behind == 2
     session.obey(StepBy(1))
     assert env.action.abs().max() == 0.25
     session.obey(StepBy(-1))
@@ -189,9 +189,9 @@ def test_a_past_that_does_not_fit_is_not_kept(shared_env: SharedEnv) -> None:
 def test_all_pasts_of_a_session_are_bounded_together(shared_env: SharedEnv) -> None:
     env = shared_env("point_mass", nworld=3)
     session = Session(env, controllers={"own": towards})
-    assert session.live.env is not env
+    assert session.stage.live.env is not env
     assert PLANT_HISTORY_BYTES + HISTORY_BYTES == 256 * 2**20
-    assert session.live.past.bytes <= PLANT_HISTORY_BYTES
+    assert session.stage.live.past.bytes <= PLANT_HISTORY_BYTES
 
 
 def test_the_return_ends_with_the_episode(shared_env: SharedEnv) -> None:
@@ -200,14 +200,14 @@ def test_the_return_ends_with_the_episode(shared_env: SharedEnv) -> None:
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=0)
     total, over = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.bool)
     for _ in range(60):
-        session.advance()
+        session.stage.advance()
         total += env.reward.double().masked_fill(over, 0.0)
         over |= env.done
     assert over.all() and (env.reward != 0).any()
-    assert torch.equal(session.live.returns, total)
+    assert torch.equal(session.stage.live.returns, total)
     session.obey(SetWorld("worst"))
-    assert session.frame().status.world == int(total.argmin())
-    assert ("return", f"{total.min().item():.6g}") in session.frame().status.text
+    assert session.stage.frame().status.world == int(total.argmin())
+    assert ("return", f"{total.min().item():.6g}") in session.stage.frame().status.text
 
 
 # pushes
@@ -269,15 +269,15 @@ def test_a_push_of_the_past_does_not_stay(shared_env: SharedEnv, push: Perturb) 
 def test_a_push_that_ends_in_the_past_does_not_stay_in_the_present(shared_env: SharedEnv, push: Perturb) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
-    session.advance(2)
+    session.stage.advance(2)
     session.obey(push)
-    session.advance(2)
+    session.stage.advance(2)
     session.obey(StepBy(-4))
     session.obey(released(push))
     session.obey(StepBy(2))
     assert pushed(env, 0)  # the push is repeated
     session.obey(StepBy(2))
-    assert not pushed(env, 0) and session.live.past.ahead == 0
+    assert not pushed(env, 0) and session.stage.live.past.ahead == 0
 
 
 def test_a_push_goes_on_under_another_controller(push: Perturb) -> None:
@@ -292,11 +292,11 @@ def test_a_push_goes_on_under_another_controller(push: Perturb) -> None:
     session.obey(SetMode("passive"))
     session.obey(push)
     session.obey(SetController("look"))
-    assert pushed(session.live.env, 0) and not pushed(env, 0)
-    session.advance(2)
+    assert pushed(session.stage.live.env, 0) and not pushed(env, 0)
+    session.stage.advance(2)
     assert seen == [0.0, 0.0]
     session.obey(released(push))
-    assert not pushed(session.live.env, 0)
+    assert not pushed(session.stage.live.env, 0)
 
 
 # worlds
@@ -306,11 +306,11 @@ def test_worlds_are_chosen_by_number_and_by_return(shared_env: SharedEnv) -> Non
     env = shared_env("hopper", nworld=4)
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=0)
     session.obey(SetWorld("last_ended"))
-    assert session.frame().messages == ("no episode has ended yet",)
+    assert session.stage.frame().messages == ("no episode has ended yet",)
     total = torch.zeros(4, dtype=torch.float64)
     ended: set[int] = set()
-    while not ended or session.live.made < 60:
-        session.advance()
+    while not ended or session.stage.live.made < 60:
+        session.stage.advance()
         total += env.reward
         if env.done.any():
             ended = set(env.done.nonzero().flatten().tolist())
@@ -318,31 +318,31 @@ def test_worlds_are_chosen_by_number_and_by_return(shared_env: SharedEnv) -> Non
     for choice, expected in (("best", total.argmax()), ("worst", total.argmin()), (2, 2), ("next", 3), ("next", 0),
                              ("previous", 3)):  # fmt: skip
         session.obey(SetWorld(choice))
-        frame = session.frame()
+        frame = session.stage.frame()
         assert frame.status.world == int(expected), choice
         np.testing.assert_array_equal(frame.state, env.get_state()[int(expected), : len(frame.state)].numpy())
     session.obey(SetWorld("last_ended"))
-    assert session.frame().status.world in ended
+    assert session.stage.frame().status.world in ended
     session.obey(SetWorld(4))
-    assert session.frame().messages == ("there is no world 4: there are 4 worlds, 0 to 3",)
+    assert session.stage.frame().messages == ("there is no world 4: there are 4 worlds, 0 to 3",)
 
 
 def test_rows_that_come_later_are_shown_a_frame_later(shared_env: SharedEnv) -> None:
     """As those of worlds on a GPU."""
     env = shared_env("hopper", nworld=4)
     session = Session(env, controllers={"policy": pushing}, seed=0)
-    session.live.asynchronous = True
-    points, rewards = [session.frame().samples], []
+    session.stage.live.asynchronous = True
+    points, rewards = [session.stage.frame().samples], []
     for _ in range(6):
         at_last_frame = env.get_state()[0]
         for _ in range(5):
-            session.advance()
+            session.stage.advance()
             rewards.append(env.reward[0].item())
-        frame = session.frame()
+        frame = session.stage.frame()
         np.testing.assert_array_equal(frame.state, at_last_frame[: len(frame.state)].numpy())
         points.append(frame.samples)
     session.obey(SetPaused(True))
-    frame = session.frame()  # while paused, of now
+    frame = session.stage.frame()  # while paused, of now
     np.testing.assert_array_equal(frame.state, env.get_state()[0, : len(frame.state)].numpy())
     np.testing.assert_array_equal(np.concatenate([*points, frame.samples])[:, 1], rewards)
 
@@ -350,24 +350,24 @@ def test_rows_that_come_later_are_shown_a_frame_later(shared_env: SharedEnv) -> 
 def test_other_worlds_and_the_past_are_shown_as_ghosts(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=4)
     session = Session(env, paused=True, seed=0)
-    session.advance(10)
+    session.stage.advance(10)
     session.obey(SetGhosts(worlds=(1, 3), burst=5, fade=0.5, doppler=True))
-    ghosts = session.frame().ghosts
+    ghosts = session.stage.frame().ghosts
     state, qpos = env.get_state(), env.state_space.parts["qpos"]
     for ghost, world in zip(ghosts, (1, 3), strict=False):
         np.testing.assert_array_equal(ghost.pose.qpos, state[world, qpos].numpy())
     past = ghosts[2:]
     assert len(past) == 5 and past[0].colour[3] == 2 * past[1].colour[3]
-    np.testing.assert_array_equal(past[-1].pose.qpos, session.live.past.states[0, 0, qpos].numpy())
+    np.testing.assert_array_equal(past[-1].pose.qpos, session.stage.live.past.states[0, 0, qpos].numpy())
     session.obey(SetGhosts(worlds=(9,)))
-    assert "there is no world 9" in session.frame().messages[0]
+    assert "there is no world 9" in session.stage.frame().messages[0]
     for ghosts, text in (
         (SetGhosts(worlds=(0,) * (MOST_GHOSTS + 1)), "at most 32 worlds are drawn as ghosts, not 33"),
         (SetGhosts(burst=MOST_BURST + 1), "at most 50 states of the burst"),
     ):
         session.obey(ghosts)
-        assert text in session.frame().messages[0]
-    assert len(session.frame().ghosts) == 7
+        assert text in session.stage.frame().messages[0]
+    assert len(session.stage.frame().ghosts) == 7
 
 
 def test_ends_of_episodes_and_faults_become_messages(shared_env: SharedEnv) -> None:
@@ -379,27 +379,27 @@ def test_ends_of_episodes_and_faults_become_messages(shared_env: SharedEnv) -> N
         return action
 
     session = Session(env, controllers={"fall": pushing, "bad": bad}, paused=True, seed=0)
-    session.frame()
+    session.stage.frame()
     while not env.done[0].item():
-        session.advance()
-    steps = session.live.made
-    (message,) = session.frame().messages
+        session.stage.advance()
+    steps = session.stage.live.made
+    (message,) = session.stage.frame().messages
     assert message.startswith(f"the episode ended after {steps} steps (terminated), return ")
     session.obey(SetController("bad"))
-    session.advance()
-    assert "fault in world 1: action (1 so far)" in session.frame().messages
+    session.stage.advance()
+    assert "fault in world 1: action (1 so far)" in session.stage.frame().messages
 
 
 def test_frames_hold_every_point_of_the_curves() -> None:
     env = lw.make("hopper", nworld=2)
     session = Session(env, paused=True, seed=0)
-    assert session.scene.curves == ("reward", "eval", *env.metrics)
+    assert session.stage.scene.curves == ("reward", "eval", *env.metrics)
     rewards = []
     for _ in range(20):
-        session.advance()
+        session.stage.advance()
         rewards.append(env.reward[0].item())
-    points = session.frame().samples
-    assert points.shape == (20, 1 + len(session.scene.curves))
+    points = session.stage.frame().samples
+    assert points.shape == (20, 1 + len(session.stage.scene.curves))
     np.testing.assert_array_equal(points[:, 1], rewards)
     np.testing.assert_allclose(points[:, 0], env.timestep * np.arange(1, 21))
 
@@ -407,11 +407,11 @@ def test_frames_hold_every_point_of_the_curves() -> None:
 def test_model_fields_that_differ_are_in_the_frame() -> None:
     env = lw.make("hopper", nworld=2, dynamics=["body_mass"])
     session = Session(env, paused=True)
-    assert session.frame().model_fields == {}
+    assert session.stage.frame().model_fields == {}
     masses = env.model.body_mass.copy()
     masses[2] *= 2
     env.set_dynamics(body_mass=masses)
-    np.testing.assert_array_equal(session.frame().model_fields["body_mass"], masses.astype(np.float32))
+    np.testing.assert_array_equal(session.stage.frame().model_fields["body_mass"], masses.astype(np.float32))
 
 
 # modes and controllers
@@ -420,19 +420,19 @@ def test_model_fields_that_differ_are_in_the_frame() -> None:
 def test_controllers_are_switched_and_passive_worlds_have_no_controls(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, controllers={"push": pushing, "half": lambda obs: 0.5 * pushing(obs)}, paused=True)
-    assert session.scene.modes == ("controller", "passive") and session.frame().status.controller == "push"
-    session.advance()
+    assert session.stage.scene.modes == ("controller", "passive") and session.stage.frame().status.controller == "push"
+    session.stage.advance()
     assert env.action.abs().max() == 0.5
     session.obey(SetController("half"))
-    session.advance()
-    assert env.action.abs().max() == 0.25 and session.frame().status.controller == "half"
+    session.stage.advance()
+    assert env.action.abs().max() == 0.25 and session.stage.frame().status.controller == "half"
     session.obey(SetMode("passive"))
-    session.advance()
-    assert env.action.abs().max() == 0 and session.frame().status.controller is None
+    session.stage.advance()
+    assert env.action.abs().max() == 0 and session.stage.frame().status.controller is None
     session.obey(SetController("none"))
-    assert session.frame().messages == ("there is no controller 'none': there are push, half",)
+    assert session.stage.frame().messages == ("there is no controller 'none': there are push, half",)
     session.obey(SetMode("playback"))
-    assert "there is no mode 'playback' here" in session.frame().messages[0]
+    assert "there is no mode 'playback' here" in session.stage.frame().messages[0]
 
 
 def test_a_planner_keeps_its_rate_and_shows_its_plan() -> None:
@@ -451,7 +451,7 @@ def test_a_planner_keeps_its_rate_and_shows_its_plan() -> None:
     frame = window.frames[-1]
     assert frame.status.time < 4 * (time.monotonic() - begun)
     assert frame.traces.shape == (7, 9, 3) and frame.best == 0 and len(frame.ghosts) == 1
-    assert frame.status.plan_ms > 0 and session.paused is False
+    assert frame.status.plan_ms > 0 and session.stage.paused is False
     # the points of the paths begin where the point is
     np.testing.assert_allclose(np.ptp(frame.traces[:, 0], axis=0), 0.0, atol=1e-12)
     points = np.concatenate([frame.samples for frame in window.frames])
@@ -463,22 +463,24 @@ def test_a_planner_controls_a_copy_of_the_shown_world(shared_env: SharedEnv) -> 
     mppi = lw.MPPI("point_mass", **PLANNER)
     session = Session(env, controllers={"mppi": mppi, "own": towards}, world=1, paused=True, seed=0)
     before = env.get_state()
-    session.advance(3)
+    session.stage.advance(3)
     assert torch.equal(env.get_state(), before)
-    moved = session.live.env.get_state()[0]
+    moved = session.stage.live.env.get_state()[0]
     assert not torch.equal(moved, before[1])
     session.obey(SetGhosts(worlds=(0,)))
-    np.testing.assert_array_equal(session.frame().ghosts[0].pose.qpos, before[0, env.state_space.parts["qpos"]].numpy())
+    np.testing.assert_array_equal(
+        session.stage.frame().ghosts[0].pose.qpos, before[0, env.state_space.parts["qpos"]].numpy()
+    )
     session.obey(SetWorld(2))  # world 1 goes on where the copy stopped
     qpos = env.state_space.parts["qpos"]
     assert torch.equal(env.get_state()[1, qpos], moved[qpos])
-    assert torch.equal(session.live.env.get_state()[0, qpos], before[2, qpos])
+    assert torch.equal(session.stage.live.env.get_state()[0, qpos], before[2, qpos])
     session.obey(SetController("own"))
-    session.advance()
+    session.stage.advance()
     session.obey(SetMode("passive"))
     after = env.get_state()
     assert torch.equal(after[0], before[0]) and not torch.equal(after[2, qpos], before[2, qpos])
-    assert session.frame().status.world == 2
+    assert session.stage.frame().status.world == 2
 
 
 def test_an_episode_of_a_plant_that_ends_is_followed_by_another() -> None:
@@ -486,7 +488,7 @@ def test_an_episode_of_a_plant_that_ends_is_followed_by_another() -> None:
     done: list[lw.Trajectory] = []
     session = Session(env, controllers={"own": towards}, seed=0, on_trajectory=done.append)
     session.obey(SetSpeed(8.0))
-    window = run(session, until(lambda frame: session.live.made > 30))
+    window = run(session, until(lambda frame: session.stage.live.made > 30))
     assert [episode.steps for episode in done[:2]] == [12, 12] and done[0].truncated
     assert any("the episode ended after 12 steps (truncated)" in message for message in window.messages)
 
@@ -504,7 +506,7 @@ def test_a_planner_does_not_foresee_a_push() -> None:
     force[1, 0] = 1.0
     before = env.get_state()
     session.obey(Perturb(force))
-    session.advance(5)
+    session.stage.advance(5)
     assert seen == [0.0] * 5
     qpos = env.state_space.parts["qpos"]
     assert env.get_state()[0, qpos][0] > before[0, qpos][0]
@@ -515,12 +517,12 @@ def test_a_planner_does_not_foresee_a_push() -> None:
 def test_a_body_is_placed_while_paused(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True, world=1)
-    session.advance(2)
+    session.stage.advance(2)
     before = env.get_state()
     qpos = before[1, env.state_space.parts["qpos"]].numpy().copy()
     qpos[1] += 0.5
     session.obey(Perturb(np.zeros((env.model.nbody, 6)), qpos=qpos))
-    np.testing.assert_array_equal(session.frame().pose.qpos, qpos)
+    np.testing.assert_array_equal(session.stage.frame().pose.qpos, qpos)
     assert torch.equal(env.get_state()[0], before[0])
 
 
@@ -609,12 +611,12 @@ def test_a_controller_that_fails_is_shown_and_loses_control(
         session = Session(env, controllers={name: controller}, seed=0)
         window = run(session, until(lambda frame: frame.status.mode == "passive" and bool(frame.messages)))
         assert window.messages[0].startswith(f"the controller {name!r} failed: {text}")
-        assert session.paused and window.frames[-1].status.paused
+        assert session.stage.paused and window.frames[-1].status.paused
         assert "Traceback" in capsys.readouterr().err
     calls.clear()
     session = Session(env, controllers={"planner": planner}, paused=True)
     session.obey(StepBy(20))
-    assert session.mode == "passive" and "ZeroDivisionError" in session.frame().messages[0]
+    assert session.stage.mode == "passive" and "ZeroDivisionError" in session.stage.frame().messages[0]
 
 
 # playback
@@ -629,35 +631,38 @@ def trajectories() -> list[lw.Trajectory]:
 def test_a_playback_is_sought_reversed_and_looped(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
     env = shared_env("point_mass")
     session = Session(env, episodes=trajectories, paused=True)
-    assert session.scene.modes == ("playback", "passive") and session.scene.episodes == ("episode 0", "episode 1")
+    assert session.stage.scene.modes == ("playback", "passive") and session.stage.scene.episodes == (
+        "episode 0",
+        "episode 1",
+    )
     qpos = env.state_space.parts["qpos"]
 
     def shown() -> np.ndarray:
-        return session.frame().pose.qpos
+        return session.stage.frame().pose.qpos
 
     session.obey(Seek(7))
     np.testing.assert_array_equal(shown(), trajectories[0].states[7, qpos])
     session.obey(StepBy(-2))
-    assert session.frame().status.step == 5
+    assert session.stage.frame().status.step == 5
     session.obey(SetBackwards(True))
-    session.advance(6)
-    assert session.frame().status.step == 20  # after the first step the last one
+    session.stage.advance(6)
+    assert session.stage.frame().status.step == 20  # after the first step the last one
     session.obey(SetEpisode(1))
-    frame = session.frame()
+    frame = session.stage.frame()
     assert frame.status.step == 15 and frame.status.steps == 15 and frame.status.episode == 1
     session.obey(SetBackwards(False))
     session.obey(Reset(random=False))
-    session.frame()
-    session.advance(3)
-    points = session.frame().samples
+    session.stage.frame()
+    session.stage.advance(3)
+    points = session.stage.frame().samples
     np.testing.assert_allclose(points[:, 1], trajectories[1].rewards[:3])
     session.obey(SetGhosts(episodes=(0, 1), burst=4, doppler=True))
-    ghosts = session.frame().ghosts
+    ghosts = session.stage.frame().ghosts
     np.testing.assert_array_equal(ghosts[0].pose.qpos, trajectories[0].states[3, qpos])
     past = [ghost for ghost in ghosts[1:] if ghost.colour[0] > ghost.colour[2]]
     assert len(past) == 1 and len(ghosts) == 5
     session.obey(SetEpisode(5))
-    assert session.frame().messages == ("there is no episode 5: there are 2, from 0",)
+    assert session.stage.frame().messages == ("there is no episode 5: there are 2, from 0",)
 
 
 def test_worlds_go_on_from_the_state_of_a_playback(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
@@ -667,15 +672,15 @@ def test_worlds_go_on_from_the_state_of_a_playback(shared_env: SharedEnv, trajec
     session.obey(SetMode("passive"))
     qpos = env.state_space.parts["qpos"]
     assert torch.equal(env.get_state()[0, qpos], trajectories[0].states[20, qpos])
-    session.advance()
+    session.stage.advance()
 
 
 def test_states_are_played_back_without_rewards(shared_env: SharedEnv) -> None:
     env = shared_env("point_mass")
     states = torch.cat([env.get_state() for _ in range(4)])
     session = Session(env, episodes=states)
-    session.advance()
-    frame = session.frame()
+    session.stage.advance()
+    frame = session.stage.frame()
     assert frame.status.steps == 3 and np.isnan(frame.samples[:, 1]).all()
 
 
@@ -723,7 +728,7 @@ def test_frames_come_as_often_where_a_plant_never_waits(speed: float) -> None:
         frames.append(time.monotonic())
         return [] if frames[-1] - frames[0] < 2.0 else None
 
-    run(session, until(lambda frame: session.live.made > 0), timed)
+    run(session, until(lambda frame: session.stage.live.made > 0), timed)
     assert len(frames) > 20
 
 
@@ -755,7 +760,7 @@ def test_a_video_that_cannot_be_written_is_a_message(
     session = Session(shared_env("point_mass"), seed=0)
     monkeypatch.setattr(Recorder, "__init__", full)
     session.obey(SetVideo(True))
-    assert "No space left on device" in session.frame().messages[0]
+    assert "No space left on device" in session.stage.frame().messages[0]
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(Recorder, "add", full)

@@ -59,12 +59,12 @@ def test_a_missing_package_is_a_message(shared_env: SharedEnv, monkeypatch: pyte
     monkeypatch.setattr("lyceum_warp.viz.drawing.check_video", missing)
     session = Session(shared_env("hopper"), paused=True)
     session.obey(protocol.SetVideo(True))
-    assert session.frame().messages == ("videos need imageio: pip install 'lyceum-warp[viz]'",)
+    assert session.stage.frame().messages == ("videos need imageio: pip install 'lyceum-warp[viz]'",)
 
 
 @pytest.fixture
 def frame(shared_env: SharedEnv) -> Frame:
-    return Session(shared_env("hopper"), paused=True).frame()
+    return Session(shared_env("hopper"), paused=True).stage.frame()
 
 
 @pytest.fixture
