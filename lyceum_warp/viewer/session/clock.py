@@ -5,7 +5,7 @@ import sys
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -31,19 +31,15 @@ class SessionWindow(Protocol):
 
     def show(self, frame: Frame, /) -> None:
         """Show a frame; never waits."""
-        ...
 
     def commands(self) -> Iterable[Command]:
         """The commands since the last call; never waits."""
-        ...
 
     def is_open(self) -> bool:
         """Whether the window is there."""
-        ...
 
     def close(self) -> None:
         """Close the window."""
-        ...
 
     # ``wants_frame``, a property, is optional: False while the frame before is on its way
 
@@ -60,17 +56,11 @@ class Session:
 
     Args:
         env: The worlds.
-        controllers: Controllers by their names; see ``lw.view``.
-        episodes: Episodes to play back.
-        world: The world that is shown first.
-        seed: Seed of a random reset at the start; by default the worlds stay as they are.
-        paused: Whether the session starts paused.
-        trace: The site or body whose path is drawn for a planner's samples.
         fps: Maximum number of frames per second.
-        title: What the window is called.
         watchers: Called about twice a second.
         on_trajectory: Called with what a controller of one world did in real time, after each episode and after each
             command that interrupts one.
+        shown: Further arguments of ``Stage``.
 
     Raises:
         ValueError: An argument does not fit.
@@ -80,21 +70,13 @@ class Session:
         self,
         env: Env,
         *,
-        controllers: Mapping[str, Any] | None = None,
-        episodes: Any = None,
-        world: int = 0,
-        seed: int | None = None,
-        paused: bool = False,
-        trace: str | None = None,
         fps: float = 30.0,
-        title: str | None = None,
         watchers: Sequence[Watcher] = (),
         on_trajectory: Callable[[Trajectory], object] | None = None,
+        **shown: Any,
     ) -> None:
         self.fps = positive_number("fps", fps, "frames per second")
-        self.stage = Stage(
-            env, controllers, episodes, world=world, seed=seed, paused=paused, trace=trace, title=title
-        )  # fmt: skip
+        self.stage = Stage(env, **shown)
         self._watchers, self._on_trajectory = watchers, on_trajectory
         self._window: SessionWindow | None = None
         self._closed = self._in_run = False
@@ -118,7 +100,10 @@ class Session:
             ends.enter_context(self.stage.videos.finishing(print))
             ends.callback(self.close)
             ends.callback(window.close)
-            while self._goes_on():
+            while True:
+                self._poll()
+                if self._closed:
+                    return
                 try:
                     if self._by_the_clock():
                         self._run_plant()
@@ -130,11 +115,6 @@ class Session:
     def close(self) -> None:
         """End the threads of the session. A second call does nothing."""
         self.stage.close()
-
-    def _goes_on(self) -> bool:
-        """Obey commands; returns whether the window is still open."""
-        self._poll()
-        return not self._closed
 
     def _tick(self) -> None:
         """Step what is due, show a frame, and wait."""

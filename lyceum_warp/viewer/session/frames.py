@@ -1,8 +1,6 @@
-"""Frames: what a window shows of worlds and of playbacks, and the messages beside it."""
+"""Make the frames of worlds and of playbacks, and the messages beside them."""
 
 import math
-import tempfile
-from pathlib import Path
 from typing import Any, Protocol
 
 import mujoco
@@ -208,7 +206,6 @@ def _seekable(live: Live, step: int) -> tuple[int, int]:
 
 def model_bytes(model: mujoco.MjModel) -> bytes:
     """A model as ``mujoco.mj_saveModel`` writes it."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "model.mjb")
-        mujoco.mj_saveModel(model, str(path), None)
-        return path.read_bytes()
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return content.tobytes()

@@ -46,14 +46,14 @@ class Stage:
     def __init__(
         self,
         env: Env,
-        controllers: Mapping[str, Any] | None,
-        episodes: Any,
         *,
-        world: int,
-        seed: int | None,
-        paused: bool,
-        trace: str | None,
-        title: str | None,
+        controllers: Mapping[str, Any] | None = None,
+        episodes: Any = None,
+        world: int = 0,
+        seed: int | None = None,
+        paused: bool = False,
+        trace: str | None = None,
+        title: str | None = None,
     ) -> None:
         check_kind("env", env, Env, "as lw.make('hopper') returns it")
         check_world(world, env.nworld)

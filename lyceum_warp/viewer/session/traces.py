@@ -1,4 +1,4 @@
-"""The paths of a planner's samples, rolled out again in worlds of their own, in a thread that takes little time.
+"""Roll out the plan and samples of a planner again, for their paths, in a thread that takes little time.
 
 A planner keeps no positions on the way: it needs rewards alone. Its samples' actions are therefore rolled out once
 more, from the state of the plan, in a few worlds of the planner's own task, model and time step. They draw from the
@@ -60,57 +60,36 @@ def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
             f"the model has no site and no body {name!r} to trace: it has {', '.join(filter(None, known)) or 'none'}"
         )
     driven = _driven_bodies(model)
-    if not driven:
+    if not driven.any():
         return TracePoint("subtree_com", 0, "centre of mass")
-    root = int(model.body_rootid[min(driven)])
-    first = _first_moving(model, root)
-    if first not in driven:  # a base that no actuator moves
+    root = int(model.body_rootid[driven.argmax()])
+    moving = np.array([model.body_jntnum[body] > 0 for body in range(model.nbody)])
+    first = next(body for body in range(model.nbody) if model.body_rootid[body] == root and moving[body])
+    if not driven[first]:  # a base that no actuator moves
         return TracePoint("subtree_com", root, f"centre of mass of {model.body(root).name or 'the robot'}")
-    end = max(_descendants(model, driven), key=lambda body: (_depth(model, body), -body))
-    sites = [i for i in range(model.nsite) if model.site_bodyid[i] == end]
+    depth = np.zeros(model.nbody, dtype=int)  # moving bodies from the world to a body that actuators move
+    for body in range(1, model.nbody):
+        parent = model.body_parentid[body]
+        driven[body] |= driven[parent]
+        depth[body] = depth[parent] + moving[body]
+    end = int(np.where(driven, depth, -1).argmax())
+    sites = np.flatnonzero(model.site_bodyid == end).tolist()
     if sites:
         return TracePoint("site_xpos", sites[0], model.site(sites[0]).name or f"site {sites[0]}")
     return TracePoint("xipos", end, model.body(end).name or f"body {end}")
 
 
-def _driven_bodies(model: mujoco.MjModel) -> set[int]:
-    """The bodies whose joints actuators move, directly or by tendons."""
-    joints = set()
-    tendon = (mujoco.mjtWrap.mjWRAP_JOINT,)
-    for i in range(model.nactuator):
-        kind, target = int(model.actuator_trntype[i]), int(model.actuator_trnid[i, 0])
-        if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
-            joints.add(target)
-        elif kind == int(mujoco.mjtTrn.mjTRN_TENDON):
-            start = int(model.tendon_adr[target])
-            for wrap in range(start, start + int(model.tendon_num[target])):
-                if int(model.wrap_type[wrap]) in map(int, tendon):
-                    joints.add(int(model.wrap_objid[wrap]))
-    return {int(model.jnt_bodyid[joint]) for joint in joints}
-
-
-def _first_moving(model: mujoco.MjModel, root: int) -> int:
-    """The first body of a tree that has joints."""
-    tree = [body for body in range(model.nbody) if model.body_rootid[body] == root]
-    return next((body for body in tree if model.body_jntnum[body]), root)
-
-
-def _descendants(model: mujoco.MjModel, bodies: set[int]) -> set[int]:
-    """Bodies that these move, themselves included, without those that have free joints of their own."""
-    found = set(bodies)
-    for body in range(1, model.nbody):
-        if int(model.body_parentid[body]) in found:
-            found.add(body)
-    return found
-
-
-def _depth(model: mujoco.MjModel, body: int) -> int:
-    """The number of moving bodies from the world to a body."""
-    depth = 0
-    while body:
-        depth += bool(model.body_jntnum[body])
-        body = int(model.body_parentid[body])
-    return depth
+def _driven_bodies(model: mujoco.MjModel) -> np.ndarray:
+    """Which bodies have joints that actuators move, directly, by tendons or at sites; (nbody,) bool."""
+    data, moment = mujoco.MjData(model), np.zeros((model.nu, model.nv))
+    mujoco.mj_fwdPosition(model, data)
+    if model.nu:
+        mujoco.mju_sparse2dense(
+            moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        )
+    driven = np.zeros(model.nbody, dtype=bool)
+    driven[model.dof_bodyid[moment.any(axis=0)]] = True
+    return driven
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """Draw the panel's windows with ImGui: the session, messages, curves, the view and the keys."""
 
-import dataclasses
 import functools
 import re
 import textwrap
@@ -19,18 +18,6 @@ from lyceum_warp.viewer.window.studio import imgui, implot, ux
 PLOT_POINTS = 200
 """Points of a plotted curve. All of them are sent to the browser for each frame."""
 WINDOWS = ("messages", "curves", "view", "keys")
-
-
-@dataclasses.dataclass(frozen=True)
-class Place:
-    """Where a window of the panel lies, in pixels."""
-
-    x: float
-    y: float
-    width: float
-    height: float
-    cond: int
-    """When it is put there, as ``ImGuiCond``."""
 
 
 class Windows:
@@ -59,19 +46,29 @@ class Windows:
         self._size, resized = (width, height), (width, height) != self._size
         cond = int(imgui.Cond.Always if resized else imgui.Cond.FirstUseEver)
         tall = min(len(self._scene.curves) * 128 + 40, height - 50)
-        self._window(self._scene.title, Place(10, 10, 320, height - 20, cond), self._session)
-        self._window("messages", Place(340, height - 110, width - 710, 100, cond), self._messages)
-        self._window("curves", Place(width - 360, 40, 350, tall, cond), self._curves)
-        self._window("view", Place(width - 360, 40, 350, height - 50, cond), self._view)
-        self._window("keys", Place(400, 60, 480, height - 200, cond), self._help)
+        self._window(self._scene.title, (10, 10, 320, height - 20), cond, self._session)
+        self._window("messages", (340, height - 110, width - 710, 100), cond, self._messages)
+        self._window("curves", (width - 360, 40, 350, tall), cond, self._curves)
+        self._window("view", (width - 360, 40, 350, height - 50), cond, self._view)
+        self._window("keys", (400, 60, 480, height - 200), cond, self._help)
 
-    def _window(self, title: str, place: Place, content: Callable[[], None]) -> None:
-        """Draw a window, unless it is closed. The first one only folds when it is closed."""
+    def _window(
+        self, title: str, place: tuple[float, float, float, float], cond: int, content: Callable[[], None]
+    ) -> None:
+        """Draw a window, unless it is closed. The first one only folds when it is closed.
+
+        Args:
+            title: Its title.
+            place: Left, top, width and height, in pixels.
+            cond: When it is put there, as ``ImGuiCond``.
+            content: Draws the inside.
+        """
+        left, top, width, height = place
         first = title == self._scene.title
         if not first and title not in self._actions.windows:
             return
-        imgui.SetNextWindowPos(imgui.Vec2(max(place.x, 0), max(place.y, 0)), place.cond)
-        imgui.SetNextWindowSize(imgui.Vec2(max(place.width, 200), max(place.height, 80)), place.cond)
+        imgui.SetNextWindowPos(imgui.Vec2(max(left, 0), max(top, 0)), cond)
+        imgui.SetNextWindowSize(imgui.Vec2(max(width, 200), max(height, 80)), cond)
         if first and self._actions.fold is not None:
             imgui.SetNextWindowCollapsed(self._actions.fold)
             self._actions.fold = None
