@@ -3,33 +3,14 @@
 import numpy as np
 import torch
 
-from lyceum_warp.viewer.protocol import (
-    MOST_BURST,
-    MOST_GHOSTS,
-    Command,
-    Mode,
-    Perturb,
-    Reset,
-    Seek,
-    SetBackwards,
-    SetController,
-    SetEpisode,
-    SetGhosts,
-    SetMode,
-    SetPaused,
-    SetSpeed,
-    SetVideo,
-    SetWorld,
-    StepBy,
-    WorldChoice,
-)
+from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.session.stage import Stage, check_world
 
 SLOWEST, FASTEST = 1 / 16, 16.0
 """Bounds of the speed, simulated seconds per second."""
 
 
-def obey(stage: Stage, command: Command) -> None:
+def obey(stage: Stage, command: protocol.Command) -> None:
     """Carry out a command.
 
     Raises:
@@ -38,25 +19,25 @@ def obey(stage: Stage, command: Command) -> None:
         ControllerError: A controller raised an exception.
     """
     match command:
-        case SetMode(mode):
+        case protocol.SetMode(mode):
             _set_mode(stage, mode)
-        case SetController(name):
+        case protocol.SetController(name):
             if name not in stage.controllers:
                 known = ", ".join(stage.controllers) or "none"
                 raise ValueError(f"there is no controller {name!r}: there are {known}")
             _set_mode(stage, "controller", name)
-        case SetWorld(world):
+        case protocol.SetWorld(world):
             _set_world(stage, world)
-        case SetEpisode(episode):
+        case protocol.SetEpisode(episode):
             stage.playback.choose(episode)
             _set_mode(stage, "playback")
-        case SetPaused(paused):
+        case protocol.SetPaused(paused):
             stage.paused = paused
             stage.measure_anew()
-        case SetSpeed(speed):
+        case protocol.SetSpeed(speed):
             stage.speed = min(max(float(speed), SLOWEST), FASTEST)
             stage.measure_anew()
-        case StepBy(steps):
+        case protocol.StepBy(steps):
             stage.paused = True
             if stage.mode == "playback":
                 stage.seek_episode(stage.playback.step + steps)
@@ -64,25 +45,25 @@ def obey(stage: Stage, command: Command) -> None:
                 stage.advance(steps)
             else:
                 stage.back(-steps)
-        case Seek(step):
+        case protocol.Seek(step):
             stage.paused = True
             _seek(stage, step)
-        case SetBackwards(backwards):
+        case protocol.SetBackwards(backwards):
             stage.playback.backwards = backwards
-        case Reset(random):
+        case protocol.Reset(random):
             if stage.mode == "playback":
                 stage.seek_episode(stage.playback.episode.steps if stage.playback.backwards else 0)
             else:
                 stage.reset(random=random)
-        case SetGhosts():
+        case protocol.SetGhosts():
             _set_ghosts(stage, command)
-        case Perturb():
+        case protocol.Perturb():
             _perturb(stage, command)
-        case SetVideo(on, camera):
+        case protocol.SetVideo(on, camera):
             stage.videos.begin(camera) if on else stage.videos.end()
 
 
-def _set_mode(stage: Stage, mode: Mode, controller: str | None = None) -> None:
+def _set_mode(stage: Stage, mode: protocol.Mode, controller: str | None = None) -> None:
     """Change the mode, or the controller.
 
     From a playback, the worlds go on from the state that is shown.
@@ -97,7 +78,7 @@ def _set_mode(stage: Stage, mode: Mode, controller: str | None = None) -> None:
         stage.go_on_from(torch.from_numpy(state), stage.live, new_episode=True)
 
 
-def _set_world(stage: Stage, choice: WorldChoice) -> None:
+def _set_world(stage: Stage, choice: protocol.WorldChoice) -> None:
     world = stage.main.choose(choice)
     if world is None and choice == "last_ended":
         raise ValueError("no episode has ended yet")
@@ -116,7 +97,7 @@ def _seek(stage: Stage, step: int) -> None:
         live.step(stage.act)
 
 
-def _perturb(stage: Stage, command: Perturb) -> None:
+def _perturb(stage: Stage, command: protocol.Perturb) -> None:
     """Push bodies of the shown world, or place them while paused."""
     given = {"mocap_pos": command.mocap_pos, "mocap_quat": command.mocap_quat}
     given["qpos"] = command.qpos if stage.paused else None
@@ -135,10 +116,10 @@ def _perturb(stage: Stage, command: Perturb) -> None:
         stage.live.end_push()
 
 
-def _set_ghosts(stage: Stage, ghosts: SetGhosts) -> None:
+def _set_ghosts(stage: Stage, ghosts: protocol.SetGhosts) -> None:
     for kind, count, most in (
-        ("worlds", len(ghosts.worlds), MOST_GHOSTS), ("episodes", len(ghosts.episodes), MOST_GHOSTS),
-        ("states of the burst", ghosts.burst, MOST_BURST),
+        ("worlds", len(ghosts.worlds), protocol.MOST_GHOSTS), ("episodes", len(ghosts.episodes), protocol.MOST_GHOSTS),
+        ("states of the burst", ghosts.burst, protocol.MOST_BURST),
     ):  # fmt: skip
         if count > most:
             raise ValueError(f"at most {most} {kind} are drawn as ghosts, not {count}: choose fewer")

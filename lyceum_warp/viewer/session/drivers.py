@@ -1,5 +1,6 @@
-"""What controls the worlds of a viewer: policies of all worlds, and controllers of one world, planners among them."""
+"""Call what controls the worlds: policies of all worlds, and controllers of one world, such as planners."""
 
+import dataclasses
 import inspect
 import threading
 import time
@@ -22,6 +23,20 @@ class ControllerError(Exception):
     def __init__(self, name: str, error: BaseException) -> None:
         text = next(iter(str(error).splitlines()), "")
         super().__init__(f"the controller {name!r} failed: {type(error).__name__}{text and ': '}{text}")
+
+
+@dataclasses.dataclass(frozen=True)
+class PlanView:
+    """One plan of a planner."""
+
+    state: torch.Tensor
+    """The state that it starts from, (state_space.size,) float64."""
+    actions: torch.Tensor
+    """(horizon, nact)."""
+    samples: torch.Tensor
+    """The actions of some samples, (horizon, samples, nact); none for planners without samples."""
+    best: int | None
+    """Index of the sample with the largest return."""
 
 
 class PolicyControl:
@@ -100,11 +115,7 @@ class WorldControl:
         return getattr(self.controller, name)
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, **words: Any) -> torch.Tensor:
-        """Call the controller.
-
-        Raises:
-            ControllerError: It raised an exception.
-        """
+        """See ``call``."""
         return self.call(None, state, obs, **words)
 
     def new_run(self) -> "ControlRun":
@@ -135,7 +146,11 @@ class WorldControl:
                 self._busy.release()
 
     def call(self, run: int | None, state: torch.Tensor, obs: torch.Tensor, **words: Any) -> torch.Tensor:
-        """Call the controller, unless the run is over."""
+        """Call the controller.
+
+        Raises:
+            ControllerError: It raised an exception, or the run is over.
+        """
         with self._busy:  # a call that an interrupted run left behind may not have ended
             if run not in (None, self._run):
                 raise ControllerError(self.name, RuntimeError("its run is over"))
@@ -163,7 +178,7 @@ class WorldControl:
             except Exception as error:
                 raise ControllerError(self.name, error) from error
 
-    def look(self) -> "PlanView | None":
+    def look(self) -> PlanView | None:
         """The plan that was copied since the last look, if there is one; asks for another."""
         seen, self._seen = self._seen, None
         self._wanted = True
@@ -188,26 +203,8 @@ class ControlRun:
         return getattr(self._control, name)
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, **words: Any) -> torch.Tensor:
-        """Call the controller.
-
-        Raises:
-            ControllerError: It raised an exception, or the run is over.
-        """
+        """See ``WorldControl.call``."""
         return self._control.call(self._number, state, obs, **words)
-
-
-class PlanView:
-    """One plan of a planner: the state that it starts from, its actions, and some of its samples.
-
-    Args:
-        state: (state_space.size,) float64.
-        actions: The plan, (horizon, nact).
-        samples: The actions of some samples, (horizon, samples, nact); none for planners without samples.
-        best: Index of the sample with the largest return.
-    """
-
-    def __init__(self, state: torch.Tensor, actions: torch.Tensor, samples: torch.Tensor, best: int | None) -> None:
-        self.state, self.actions, self.samples, self.best = state, actions, samples, best
 
 
 def plan_view(controller: Any, state: torch.Tensor) -> PlanView | None:
@@ -273,20 +270,17 @@ def controls(given: Mapping[str, Any], env: Env) -> dict[str, Control]:
 
 def _is_policy(controller: Any) -> bool:
     """Whether a controller takes observations alone."""
-    function = controller.forward if isinstance(controller, torch.nn.Module) else controller
+    module = isinstance(controller, torch.nn.Module)
     try:
-        signature = inspect.signature(function)
+        signature = inspect.signature(controller.forward if module else controller)
     except (TypeError, ValueError):
         return False
     try:
         signature.bind(None, None)
     except TypeError:
         return True
-    needed = [
-        p for p in signature.parameters.values()
-        if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
-    ]  # fmt: skip
-    return isinstance(controller, torch.nn.Module) and len(needed) < 2
+    places = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return module and sum(p.default is p.empty and p.kind in places for p in signature.parameters.values()) < 2
 
 
 def _on_device(policy: Any, env: Env) -> Any:

@@ -1,4 +1,4 @@
-"""The worlds that a session steps: their past, their episodes so far, and copies of a few of their rows for the window.
+"""Step the worlds of a session, keep their past, and copy the few rows that a frame shows to the host.
 
 Everything that happens in a step stays on the worlds' device: the past, the returns so far, the points of the curves. A
 frame copies the rows that it shows to the host, on a GPU without waiting for them.
@@ -124,7 +124,7 @@ class Live:
         """The world in whose state a person's push is."""
         device, n = env.obs.device, env.nworld
         self.asynchronous = device.type != "cpu"
-        """Whether rows are on the host only some time after they were requested."""
+        """Whether rows are copied to the host asynchronously."""
         self.returns = torch.zeros(n, dtype=torch.float64, device=device)
         """Return of each world's episode so far, (nworld,)."""
         self._ends = torch.zeros(n, _END, dtype=torch.float64, device=device)
@@ -266,12 +266,12 @@ class Live:
 
     # changes from outside
 
-    def reset(self, *, random: bool, seed: int | None = None) -> None:
+    def reset(self, *, random: bool) -> None:
         """Begin a new episode of the shown world."""
-        mask = self._mask()
+        mask = self._number == self.world
         self.past.drop_ahead()
         if random:
-            self.env.rand_reset(seed, mask=mask)
+            self.env.rand_reset(mask=mask)
         else:
             self.env.reset(mask=mask)
         self.returns.masked_fill_(mask, 0.0)
@@ -328,9 +328,6 @@ class Live:
             state[where] = torch.as_tensor(np.ascontiguousarray(value).ravel(), dtype=torch.float64).to(state.device)
         self.set_row(state)
 
-    def _mask(self) -> torch.Tensor:
-        return self._number == self.world
-
     # worlds to show
 
     def choose(self, choice: int | str) -> int | None:
@@ -384,11 +381,6 @@ class Live:
         reading, self._reading = self._reading, None
         return None if reading is None else reading.rows()
 
-    @property
-    def requested(self) -> bool:
-        """Whether a copy is on its way."""
-        return self._reading is not None
-
 
 @dataclasses.dataclass
 class _Reading:
@@ -439,9 +431,9 @@ def pose(state: np.ndarray, parts: Mapping[str, slice], nmocap: int) -> Pose:
         parts: The places of its parts.
         nmocap: Number of mocap bodies.
     """
-    empty = slice(0, 0)
-    position, quaternion = (state[parts.get(name, empty)].reshape(-1, size) for name, size in _MOCAP)
-    return Pose(state[parts["qpos"]].copy(), position[:nmocap].copy(), quaternion[:nmocap].copy())
-
-
-_MOCAP = (("mocap_pos", 3), ("mocap_quat", 4))
+    none = slice(0, 0)
+    position, quaternion = (
+        state[parts.get(name, none)].reshape(-1, size)[:nmocap].copy()
+        for name, size in (("mocap_pos", 3), ("mocap_quat", 4))
+    )
+    return Pose(state[parts["qpos"]].copy(), position, quaternion)

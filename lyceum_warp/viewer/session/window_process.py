@@ -139,11 +139,7 @@ class Window:
 
     def commands(self) -> list[Command]:
         """The commands since the last call, in order."""
-        commands = []
-        with contextlib.suppress(IndexError):
-            while True:
-                commands.append(self._commands.popleft())
-        return commands
+        return [self._commands.popleft() for _ in range(len(self._commands))]
 
     def is_open(self) -> bool:
         """Whether the window's process runs."""
@@ -182,7 +178,7 @@ class Window:
         if code is None:
             return "its process closed the connection"
         if code < 0:
-            return f"its process was ended by {_signal_name(-code)}"
+            return f"its process was ended by {signal.Signals(-code).name}"
         self._log.seek(0)
         lines = [line.strip() for line in self._log.read().decode(errors="replace").splitlines() if line.strip()]
         return lines[-1] if lines else f"its process ended with code {code}"
@@ -227,10 +223,3 @@ class Window:
                 self.error = self._last_words()
         finally:
             self._end()
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
