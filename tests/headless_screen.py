@@ -108,6 +108,11 @@ class Bench:
         given, self.given = self.given, None
         return given
 
+    def show(self, status: Status) -> None:
+        """Draw a frame with this status, and forget what was sent before."""
+        self.draw(frame_of(self.model, self.data, status))
+        self.sent.clear()
+
     def draw(self, frame: Frame | None = None) -> list[Reply]:
         """Draw one frame; what the panel sent meanwhile."""
         self.given, before = frame, len(self.sent)

@@ -349,12 +349,10 @@ def test_ctrl_c_ends_the_command_and_closes_its_port(context: BrowserContext, tm
         with page.expect_event("websocket", lambda opened: "/state" in opened.url, timeout=SECONDS * 1000):
             pass
         process.send_signal(signal.SIGINT)
-        began = time.monotonic()
-        _, error = process.communicate(timeout=20)
-        assert time.monotonic() - began < 10
+        _, error = process.communicate(timeout=SECONDS)
         assert process.returncode == 130
         assert "Traceback" not in error
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + SECONDS
         while not any("/state" in url for url in closed):
             assert time.monotonic() < deadline
             page.wait_for_timeout(50)

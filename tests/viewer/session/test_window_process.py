@@ -58,7 +58,7 @@ def process_of(window: Window) -> int:
     return window._process.pid
 
 
-def wait_until(done: object, seconds: float = 10.0) -> bool:
+def wait_until(done: object, seconds: float = 60.0) -> bool:
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         if done():  # type: ignore[operator]
@@ -103,14 +103,11 @@ def test_process_does_not_load_torch_or_warp(shared_window: Window) -> None:
 
 
 def test_frames_are_taken_without_a_browser(shared_window: Window) -> None:
+    assert shared_window.commands() == []
     assert wait_until(lambda: shared_window.wants_frame)
     shared_window.show(frame_of(MODEL, DATA))
     assert not shared_window.wants_frame
     assert wait_until(lambda: shared_window.wants_frame)
-
-
-def test_window_has_no_commands_without_a_person(shared_window: Window) -> None:
-    assert shared_window.commands() == []
 
 
 def test_studio_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
@@ -129,7 +126,7 @@ def test_show_never_waits_for_a_window_that_hangs(window: Window) -> None:
         began = time.monotonic()
         for _ in range(2000):
             window.show(frame)
-        assert time.monotonic() - began < 1.0
+        assert time.monotonic() - began < 20  # a pipe that is full would not be emptied
     finally:
         os.kill(process_of(window), signal.SIGCONT)
 
@@ -153,8 +150,7 @@ def test_frames_that_wait_for_hours_keep_a_limited_number_of_points() -> None:
     merged = frame_of(MODEL, DATA)
     for i in range(30):
         merged = latest(merged, frame_of(MODEL, DATA, samples=np.full((1000, 3), i), messages=("m",) * 10))
-    assert len(merged.samples) == 20_000
-    assert len(merged.messages) == 200
+    assert len(merged.samples) == 20_000 and len(merged.messages) == 200
 
 
 # ends
@@ -163,21 +159,12 @@ def test_frames_that_wait_for_hours_keep_a_limited_number_of_points() -> None:
 def test_close_ends_the_process_and_may_be_called_twice() -> None:
     window = Window(scene_of(MODEL))
     pid = process_of(window)
-    began = time.monotonic()
     window.close()
     window.close()
-    assert time.monotonic() - began < 4
+    assert window._process.returncode != -signal.SIGKILL
     assert not is_alive(pid)
     assert not window.is_open()
     window.show(frame_of(MODEL, DATA))  # without effect
-
-
-def test_process_that_was_killed_is_noticed(window: Window) -> None:
-    os.kill(process_of(window), signal.SIGKILL)
-    assert wait_until(lambda: not window.is_open())
-    assert window.error == "its process was ended by SIGKILL"
-    window.show(frame_of(MODEL, DATA))
-    assert window.commands() == []
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV, signal.SIGTERM])
@@ -273,14 +260,11 @@ def test_port_in_use_is_one_line(window: Window) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_window_without_a_display_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_windows_that_cannot_be_opened_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(RuntimeError, match="cannot be opened: there is no display"):
         Window(scene_of(MODEL), gfx="native")
-
-
-def test_unknown_graphics_are_refused() -> None:
     with pytest.raises(ValueError, match="'web' or 'native', not 'opengl'"):
         Window(scene_of(MODEL), gfx="opengl")  # type: ignore[arg-type]
 

@@ -4,7 +4,7 @@ import pytest
 from headless_screen import robot
 
 from lyceum_warp.viewer.protocol import BEST_COLOUR, Ghost, Pose
-from lyceum_warp.viewer.window.scene import ExtraGeoms
+from lyceum_warp.viewer.window.scene import ExtraGeoms, ModelValues
 
 MODEL = robot()
 MOCAP = np.array([[1.0, 0, 1]]), np.array([[1.0, 0, 0, 0]])
@@ -122,3 +122,35 @@ def test_limit_is_never_exceeded(limit: int, best: int | None) -> None:
 @pytest.mark.parametrize("traces", [np.zeros((0, 5, 3)), np.zeros((3, 1, 3)), None])
 def test_traces_without_lines_draw_nothing(traces: np.ndarray | None) -> None:
     assert ExtraGeoms(MODEL, 10).draw(pose(0), traces=traces).geoms == []
+
+
+# the model of the world that is shown
+
+
+def test_values_of_a_world_are_set_and_taken_back() -> None:
+    values, gravity = ModelValues(MODEL), np.array([0.0, 0, -1])
+    assert values.differ({"gravity": gravity})
+    assert not values.set({"gravity": gravity})
+    assert not values.differ({"gravity": gravity.copy()})
+    np.testing.assert_array_equal(values.model.opt.gravity, gravity)
+    assert values.differ({})
+    values.set({})
+    np.testing.assert_array_equal(values.model.opt.gravity, MODEL.opt.gravity)
+    assert values.differences == []
+
+
+@pytest.mark.parametrize(
+    ("name", "seen"),
+    [("geom_size", True), ("geom_rgba", True), ("body_pos", True), ("geom_friction", False), ("dof_damping", False)],
+)
+def test_only_fields_that_change_the_picture_are_seen(name: str, seen: bool) -> None:
+    assert ModelValues(MODEL).set({name: np.array(getattr(MODEL, name)) + 0.1}) == seen
+
+
+def test_constants_follow_the_values_and_elements_are_named() -> None:
+    values = ModelValues(MODEL)
+    values.set({"body_mass": np.array(MODEL.body_mass) * 2, "geom_rgba": np.array(MODEL.geom_rgba) / 2})
+    assert values.model.body_subtreemass[0] == pytest.approx(2 * MODEL.body_subtreemass[0])
+    assert [name for name, _ in values.differences] == [
+        "body_mass ball", "body_mass goal", "geom_rgba 0", "geom_rgba ball", "geom_rgba goal",
+    ]  # fmt: skip
