@@ -1,4 +1,4 @@
-"""``lw.view``: a session and its window."""
+"""Open a session and its window: ``lw.view``."""
 
 import os
 import platform

@@ -1,1 +1,1 @@
-"""The session: this process, with torch, Warp and the worlds."""
+"""The session, in this process: torch, Warp and the worlds."""

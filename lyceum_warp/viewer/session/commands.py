@@ -33,10 +33,10 @@ def obey(stage: Stage, command: protocol.Command) -> None:
             _set_mode(stage, "playback")
         case protocol.SetPaused(paused):
             stage.paused = paused
-            stage.measure_anew()
+            stage.restart_measurement()
         case protocol.SetSpeed(speed):
             stage.speed = min(max(float(speed), SLOWEST), FASTEST)
-            stage.measure_anew()
+            stage.restart_measurement()
         case protocol.StepBy(steps):
             stage.paused = True
             if stage.mode == "playback":

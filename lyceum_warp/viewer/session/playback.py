@@ -1,4 +1,4 @@
-"""Episodes that are played back: states one after another, with their rewards where these are known."""
+"""Play back episodes: states one after another, with their rewards if these are known."""
 
 import dataclasses
 import math

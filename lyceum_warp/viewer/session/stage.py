@@ -138,7 +138,7 @@ class Stage:
         """Count a step for the measured speed."""
         self._steps += 1
 
-    def measure_anew(self) -> None:
+    def restart_measurement(self) -> None:
         """Measure the speed from now on."""
         self._progress.clear()
 
@@ -214,7 +214,7 @@ class Stage:
         if chosen != (mode, controller):
             self.live.past.drop_ahead()
             self.reset_controller()
-            self.measure_anew()
+            self.restart_measurement()
         self.frames.forget_seen(self.live)
         if isinstance(current := self.control, WorldControl) and current.name not in self._threads:
             self._threads[current.name] = self._trace_thread(current)

@@ -1,4 +1,4 @@
-"""Videos of what a viewer shows, drawn in processes of their own."""
+"""Take videos of what a viewer shows; subprocesses draw them."""
 
 import contextlib
 import datetime

@@ -1,1 +1,1 @@
-"""The window: a process of its own that draws, with mujoco and NumPy, without torch and Warp."""
+"""The window, in a process of its own: mujoco, NumPy and studio, never torch or Warp."""

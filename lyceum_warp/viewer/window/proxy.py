@@ -14,7 +14,7 @@ serves everything below that path. Studio's page asks for some addresses from th
 proxy adds to the page puts the path in front of them.
 
 aiohttp parses requests and bounds their heads (8 KiB a line, 128 lines). It runs in a thread with an event loop of its
-own. What studio receives is written anew from the checked parts.
+own. What studio receives is built from the checked parts.
 """
 
 import asyncio

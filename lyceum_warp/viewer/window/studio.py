@@ -1,4 +1,4 @@
-"""All contact with mujoco.studio, whose interface is young: no other module imports it.
+"""Wrap mujoco.studio, whose interface is young: no other module imports it.
 
 Studio draws a scene and a panel, in a browser or in a window, and hands over keys and the mouse. ``Screen.run`` opens
 it with a plugin: an object derived from ``Plugin`` whose handlers take ``Started``, ``Update`` and ``Gui``. The

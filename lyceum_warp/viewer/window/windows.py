@@ -1,4 +1,4 @@
-"""Draw the panel's windows with ImGui: the session, messages, curves, the view and the keys."""
+"""Draw the panel with ImGui: the session, messages, curves, the view and the keys."""
 
 import functools
 import re

@@ -149,7 +149,7 @@ def test_keys_are_unique_and_known_to_studio() -> None:
 # cameras and videos
 
 
-def test_camera_that_tracks_a_body_is_the_first_one_and_films(bench: Bench) -> None:
+def test_camera_that_tracks_a_body_is_the_first_one_and_takes_videos(bench: Bench) -> None:
     ball = bench.model.body("ball").id
     assert bench.viewer.camera.type == mujoco.mjtCamera.mjCAMERA_TRACKING
     assert bench.viewer.camera.trackbodyid == ball

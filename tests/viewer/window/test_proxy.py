@@ -489,7 +489,7 @@ def test_two_tabs_talk_at_once_and_one_may_close(echo: Echo) -> None:
     wait_until(lambda: not opened)
 
 
-def test_the_page_is_told_why_studio_closed_its_websocket(echo: Echo) -> None:
+def test_the_page_gets_the_reason_why_studio_closed_its_websocket(echo: Echo) -> None:
     """Studio's page shows a notice for its own codes, as when another tab takes control."""
     with open_tab(echo[0]) as tab:
         tab.send("close")
