@@ -83,10 +83,10 @@ class PolicyControl:
 
 
 class WorldControl:
-    """A controller of one world, as the loops of ``lyceum_warp.controllers`` call it, whose last plan can be looked at.
+    """A controller of one world, whose last plan can be looked at.
 
-    It passes every member of the controller on. When asked for, it copies the state, the plan and some samples of the
-    next call, in the thread of that call.
+    Loops call it through ``new_run``. When asked for, it copies the state, the plan and some samples of the next call,
+    in the thread of that call.
 
     Args:
         name: Its name.
@@ -96,11 +96,6 @@ class WorldControl:
     def __init__(self, name: str, controller: Any) -> None:
         self.name, self.seconds = name, float("nan")
         self.controller = controller
-        self.__name__ = getattr(controller, "__name__", type(controller).__name__)
-        try:
-            self.__signature__ = inspect.signature(controller)
-        except (TypeError, ValueError):  # of some functions written in C
-            self.__signature__ = inspect.Signature()
         self._busy = threading.Lock()
         self._run = self.calls = 0
         self._reset_with: tuple[int | None] | None = None
@@ -108,15 +103,6 @@ class WorldControl:
         self._seen: PlanView | None = None
         self.hidden: slice | None = None
         """Columns of the state that the controller sees as zeros: those of a push, which a robot cannot foresee."""
-
-    def __getattr__(self, name: str) -> Any:
-        if name in ("controller", "_busy"):  # before the constructor
-            raise AttributeError(name)
-        return getattr(self.controller, name)
-
-    def __call__(self, state: torch.Tensor, obs: torch.Tensor, **words: Any) -> torch.Tensor:
-        """See ``call``."""
-        return self.call(None, state, obs, **words)
 
     def new_run(self) -> "ControlRun":
         """The controller for one run of a loop; calls of the runs before fail from now on."""
@@ -145,14 +131,14 @@ class WorldControl:
             finally:
                 self._busy.release()
 
-    def call(self, run: int | None, state: torch.Tensor, obs: torch.Tensor, **words: Any) -> torch.Tensor:
+    def call(self, run: int, state: torch.Tensor, obs: torch.Tensor, **words: Any) -> torch.Tensor:
         """Call the controller.
 
         Raises:
             ControllerError: It raised an exception, or the run is over.
         """
         with self._busy:  # a call that an interrupted run left behind may not have ended
-            if run not in (None, self._run):
+            if run != self._run:
                 raise ControllerError(self.name, RuntimeError("its run is over"))
             self._reset_now()
             if (hidden := self.hidden) is not None:
@@ -186,7 +172,7 @@ class WorldControl:
 
 
 class ControlRun:
-    """A controller of one world, for one run of a loop.
+    """A controller of one world, for one run of a loop, with every member of the controller.
 
     Args:
         control: The controller.
@@ -195,16 +181,22 @@ class ControlRun:
 
     def __init__(self, control: WorldControl, number: int) -> None:
         self._control, self._number = control, number
-        self.__name__, self.__signature__ = control.__name__, control.__signature__
+        self.__name__ = getattr(control.controller, "__name__", type(control.controller).__name__)
+        try:
+            self.__signature__ = inspect.signature(control.controller)
+        except (TypeError, ValueError):  # of some functions written in C
+            self.__signature__ = inspect.Signature()
 
     def __getattr__(self, name: str) -> Any:
-        if name == "_control":  # before the constructor
-            raise AttributeError(name)
-        return getattr(self._control, name)
+        return getattr(self._control.controller, name)
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, **words: Any) -> torch.Tensor:
         """See ``WorldControl.call``."""
         return self._control.call(self._number, state, obs, **words)
+
+    def reset(self, seed: int | None = None) -> None:
+        """See ``WorldControl.reset``."""
+        self._control.reset(seed)
 
 
 def plan_view(controller: Any, state: torch.Tensor) -> PlanView | None:

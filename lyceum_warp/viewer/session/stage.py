@@ -129,7 +129,7 @@ class Stage:
                 self.frames.add_point(self.playback)
                 continue
             if isinstance(self.control, WorldControl) and not self.live.past.ahead:
-                self._step_plant()
+                self._step_plant(self.control)
             else:
                 self.live.step(self.act)
             self.end_old_push()
@@ -149,16 +149,15 @@ class Stage:
         else:
             self.live.env.action.zero_()
 
-    def _step_plant(self) -> None:
+    def _step_plant(self, current: WorldControl) -> None:
         """One step of a plant that waits for its controller."""
-        live = self.live
         self.begin_due_episode()
-        live.expect_steps()
+        self.live.expect_steps()
         try:
-            control(live.env, self.control, steps=1, reset=False)  # type: ignore[arg-type]
+            control(self.live.env, current.new_run(), steps=1, reset=False)
         except ValueError as error:  # of actions that do not fit
-            raise ControllerError(str(self.controller), error) from error
-        live.stepped()
+            raise ControllerError(current.name, error) from error
+        self.live.stepped()
 
     def begin_due_episode(self) -> None:
         """Begin a new episode of the plant, and of its controller, if the last one is over."""

@@ -57,7 +57,7 @@ def test_paths_are_those_that_the_samples_take(shared_env: SharedEnv) -> None:
     assert control.look() is None
     plant.rand_reset(3)
     start = plant.get_state()
-    control(start[0], plant.obs[0])
+    control.new_run()(start[0], plant.obs[0])
     view = control.look()
     assert view is not None and view.best == 0
     best = int(mppi.returns.argmax())
@@ -82,7 +82,7 @@ def test_the_thread_keeps_the_newest_plan_and_forgets_on_request(shared_env: Sha
     plant = shared_env("point_mass", autoreset=False)
     control = WorldControl("mppi", lw.MPPI("point_mass", samples=4, horizon=3))
     control.look()
-    control(plant.get_state()[0], plant.obs[0])
+    control.new_run()(plant.get_state()[0], plant.obs[0])
     view = control.look()
     assert view is not None
     thread = TraceThread(rollouts_for(control.controller, plant, "agent"), share=0.9)
