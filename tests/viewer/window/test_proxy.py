@@ -413,7 +413,7 @@ def test_a_slow_head_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
         socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client,
         pytest.raises(ConnectionError),
     ):
-        for byte in b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n" * 100:  # each byte is in time, all of them are not
+        for byte in b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + 600 * b"a":  # each byte is in time, all are not
             client.send(bytes([byte]))
             time.sleep(0.02)
 
@@ -437,6 +437,10 @@ def test_a_client_that_takes_nothing_is_dropped(monkeypatch: pytest.MonkeyPatch)
             client.connect(("127.0.0.1", proxy.port))
             client.sendall(f"GET {path}/ HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: {key}\r\n\r\n".encode())
             wait_until(lambda: upstream.ended == 1)
+            with pytest.raises(ConnectionError):  # a connection that waits for the client would take this
+                for _ in range(1000):
+                    client.send(b"x")
+                    time.sleep(0.01)
 
 
 # WebSockets
