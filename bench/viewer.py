@@ -36,8 +36,8 @@ from rich.table import Table
 
 import lyceum_warp as lw
 from lyceum_warp.viewer.protocol import Command, Frame
-from lyceum_warp.viewer.session import Session
-from lyceum_warp.viewer.window import Window
+from lyceum_warp.viewer.session.clock import Session
+from lyceum_warp.viewer.session.window_process import Window
 
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _FLAGS = (
@@ -131,7 +131,7 @@ def page(address: str, shown: bool) -> Iterator[None]:
 
 def shown(session: Session, options: Options) -> Timed:
     """Run a session whose page is open."""
-    window = Window(session.scene, "web")
+    window = Window(session.stage.scene, "web")
     with page(window.address, options.browser):
         timed = Timed(window, _LOADING if options.browser else 1.0, options.seconds)
         session.run(timed)

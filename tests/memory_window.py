@@ -4,7 +4,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 
+import torch
+
 from lyceum_warp.viewer.protocol import Command, Frame
+from lyceum_warp.viewer.session.clock import Session
 
 
 class MemoryWindow:
@@ -45,3 +48,32 @@ class MemoryWindow:
     @property
     def messages(self) -> list[str]:
         return [message for frame in self.frames for message in frame.messages]
+
+
+def run(session: Session, *script: Iterable[Command] | Callable[[Frame], Iterable[Command] | None]) -> MemoryWindow:
+    """Run a session: after each frame the next entry of the script. A function is called until it returns None."""
+    entries = list(script)
+
+    def after(frame: Frame, number: int) -> Iterable[Command] | None:
+        while entries:
+            entry = entries[0]
+            if not callable(entry):
+                entries.pop(0)
+                return entry
+            if (commands := entry(frame)) is not None:
+                return commands
+            entries.pop(0)
+        return None
+
+    window = MemoryWindow(after)
+    session.run(window)
+    assert window.closed == 1
+    return window
+
+
+def until(wanted: Callable[[Frame], bool]) -> Callable[[Frame], list[Command] | None]:
+    return lambda frame: None if wanted(frame) else []
+
+
+def pushing(obs: torch.Tensor) -> torch.Tensor:
+    return 0.5 * torch.sign(obs[:, :3])

@@ -108,6 +108,21 @@ def test_no_module_imports_itself_through_others() -> None:
         visit(name, ())
 
 
+def test_the_viewers_window_imports_neither_torch_nor_warp_nor_other_rooms() -> None:
+    """It draws in a process of its own, which must start quickly and stay small."""
+    window = sorted(name for name in MODULES if name.startswith("lyceum_warp.viewer.window"))
+    code = f"import sys, {', '.join(window)}; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
+    assert not {"torch", "warp"} & set(loaded)
+    own = {name for name in loaded if name.partition(".")[0] == "lyceum_warp"}
+    assert own == {"lyceum_warp", "lyceum_warp.viewer", "lyceum_warp.viewer.protocol", *window}
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if name.startswith("lyceum_warp.viewer.session")])
+def test_the_viewers_session_imports_nothing_of_its_window(name: str) -> None:
+    assert not [other for other in IMPORTS[name] if other.startswith("lyceum_warp.viewer.window")]
+
+
 def test_module_names_are_unique() -> None:
     places = defaultdict(list)
     for name in MODULES:

@@ -25,7 +25,8 @@ from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.runs.task_copy import note_changes, run_env
 from lyceum_warp.validate import whole_number
 from lyceum_warp.viewer.follow import Follower, Parent, wait_for_run
-from lyceum_warp.viewer.session import Watcher, check_world
+from lyceum_warp.viewer.session.clock import Watcher
+from lyceum_warp.viewer.session.stage import check_world
 from lyceum_warp.viewer.show import chosen_graphics, view
 
 _RUN_WORLDS = 16

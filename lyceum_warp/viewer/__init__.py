@@ -1,21 +1,16 @@
-"""The interactive viewer, in a browser or in a window.
+"""The interactive viewer, in a browser or in a window: two processes, a folder for each.
 
-==================  =====================================================================================
-``protocol.py``     what a session and a window exchange: scene, frames, commands
-``view.py``         ``lw.view``: a session and its window
-``session.py``      the loop that steps, obeys commands and shows frames
-``frames.py``       frames: poses, ghosts, curves and messages
-``live.py``         the worlds that are stepped, their past, and copies of the rows that are shown
-``controllers.py``  policies of all worlds, and controllers of one world, whose plans can be looked at
-``traces.py``       the paths of a planner's samples, in worlds and a thread of their own
-``playback.py``     episodes that are played back
-``follow.py``       the newest policy of a training run; ``lw.RunViewer``
-``videos.py``       videos of what is shown
-``window.py``       the window's process, seen from the session; ``window_process.py``, the process itself
-``link.py``         their messages
-``panel.py``        the panel, its keys, and what the mouse does
-``studio.py``       all contact with mujoco.studio
-``front.py``        the server that checks every request of a browser
-``curves.py``, ``extra_geoms.py``, ``model_values.py``    parts of the panel: curves, ghosts, model fields
-==================  =====================================================================================
+=================  ====================================================================================================
+``show.py``        ``lw.view``: open a session and its window
+``follow.py``      follow a training run: its newest policy; ``lw.RunViewer``
+``protocol.py``    the messages between both processes: scene, frames, commands
+``session/``       this process: torch, Warp and the worlds. ``clock.py`` loops; ``commands.py`` carries out commands;
+                   ``stage.py`` holds what is shown; ``plant.py`` runs a planner's plant in real time; ``live.py`` steps
+                   worlds and keeps their past; ``drivers.py`` calls controllers; ``playback.py``, ``frames.py``,
+                   ``traces.py`` and ``videos.py``; ``window_process.py`` starts and feeds the other process
+``window/``        the other process: mujoco, NumPy and studio, never torch or Warp. ``main.py`` is its entry;
+                   ``panel.py`` shows frames; ``windows.py`` draws the ImGui windows; ``actions.py`` has the keys;
+                   ``mouse.py`` pushes bodies; ``scene.py`` draws ghosts and traces; ``studio.py`` is all contact with
+                   mujoco.studio; ``proxy.py`` and ``sockets.py`` guard the page
+=================  ====================================================================================================
 """

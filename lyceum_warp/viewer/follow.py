@@ -1,4 +1,4 @@
-"""Following a training run: a viewer whose worlds are its own, and whose policy is the run's newest.
+"""Follow a training run: show its newest policy in worlds of the viewer's own.
 
 The run is not touched: the viewer reads the files that training writes. So a run has the same numbers with and without
 it, also where both run on different machines that share the folder.

@@ -1,7 +1,6 @@
-"""What the session, which owns the environments, and the window, which a person looks at, tell each other.
+"""Define the messages between the session process, which owns the worlds, and the window process, which draws them.
 
-The window runs in a process of its own, so that drawing never holds up a step or a plan. Everything here can be pickled
-and is written once by its sender.
+Both processes import this module, so it needs NumPy alone. Messages are pickled. Each is written once, by its sender.
 """
 
 import dataclasses
@@ -9,15 +8,24 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+Graphics: TypeAlias = Literal["web", "native"]
+
 Mode: TypeAlias = Literal["passive", "controller", "playback"]
 
 WorldChoice: TypeAlias = int | Literal["next", "previous", "best", "worst", "last_ended"]
 """A world by its number, or by its return or its place."""
 
 MOST_GHOSTS = 32
-"""The most other worlds, and the most other episodes, that are drawn at once."""
+"""Maximum number of other worlds, and of other episodes, that are drawn at once."""
 MOST_BURST = 50
-"""The most states along a trajectory that are drawn at once."""
+"""Maximum number of states along a trajectory that are drawn at once."""
+
+TRACE_COLOUR = (0.6, 0.65, 0.75, 0.5)
+BEST_COLOUR = (0.1, 0.75, 0.3, 1.0)
+"""Colours of a planner's samples and of the best one, in the window and in videos."""
+
+MAX_POINTS, MAX_MESSAGES = 20_000, 200
+"""Maximum numbers of curve points and of messages that a frame carries over from earlier frames."""
 
 
 # from the session to the window
@@ -25,7 +33,7 @@ MOST_BURST = 50
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What stays the same while a window is open."""
+    """The part of the display that is constant while a window is open."""
 
     title: str
     """The task's name, or what else is shown."""
@@ -47,7 +55,7 @@ class Scene:
 
 @dataclasses.dataclass(frozen=True)
 class Pose:
-    """What the poses of all bodies of one world depend on."""
+    """The coordinates that determine the poses of all bodies of one world."""
 
     qpos: np.ndarray
     """(nq,) float64."""
@@ -68,7 +76,7 @@ class Ghost:
 
 @dataclasses.dataclass(frozen=True)
 class Status:
-    """What the panel says."""
+    """The contents of the panel."""
 
     mode: Mode
     controller: str | None
@@ -119,7 +127,19 @@ class Frame:
     """New lines: ends of episodes, faults, refused commands."""
 
 
-# from the window to the session
+def latest(older: Frame | None, newer: Frame) -> Frame:
+    """The newer frame, with the curve points and messages of an older one that was not shown."""
+    if older is None or (older.samples is None and not older.messages):
+        return newer
+    samples = [part for part in (older.samples, newer.samples) if part is not None]
+    return dataclasses.replace(
+        newer,
+        samples=np.concatenate(samples)[-MAX_POINTS:] if samples else None,
+        messages=(older.messages + newer.messages)[-MAX_MESSAGES:],
+    )
+
+
+# from the window to the session: commands
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,14 +187,14 @@ class SetSpeed:
 
 @dataclasses.dataclass(frozen=True)
 class StepBy:
-    """Pauses, and moves by some steps; negative ones go back."""
+    """Pause, and move by some steps; negative ones go back."""
 
     steps: int
 
 
 @dataclasses.dataclass(frozen=True)
 class Seek:
-    """Pauses, and shows one step of the episode that is played back or of the past of the world."""
+    """Pause, and show one step of the episode that is played back or of the past of the world."""
 
     step: int
 
@@ -191,10 +211,6 @@ class Reset:
     """Begin a new episode of the world that is shown."""
 
     random: bool
-
-
-MAX_GHOSTS = 128
-"""Worlds that may be drawn at once beside the one that is shown, and as many episodes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -247,7 +263,7 @@ class Camera:
 
 @dataclasses.dataclass(frozen=True)
 class SetVideo:
-    """Begins a video, or ends it."""
+    """Begin a video, or end it."""
 
     on: bool
     camera: Camera | None = None
@@ -255,10 +271,54 @@ class SetVideo:
 
 @dataclasses.dataclass(frozen=True)
 class Close:
-    """Ends the session. Closing a page is not reported, because it can be opened again."""
+    """End the session. Closing a page is not reported, because it can be opened again."""
 
 
 Command: TypeAlias = (
     SetMode | SetController | SetWorld | SetEpisode | SetPaused | SetSpeed | StepBy | Seek | SetBackwards | Reset
     | SetGhosts | Perturb | SetVideo | Close
 )  # fmt: skip
+
+
+# how the window process starts and reports
+
+
+@dataclasses.dataclass(frozen=True)
+class Opening:
+    """The first message to the window process."""
+
+    scene: Scene
+    graphics: Graphics
+    host: str
+    """Address on which the page is served."""
+    port: int | None
+    """Port of the page; None for the first free one from 8080 on."""
+    browser: bool
+    """Whether to open the page in this machine's browser."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Opened:
+    """The window runs."""
+
+    address: str = ""
+    """The page's address with its token; empty without a page."""
+    instructions: tuple[str, ...] = ()
+    """Lines to print."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Failed:
+    """The window ends because of an error."""
+
+    reason: str
+    refused: bool = False
+    """Whether the caller's address or port is the reason."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Taken:
+    """The window is ready for another frame."""
+
+
+Reply: TypeAlias = Opened | Failed | Taken | Command

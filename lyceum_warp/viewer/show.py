@@ -1,4 +1,4 @@
-"""``lw.view``: a session and its window."""
+"""Open a session and its window: ``lw.view``."""
 
 import os
 import platform
@@ -7,10 +7,9 @@ from typing import Any
 
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
-from lyceum_warp.viewer.link import Graphics
-from lyceum_warp.viewer.protocol import Scene
-from lyceum_warp.viewer.session import Session, Watcher
-from lyceum_warp.viewer.window import Window
+from lyceum_warp.viewer.protocol import Graphics, Scene
+from lyceum_warp.viewer.session.clock import Session, Watcher
+from lyceum_warp.viewer.session.window_process import Window
 
 
 def has_display() -> bool:
@@ -97,7 +96,7 @@ def view(
         title=title, watchers=watchers, on_trajectory=on_trajectory,
     )  # fmt: skip
     try:
-        window = opened(session.scene, graphics, host=host, port=port, browser=browser)
+        window = opened(session.stage.scene, graphics, host=host, port=port, browser=browser)
         session.run(window)
     finally:
         session.close()

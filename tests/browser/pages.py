@@ -14,8 +14,8 @@ from PIL import Image
 from playwright.sync_api import Browser, BrowserContext, Page, Playwright
 
 from lyceum_warp.viewer.protocol import Command, Frame, Scene, Status
-from lyceum_warp.viewer.session import Session
-from lyceum_warp.viewer.window import Window
+from lyceum_warp.viewer.session.clock import Session
+from lyceum_warp.viewer.session.window_process import Window
 
 SECONDS = 120.0
 """A page must do within this time what a test waits for: without a GPU it draws a few frames a second."""
@@ -74,7 +74,7 @@ class Viewer:
 
     def __init__(self, session: Session) -> None:
         self.session = session
-        self.window = WatchedWindow(session.scene)
+        self.window = WatchedWindow(session.stage.scene)
         self.error: BaseException | None = None
         self.thread = threading.Thread(target=self.run, daemon=True)
         self.thread.start()

@@ -13,7 +13,7 @@ from playwright.sync_api import sync_playwright
 
 import lyceum_warp as lw
 from lyceum_warp.viewer.protocol import Command, SetGhosts, SetPaused, SetWorld, StepBy
-from lyceum_warp.viewer.session import Session
+from lyceum_warp.viewer.session.clock import Session
 
 WIDTH, HEIGHT, QUALITY = 1200, 720, 82
 

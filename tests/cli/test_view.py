@@ -15,7 +15,7 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.viewer import show as views
 from lyceum_warp.viewer.protocol import Frame, Scene
-from lyceum_warp.viewer.window import Window
+from lyceum_warp.viewer.session.window_process import Window
 
 
 class Opened:

@@ -7,7 +7,7 @@ from test_gpu import nothing_waits
 
 import lyceum_warp as lw
 from lyceum_warp.viewer.protocol import SetController, SetGhosts, SetPaused, SetWorld, StepBy
-from lyceum_warp.viewer.session import Session
+from lyceum_warp.viewer.session.clock import Session
 
 pytestmark = pytest.mark.gpu
 
@@ -21,37 +21,37 @@ def test_steps_and_frames_are_asked_for_without_waiting() -> None:
     session = Session(env, controllers={"policy": lw.GaussianPolicy(11, 3)}, world=3, seed=0)
     session.obey(SetGhosts(worlds=(5, 6), burst=4))
     for _ in range(3):
-        session.advance(2)
-        session.frame()
-    session.live.take()
+        session.stage.advance(2)
+        session.stage.frame()
+    session.stage.live.take()
     with nothing_waits():
-        session.advance(20)
-        session.live.request((5, 6), 4)
+        session.stage.advance(20)
+        session.stage.live.request((5, 6), 4)
 
 
 def test_any_world_is_shown_a_frame_later() -> None:
     env = lw.make("hopper", nworld=4096, device="cuda")
     session = Session(env, controllers={"policy": pushing}, world=3000, seed=0)
-    assert session.live.past.bytes <= 256 * 2**20
-    session.frame()
-    session.advance(5)
-    session.frame()
+    assert session.stage.live.past.bytes <= 256 * 2**20
+    session.stage.frame()
+    session.stage.advance(5)
+    session.stage.frame()
     shown = env.get_state()[3000].cpu().numpy()
-    session.advance(5)
-    frame = session.frame()  # of the time of the frame before
+    session.stage.advance(5)
+    frame = session.stage.frame()  # of the time of the frame before
     np.testing.assert_array_equal(frame.state, shown[: len(frame.state)])
     session.obey(SetPaused(True))
     session.obey(SetGhosts(worlds=(17,), burst=3))
     session.obey(SetWorld("best"))
-    frame = session.frame()  # while paused, of now
-    assert frame.status.world == int(session.live.returns.argmax())
+    frame = session.stage.frame()  # while paused, of now
+    assert frame.status.world == int(session.stage.live.returns.argmax())
     state, qpos = env.get_state(), env.state_space.parts["qpos"]
     np.testing.assert_array_equal(frame.state, state[frame.status.world, : len(frame.state)].cpu().numpy())
     np.testing.assert_array_equal(frame.ghosts[0].pose.qpos, state[17, qpos].cpu().numpy())
     assert len(frame.ghosts) == 4
-    session.advance(60)
-    messages = session.frame().messages + session.frame().messages
-    assert np.isfinite(session.frame().samples).all() and all("fault" not in message for message in messages)
+    session.stage.advance(60)
+    messages = session.stage.frame().messages + session.stage.frame().messages
+    assert np.isfinite(session.stage.frame().samples).all() and all("fault" not in message for message in messages)
 
 
 def test_going_on_after_stepping_back_gives_the_same_numbers_to_the_bit() -> None:
@@ -59,7 +59,7 @@ def test_going_on_after_stepping_back_gives_the_same_numbers_to_the_bit() -> Non
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=1)
     states = [env.get_state()]
     for _ in range(30):
-        session.advance()
+        session.stage.advance()
         states.append(env.get_state())
     session.obey(StepBy(-20))
     assert torch.equal(env.get_state(), states[10])
@@ -72,13 +72,13 @@ def test_a_planner_controls_a_copy_of_a_world_on_a_gpu() -> None:
     env = lw.make("reach", nworld=256, device="cuda")
     session = Session(env, controllers={"policy": lw.GaussianPolicy(env.obs_space.size, 7), "mppi": lw.MPPI("reach")},
                       world=100, paused=True, seed=0)  # fmt: skip
-    session.advance(3)
+    session.stage.advance(3)
     before = env.get_state()
     session.obey(SetController("mppi"))
-    assert session.live.env.obs.device.type == "cpu"
+    assert session.stage.live.env.obs.device.type == "cpu"
     qpos = env.state_space.parts["qpos"]
-    np.testing.assert_allclose(session.frame().pose.qpos, before[100, qpos].cpu().numpy(), atol=1e-6)
-    session.advance(3)
+    np.testing.assert_allclose(session.stage.frame().pose.qpos, before[100, qpos].cpu().numpy(), atol=1e-6)
+    session.stage.advance(3)
     session.obey(SetController("policy"))
     after = env.get_state()
     assert torch.equal(after[99], before[99]) and not torch.equal(after[100, qpos], before[100, qpos])

@@ -1,0 +1,1 @@
+"""The session, in this process: torch, Warp and the worlds."""

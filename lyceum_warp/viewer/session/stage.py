@@ -1,0 +1,302 @@
+"""Hold what is shown: the mode, the controller, the worlds or the episode, and the frames that show them."""
+
+import math
+import time
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from lyceum_warp.controllers.loop import control
+from lyceum_warp.env import Env
+from lyceum_warp.validate import check_kind, whole_number
+from lyceum_warp.viewer.protocol import Frame, Mode, Scene, Status
+from lyceum_warp.viewer.session.drivers import Control, ControllerError, PolicyControl, WorldControl, controls
+from lyceum_warp.viewer.session.frames import FrameMaker, model_bytes, past_text
+from lyceum_warp.viewer.session.live import Live
+from lyceum_warp.viewer.session.plant import make_plant
+from lyceum_warp.viewer.session.playback import Playback, episodes_of
+from lyceum_warp.viewer.session.traces import Traces, TraceThread, rollouts_for, trace_point
+from lyceum_warp.viewer.session.videos import VideoTaker
+
+_OLD = 1.0  # seconds after which paths of samples are no longer shown
+
+
+class Stage:
+    """The worlds, controllers and episodes of a session, and which of them are shown.
+
+    Policies act in all worlds. A controller of one world, such as a planner, acts in the plant, a copy of the shown
+    world, while the others wait.
+
+    Args:
+        env: The worlds.
+        controllers: Controllers by their names; see ``lw.view``.
+        episodes: Episodes to play back.
+        world: The world that is shown first.
+        seed: Seed of a random reset at the start; by default the worlds stay as they are.
+        paused: Whether the session starts paused.
+        trace: The site or body whose path is drawn for a planner's samples.
+        title: The title of the window; by default the task's name.
+
+    Raises:
+        ValueError: An argument does not fit.
+    """
+
+    def __init__(
+        self,
+        env: Env,
+        *,
+        controllers: Mapping[str, Any] | None = None,
+        episodes: Any = None,
+        world: int = 0,
+        seed: int | None = None,
+        paused: bool = False,
+        trace: str | None = None,
+        title: str | None = None,
+    ) -> None:
+        check_kind("env", env, Env, "as lw.make('hopper') returns it")
+        check_world(world, env.nworld)
+        self.env = env
+        self.controllers = controls(controllers or {}, env)
+        self.playback = Playback([] if episodes is None else episodes_of(episodes, env))
+        if trace is not None:
+            trace_point(env.task.model, trace)
+        if seed is not None:
+            env.rand_reset(whole_number("seed", seed, low=0))
+        self.main = Live(env)
+        self.main.world = world
+        planned = any(isinstance(each, WorldControl) for each in self.controllers.values())
+        self._plant = make_plant(self.main) if planned else None
+        self._trace = trace
+        self._threads: dict[str, TraceThread | None] = {}
+        self.mode: Mode = "passive"
+        self.controller: str | None = None
+        self.paused, self.speed = bool(paused), 1.0
+        self.dragging = False
+        """Whether a person pushes a body."""
+        self.changed = False
+        """Whether something has changed since the last frame."""
+        modes: list[Mode] = ["playback"] if self.playback.episodes else []
+        modes += ["controller"] if self.controllers else []
+        modes.append("passive")
+        self.scene = Scene(
+            title=title or env.task.name, model=model_bytes(env.task.model), nworld=env.nworld, timestep=env.timestep,
+            modes=tuple(modes), controllers=tuple(self.controllers),
+            episodes=tuple(episode.name for episode in self.playback.episodes),
+            curves=("reward", "eval", *env.metrics),
+        )  # fmt: skip
+        self.videos = VideoTaker(env.task.model, self.scene.title)
+        self.frames = FrameMaker(env, len(self.scene.curves))
+        self._progress: deque[tuple[float, int]] = deque(maxlen=64)
+        self._steps = 0
+        self.select(modes[0], next(iter(self.controllers), None))
+
+    @property
+    def live(self) -> Live:
+        """The worlds that are stepped: the plant under a controller of one world, the environment otherwise."""
+        return self._plant if self._plant is not None and isinstance(self.control, WorldControl) else self.main
+
+    @property
+    def control(self) -> Control | None:
+        """The controller that acts."""
+        return self.controllers[self.controller] if self.mode == "controller" and self.controller else None
+
+    def say(self, message: str) -> None:
+        """Show a message in the next frame."""
+        self.frames.say(message)
+
+    def close(self) -> None:
+        """End the threads. A second call does nothing."""
+        threads, self._threads = self._threads, {}
+        for thread in threads.values():
+            if thread is not None:
+                thread.close()
+
+    # steps
+
+    def advance(self, steps: int = 1) -> None:
+        """Make steps, without waiting for the clock.
+
+        Raises:
+            ControllerError: The controller raised an exception.
+        """
+        self.changed = True
+        for _ in range(steps):
+            self.count_step()
+            if self.mode == "playback":
+                self.playback.advance()
+                self.frames.add_point(self.playback)
+                continue
+            if isinstance(self.control, WorldControl) and not self.live.past.ahead:
+                self._step_plant(self.control)
+            else:
+                self.live.step(self.act)
+            self.end_old_push()
+
+    def count_step(self) -> None:
+        """Count a step for the measured speed."""
+        self._steps += 1
+
+    def restart_measurement(self) -> None:
+        """Measure the speed from now on."""
+        self._progress.clear()
+
+    def act(self) -> None:
+        """Write the actions of the next step of all worlds."""
+        if isinstance(self.control, PolicyControl):
+            self.control.act()
+        else:
+            self.live.env.action.zero_()
+
+    def _step_plant(self, current: WorldControl) -> None:
+        """One step of a plant that waits for its controller."""
+        self.begin_due_episode()
+        self.live.expect_steps()
+        try:
+            control(self.live.env, current.new_run(), steps=1, reset=False)
+        except ValueError as error:  # of actions that do not fit
+            raise ControllerError(current.name, error) from error
+        self.live.stepped()
+
+    def begin_due_episode(self) -> None:
+        """Begin a new episode of the plant, and of its controller, if the last one is over."""
+        if self.live.env.done.item():
+            self.reset(random=True)
+
+    def reset(self, *, random: bool) -> None:
+        """Begin a new episode of the shown world, and of its controller."""
+        self.live.reset(random=random)
+        self.reset_controller()
+
+    def reset_controller(self) -> None:
+        """Call the controller's ``reset``, and drop the traces of its plans."""
+        if isinstance(current := self.control, WorldControl):
+            current.reset()
+        if (thread := self._threads.get(str(self.controller))) is not None:
+            thread.forget()
+
+    def back(self, steps: int) -> None:
+        """Take steps back."""
+        done = self.live.back(steps)
+        if done < steps:
+            self.say(f"the past ends here: {past_text(self.live)}")
+
+    def seek_episode(self, step: int) -> None:
+        """Show a step of the episode that is played back."""
+        self.playback.seek(step)
+        self.frames.add_point(self.playback)
+
+    def end_old_push(self) -> None:
+        """End a push that steps through the past have put back, once the worlds go on from there."""
+        live = self.live
+        if live.pushed is not None and not self.dragging and not live.past.ahead:
+            live.end_push()
+        # a planner does not know of the push
+        pushed = self.env.state_space.parts["xfrc_applied"] if live.pushed is not None else None
+        for each in self.controllers.values():
+            if isinstance(each, WorldControl):
+                each.hidden = pushed
+
+    # which worlds
+
+    def select(self, mode: Mode, controller: str | None) -> None:
+        """Change the mode and the controller; the shown world goes on in the worlds of the new one."""
+        before, chosen = self.live, (self.mode, self.controller)
+        self.mode, self.controller = mode, controller
+        if self.live is not before:
+            self._transfer(before, self.live)
+            before.end_push()
+        for thread in self._threads.values():
+            if thread is not None:
+                thread.forget()
+        if chosen != (mode, controller):
+            self.live.past.drop_ahead()
+            self.reset_controller()
+            self.restart_measurement()
+        self.frames.forget_seen(self.live)
+        if isinstance(current := self.control, WorldControl) and current.name not in self._threads:
+            self._threads[current.name] = self._trace_thread(current)
+
+    def show_world(self, world: int) -> None:
+        """Show another world; a push ends."""
+        before = self.live
+        before.end_push()
+        self.dragging = False
+        if before is not self.main:
+            self._transfer(before, self.main)
+        self.main.world = world
+        if before is not self.main:
+            self._transfer(self.main, before)
+            self.reset_controller()
+        self.frames.forget_seen(self.live)
+
+    def go_on_from(self, state: torch.Tensor, live: Live, *, new_episode: bool = False) -> None:
+        """Put the shown world of ``live`` into a state, as one whose episode goes on."""
+        state = state.clone()
+        state[self.env.state_space.parts["done_reason"]] = 0.0
+        live.set_row(state, new_episode=new_episode)
+
+    def _transfer(self, before: Live, after: Live) -> None:
+        """Transfer the shown world's state to another environment."""
+        self.go_on_from(before.row(), after)
+        if before.pushed == before.world:
+            after.pushed = after.world
+        after.returns[after.world] = before.returns[before.world].item()
+
+    def _trace_thread(self, current: WorldControl) -> TraceThread | None:
+        """The thread for a planner's traces; None for a controller without plans."""
+        if not hasattr(current.controller, "actions"):
+            return None
+        rollouts = rollouts_for(current.controller, self.live.env, self._trace)
+        self.frames.text["trace"] = rollouts.point.name
+        return TraceThread(rollouts)
+
+    # frames
+
+    def frame(self) -> Frame:
+        """What is shown now."""
+        if self.mode == "playback":
+            return self.frames.of_playback(self.playback, self._status)
+        plan_ms = 1000 * self.control.seconds if self.control else math.nan
+        return self.frames.of_worlds(
+            self.live, self.main, self._traces(), self._status, plan_ms=plan_ms, paused=self.paused
+        )
+
+    def _traces(self) -> Traces | None:
+        """The newest paths of a planner's samples, if they are to be shown; asks for others."""
+        thread, current = self._threads.get(str(self.controller)), self.control
+        if not self.frames.ghosts.plan or thread is None or not isinstance(current, WorldControl):
+            return None
+        if thread.error is not None:
+            self.say(f"no paths of samples: {thread.error}")
+            self._threads[current.name] = None
+        if (view := current.look()) is not None:
+            thread.give(view)
+        seen = thread.newest()
+        return seen if seen is not None and (self.paused or time.perf_counter() - seen.made < _OLD) else None
+
+    def _status(self, **rest: Any) -> Status:
+        now = time.perf_counter()
+        self._progress.append((now, self._steps))
+        begun, steps = self._progress[0]
+        measured = math.nan
+        if not self.paused and now - begun > 0.1:
+            measured = (self._steps - steps) * self.env.timestep / (now - begun)
+        return Status(
+            mode=self.mode, controller=self.controller if self.mode == "controller" else None,
+            episode=self.playback.index if self.mode == "playback" else None, paused=self.paused, speed=self.speed,
+            measured_speed=measured, backwards=self.playback.backwards, video=self.videos.name, **rest,
+        )  # fmt: skip
+
+
+def check_world(world: Any, nworld: int) -> int:
+    """Check the number of a world.
+
+    Raises:
+        ValueError: There is no such world.
+    """
+    if not isinstance(world, int) or isinstance(world, bool) or not 0 <= world < nworld:
+        known = "is 1 world, number 0" if nworld == 1 else f"are {nworld} worlds, 0 to {nworld - 1}"
+        raise ValueError(f"there is no world {world!r}: there {known}")
+    return world

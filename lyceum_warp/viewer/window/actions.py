@@ -1,0 +1,235 @@
+"""Turn keys and buttons into commands: what a person can do, and the table of keys."""
+
+import dataclasses
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from lyceum_warp.viewer import protocol
+from lyceum_warp.viewer.protocol import MOST_BURST, Command, Frame, Scene, Status
+from lyceum_warp.viewer.window.scene import ViewCameras
+from lyceum_warp.viewer.window.studio import imgui, inputs, ux
+
+SPEEDS = tuple(2.0**power for power in range(-4, 5))
+"""Wanted speeds to choose from, simulated seconds per second."""
+PLAIN_WITHOUT = (
+    mujoco.mjtRndFlag.mjRND_SHADOW,
+    mujoco.mjtRndFlag.mjRND_REFLECTION,
+    mujoco.mjtRndFlag.mjRND_SKYBOX,
+    mujoco.mjtRndFlag.mjRND_HAZE,
+    mujoco.mjtRndFlag.mjRND_POST_PROCESSING,
+)
+MANY_STEPS = 50
+"""Steps of the arrow keys with Shift."""
+
+KEY_NAMES = {
+    "Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down": "DownArrow", "[": "LeftBracket",
+    "]": "RightBracket", "-": "Minus", "=": "Equal",
+}  # fmt: skip
+"""Studio's names of keys that have others here."""
+
+
+class Actions:
+    """The choices of a person, and the commands that follow from them.
+
+    Args:
+        scene: What is shown.
+        do: Sends a command to the session.
+    """
+
+    def __init__(self, scene: Scene, do: Callable[[Command], None]) -> None:
+        self.scene, self.do = scene, do
+        self.frame: Frame | None = None
+        """The frame that is shown; None before the first one."""
+        self.viewer: Any
+        """Studio's viewer, from the start of the window on."""
+        self.cameras: ViewCameras
+        """The same."""
+        self.ghosts = protocol.SetGhosts()
+        self.windows = {"messages", *(["curves"] if scene.curves else [])}
+        """Names of the open windows."""
+        self.folded = False
+        """Whether the first window is folded."""
+        self.fold: bool | None = None
+        """Whether to fold it, or to unfold it, in the next drawing."""
+        self.messages: deque[str] = deque(maxlen=200)
+        self.scroll_down = False
+        """Whether the newest message has not been drawn yet."""
+        self._slow = SPEEDS[0] * 2
+        self._keys = key_table()
+
+    @property
+    def status(self) -> Status:
+        """The session's status; there is one from the first frame on."""
+        assert self.frame is not None
+        return self.frame.status
+
+    def say(self, *messages: str) -> None:
+        """Add lines to the messages."""
+        self.messages.extend(messages)
+        self.scroll_down = True
+
+    def press_keys(self) -> None:
+        """Act on the keys that were pressed."""
+        io = imgui.GetIO()
+        if io.WantCaptureKeyboard:
+            return
+        for key in self._keys:
+            if key.ctrl == io.KeyCtrl and key.shift == io.KeyShift and imgui.IsKeyPressed(key.code, key.repeat):
+                key.action(self)
+                return
+        viewer, flying = self.viewer, self.cameras.state.camera_index == ux.FREE_CAMERA_IDX
+        if not io.KeyCtrl:
+            inputs.handle_vis_options_keyboard_events(viewer.vis_options, flying)
+        if flying and viewer.client_camera is None:
+            _, viewer.cam_speed = ux.move_camera_with_keys(viewer.model, viewer.camera, viewer.cam_speed)
+
+    def change_mode(self, by: int) -> None:
+        """Go to the next mode, or to one before."""
+        modes = self.scene.modes
+        self.do(protocol.SetMode(modes[(modes.index(self.status.mode) + by) % len(modes)]))
+
+    def change_controller(self, by: int) -> None:
+        """Go to the next controller, or to one before."""
+        names = self.scene.controllers
+        if names:
+            now = names.index(self.status.controller) if self.status.controller in names else -by
+            self.do(protocol.SetController(names[(now + by) % len(names)]))
+
+    def change_shown(self, by: int) -> None:
+        """Go to the next world or episode, or to one before."""
+        if self.status.mode == "playback":
+            if self.scene.episodes:
+                self.do(protocol.SetEpisode(((self.status.episode or 0) + by) % len(self.scene.episodes)))
+        else:
+            self.do(protocol.SetWorld("next" if by > 0 else "previous"))
+
+    def change_speed(self, by: int) -> None:
+        """Double the speed, or halve it."""
+        now = int(np.argmin(np.abs(np.log2(SPEEDS) - np.log2(max(self.status.speed, 1e-3)))))
+        self.do(protocol.SetSpeed(SPEEDS[min(max(now + by, 0), len(SPEEDS) - 1)]))
+
+    def toggle_slow(self) -> None:
+        """Change between real time and the slower or faster speed before."""
+        if self.status.speed == 1:
+            self.do(protocol.SetSpeed(self._slow))
+        else:
+            self._slow = self.status.speed
+            self.do(protocol.SetSpeed(1.0))
+
+    def set_ghosts(self, **changes: Any) -> None:
+        """Change which ghosts are drawn."""
+        ghosts = dataclasses.replace(self.ghosts, **changes)
+        if ghosts != self.ghosts:
+            self.ghosts = ghosts
+            self.do(ghosts)
+
+    def toggle_burst(self) -> None:
+        """Draw many states along the trajectory at once, or only the present one."""
+        self.set_ghosts(burst=0 if self.ghosts.burst else MOST_BURST // 2)
+
+    def toggle_video(self) -> None:
+        """Begin a video from the camera of the view, or end it."""
+        on = self.status.video is None
+        self.do(protocol.SetVideo(on, self.cameras.view() if on else None))
+
+    def toggle_fold(self) -> None:
+        """Fold the first window, or unfold it."""
+        self.fold = not self.folded
+
+    def toggle_window(self, title: str) -> None:
+        """Open a window of the panel, or close it."""
+        self.windows ^= {title}
+
+    def draw_plainly(self) -> None:
+        """Leave out what a browser without a graphics card draws slowly."""
+        flags = list(self.viewer.render_flags.flags)
+        for flag in PLAIN_WITHOUT:
+            flags[int(flag)] = 0
+        self.viewer.render_flags.flags = flags
+
+
+@dataclasses.dataclass(frozen=True)
+class Key:
+    """A key with what it does."""
+
+    name: str
+    what: str
+    action: Callable[["Actions"], None]
+    repeat: bool = False
+    """Whether holding it repeats it."""
+
+    @property
+    def code(self) -> Any:
+        """Studio's name of the key, without Ctrl and Shift."""
+        last = self.name.rpartition("+")[2]
+        return getattr(imgui.Key, KEY_NAMES.get(last, last))
+
+    @property
+    def ctrl(self) -> bool:
+        """Whether it is pressed with Ctrl."""
+        return "Ctrl+" in self.name
+
+    @property
+    def shift(self) -> bool:
+        """Whether it is pressed with Shift."""
+        return "Shift+" in self.name
+
+
+def key_table() -> list[Key]:
+    """The keys of the panel: Lyceum's, where a browser leaves them to the page."""
+    frames, labels = int(mujoco.mjtFrame.mjNFRAME), int(mujoco.mjtLabel.mjNLABEL)
+
+    def turn(panel: "Actions", option: str, by: int, number: int) -> None:
+        options = panel.viewer.vis_options
+        setattr(options, option, (getattr(options, option) + by) % number)
+
+    return [
+        Key("F1", "show or hide this table", lambda p: p.toggle_window("keys")),
+        Key("F2", "messages", lambda p: p.toggle_window("messages")),
+        Key("F3", "curves", lambda p: p.toggle_window("curves")),
+        Key("F4", "plain drawing, for slow browsers", lambda p: p.draw_plainly()),
+        Key("Tab", "fold or unfold the panel", lambda p: p.toggle_fold()),
+        Key("Space", "pause or go on", lambda p: p.do(protocol.SetPaused(not p.status.paused))),
+        Key("Right", "a step", lambda p: p.do(protocol.StepBy(1)), repeat=True),
+        Key("Left", "a step back", lambda p: p.do(protocol.StepBy(-1)), repeat=True),
+        Key("Shift+Right", f"{MANY_STEPS} steps", lambda p: p.do(protocol.StepBy(MANY_STEPS)), repeat=True),
+        Key("Shift+Left", f"{MANY_STEPS} steps back", lambda p: p.do(protocol.StepBy(-MANY_STEPS)), repeat=True),
+        Key("Ctrl+Right", "next mode", lambda p: p.change_mode(1)),
+        Key("Ctrl+Left", "mode before", lambda p: p.change_mode(-1)),
+        Key("Ctrl+Down", "next controller", lambda p: p.change_controller(1)),
+        Key("Ctrl+Up", "controller before", lambda p: p.change_controller(-1)),
+        Key("Down", "next world, or next episode of a playback", lambda p: p.change_shown(1), repeat=True),
+        Key("Up", "world or episode before", lambda p: p.change_shown(-1), repeat=True),
+        Key("Shift+Up", "double the speed", lambda p: p.change_speed(1)),
+        Key("Shift+Down", "halve the speed", lambda p: p.change_speed(-1)),
+        Key("Enter", "real time, or the speed before", lambda p: p.toggle_slow()),
+        Key("Backspace", "reset", lambda p: p.do(protocol.Reset(random=False))),
+        Key("Shift+Backspace", "random reset", lambda p: p.do(protocol.Reset(random=True))),
+        Key("Ctrl+R", "reverse the playback", lambda p: p.do(protocol.SetBackwards(not p.status.backwards))),
+        Key("Ctrl+B", "burst: many states at once", lambda p: p.toggle_burst()),
+        Key("Ctrl+D", "burst in colours: past red, future blue", lambda p: p.set_ghosts(doppler=not p.ghosts.doppler)),
+        Key("Ctrl+V", "begin or end a video", lambda p: p.toggle_video()),
+        Key("Ctrl+A", "look at everything", lambda p: p.cameras.reset()),
+        Key("Escape", "free camera", lambda p: p.cameras.choose(ux.TUMBLE_CAMERA_IDX)),
+        Key("PageDown", "next camera", lambda p: p.cameras.change(1)),
+        Key("PageUp", "camera before", lambda p: p.cameras.change(-1)),
+        Key("[", "frames of the next kind", lambda p: turn(p, "frame", 1, frames)),
+        Key("]", "frames of the kind before", lambda p: turn(p, "frame", -1, frames)),
+        Key("-", "labels of the next kind", lambda p: turn(p, "label", 1, labels)),
+        Key("=", "labels of the kind before", lambda p: turn(p, "label", -1, labels)),
+    ]  # fmt: skip
+
+
+OTHER_KEYS = (
+    ("0 to 5", "groups of geoms, with Shift groups of sites"),
+    ("letters", "MuJoCo's flags, such as T transparent, C contacts, F forces, J joints, M centre of mass"),
+    ("drag left, right", "rotate or move the camera; the wheel zooms"),
+    ("double-click left", "choose a body"),
+    ("Ctrl + drag right, left", "push or twist that body; while paused, place it"),
+    ("double-click right", "look at a point, with Ctrl follow the body"),
+)
+"""What studio does itself."""

@@ -1,0 +1,80 @@
+"""Push the body that the mouse drags, or place it while paused."""
+
+import dataclasses
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from lyceum_warp.viewer.protocol import Perturb
+
+
+class Mouse:
+    """Turns a drag of the selected body into commands.
+
+    Args:
+        do: Sends a command to the session.
+    """
+
+    def __init__(self, do: Callable[[Perturb], None]) -> None:
+        self._do = do
+        self._pushed: Perturb | None = None
+        self._left = False
+        self._lock = threading.Lock()
+
+    def drag(self, viewer: Any, *, paused: bool) -> None:
+        """Push the selected body while the mouse drags it; while paused, place it.
+
+        Args:
+            viewer: Studio's viewer.
+            paused: Whether the session is paused.
+        """
+        with self._lock:
+            if self._left:
+                self._left = False
+                viewer.perturb.active = 0
+            if viewer.perturb.active and viewer.perturb.select > 0:
+                push = _perturbation(viewer.model, viewer.data, viewer.perturb, paused)
+                if self._pushed is None or not _same(push, self._pushed):
+                    self._pushed = push
+                    self._do(push)
+            else:
+                self._end()
+
+    def let_go(self) -> None:
+        """End a push: the person who drags has left. Any thread may call it."""
+        with self._lock:
+            self._left = True  # studio draws nothing without a browser, and does not see that the button was let go
+            self._end()
+
+    def _end(self) -> None:
+        """Clear the applied force."""
+        if self._pushed is not None:
+            forces, self._pushed = np.zeros_like(self._pushed.forces), None
+            self._do(Perturb(forces=forces))
+
+
+def _perturbation(model: mujoco.MjModel, data: mujoco.MjData, perturb: mujoco.MjvPerturb, paused: bool) -> Perturb:
+    """The effect of the drag: a force, or a new position."""
+    data.xfrc_applied[:] = 0
+    mujoco.mjv_applyPerturbPose(model, data, perturb, int(paused))
+    if not paused:
+        mujoco.mjv_applyPerturbForce(model, data, perturb)
+    moved = bool(model.body_mocapid[model.body_rootid[perturb.select]] >= 0)
+    return Perturb(
+        forces=data.xfrc_applied.copy(),
+        qpos=data.qpos.copy() if paused else None,
+        mocap_pos=data.mocap_pos.copy() if moved else None,
+        mocap_quat=data.mocap_quat.copy() if moved else None,
+    )
+
+
+def _same(one: Perturb, other: Perturb) -> bool:
+    """Whether two pushes do the same, up to rounding errors."""
+    pairs = [(getattr(one, field.name), getattr(other, field.name)) for field in dataclasses.fields(Perturb)]
+    return all(
+        a is b or (a is not None and b is not None and a.shape == b.shape and np.allclose(a, b, rtol=0, atol=1e-9))
+        for a, b in pairs
+    )

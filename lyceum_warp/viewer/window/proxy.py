@@ -1,0 +1,415 @@
+"""Serve the page of mujoco.studio to browsers that know the secret: a reverse proxy with access control.
+
+Studio's own server has no password. It listens on a private socket (``sockets.py``), which refuses other processes, and
+this proxy stands in front of it, on the loopback address unless asked otherwise. It forwards a request only if
+
+- its ``Host`` is an address or a name of this machine, so that DNS rebinding leads nowhere;
+- its ``Origin``, which browsers send with every WebSocket, is the proxy itself, and no other site's page asked for it;
+- it carries the secrets of this viewer: once the token of the printed address, afterwards a cookie and the page's path;
+- it is a GET without a body, or opens one of studio's WebSockets for the screen; other models cannot be loaded.
+
+Browsers send a cookie to every port of its host, and so to servers of other users on the same loopback address. The
+cookie is therefore limited to a random path (``Path=/RANDOM/``), which only the viewer and its browsers know. The proxy
+serves everything below that path. Studio's page asks for some addresses from the root of the host; a script that the
+proxy adds to the page puts the path in front of them.
+
+aiohttp parses requests and bounds their heads (8 KiB a line, 128 lines). It runs in a thread with an event loop of its
+own. What studio receives is built from the checked parts.
+"""
+
+import asyncio
+import contextlib
+import getpass
+import hmac
+import html
+import ipaddress
+import logging
+import os
+import re
+import secrets
+import socket
+import tempfile
+import threading
+import time
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+from aiohttp import web
+from yarl import URL
+
+from lyceum_warp.viewer.window.sockets import public_sockets, reachable_address
+
+HEAD_SECONDS = 10.0
+"""Time in which the head of a request must arrive, and after which an idle connection is closed."""
+WRITE_SECONDS = 60.0
+"""Time in which a client must take some bytes of a response."""
+UNCHECKED = 128
+"""Maximum number of connections that have not shown the secret; beyond it the oldest one is closed."""
+MESSAGE_BYTES = 2**20
+"""Maximum size of a WebSocket message of a browser."""
+QUIET_SECONDS = 2.0
+"""Time without input after which the browser that controls the viewer counts as gone.
+
+A page sends input for every frame that it draws; a page that is closed, hidden or cut off does not.
+"""
+PROTECTION = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "X-Frame-Options": "DENY",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Embedder-Policy": "require-corp",  # studio's page shares memory between threads
+}
+"""Headers of every response: other sites can neither read nor embed it, and an address is never passed to them."""
+SCRIPT = """<script>
+(() => {
+  const path = location.pathname.slice(0, location.pathname.indexOf("/", 1));
+  const below = (address) => {
+    const whole = new URL(address, document.baseURI);
+    if (whole.host === location.host && !whole.pathname.startsWith(path + "/")) {
+      whole.pathname = path + whole.pathname;
+    }
+    return whole.href;
+  };
+  const original = window.fetch;
+  window.fetch = (what, options) => original(what instanceof Request ? what : below(what), options);
+  window.WebSocket = class extends WebSocket {
+    constructor(address, protocols = []) {
+      super(below(address), protocols);
+    }
+  };
+})();
+</script>"""
+"""Puts the path of the page in front of the addresses that it asks for from the root of the host."""
+
+_PATH = re.compile(r"(/[A-Za-z0-9_~!$&'()*+,;=:@\[\]-][A-Za-z0-9._~!$&'()*+,;=:@\[\]-]*)+|/")
+_HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
+_COOKIE = "lyceum-warp"
+_WHERE = "Open the address that was printed where the viewer was started; it ends in ?token=..."
+_ENDED = "The viewer has ended.\n"
+_HEARTBEAT = 30.0  # seconds between pings of a browser, which find out that it is gone, as after a lid was closed
+_SocketEnd = web.WebSocketResponse | aiohttp.ClientWebSocketResponse
+
+
+class Proxy:
+    """A server that forwards requests with the right secret to a private server of this process.
+
+    Construction opens the port, ``start`` begins to answer, and ``close`` ends it, as does a ``with`` block.
+
+    Args:
+        host: Address or name to listen on. The default is the loopback address, which other machines cannot reach.
+            Traffic is not encrypted, so forward the port by ssh rather than listen on another address.
+        port: Port to listen on. By default the first free one from 8080 on.
+
+    Raises:
+        ValueError: The port is out of range or in use, or the address is not one of this machine.
+    """
+
+    def __init__(self, *, host: str = "127.0.0.1", port: int | None = None) -> None:
+        self._sockets = public_sockets(host, port)
+        addresses = [ipaddress.ip_address(each.getsockname()[0].partition("%")[0]) for each in self._sockets]
+        self.port: int = self._sockets[0].getsockname()[1]
+        """The port that browsers connect to."""
+        self.local = all(address.is_loopback for address in addresses)
+        """Whether only this machine can connect."""
+        self._token, self._cookie, self._path = (secrets.token_urlsafe(32) for _ in range(3))
+        machine = socket.gethostname().lower()
+        self._names = {"localhost", machine, machine.partition(".")[0], host.lower()}
+        everywhere = any(address.is_unspecified for address in addresses)
+        self._host = "127.0.0.1" if self.local or everywhere else host
+        families = {int(each.family) for each in self._sockets}
+        self._shown_host = reachable_address(families) or machine if everywhere else self._host
+        self._thread: threading.Thread | None = None
+        self._loop: asyncio.AbstractEventLoop
+        self._stop: asyncio.Event
+        self._server: _Server
+        self._client: aiohttp.ClientSession
+        self._upstream = ""
+        self._on_quiet: Callable[[], None] | None = None
+        self._heard: float | None = None
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+
+    @property
+    def address(self) -> str:
+        """The address to open in a browser, with the token."""
+        return self._address(self._shown_host)
+
+    @property
+    def ssh_line(self) -> str:
+        """The command that forwards the port, with compression, to the machine on which a person sits.
+
+        In a session of ssh it names the address by which that session reached this machine.
+        """
+        connection = os.environ.get("SSH_CONNECTION", "").split()
+        host, ssh_port = (connection[2], connection[3]) if len(connection) == 4 else (socket.gethostname(), "22")
+        target = f"-p {ssh_port} " if ssh_port != "22" else ""
+        try:
+            target += f"{getpass.getuser()}@{host}"
+        except (KeyError, OSError):  # a user without a name, as in some containers
+            target += host
+        return f"ssh -C -N -L {self.port}:{_bracketed(self._host)}:{self.port} {target}"
+
+    @property
+    def instructions(self) -> list[str]:
+        """Lines to print: the address, the command for ssh, and a warning if other machines can connect."""
+        if self.local:
+            return [f"viewer: {self.address}", f"from another machine: {self.ssh_line}"]
+        return [
+            f"viewer: {self.address}",
+            "warning: other machines can connect, and what they send is not encrypted",
+            f"encrypted, from another machine: {self.ssh_line}",
+            f"and open there: {self._address('127.0.0.1')}",
+        ]
+
+    def _address(self, host: str) -> str:
+        return f"http://{_bracketed(host)}:{self.port}/?token={self._token}"
+
+    def open_in_browser(self) -> None:
+        """Open the page in this machine's browser, from a private file that leads to the address.
+
+        Other users can see the command lines of all processes, so the browser's must not contain the token.
+        """
+        self._folder = tempfile.TemporaryDirectory(prefix="lyceum-warp-", ignore_cleanup_errors=True)
+        file = Path(self._folder.name) / "viewer.html"  # a folder of tempfile is for its user only
+        file.write_text(_page_leading_to(self.address))
+        threading.Thread(target=webbrowser.open, args=(file.as_uri(),), kwargs={"new": 2}, daemon=True).start()
+
+    def start(self, upstream: tuple[str, int], on_quiet: Callable[[], None] | None = None) -> None:
+        """Begin to answer, in a thread.
+
+        Args:
+            upstream: Host and port of the private server.
+            on_quiet: Called in that thread when the browser that controls the viewer has sent nothing for a while, as
+                after its page was closed.
+        """
+        self._upstream, self._on_quiet = "http://{}:{}".format(*upstream), on_quiet
+        ready = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run(ready)), name="viewer-proxy", daemon=True)
+        self._thread.start()
+        ready.wait()
+
+    def close(self) -> None:
+        """Close the port and all connections. A second call does nothing."""
+        if self._thread is not None and self._thread.is_alive():
+            with contextlib.suppress(RuntimeError):  # the loop has just ended
+                self._loop.call_soon_threadsafe(self._stop.set)
+            self._thread.join(timeout=5.0)
+        for opened in self._sockets:
+            opened.close()
+        if self._folder is not None:
+            self._folder.cleanup()
+
+    def __enter__(self) -> "Proxy":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # within the thread
+
+    async def _run(self, ready: threading.Event) -> None:
+        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+        self._server = _Server(self._answer)
+        runner = web.ServerRunner(self._server, shutdown_timeout=0.2)
+        timeout = aiohttp.ClientTimeout(total=None, sock_read=WRITE_SECONDS)
+        async with aiohttp.ClientSession(timeout=timeout, auto_decompress=False) as self._client:
+            try:
+                await runner.setup()
+                for each in self._sockets:
+                    await web.SockSite(runner, each).start()
+            finally:
+                ready.set()
+            while not self._stop.is_set():
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._stop.wait(), QUIET_SECONDS / 8)
+                if self._heard is not None and time.monotonic() - self._heard > QUIET_SECONDS:
+                    self._heard = None
+                    if self._on_quiet is not None:
+                        self._on_quiet()
+            await runner.cleanup()
+
+    async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
+        try:
+            self._check_sender(request)
+            if "token" in request.query:
+                return self._enter(request)
+            target = self._checked_target(request)
+            self._server.unchecked.pop(request.protocol, None)
+            return await (self._bridge if "Upgrade" in request.headers else self._fetch)(request, target)
+        except web.HTTPException as refusal:
+            refusal.headers.update(PROTECTION)
+            refusal.force_close()
+            raise
+
+    def _check_sender(self, request: web.BaseRequest) -> None:
+        """Refuse names that are not this machine's, requests of other sites' pages, and all but a plain GET."""
+        hosts = [value.lower() for value in request.headers.getall("Host", [])]
+        match = _HOST.fullmatch(hosts[0]) if len(hosts) == 1 else None
+        if match is None:
+            raise web.HTTPBadRequest(text="the Host header is missing or malformed\n")
+        name = match[1].strip("[]")
+        try:
+            ipaddress.ip_address(name)  # a page that a browser got from a bare address cannot be rebound
+        except ValueError:
+            if name not in self._names:
+                text = f"{name} is not a name of this machine; use its address instead\n"
+                raise web.HTTPMisdirectedRequest(text=text) from None
+        own = (f"http://{hosts[0]}", f"https://{hosts[0]}")
+        foreign = any(origin.lower() not in own for origin in request.headers.getall("Origin", []))
+        # a link on another page may lead here; its token decides
+        modes = request.headers.get("Sec-Fetch-Mode"), request.headers.get("Sec-Fetch-Dest")
+        if foreign or (_is_cross_site(request) and modes != ("navigate", "document")):
+            raise web.HTTPForbidden(text="a request of another site's page\n")
+        if request.method != "GET":
+            raise web.HTTPMethodNotAllowed(request.method, ["GET"], text="only GET is allowed\n")
+        if request.body_exists:
+            raise web.HTTPBadRequest(text="a request with a body\n")
+
+    def _enter(self, request: web.BaseRequest) -> web.Response:
+        """Exchange the token for the cookie and its path; the page's address has no token."""
+        tokens = request.query.getall("token")
+        if len(tokens) > 1 or not _same(tokens[0], self._token):
+            raise web.HTTPForbidden(text=f"This token is not the one of this viewer. {_WHERE}\n")
+        if "Upgrade" in request.headers or request.path != "/":
+            raise web.HTTPBadRequest(text="a token belongs to the first page\n")
+        target = f"/{self._path}/"
+        headers = {
+            **PROTECTION,
+            "Set-Cookie": f"{_COOKIE}={self._cookie}; Path={target}; HttpOnly; SameSite=Strict",
+            "Cache-Control": "no-store",
+        }
+        if not _is_cross_site(request):
+            return web.Response(status=303, headers={**headers, "Location": target})
+        # A browser that follows a link of another site does not send the cookie (SameSite=Strict), and neither when
+        # that link's answer redirects it. It sends the cookie when a page of the proxy leads on.
+        return web.Response(text=_page_leading_to(target), content_type="text/html", headers=headers)
+
+    def _checked_target(self, request: web.BaseRequest) -> str:
+        """Compare the path and the cookie; returns the target as the private server knows it."""
+        path, question, query = request.raw_path.partition("?")
+        first, slash, below = path.removeprefix("/").partition("/")
+        wanted = f"{_COOKIE}={self._cookie}"
+        cookies = ";".join(request.headers.getall("Cookie", [])).split(";")
+        known = any([_same(each.strip(), wanted) for each in cookies])
+        if not _same(first, self._path) or not slash or not known:
+            raise web.HTTPForbidden(text=f"{_WHERE}\n")
+        if _PATH.fullmatch(f"/{below}") is None:
+            raise web.HTTPNotFound(text="no such page\n")
+        if "Upgrade" in request.headers and below not in ("ui", "state"):
+            raise web.HTTPNotFound(text="no such WebSocket\n")
+        return f"/{below}{question}{query}"
+
+    async def _fetch(self, request: web.BaseRequest, target: str) -> web.StreamResponse:
+        """Answer with the private server's response, of which only type, length, caching and body are kept."""
+        try:
+            found = await self._client.get(URL(self._upstream + target, encoded=True), allow_redirects=False)
+        except (aiohttp.ClientError, TimeoutError):
+            raise web.HTTPBadGateway(text=_ENDED) from None
+        async with found:
+            kept = {name: found.headers[name] for name in ("Content-Type", "Cache-Control") if name in found.headers}
+            headers = PROTECTION | kept
+            if found.content_type == "text/html":
+                begin, tag, rest = (await found.text()).partition("<head>")
+                if not tag:
+                    raise web.HTTPBadGateway(text="an unexpected page\n")
+                body = (begin + tag + SCRIPT + rest).encode()
+                return web.Response(status=found.status, body=body, headers=headers)
+            answer = web.StreamResponse(status=found.status, headers=headers)
+            answer.content_length = found.content_length
+            await answer.prepare(request)
+            async for chunk in found.content.iter_any():
+                try:
+                    async with asyncio.timeout(WRITE_SECONDS):
+                        await answer.write(chunk)
+                except TimeoutError:
+                    assert request.transport is not None
+                    request.transport.abort()
+                    raise
+            return answer
+
+    async def _bridge(self, request: web.BaseRequest, target: str) -> web.StreamResponse:
+        """Pass on the messages of a WebSocket in both directions, until one end closes it."""
+        browser = web.WebSocketResponse(heartbeat=_HEARTBEAT, compress=False, max_msg_size=MESSAGE_BYTES)
+        browser.headers.update(PROTECTION)
+        await browser.prepare(request)  # refuses malformed handshakes
+        try:
+            studio = await self._client.ws_connect(URL(self._upstream + target, encoded=True), max_msg_size=0)
+        except (aiohttp.ClientError, TimeoutError):
+            await browser.close(code=aiohttp.WSCloseCode.GOING_AWAY, message=_ENDED.encode())
+            return browser
+        async with studio:
+            controls = target.partition("?")[0] == "/ui"
+            await asyncio.gather(_relay(studio, browser), _relay(browser, studio, self._hear if controls else None))
+        return browser
+
+    def _hear(self) -> None:
+        self._heard = time.monotonic()
+
+
+class _Server(web.Server):
+    """Closes the oldest of too many connections that have not shown the secret, and slow or idle ones."""
+
+    def __init__(self, handler: Any) -> None:
+        super().__init__(
+            handler, handler_cancellation=True, keepalive_timeout=HEAD_SECONDS, lingering_time=1.0, access_log=None,
+            logger=logging.Logger("viewer-proxy", logging.CRITICAL),  # malformed requests would fill a file
+        )  # fmt: skip
+        self.unchecked: dict[web.RequestHandler, None] = {}
+
+    def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
+        super().connection_made(handler, transport)
+        if len(self.unchecked) >= UNCHECKED:
+            next(iter(self.unchecked)).force_close()
+        self.unchecked[handler] = None
+
+    def connection_lost(self, handler: web.RequestHandler, exc: BaseException | None = None) -> None:
+        super().connection_lost(handler, exc)
+        self.unchecked.pop(handler, None)
+
+
+async def _relay(source: _SocketEnd, sink: _SocketEnd, heard: Callable[[], None] | None = None) -> None:
+    """Pass on messages until the source is closed, then close the sink in the same way.
+
+    Args:
+        source: Where messages come from.
+        sink: Where they go.
+        heard: Called for each message.
+    """
+    code, reason = int(aiohttp.WSCloseCode.GOING_AWAY), ""
+    with contextlib.suppress(ConnectionError):  # the sink is gone
+        while True:
+            message = await source.receive()
+            if heard is not None:
+                heard()
+            if message.type is aiohttp.WSMsgType.BINARY:
+                await sink.send_bytes(message.data)
+            elif message.type is aiohttp.WSMsgType.TEXT:
+                await sink.send_str(message.data)
+            else:
+                if message.type is aiohttp.WSMsgType.CLOSE and message.data:
+                    code, reason = int(message.data), str(message.extra or "")
+                break
+    await sink.close(code=code, message=reason.encode())
+
+
+def _same(given: str, secret: str) -> bool:
+    """Compare in a time that does not depend on where the two differ."""
+    return hmac.compare_digest(given.encode(errors="replace"), secret.encode())
+
+
+def _is_cross_site(request: web.BaseRequest) -> bool:
+    return request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin")
+
+
+def _bracketed(host: str) -> str:
+    """A host as it is written in an address: IPv6 in brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
+def _page_leading_to(address: str) -> str:
+    """A page that opens another one at once."""
+    return f'<!doctype html><meta http-equiv="refresh" content="0; url={html.escape(address)}">'

@@ -1,0 +1,133 @@
+"""Studio's viewer without a browser or a window: the panel runs in it, and what it draws is thrown away."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.studio import launch_thread, messages, ux, viewer_protocol
+
+from lyceum_warp.viewer.protocol import Frame, Opened, Pose, Reply, Scene, Status
+from lyceum_warp.viewer.window.panel import Panel
+from lyceum_warp.viewer.window.studio import Screen, imgui, implot
+
+ROBOT = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="2 2 .1"/>
+    <camera name="side" pos="0 -3 1" xyaxes="1 0 0 0 0 1"/>
+    <body name="ball" pos="0 0 1">
+      <freejoint/>
+      <geom name="ball" size=".1"/>
+      <camera name="track" mode="trackcom" pos="0 -3 0" xyaxes="1 0 0 0 0 1"/>
+    </body>
+    <body name="goal" mocap="true" pos="1 0 1"><geom name="goal" size=".05" contype="0" conaffinity="0"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def robot() -> mujoco.MjModel:
+    """A ball that falls, and a goal that a mouse can place."""
+    return mujoco.MjModel.from_xml_string(ROBOT)
+
+
+def scene_of(model: mujoco.MjModel, **changes: Any) -> Scene:
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    values: dict[str, Any] = dict(
+        title="ball", model=content.tobytes(), nworld=8, timestep=0.01, modes=("passive", "controller", "playback"),
+        controllers=("policy", "mppi"), episodes=("first", "second"), curves=("reward", "eval"),
+    )  # fmt: skip
+    return Scene(**values | changes)
+
+
+def pose_of(data: mujoco.MjData) -> Pose:
+    return Pose(data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy())
+
+
+def status_of(**changes: Any) -> Status:
+    values: dict[str, Any] = dict(
+        mode="passive", controller="policy", episode=None, world=3, step=7, steps=100, time=0.07, paused=False,
+        speed=1.0, measured_speed=0.9, plan_ms=2.5, backwards=False, video=None,
+    )  # fmt: skip
+    return Status(**values | changes)
+
+
+def frame_of(model: mujoco.MjModel, data: mujoco.MjData, status: Status | None = None, **changes: Any) -> Frame:
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.empty(mujoco.mj_stateSize(model, kind))
+    mujoco.mj_getState(model, data, state, kind)
+    values: dict[str, Any] = dict(pose=pose_of(data), state=state, model_fields={}, status=status or status_of())
+    return Frame(**values | changes)
+
+
+class HeadlessViewer(viewer_protocol.Viewer):
+    dropped = ""
+
+    def prepare_next_frame(self) -> bool:
+        return True
+
+    def sync(self) -> None:
+        pass
+
+    def get_drop_file(self) -> str:
+        dropped, self.dropped = self.dropped, ""
+        return dropped
+
+    def upload_image(self, *arguments: Any) -> int:
+        return 0
+
+
+class Bench:
+    """A panel in a viewer of its own, with the session's end at hand."""
+
+    def __init__(self, model: mujoco.MjModel, scene: Scene, **options: Any) -> None:
+        self.model, self.data = model, mujoco.MjData(model)
+        mujoco.mj_forward(model, self.data)
+        context, plots = imgui.CreateContext(), implot.CreateContext()
+        imgui.SetCurrentContext(context)
+        for module in (ux, implot):
+            module.set_imgui_context(context)
+            module.set_implot_context(plots)
+        io = imgui.GetIO()
+        io.DisplaySize = imgui.Vec2(1280, 800)
+        io.BackendFlags = int(io.BackendFlags) | int(imgui.BackendFlags.RendererHasTextures)
+        self.sent: list[Reply] = []
+        self.given: Frame | None = None
+        self.models: list[mujoco.MjModel] = []
+        self.panel = Panel(scene, model, self, ShownModels(self.models), Opened("http://here"), **options)
+        here, _ = launch_thread.make_thread_endpoints()
+        config = viewer_protocol.ViewerConfig()
+        self.viewer = HeadlessViewer(config, here, model=model, plugins=[self.panel])
+        self.viewer.dispatch(viewer_protocol.ViewerInitEvent(viewer=self.viewer))
+
+    def send(self, reply: Reply) -> None:
+        self.sent.append(reply)
+
+    def take(self) -> Frame | None:
+        given, self.given = self.given, None
+        return given
+
+    def show(self, status: Status) -> None:
+        """Draw a frame with this status, and forget what was sent before."""
+        self.draw(frame_of(self.model, self.data, status))
+        self.sent.clear()
+
+    def draw(self, frame: Frame | None = None) -> list[Reply]:
+        """Draw one frame; what the panel sent meanwhile."""
+        self.given, before = frame, len(self.sent)
+        imgui.NewFrame()
+        self.viewer.dispatch(messages.UpdateEvent())
+        self.viewer.dispatch(messages.BuildGuiEvent())
+        imgui.Render()
+        return self.sent[before:]
+
+
+class ShownModels(Screen):
+    """Takes the models that the panel shows."""
+
+    def __init__(self, shown: list[mujoco.MjModel]) -> None:
+        self.shown = shown
+
+    def show_model(self, model: mujoco.MjModel) -> None:
+        self.shown.append(model)

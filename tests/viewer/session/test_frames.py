@@ -1,0 +1,99 @@
+"""What frames hold."""
+
+import math
+
+import numpy as np
+import torch
+from conftest import SharedEnv
+from memory_window import pushing
+
+import lyceum_warp as lw
+from lyceum_warp.viewer import protocol
+from lyceum_warp.viewer.session.clock import Session
+
+
+def test_rows_that_come_later_are_shown_a_frame_later(shared_env: SharedEnv) -> None:
+    """As those of worlds on a GPU."""
+    env = shared_env("hopper", nworld=4)
+    session = Session(env, controllers={"policy": pushing}, seed=0)
+    session.stage.live.asynchronous = True
+    points, rewards = [session.stage.frame().samples], []
+    for _ in range(6):
+        at_last_frame = env.get_state()[0]
+        for _ in range(5):
+            session.stage.advance()
+            rewards.append(env.reward[0].item())
+        frame = session.stage.frame()
+        np.testing.assert_array_equal(frame.state, at_last_frame[: len(frame.state)].numpy())
+        points.append(frame.samples)
+    session.obey(protocol.SetPaused(True))
+    frame = session.stage.frame()  # while paused, of now
+    np.testing.assert_array_equal(frame.state, env.get_state()[0, : len(frame.state)].numpy())
+    np.testing.assert_array_equal(np.concatenate([*points, frame.samples])[:, 1], rewards)
+
+
+def test_other_worlds_and_the_past_are_shown_as_ghosts(shared_env: SharedEnv) -> None:
+    env = shared_env("hopper", nworld=4)
+    session = Session(env, paused=True, seed=0)
+    session.stage.advance(10)
+    session.obey(protocol.SetGhosts(worlds=(1, 3), burst=5, fade=0.5, doppler=True))
+    ghosts = session.stage.frame().ghosts
+    state, qpos = env.get_state(), env.state_space.parts["qpos"]
+    for ghost, world in zip(ghosts, (1, 3), strict=False):
+        np.testing.assert_array_equal(ghost.pose.qpos, state[world, qpos].numpy())
+    past = ghosts[2:]
+    assert len(past) == 5 and past[0].colour[3] == 2 * past[1].colour[3]
+    np.testing.assert_array_equal(past[-1].pose.qpos, session.stage.live.past.states[0, 0, qpos].numpy())
+    session.obey(protocol.SetGhosts(worlds=(9,)))
+    assert "there is no world 9" in session.stage.frame().messages[0]
+    for ghosts, text in (
+        (protocol.SetGhosts(worlds=(0,) * (protocol.MOST_GHOSTS + 1)), "at most 32 worlds are drawn as ghosts, not 33"),
+        (protocol.SetGhosts(burst=protocol.MOST_BURST + 1), "at most 50 states of the burst"),
+    ):
+        session.obey(ghosts)
+        assert text in session.stage.frame().messages[0]
+    assert len(session.stage.frame().ghosts) == 7
+
+
+def test_ends_of_episodes_and_faults_become_messages(shared_env: SharedEnv) -> None:
+    env = shared_env("hopper", nworld=2)
+
+    def bad(obs: torch.Tensor) -> torch.Tensor:
+        action = torch.zeros(2, 3)
+        action[1, 0] = math.nan
+        return action
+
+    session = Session(env, controllers={"fall": pushing, "bad": bad}, paused=True, seed=0)
+    session.stage.frame()
+    while not env.done[0].item():
+        session.stage.advance()
+    steps = session.stage.live.made
+    (message,) = session.stage.frame().messages
+    assert message.startswith(f"the episode ended after {steps} steps (terminated), return ")
+    session.obey(protocol.SetController("bad"))
+    session.stage.advance()
+    assert "fault in world 1: action (1 so far)" in session.stage.frame().messages
+
+
+def test_frames_hold_every_point_of_the_curves() -> None:
+    env = lw.make("hopper", nworld=2)
+    session = Session(env, paused=True, seed=0)
+    assert session.stage.scene.curves == ("reward", "eval", *env.metrics)
+    rewards = []
+    for _ in range(20):
+        session.stage.advance()
+        rewards.append(env.reward[0].item())
+    points = session.stage.frame().samples
+    assert points.shape == (20, 1 + len(session.stage.scene.curves))
+    np.testing.assert_array_equal(points[:, 1], rewards)
+    np.testing.assert_allclose(points[:, 0], env.timestep * np.arange(1, 21))
+
+
+def test_model_fields_that_differ_are_in_the_frame() -> None:
+    env = lw.make("hopper", nworld=2, dynamics=["body_mass"])
+    session = Session(env, paused=True)
+    assert session.stage.frame().model_fields == {}
+    masses = env.model.body_mass.copy()
+    masses[2] *= 2
+    env.set_dynamics(body_mass=masses)
+    np.testing.assert_array_equal(session.stage.frame().model_fields["body_mass"], masses.astype(np.float32))

@@ -1,0 +1,86 @@
+"""Episodes that are played back."""
+
+import numpy as np
+import pytest
+import torch
+from conftest import SharedEnv
+from toy_controllers import towards
+
+import lyceum_warp as lw
+from lyceum_warp.viewer import protocol
+from lyceum_warp.viewer.protocol import StepBy
+from lyceum_warp.viewer.session.clock import Session
+
+
+@pytest.fixture(scope="module")
+def trajectories() -> list[lw.Trajectory]:
+    env = lw.make("point_mass", autoreset=False, horizon=20)
+    return [lw.control(env, towards, seed=seed, steps=20 - 5 * seed) for seed in (0, 1)]
+
+
+def test_a_playback_is_sought_reversed_and_looped(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
+    env = shared_env("point_mass")
+    session = Session(env, episodes=trajectories, paused=True)
+    assert session.stage.scene.modes == ("playback", "passive") and session.stage.scene.episodes == (
+        "episode 0",
+        "episode 1",
+    )
+    qpos = env.state_space.parts["qpos"]
+
+    def shown() -> np.ndarray:
+        return session.stage.frame().pose.qpos
+
+    session.obey(protocol.Seek(7))
+    np.testing.assert_array_equal(shown(), trajectories[0].states[7, qpos])
+    session.obey(StepBy(-2))
+    assert session.stage.frame().status.step == 5
+    session.obey(protocol.SetBackwards(True))
+    session.stage.advance(6)
+    assert session.stage.frame().status.step == 20  # after the first step the last one
+    session.obey(protocol.SetEpisode(1))
+    frame = session.stage.frame()
+    assert frame.status.step == 15 and frame.status.steps == 15 and frame.status.episode == 1
+    session.obey(protocol.SetBackwards(False))
+    session.obey(protocol.Reset(random=False))
+    session.stage.frame()
+    session.stage.advance(3)
+    points = session.stage.frame().samples
+    np.testing.assert_allclose(points[:, 1], trajectories[1].rewards[:3])
+    session.obey(protocol.SetGhosts(episodes=(0, 1), burst=4, doppler=True))
+    ghosts = session.stage.frame().ghosts
+    np.testing.assert_array_equal(ghosts[0].pose.qpos, trajectories[0].states[3, qpos])
+    past = [ghost for ghost in ghosts[1:] if ghost.colour[0] > ghost.colour[2]]
+    assert len(past) == 1 and len(ghosts) == 5
+    session.obey(protocol.SetEpisode(5))
+    assert session.stage.frame().messages == ("there is no episode 5: there are 2, from 0",)
+
+
+def test_worlds_go_on_from_the_state_of_a_playback(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
+    env = shared_env("point_mass")
+    session = Session(env, episodes={"first": trajectories[0]}, paused=True)
+    session.obey(protocol.Seek(20))
+    session.obey(protocol.SetMode("passive"))
+    qpos = env.state_space.parts["qpos"]
+    assert torch.equal(env.get_state()[0, qpos], trajectories[0].states[20, qpos])
+    session.stage.advance()
+
+
+def test_states_are_played_back_without_rewards(shared_env: SharedEnv) -> None:
+    env = shared_env("point_mass")
+    states = torch.cat([env.get_state() for _ in range(4)])
+    session = Session(env, episodes=states)
+    session.stage.advance()
+    frame = session.stage.frame()
+    assert frame.status.steps == 3 and np.isnan(frame.samples[:, 1]).all()
+
+
+def test_an_episode_that_does_not_fit_is_refused(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
+    with pytest.raises(ValueError, match="episode 0 is an episode of the task 'point_mass', not of 'hopper'"):
+        Session(shared_env("hopper"), episodes=trajectories)
+    env = lw.make("point_mass", dynamics=["body_mass"])
+    with pytest.raises(ValueError, match="episode 0 does not fit the task 'point_mass' as it is now"):
+        Session(env, episodes=trajectories[0])
+    with pytest.raises(ValueError, match="or states of shape"):
+        Session(shared_env("hopper"), episodes=torch.zeros(3, 4))
+    with pytest.raises(FileNotFoundError, match="missing.npz"):
+        Session(shared_env("hopper"), episodes=["missing.npz"])

@@ -1,0 +1,75 @@
+import mujoco
+import numpy as np
+import pytest
+from headless_screen import Bench, frame_of, robot, scene_of, status_of
+
+from lyceum_warp.viewer.protocol import Perturb
+from lyceum_warp.viewer.window import studio
+
+
+@pytest.fixture
+def bench() -> Bench:
+    model = robot()
+    bench = Bench(model, scene_of(model))
+    bench.show(status_of())
+    return bench
+
+
+def drag(bench: Bench, body: str, *, paused: bool) -> list[Perturb]:
+    """Drag a body by half a metre, as studio reports it; what the session is sent."""
+    perturb, data = bench.viewer.perturb, bench.viewer.data
+    perturb.select = bench.model.body(body).id
+    perturb.flexselect = perturb.skinselect = -1
+    kind = int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
+    studio.ux.InitPerturb(bench.viewer.model, data, bench.viewer.camera, perturb, kind)
+    perturb.refpos = data.body(body).xipos + np.array([0.5, 0, 0])
+    perturb.refselpos = perturb.refselpos + np.array([0.5, 0, 0])
+    return hold(bench, paused=paused)
+
+
+def hold(bench: Bench, *, paused: bool) -> list[Perturb]:
+    before = len(bench.sent)
+    bench.panel.mouse.drag(bench.viewer, paused=paused)
+    return bench.sent[before:]  # type: ignore[return-value]
+
+
+def test_dragged_body_is_pushed_until_it_is_left(bench: Bench) -> None:
+    (push,) = drag(bench, "ball", paused=False)
+    assert push.forces[bench.model.body("ball").id, 0] > 0
+    assert push.qpos is None and push.mocap_pos is None
+    bench.viewer.perturb.active = 0
+    (end,) = hold(bench, paused=False) + hold(bench, paused=False)
+    assert not end.forces.any()
+
+
+def test_dragged_body_is_placed_while_paused_and_only_when_it_moves(bench: Bench) -> None:
+    (place,) = drag(bench, "ball", paused=True)
+    np.testing.assert_allclose(place.qpos[0], 0.5)
+    assert not place.forces.any()
+    for _ in range(5):
+        assert hold(bench, paused=True) == []
+        bench.data.qpos[:] = bench.viewer.data.qpos
+        bench.panel.take(frame_of(bench.model, bench.data, status_of(paused=True)))
+    bench.viewer.perturb.refpos = bench.viewer.perturb.refpos + np.array([0.0, 0.1, 0])
+    (place,) = hold(bench, paused=True)
+    np.testing.assert_allclose(place.qpos[:2], [0.5, 0.1])
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_push_ends_when_its_person_has_left(bench: Bench, paused: bool) -> None:
+    """A browser that is closed in the middle of a drag never lets go of the button."""
+    drag(bench, "ball", paused=paused)
+    bench.sent.clear()
+    bench.panel.mouse.let_go()  # of another thread; nothing is drawn from here on
+    bench.panel.mouse.let_go()
+    (end,) = bench.sent
+    assert isinstance(end, Perturb) and not end.forces.any() and end.qpos is None
+    assert hold(bench, paused=paused) == []  # the next browser
+    assert not bench.viewer.perturb.active
+    assert len(drag(bench, "ball", paused=paused)) == 1
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_dragged_mocap_body_is_placed(bench: Bench, paused: bool) -> None:
+    (place,) = drag(bench, "goal", paused=paused)
+    np.testing.assert_allclose(place.mocap_pos, [[1.5, 0, 1]])

@@ -1,0 +1,654 @@
+"""The proxy in front of the viewer: what it forwards, and each attack that it must refuse."""
+
+import contextlib
+import http.client
+import http.cookiejar
+import ipaddress
+import os
+import re
+import socket
+import stat
+import subprocess
+import sys
+import threading
+import time
+import urllib.parse
+import urllib.request
+import webbrowser
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+from websockets.sync.server import ServerConnection, serve
+
+from lyceum_warp.viewer.window import proxy as module
+from lyceum_warp.viewer.window import sockets as sockets_module
+from lyceum_warp.viewer.window.proxy import Proxy
+from lyceum_warp.viewer.window.sockets import private_socket
+
+UPGRADE = (
+    "Upgrade: websocket", "Connection: keep-alive, Upgrade", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+    "Sec-WebSocket-Version: 13",
+)  # fmt: skip
+
+
+class Upstream:
+    """A private server that keeps every byte it gets."""
+
+    def __init__(self, answer: bytes | None = None) -> None:
+        headers = b"Access-Control-Allow-Origin: *\r\nSet-Cookie: a=b\r\nCache-Control: no-cache\r\nConnection: close"
+        self.answer = answer or b"HTTP/1.1 200 OK\r\nContent-Length: 5\r\n" + headers + b"\r\n\r\nrobot"
+        self.received: list[bytes] = []
+        self.ended = 0
+        self.listener = private_socket()
+        threading.Thread(target=self.listen, daemon=True).start()
+
+    def listen(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                connection, _ = self.listener.accept()
+                threading.Thread(target=self.serve, args=(connection,), daemon=True).start()
+
+    def serve(self, connection: socket.socket) -> None:
+        with contextlib.suppress(OSError), connection:
+            self.received.append(connection.recv(65536))
+            connection.sendall(self.answer)
+            connection.shutdown(socket.SHUT_WR)
+            while connection.recv(65536):
+                pass
+        self.ended += 1
+
+
+@contextlib.contextmanager
+def proxy_of(answer: bytes | None = None) -> Iterator[tuple[Proxy, Upstream]]:
+    upstream = Upstream(answer)
+    with Proxy() as opened:
+        opened.start(upstream.listener.getsockname())
+        yield opened, upstream
+    upstream.listener.close()
+
+
+@pytest.fixture
+def both() -> Iterator[tuple[Proxy, Upstream]]:
+    with proxy_of() as opened:
+        yield opened
+
+
+@pytest.fixture
+def proxy(both: tuple[Proxy, Upstream]) -> Proxy:
+    return both[0]
+
+
+@pytest.fixture
+def upstream(both: tuple[Proxy, Upstream]) -> Iterator[Upstream]:
+    yield both[1]
+
+
+@pytest.fixture
+def untouched(upstream: Upstream) -> Iterator[None]:
+    """Nothing of the test may reach the private server."""
+    yield
+    assert not upstream.received
+
+
+def token(proxy: Proxy) -> str:
+    return proxy.address.partition("token=")[2]
+
+
+def request(proxy: Proxy, head: str, *, rest: bytes = b"") -> bytes:
+    """Everything that the proxy answers to a head, whose lines are separated by line breaks."""
+    with socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client:
+        lines = head.split("\n")
+        lines.append("Connection: close" if "Connection: " not in head else "X: y")
+        client.sendall("\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + rest)
+        answer = b""
+        while data := client.recv(65536):
+            answer += data
+        return answer
+
+
+def status(answer: bytes) -> int:
+    return int(answer.split(b" ", 2)[1])
+
+
+def entered(proxy: Proxy) -> tuple[str, str]:
+    """The cookie that the token is exchanged for, and the path that it belongs to."""
+    answer = request(proxy, f"GET /?token={token(proxy)} HTTP/1.1\nHost: 127.0.0.1").decode()
+    found = re.search(r"\r\nSet-Cookie: ([^;]*); Path=(/[^;]*)/;", answer)
+    assert found is not None
+    return found[1], found[2]
+
+
+def get(proxy: Proxy, path: str = "/", *headers: str, host: str = "", key: str | None = None) -> bytes:
+    """The answer to GET below the right path, with the right cookie or with another one."""
+    own, before = entered(proxy)
+    path = path if "token=" in path else before + path
+    lines = [
+        f"GET {path} HTTP/1.1",
+        f"Host: {host or f'127.0.0.1:{proxy.port}'}",
+        f"Cookie: {own if key is None else key}",
+    ]
+    return request(proxy, "\n".join([*lines, *headers]))
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+# the secret
+
+
+def test_the_token_becomes_a_cookie_and_leaves_the_address(proxy: Proxy, upstream: Upstream) -> None:
+    answer = request(proxy, f"GET /?token={token(proxy)} HTTP/1.1\nHost: localhost:{proxy.port}").decode()
+    assert answer.startswith("HTTP/1.1 303 ")
+    target = re.search(r"\r\nLocation: (/[\w-]{43}/)\r\n", answer)
+    given = re.search(r"\r\nSet-Cookie: lyceum-warp=([\w-]{43})(.*)\r\n", answer)
+    assert target is not None and given is not None
+    assert given[2] == f"; Path={target[1]}; HttpOnly; SameSite=Strict"
+    assert token(proxy) not in answer and given[1] not in target[1]
+    assert not upstream.received
+    assert get(proxy).endswith(b"\r\n\r\nrobot")
+
+
+def test_an_address_has_32_random_bytes() -> None:
+    with Proxy() as one, Proxy() as other:
+        assert token(one) != token(other) and len(token(one)) == 43
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize("path", ["/", "/?token=", "/?token=WRONG", "/?token=OTHER", "/?token=TOKEN&token=WRONG",
+                                  "/?token=TOKEN&token=TOKEN", "/model", "/model?token=WRONG", "/model?token=TOKEN",
+                                  "/?tokenx=TOKEN", "/?token=token\xe9"])  # fmt: skip
+def test_requests_without_the_right_token_are_refused(proxy: Proxy, path: str) -> None:
+    with Proxy() as other:
+        path = path.replace("TOKEN", token(proxy)).replace("OTHER", token(other))
+        assert status(request(proxy, f"GET {path} HTTP/1.1\nHost: 127.0.0.1")) in (400, 403)
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize("key", ["", "lyceum-warp=", "lyceum-warp=wrong", "lyceum-warp=TOKEN", "NAME=VALUEx", "x=VALUE",
+                                 "lyceum-warp=PATH", "lyceum-warp=VALUE\xe9"])  # fmt: skip
+def test_requests_without_the_right_cookie_are_refused(proxy: Proxy, key: str) -> None:
+    own, path = entered(proxy)
+    name, _, value = own.partition("=")
+    for word, meaning in (("NAME", name), ("VALUE", value), ("PATH", path.strip("/")), ("TOKEN", token(proxy))):
+        key = key.replace(word, meaning)
+    assert status(get(proxy, key=key)) == 403
+    assert status(get(proxy, "/ui", *UPGRADE, key=key)) == 403
+
+
+def test_cookies_of_other_servers_do_not_disturb(proxy: Proxy) -> None:
+    """Of another viewer and of one that ran before, and malformed ones."""
+    with Proxy() as other:
+        other.start(("127.0.0.1", 1))
+        foreign = entered(other)[0]
+    assert status(get(proxy, key=foreign)) == 403
+    assert status(get(proxy, key=f"{foreign}; bad[{{; theme=dark; {entered(proxy)[0]}; lyceum-warp=stale")) == 200
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize("path", ["/", "/index.html", "//", "/WRONG/", "/PATH", "/PATHx/", "//PATH/", "/x/../PATH/",
+                                  "/VALUE/", "/model"])  # fmt: skip
+def test_the_cookie_without_the_right_path_is_refused(proxy: Proxy, path: str) -> None:
+    key, before = entered(proxy)
+    path = path.replace("PATH", before.strip("/")).replace("VALUE", key.partition("=")[2])
+    assert status(request(proxy, f"GET {path} HTTP/1.1\nHost: 127.0.0.1\nCookie: {key}")) == 403
+
+
+class Jar(http.cookiejar.CookieJar):
+    """Cookies as a browser sends them: to every port of their host, below their path."""
+
+    def sent_to(self, address: str) -> str | None:
+        asked = urllib.request.Request(address)
+        self.add_cookie_header(asked)
+        return asked.get_header("Cookie")
+
+
+def test_another_port_of_the_host_is_not_sent_the_cookie(proxy: Proxy) -> None:
+    """Other users of the machine may listen there."""
+    jar = Jar()
+    browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(jar))
+    cookie, path = entered(proxy)
+    with browser.open(proxy.address) as page:
+        assert page.read() == b"robot"
+        assert jar.sent_to(f"http://127.0.0.1:{proxy.port}{path}/") == cookie
+    for other in ("/", "/ui", "/state", "/model", "/lyceum-warp/", "/index.html"):
+        assert jar.sent_to(f"http://127.0.0.1:{proxy.port + 1}{other}") is None
+
+
+# what studio's responses may contain
+
+
+def test_other_sites_cannot_read_or_embed_the_page_and_studio_sets_no_cookies(proxy: Proxy) -> None:
+    for answer in (get(proxy, "/model"), get(proxy, key=""), request(proxy, "GET / HTTP/1.1\nHost: x")):
+        head = answer.partition(b"\r\n\r\n")[0].decode().lower()
+        for line in ("x-frame-options: deny", "cross-origin-resource-policy: same-origin",
+                     "referrer-policy: no-referrer"):  # fmt: skip
+            assert head.count(f"\r\n{line}") == 1
+        assert "access-control-" not in head and "set-cookie" not in head
+    assert b"\r\nCache-Control: no-cache\r\n" in get(proxy, "/model")
+
+
+def test_the_page_asks_below_its_path() -> None:
+    page = b"<!doctype html><html><head><title>robot</title></head></html>"
+    head = b"HTTP/1.1 200 OK\r\nContent-Type: text/html; charset=utf-8\r\nContent-Length: %d\r\n\r\n" % len(page)
+    with proxy_of(head + page) as (proxy, _):
+        head, _, body = get(proxy).partition(b"\r\n\r\n")
+        assert body.startswith(b"<!doctype html><html><head><script>")
+        assert body.endswith(b"</script><title>robot</title></head></html>")
+        assert re.findall(rb"(?i)content-length: (\d+)", head) == [b"%d" % len(body)]
+
+
+@pytest.mark.parametrize("answer", [
+    b"nonsense\r\n\r\n", b"HTTP/1.1 200 OK\r\n",
+    b"HTTP/1.1 200 OK\r\nContent-Type: text/html\r\nContent-Length: 26\r\n\r\n<title>robot</title>      ",
+])  # fmt: skip
+def test_a_broken_response_and_a_page_without_a_head_are_reported(answer: bytes) -> None:
+    with proxy_of(answer) as (proxy, _):
+        assert status(get(proxy)) == 502
+
+
+def test_a_private_server_that_has_ended_is_reported(proxy: Proxy, upstream: Upstream) -> None:
+    upstream.listener.shutdown(socket.SHUT_RDWR)
+    answer = get(proxy)
+    assert status(answer) == 502 and answer.endswith(b"The viewer has ended.\n")
+
+
+# other sites
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1", "http://127.0.0.1:1", "file://",
+                                    "http://localhost:PORT", "http://127.0.0.1:PORT.evil.example",
+                                    "http://127.0.0.1:PORT/", ""])  # fmt: skip
+def test_foreign_origins_are_refused(proxy: Proxy, origin: str) -> None:
+    header = f"Origin: {origin.replace('PORT', str(proxy.port))}"
+    assert status(get(proxy, "/model", header)) == 403
+    assert status(get(proxy, "/state", header, *UPGRADE)) == 403
+    assert status(get(proxy, f"/?token={token(proxy)}", header)) == 403
+    assert status(get(proxy, "/model", f"Origin: http://127.0.0.1:{proxy.port}", header)) in (400, 403)
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize("headers", [
+    ("Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: no-cors", "Sec-Fetch-Dest: script"),
+    ("Sec-Fetch-Site: same-site", "Sec-Fetch-Mode: no-cors", "Sec-Fetch-Dest: image"),
+    ("Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: navigate", "Sec-Fetch-Dest: iframe"),
+    ("Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: websocket", "Sec-Fetch-Dest: websocket"),
+])  # fmt: skip
+def test_what_another_sites_page_embeds_is_refused(proxy: Proxy, headers: tuple[str, ...]) -> None:
+    assert status(get(proxy, "/model", *headers)) == 403
+    assert status(get(proxy, "/state", *headers, *UPGRADE)) == 403
+
+
+@pytest.mark.usefixtures("untouched")
+def test_a_link_on_another_page_leads_to_the_viewer_if_it_has_the_token(proxy: Proxy) -> None:
+    link = ("Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: navigate", "Sec-Fetch-Dest: document")
+    assert status(get(proxy, "/", *link, key="")) == 403
+    answer = get(proxy, f"/?token={token(proxy)}", *link, key="").decode()
+    assert answer.startswith("HTTP/1.1 200 ") and "Set-Cookie: " in answer
+    assert f'content="0; url={entered(proxy)[1]}/"' in answer
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:PORT", "127.0.0.1.evil.example",
+                                  "localhost.evil.example:PORT", "localhost."])  # fmt: skip
+def test_names_that_are_not_this_machines_are_refused(proxy: Proxy, host: str) -> None:
+    """A foreign name may resolve to this machine (DNS rebinding)."""
+    host = host.replace("PORT", str(proxy.port))
+    assert status(get(proxy, f"/?token={token(proxy)}", host=host)) == 421
+    assert status(get(proxy, host=host)) == 421
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize("hosts", ["", "Host:", "Host: HOST\nHost: HOST", "Host: a@HOST", "Host: HOST/"])
+def test_a_missing_or_malformed_host_is_refused(proxy: Proxy, hosts: str) -> None:
+    key, path = entered(proxy)
+    head = "\n".join(filter(None, [f"GET {path}/ HTTP/1.1", hosts.replace("HOST", "127.0.0.1"), f"Cookie: {key}"]))
+    assert status(request(proxy, head)) == 400
+
+
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1", "127.0.0.1:9000", "localhost:9000", "LOCALHOST:80", "[::1]:9000", "192.168.0.7:8080"]
+)
+def test_addresses_of_this_machine_are_accepted_at_any_port(proxy: Proxy, host: str) -> None:
+    """A port may be forwarded."""
+    assert status(get(proxy, "/", f"Origin: http://{host.lower()}", host=host)) == 200
+
+
+# requests
+
+
+def test_pages_are_forwarded_without_the_clients_headers(proxy: Proxy, upstream: Upstream) -> None:
+    for path in ("/index.html", "/model?crc32=1&total_bytes", "/assets/AtkinsonHyperlegibleNext[wght].ttf"):
+        upstream.received.clear()
+        assert get(proxy, path, "X-Forwarded-For: 1").endswith(b"\r\n\r\nrobot")
+        (received,) = upstream.received
+        assert received.startswith(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:".encode())
+        assert b"Cookie" not in received and b"X-Forwarded-For" not in received
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize("path", ["//drop", "/./drop", "/x/../drop", "/%64rop", "/drop%20", "/..", "/assets/../../x",
+                                  "/\\drop"])  # fmt: skip
+def test_paths_in_other_spellings_are_refused(proxy: Proxy, path: str) -> None:
+    assert status(get(proxy, path)) in (400, 404)
+    assert status(get(proxy, path, *UPGRADE)) in (400, 404)
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize("path", ["/", "/model", "/upload", "/drop", "/drop?sid=1", "/ui/"])
+def test_other_websockets_and_dropped_models_are_refused(proxy: Proxy, path: str) -> None:
+    assert status(get(proxy, path, *UPGRADE)) == 404
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize("header", ["Upgrade: h2c", "Sec-WebSocket-Key: short", "Sec-WebSocket-Key: ",
+                                    "Connection: close", "Sec-WebSocket-Version: 6"])  # fmt: skip
+def test_other_upgrades_are_refused(proxy: Proxy, header: str) -> None:
+    name = header.partition(":")[0]
+    kept = [line for line in UPGRADE if not line.startswith(name + ":")]
+    assert status(get(proxy, "/ui", *kept, header)) == 400
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "HEAD", "OPTIONS", "TRACE"])
+def test_only_get_is_allowed(proxy: Proxy, method: str) -> None:
+    key, path = entered(proxy)
+    assert status(request(proxy, f"{method} {path}/ HTTP/1.1\nHost: 127.0.0.1\nCookie: {key}")) == 405
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize("header", ["X: " + "a" * 20_000, "\n".join(f"X-{n}: {n}" for n in range(3000)),
+                                    "Cookie: " + "a=b; " * 5000])  # fmt: skip
+def test_large_heads_are_refused(proxy: Proxy, header: str) -> None:
+    key, path = entered(proxy)
+    assert status(request(proxy, f"GET {path}/ HTTP/1.1\nHost: 127.0.0.1\nCookie: {key}\n{header}")) in (400, 431)
+
+
+def test_an_endless_head_is_refused_without_being_kept(proxy: Proxy) -> None:
+    with socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client:
+        sent = 0
+        with contextlib.suppress(OSError):
+            while sent < 64 * 2**20:
+                sent += client.send(b"a" * 2**16)
+        assert sent < 64 * 2**20
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize("header", ["Content-Length: 44", "Transfer-Encoding: chunked",
+                                    "Content-Length: 0\nTransfer-Encoding: chunked"])  # fmt: skip
+def test_requests_with_a_body_are_refused(proxy: Proxy, header: str) -> None:
+    key, path = entered(proxy)
+    answer = request(
+        proxy,
+        f"GET {path}/ HTTP/1.1\nHost: 127.0.0.1\nCookie: {key}\n{header}",
+        rest=b"0\r\n\r\nGET /drop HTTP/1.1\r\n\r\n",
+    )
+    assert status(answer) == 400 and len(re.findall(rb"HTTP/1\.[01] \d", answer)) == 1
+
+
+def test_a_second_request_on_a_connection_is_checked_again(proxy: Proxy, upstream: Upstream) -> None:
+    key, path = entered(proxy)
+    answer = request(
+        proxy, f"GET {path}/ HTTP/1.1\nHost: 127.0.0.1\nCookie: {key}\nConnection: keep-alive",
+        rest=b"GET /model HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n",
+    )  # fmt: skip
+    assert [int(code) for code in re.findall(rb"HTTP/1.1 (\d+)", answer)] == [200, 403]
+    assert len(upstream.received) == 1
+
+
+# slow clients, and many
+
+
+def test_a_slow_head_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "HEAD_SECONDS", 0.3)
+    with (
+        proxy_of() as (proxy, _),
+        socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client,
+        pytest.raises(ConnectionError),
+    ):
+        for byte in b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + 600 * b"a":  # each byte is in time, all are not
+            client.send(bytes([byte]))
+            time.sleep(0.02)
+
+
+def test_silent_connections_leave_room_for_others(proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "UNCHECKED", 8)
+    with contextlib.ExitStack() as stack:
+        silent = [stack.enter_context(socket.create_connection(("127.0.0.1", proxy.port))) for _ in range(40)]
+        assert status(get(proxy)) == 200
+        silent[0].settimeout(5)
+        assert silent[0].recv(1) == b""  # the oldest ones were closed
+
+
+def test_a_client_that_takes_nothing_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "WRITE_SECONDS", 0.3)
+    size = 64 * 2**20
+    with proxy_of(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n" % size + bytes(size)) as (proxy, upstream):
+        key, path = entered(proxy)
+        with socket.socket() as client:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            client.connect(("127.0.0.1", proxy.port))
+            client.sendall(f"GET {path}/ HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: {key}\r\n\r\n".encode())
+            wait_until(lambda: upstream.ended == 1)
+            with pytest.raises(ConnectionError):  # a connection that waits for the client would take this
+                for _ in range(1000):
+                    client.send(b"x")
+                    time.sleep(0.01)
+
+
+# WebSockets
+
+
+@pytest.fixture
+def echo() -> Iterator[tuple[Proxy, list[ServerConnection], list[float]]]:
+    """A proxy before a WebSocket server of the library that studio uses, its open connections, and times of silence."""
+    opened: list[ServerConnection] = []
+    quiet: list[float] = []
+
+    def handle(connection: ServerConnection) -> None:
+        opened.append(connection)
+        with contextlib.suppress(ConnectionClosed):
+            for message in connection:
+                if message == "close":
+                    connection.close(4001, "control taken")
+                connection.send(message)
+        opened.remove(connection)
+
+    private = private_socket()
+    with serve(handle, sock=private, compression=None, max_size=None) as server, Proxy() as proxy:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        proxy.start(private.getsockname(), on_quiet=lambda: quiet.append(time.monotonic()))
+        yield proxy, opened, quiet
+
+
+Echo = tuple[Proxy, list[ServerConnection], list[float]]
+
+
+def open_tab(proxy: Proxy, *, origin: str | None = None, key: str | None = None, path: str = "/ui") -> ClientConnection:
+    cookie, before = entered(proxy)
+    host = f"127.0.0.1:{proxy.port}"
+    return connect(f"ws://{host}{before}{path}", origin=origin or f"http://{host}", max_size=None,  # type: ignore[arg-type]
+                   additional_headers={"Cookie": cookie if key is None else key})  # fmt: skip
+
+
+def test_two_tabs_talk_at_once_and_one_may_close(echo: Echo) -> None:
+    proxy, opened, _ = echo
+    with open_tab(proxy) as one:
+        with open_tab(proxy, path="/state?sid=b") as two:
+            large = os.urandom(2**20 - 100)
+            one.send(large)
+            two.send("two")
+            assert two.recv() == "two"
+            assert one.recv() == large
+        wait_until(lambda: len(opened) == 1)
+        one.send(b"still here")
+        assert one.recv() == b"still here"
+    wait_until(lambda: not opened)
+
+
+def test_the_page_gets_the_reason_why_studio_closed_its_websocket(echo: Echo) -> None:
+    """Studio's page shows a notice for its own codes, as when another tab takes control."""
+    with open_tab(echo[0]) as tab:
+        tab.send("close")
+        with pytest.raises(ConnectionClosed, match="4001.*control taken"):
+            tab.recv(timeout=10)
+
+
+def test_a_message_that_is_too_large_ends_its_websocket(echo: Echo) -> None:
+    with open_tab(echo[0]) as tab, pytest.raises(ConnectionClosed):
+        tab.send(bytes(2**20 + 1))
+        tab.recv(timeout=10)
+    wait_until(lambda: not echo[1])
+
+
+def test_a_tab_that_disappears_is_noticed_by_the_private_server(echo: Echo) -> None:
+    proxy, opened, _ = echo
+    tab = open_tab(proxy)
+    wait_until(lambda: len(opened) == 1)
+    tab.socket.shutdown(socket.SHUT_RDWR)  # as the system does for a killed browser
+    wait_until(lambda: not opened)
+
+
+def test_a_browser_that_controls_and_falls_silent_is_reported(monkeypatch: pytest.MonkeyPatch, echo: Echo) -> None:
+    monkeypatch.setattr(module, "QUIET_SECONDS", 0.5)
+    proxy, _, quiet = echo
+    with open_tab(proxy) as tab:
+        tab.send(b"input")
+        wait_until(lambda: len(quiet) == 1)  # hidden, or cut off
+        tab.send(b"input")
+    wait_until(lambda: len(quiet) == 2)  # closed
+    time.sleep(1.0)
+    assert len(quiet) == 2
+
+
+def test_websockets_need_the_cookie_and_the_right_origin(echo: Echo) -> None:
+    for options in ({"key": ""}, {"origin": "http://evil.example"}, {"path": "/drop"}):
+        with pytest.raises(InvalidStatus):
+            open_tab(echo[0], **options)
+    assert not echo[1]
+
+
+# addresses and ports
+
+
+def test_only_this_machine_can_connect_by_default(proxy: Proxy) -> None:
+    assert proxy.local
+    assert proxy.address.startswith(f"http://127.0.0.1:{proxy.port}/?token=")
+    for family, _, _, _, address in socket.getaddrinfo(socket.gethostname(), proxy.port, type=socket.SOCK_STREAM):
+        if not ipaddress.ip_address(str(address[0]).partition("%")[0]).is_loopback:
+            with socket.socket(family, socket.SOCK_STREAM) as client:
+                client.settimeout(2)
+                assert client.connect_ex(address) != 0
+
+
+def test_both_loopback_addresses_are_taken(proxy: Proxy) -> None:
+    """On one that is left out another program could pose as the viewer."""
+    try:
+        connection = http.client.HTTPConnection("::1", proxy.port, timeout=5)
+        connection.connect()
+    except OSError:
+        with pytest.raises(OSError), socket.create_server(("::1", 0), family=socket.AF_INET6):
+            pass
+        pytest.skip("no IPv6")
+    cookie, path = entered(proxy)
+    connection.request("GET", f"{path}/", headers={"Host": f"[::1]:{proxy.port}", "Cookie": cookie})
+    assert connection.getresponse().read() == b"robot"
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+def test_other_machines_are_given_an_address_and_the_ssh_line(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The machine's name often does not resolve elsewhere."""
+    monkeypatch.setenv("SSH_CONNECTION", "198.51.100.7 50000 203.0.113.9 22")
+    with Proxy(host=host) as proxy:
+        assert proxy.address.startswith(f"http://203.0.113.9:{proxy.port}/?token=")
+        assert not proxy.local and "not encrypted" in proxy.instructions[1]
+        assert proxy.ssh_line in proxy.instructions[2]
+        assert f"http://127.0.0.1:{proxy.port}/?token={token(proxy)}" in proxy.instructions[3]
+    monkeypatch.delenv("SSH_CONNECTION")
+    with Proxy(host=host) as proxy:
+        shown = urllib.parse.urlsplit(proxy.address).hostname or ""
+        if shown != socket.gethostname().lower():  # a machine without a network
+            assert not ipaddress.ip_address(shown).is_loopback and not ipaddress.ip_address(shown).is_unspecified
+
+
+def test_a_port_is_found_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sockets_module, "PORTS", 1)
+    with Proxy() as one, Proxy() as other:
+        assert one.port != other.port
+        with pytest.raises(ValueError, match=f"^port {one.port} is in use: choose another one"):
+            Proxy(port=one.port)
+        monkeypatch.setattr(sockets_module, "FIRST_PORT", one.port)
+        with Proxy() as third:  # all usual ports are in use
+            assert third.port != one.port
+    for port in (-1, 65536):
+        with pytest.raises(ValueError, match=f"port {port} is out of range"):
+            Proxy(port=port)
+    for host, message in (("192.0.2.1", "no such address"), ("no.such.host.invalid", "no address of that name is")):
+        with pytest.raises(ValueError, match=f"^cannot listen on '{host}'.*{message}"):
+            Proxy(host=host)
+
+
+def test_close_ends_connections_and_frees_the_port() -> None:
+    with proxy_of() as (proxy, _), socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client:
+        client.sendall(b"GET /")
+        assert get(proxy)
+        proxy.close()
+        assert client.recv(1) == b""
+        proxy.close()
+        with Proxy(port=proxy.port) as again:
+            assert again.port == proxy.port
+
+
+def test_the_ssh_line_forwards_the_port(proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("getpass.getuser", lambda: "ada")
+    monkeypatch.delenv("SSH_CONNECTION", raising=False)
+    forward = f"ssh -C -N -L {proxy.port}:127.0.0.1:{proxy.port}"
+    assert proxy.ssh_line == f"{forward} ada@{socket.gethostname()}"
+    monkeypatch.setenv("SSH_CONNECTION", "198.51.100.7 50000 203.0.113.9 2222")
+    assert proxy.ssh_line == f"{forward} -p 2222 ada@203.0.113.9"
+    assert proxy.instructions == [f"viewer: {proxy.address}", f"from another machine: {proxy.ssh_line}"]
+
+
+def test_the_browsers_command_line_does_not_contain_the_token(proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", lambda address, new: opened.append(address))
+    proxy.open_in_browser()
+    wait_until(lambda: bool(opened))
+    file = Path(opened[0].removeprefix("file://"))
+    assert token(proxy) not in opened[0] and proxy.address in file.read_text()
+    assert stat.S_IMODE(file.parent.stat().st_mode) == 0o700
+    proxy.close()
+    assert not file.parent.exists()
+
+
+# the private socket
+
+CONNECT = """
+import socket, sys
+with socket.create_connection(("127.0.0.1", int(sys.argv[1])), timeout=10) as client:
+    client.sendall(b"hello")
+    try:
+        print("closed" if client.recv(10) == b"" else "answered")
+    except ConnectionError:
+        print("closed")
+"""
+
+
+def test_other_processes_cannot_connect_to_a_private_socket() -> None:
+    with private_socket() as private:
+        command = [sys.executable, "-c", CONNECT, str(private.getsockname()[1])]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+            with pytest.raises(ConnectionAbortedError, match="another process"):
+                private.accept()
+            assert process.communicate(timeout=30)[0] == b"closed\n"
+        with socket.create_connection(private.getsockname()) as own:
+            connection, address = private.accept()
+            with connection:
+                assert address == own.getsockname()

@@ -1,0 +1,76 @@
+"""What the viewer uses of mujoco.studio, whose interface is young: these tests fail where a new version changes it."""
+
+import ast
+import inspect
+import socket
+from pathlib import Path
+
+import mujoco
+import pytest
+from mujoco.studio import launch_native, launch_thread, launch_web, viewer_protocol, web_viewer
+from mujoco.studio.web import web_server
+
+import lyceum_warp
+from lyceum_warp.viewer.window import studio
+
+ROOT = Path(lyceum_warp.__file__).parent
+NAMES = {"imgui": studio.imgui, "implot": studio.implot, "ux": studio.ux, "inputs": studio.inputs}
+
+
+def used_names(path: Path) -> set[str]:
+    """Attributes of studio's modules that a file reads, as "ux.GuiTheme.LIGHT"."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Attribute):
+            text = ast.unparse(node).replace("GetIO()", "IO").partition("(")[0]
+            if text.partition(".")[0] in NAMES:
+                found.add(text)
+    return found
+
+
+def test_only_one_file_imports_studio() -> None:
+    importing = [path.name for path in ROOT.rglob("*.py") if "mujoco.studio import" in path.read_text()]
+    assert importing == ["studio.py"]
+
+
+@pytest.mark.parametrize("name", sorted(set().union(*map(used_names, (ROOT / "viewer" / "window").glob("*.py")))))
+def test_studio_has_every_name_that_the_window_uses(name: str) -> None:
+    module, *attributes = name.split(".")
+    thing = NAMES[module]
+    for attribute in attributes:
+        assert hasattr(thing, attribute), f"mujoco.studio {mujoco.__version__} has no {name} any more"
+        thing = getattr(thing, attribute)
+
+
+def test_functions_that_run_studio_take_the_arguments_that_are_given() -> None:
+    for run in (launch_web.run_web_viewer, launch_native.run_native_viewer):
+        assert list(inspect.signature(run).parameters)[:3] == ["config", "endpoint", "plugins"]
+    here, _ = launch_thread.make_thread_endpoints()
+
+    class Plain(viewer_protocol.Viewer):
+        prepare_next_frame = sync = get_drop_file = upload_image = lambda self: None
+
+    viewer = Plain(viewer_protocol.ViewerConfig(title="", gfx="web", open_browser=False), here)
+    for name in ("model", "data", "camera", "cam_speed", "client_camera", "camera_index", "perturb", "vis_options",
+                 "extra_geoms", "render_flags"):  # fmt: skip
+        assert hasattr(viewer, name), f"mujoco.studio {mujoco.__version__}: its viewer has no {name} any more"
+
+
+def test_web_viewer_takes_its_sockets_from_the_functions_that_are_replaced() -> None:
+    source = inspect.getsource(web_viewer.WebViewer.__init__)
+    for name in ("web_server.bind_public_socket(", "web_server.bind_loopback_socket("):
+        assert name in source, f"mujoco.studio {mujoco.__version__} binds its sockets otherwise: see Screen.run"
+
+
+def test_screen_refuses_to_listen_on_a_socket_of_studio(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As under a later version of studio that no longer calls bind_public_socket."""
+    from mujoco.studio import plugin_registry
+
+    def start(config: object, endpoint: object, plugins: list[object]) -> None:
+        plugin_registry.PluginRegistry(plugins).dispatch(studio.Started(viewer=None))
+
+    monkeypatch.setattr(launch_web, "run_web_viewer", start)
+    for name in ("bind_public_socket", "bind_loopback_socket"):
+        monkeypatch.setattr(web_server, name, getattr(web_server, name))
+    with socket.socket() as given, pytest.raises(RuntimeError, match="every address"):
+        studio.Screen().run(studio.Plugin(), gfx="web", title="", sock=given)
