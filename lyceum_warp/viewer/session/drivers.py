@@ -263,9 +263,9 @@ def controls(given: Mapping[str, Any], env: Env) -> dict[str, Control]:
 
 def _is_policy(controller: Any) -> bool:
     """Whether a controller takes observations alone."""
-    function = acting(controller)
-    module = isinstance(function, torch.nn.Module)
-    function = function.forward if module else function
+    function: Any = acting(controller)
+    if module := isinstance(function, torch.nn.Module):
+        function = function.forward
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):
