@@ -16,12 +16,13 @@ from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.warp import overflow, substep
 from lyceum_warp.engines.warp.contact_sizes import probe_sizes
 from lyceum_warp.engines.warp.data_memory import data_bytes
-from lyceum_warp.engines.warp.forward_parts import Part, forward_parts, step_after, takes_over
+from lyceum_warp.engines.warp.forward_parts import forward_parts
 from lyceum_warp.engines.warp.group_turns import group_size
 from lyceum_warp.engines.warp.model_constants import ModelConstants
 from lyceum_warp.engines.warp.model_rows import ModelRows, constants_of, outputs_of, owner, put_varied_model
 from lyceum_warp.engines.warp.partial_forward import Conditional, PartialForward
 from lyceum_warp.engines.warp.static_geoms import StaticGeoms
+from lyceum_warp.engines.warp.substep import Part
 from lyceum_warp.fields import Field, Stage, early_sensor_columns
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_columns, copy_rows, fill_rows, narrow, widen, zero_columns
@@ -84,7 +85,6 @@ class WarpEngine(Engine):
             self.m = self._put_model()
             self.spare = _contacts_of_one_world(self.m) if nconmax is None else 0
             self.d = self._make_data(nworld)
-        self._needs_velocities = substep.needs_velocities(self.m)
         self.naconmax = self.d.naconmax
         with wp.ScopedDevice(device):
             self._state = wp.zeros((nworld, self.integration_size), dtype=float)
@@ -104,14 +104,15 @@ class WarpEngine(Engine):
             self._start = wp.array(self.initial, dtype=float, device=device)
         self._reset = [field.name for field in self.fields.values() if field.reset > Stage.NONE]
         current = [field.name for field in self.fields.values() if field.refresh > Stage.NONE]
-        self._current_parts = forward_parts(model, current, self.dynamics)
+        self._current_parts = forward_parts(model, current)
         self._reset_parts = None
         if self.reset_stage < Stage.ACCELERATION:
-            self._reset_parts = forward_parts(model, self._reset, self.dynamics)
+            self._reset_parts = forward_parts(model, self._reset)
         self._columns: wp.array = wp.array(early_sensor_columns(model), dtype=int, device=device)
         # a step goes on from the parts that were computed for its state, whether a world stepped there or restarted
         moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
-        self._shared = () if moved else takes_over(model, self._current_parts or (), self.dynamics)
+        current_parts = () if moved else self._current_parts or ()
+        self._shared = tuple(part for part in current_parts if part in substep.POSITION)
         # A geom at a place that is not-a-number has contacts with every element of a flex. Their rows of the Jacobian
         # would outlast a reset, because the solver multiplies unused rows by zero: a reset clears them.
         self._jacobian = flat(self.d.efc.J if model.nflex else wp.zeros((nworld, 0), dtype=float, device=device))
@@ -194,12 +195,7 @@ class WarpEngine(Engine):
     def step(self, nstep: int) -> None:
         with self._on_device():
             for i in range(nstep):
-                if i == 0 and self._shared:
-                    step_after(self._shared, self.m, self.d)
-                elif self._needs_velocities:
-                    substep.step(self.m, self.d)
-                else:
-                    mjw.step(self.m, self.d)
+                substep.step(self.m, self.d, self._shared if i == 0 else ())
         self._copy_snapshots(self._everyone, self.snapshots)
         self.refresh_current(self._everyone)
 
