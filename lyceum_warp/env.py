@@ -185,6 +185,8 @@ class Env:
             self.rand_reset(options.seed)
             if self.task.dynamics and not _replica:  # later, and in a replica, a bad draw is a fault of its world
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
+            if not _replica:
+                self.engine.check_room()
             self.task.check_results(worlds.after, worlds.params, worlds.counters)
         except Exception as error:
             if (explained := self.task.explained(error)) is error:

@@ -27,7 +27,14 @@ DRIVES = {
     "dcmotor": '<dcmotor {place} motorconst=".5" resistance="1" {extra}/>',
     "user": GENERAL.replace("{kind}", 'dyntype="user" gaintype="user" biastype="user" actdim="1"'),
 }  # fmt: skip
-"""Actuators by their dynamics; every model of a drive has one on each of the places."""
+"""Actuators by their dynamics."""
+
+DRIVE_GROUPS = {
+    "instant": ("motor", "servo", "damper"),
+    "filtered": ("integrator", "filter", "filterexact"),
+    "special": ("muscle", "dcmotor", "user"),
+}
+"""Drives of one model, which has each of them on each of the places."""
 
 PLACES = {
     "joint": 'joint="hip"',
@@ -42,13 +49,12 @@ PLACES = {
 
 EQUALITIES = {
     "none": "",
-    "connect": '<connect body1="hand" body2="arm" anchor=".02 0 -.1" {}/>',
-    "connected sites": '<connect site1="tip" site2="knot" {}/>',
-    "weld": '<weld body1="cart" body2="target" solref=".05 1" {}/>',
-    "welded sites": '<weld site1="tip" site2="knot" torquescale=".1" {}/>',
-    "joint": '<joint joint1="hip" joint2="elbow" polycoef=".1 .5 0 0 0" {}/>',
-    "lone joint": '<joint joint1="lift" polycoef=".1 0 0 0 0" {}/>',
-    "tendon": '<tendon tendon1="cord" tendon2="string" polycoef="0 .5 0 0 0" {}/>',
+    "connect": '<connect body1="hand" body2="arm" anchor=".02 0 -.1" {0}/><connect site1="tip" site2="knot" {0}/>',
+    "weld": '<weld body1="cart" body2="target" solref=".05 1" {0}/>'
+    '<weld site1="tip" site2="knot" torquescale=".1" {0}/>',
+    "joint": '<joint joint1="hip" joint2="elbow" polycoef=".1 .5 0 0 0" {0}/>'
+    '<joint joint1="lift" polycoef=".1 0 0 0 0" {0}/>',
+    "tendon": '<tendon tendon1="cord" tendon2="string" polycoef="0 .5 0 0 0" {0}/>',
 }
 SHAPE = '<flexcomp name="soft" type="grid" spacing=".1 .1 .1" radius=".02" mass=".2" '
 LOOSE = '<contact selfcollide="none"/>'
@@ -69,36 +75,34 @@ TENDONS = {
     "plain": "",
     "springs": 'stiffness="5" damping=".2" springlength="0 .1"',
     "armature": 'armature=".2"',
-    "friction": 'frictionloss=".1"',
+    "friction": 'frictionloss=".5"',
     "limits": 'limited="true" range="-.05 .4" margin=".01" actuatorfrclimited="true" actuatorfrcrange="-1 1"',
 }
 SENSORS = {
     "none": "",
     "position": """<magnetometer site="tip"/><camprojection site="tip" camera="eye"/><rangefinder site="tip"/>
-    <jointpos joint="hip"/><tendonpos tendon="cord"/><actuatorpos actuator="joint"/><ballquat joint="ball"/>
+    <jointpos joint="hip"/><tendonpos tendon="cord"/><actuatorpos actuator="{drive} joint"/><ballquat joint="ball"/>
     <framepos objtype="site" objname="tip"/><framequat objtype="body" objname="hand"/>
     <framexaxis objtype="geom" objname="fist"/><frameyaxis objtype="camera" objname="eye"/>
     <framezaxis objtype="xbody" objname="hand" reftype="site" refname="here"/><subtreecom body="arm"/>
     <insidesite site="here" objtype="body" objname="hand"/><e_potential/><clock/>""",
     "velocity": """<velocimeter site="tip"/><gyro site="tip"/><jointvel joint="hip"/><tendonvel tendon="string"/>
-    <actuatorvel actuator="cord"/><ballangvel joint="ball"/><framelinvel objtype="site" objname="tip"/>
+    <actuatorvel actuator="{drive} cord"/><ballangvel joint="ball"/><framelinvel objtype="site" objname="tip"/>
     <frameangvel objtype="camera" objname="eye" reftype="body" refname="arm"/><subtreelinvel body="arm"/>
-    <subtreeangmom body="arm"/>""",
-    "energy": "<e_kinetic/>",
+    <subtreeangmom body="arm"/><e_kinetic/>""",
     "limits": """<jointlimitpos joint="elbow"/><jointlimitvel joint="elbow"/><jointlimitfrc joint="elbow"/>
     <tendonlimitpos tendon="stop"/><tendonlimitvel tendon="stop"/><tendonlimitfrc tendon="stop"/>
     <distance geom1="fist" geom2="floor" cutoff="2"/><normal geom1="fist" geom2="floor" cutoff="2"/>
     <fromto geom1="fist" geom2="floor" cutoff="2"/>""",
     "acceleration": """<touch site="foot"/><accelerometer site="tip"/><force site="tip"/><torque site="tip"/>
-    <actuatorfrc actuator="joint"/><jointactuatorfrc joint="hip"/><tendonactuatorfrc tendon="cord"/>
+    <actuatorfrc actuator="{drive} joint"/><jointactuatorfrc joint="hip"/><tendonactuatorfrc tendon="cord"/>
     <framelinacc objtype="site" objname="tip"/><frameangacc objtype="body" objname="hand"/>
     <contact geom1="floor" num="1" data="found force"/>""",
     "histories": """<jointpos joint="hip" nsample="4" delay=".005"/><gyro site="tip" nsample="4" interval=".006"/>
     <accelerometer site="tip" nsample="4" delay=".004"/><framepos objtype="site" objname="tip"/>""",
 }
 
-FIELDS = {
-    "nothing": "",
+STAGES = {
     "kinematics": "site_xpos",
     "com": "subtree_com",
     "camlight": "cam_xpos light_xdir",
@@ -108,27 +112,33 @@ FIELDS = {
     "transmission": "actuator_length",
     "com velocity": "cvel",
     "velocity": "ten_velocity actuator_velocity qfrc_bias qfrc_passive",
-    "forward": "energy site_xpos qacc qfrc_actuator",
-    "all": "site_xpos subtree_com cam_xpos flexvert_xpos ten_length crb actuator_length cvel qfrc_passive",
+    "subtree velocity": "subtree_linvel",
+    "energy": "energy",
+    "acceleration": "qacc qfrc_actuator",
 }
 """Fields that a task's World may ask for, by the stage that computes them."""
+
+FIELDS = {
+    "nothing": "",
+    "bodies": " ".join(STAGES[name] for name in ("kinematics", "com", "camlight")),
+    "positions": " ".join(STAGES[name] for name in ("camlight", "flex", "tendon", "inertia", "transmission")),
+    "velocities": " ".join(STAGES[name] for name in ("camlight", "com velocity", "velocity")),
+    "everything": " ".join(STAGES.values()).replace("subtree_linvel ", ""),
+}
+"""Fields of several stages."""
 
 FLAGS = {
     "": "",
     "energy": 'energy="enable" invdiscrete="enable"',
-    "no springs": 'spring="disable" warmstart="disable"',
-    "no dampers": 'damper="disable" filterparent="disable" island="disable"',
-    "no spring forces": 'spring="disable" damper="disable" nativeccd="disable"',
-    "no gravity": 'gravity="disable" clampctrl="disable" eulerdamp="disable"',
-    "no limits": 'limit="disable" frictionloss="disable" refsafe="disable" multiccd="disable"',
-    "no contacts": 'contact="disable" equality="disable"',
-    "no actuation": 'actuation="disable" constraint="disable"',
-    "no sensors": 'sensor="disable"',
+    "no springs": 'spring="disable" warmstart="disable" nativeccd="disable" multiccd="disable" filterparent="disable"',
+    "no passive forces": 'spring="disable" damper="disable" gravity="disable" clampctrl="disable" island="disable"',
+    "no limits": 'limit="disable" frictionloss="disable" refsafe="disable" equality="disable" contact="disable"',
+    "no constraints": 'constraint="disable" sensor="disable" actuation="disable" eulerdamp="disable"',
 }
 
 FACTORS: dict[str, tuple[str, ...]] = {
     "asked": tuple(FIELDS),
-    "drive": tuple(DRIVES),
+    "drives": tuple(DRIVE_GROUPS),
     "flags": tuple(FLAGS),
     "flex": tuple(FLEXES),
     "equality": tuple(EQUALITIES),
@@ -191,14 +201,14 @@ def xml(case: Case) -> str:
     """The model of a case."""
     delay = "" if case["delay"] == "none" else f'delay=".005" nsample="4" interp="{case["delay"]}"'
     actuators = []
-    for name, place in PLACES.items():
+    for drive, (name, place) in itertools.product(DRIVE_GROUPS[case["drives"]], PLACES.items()):
         heavy = case["armature"] == "motors" and "site" not in place  # MuJoCo refuses armature at sites
         extra = f'armature=".1" damping=".05" {delay}' if heavy else delay
-        actuators.append(DRIVES[case["drive"]].format(place=f'name="{name}" {place}', extra=extra))
+        actuators.append(DRIVES[drive].format(place=f'name="{drive} {name}" {place}', extra=extra))
     if case["adhesion"] == "actuator":
         actuators.append('<adhesion name="sticky" body="cart" gain="2" ctrlrange="0 1"/>')
     sticky = {"geom": 'adhesion="3"'}.get(case["adhesion"], "")
-    pair = '<contact><pair geom1="fist" geom2="floor" adhesion="3"/></contact>' if case["adhesion"] == "pair" else ""
+    pair = '<contact><pair geom1="box" geom2="floor" adhesion="3"/></contact>' if case["adhesion"] == "pair" else ""
     fluid = 'density="20" viscosity=".1" wind="1 .5 0"' if case["fluid"] != "none" else ""
     shape = 'fluidshape="ellipsoid"' if case["fluid"] == "ellipsoid" else ""
     gravcomp = 'gravcomp=".7"' if case["gravcomp"] != "none" else ""
@@ -209,7 +219,7 @@ def xml(case: Case) -> str:
     return f"""
     <mujoco>
       <option timestep="0.002" integrator="{case["integrator"]}" cone="{case["cone"]}" solver="{case["solver"]}"
-        jacobian="{case["jacobian"]}" noslip_iterations="{case["noslip"]}" iterations="20" ls_iterations="20" {fluid}>
+        jacobian="{case["jacobian"]}" noslip_iterations="{case["noslip"]}" iterations="10" ls_iterations="10" {fluid}>
         <flag {FLAGS[case["flags"]]}/></option>
       <worldbody>
         <geom name="floor" type="plane" size="5 5 1"/>
@@ -225,15 +235,17 @@ def xml(case: Case) -> str:
           <site name="slider" pos=".1 0 -.1" zaxis="1 0 1"/> <site name="knot" pos=".05 0 -.45"/>
           <camera name="eye" pos="-1 0 0" xyaxes="0 -1 0 1 0 1" resolution="64 48"/>
           <body name="hand" pos="0 0 -.4">
-            <joint name="elbow" axis="0 1 0" damping=".1" range="-40 5" limited="true" frictionloss=".02"/>
+            <joint name="elbow" axis="0 1 0" damping=".1" range="-40 5" limited="true" frictionloss=".3"
+              actuatorfrclimited="true" actuatorfrcrange="-.1 .1"/>
             <geom name="fist" type="capsule" fromto="0 0 0 .05 0 -.3" size=".03" {shape}/>
             <site name="tip" pos=".05 0 -.3"/>
           </body>
         </body>
         <body pos="0 .6 .8" {gravcomp}><joint name="ball" type="ball" damping=".1"/>
           <geom type="box" size=".05 .1 .15" pos="0 0 -.15" {shape}/></body>
-        <body pos="0 -.6 .5"><joint name="lift" type="slide" axis="0 0 1" damping="1"/><geom size=".06"/></body>
-        <body name="cart" pos=".8 0 .098"><freejoint/><geom type="box" size=".1 .1 .1" {sticky} {shape}/>
+        <body pos="0 -.6 .059"><joint name="lift" type="slide" axis="1 0 1" damping="1" frictionloss="9"/>
+          <geom name="weight" size=".06" solref=".03 1"/></body>
+        <body name="cart" pos=".8 0 .098"><freejoint/><geom name="box" type="box" size=".1 .1 .1" {sticky} {shape}/>
           <site name="foot" type="box" size=".12 .12 .12"/></body>
         {FLEXES[case["flex"]]}
       </worldbody>
@@ -247,14 +259,14 @@ def xml(case: Case) -> str:
       {pair}
       <actuator>{"".join(actuators)}</actuator>
       <equality>{equality}</equality>
-      <sensor>{SENSORS[case["sensors"]]}</sensor>
+      <sensor>{SENSORS[case["sensors"]].format(drive=DRIVE_GROUPS[case["drives"]][0])}</sensor>
     </mujoco>"""
 
 
 def fields_of(case: Case) -> list[str]:
     """The fields that a case's World asks for."""
-    names = FIELDS[case["asked"]].split()
-    if SENSORS[case["sensors"]] and case["flags"] != "no sensors":
+    names = (FIELDS | STAGES)[case["asked"]].split()
+    if SENSORS[case["sensors"]] and case["flags"] != "no constraints":
         names.append("sensordata")
     return names
 
@@ -264,12 +276,14 @@ def model_of(case: Case) -> mujoco.MjModel:
     spec = mujoco.MjSpec.from_string(xml(case))
     if "energy" in fields_of(case):
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    if "subtree_linvel" in fields_of(case):
+        spec.add_sensor(type=mujoco.mjtSensor.mjSENS_SUBTREELINVEL, objtype=mujoco.mjtObj.mjOBJ_BODY, objname="arm")
     return spec.compile()
 
 
 def is_refused(case: Case) -> bool:
     """Whether a case is among those that MuJoCo or MuJoCo Warp refuses."""
-    return any(all(case[name] in levels for name, levels in match.items()) for match, _ in REFUSED)
+    return any(all(case.get(name) in levels for name, levels in match.items()) for match, _ in REFUSED)
 
 
 def singles() -> Iterator[Case]:
@@ -288,56 +302,47 @@ def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
     that adds the most of those that are missing.
     """
     rng = random.Random(seed)
-    names = list(FACTORS)
     missing: dict[tuple[tuple[str, str], ...], None] = {}
-    for chosen in itertools.combinations(names, strength):
+    for chosen in itertools.combinations(FACTORS, strength):
         for levels in itertools.product(*(FACTORS[name] for name in chosen)):
             missing[tuple(zip(chosen, levels, strict=True))] = None
     cases = []
     while missing:
-        case = dict(next(iter(missing)))
-        if (found := _completed(case, rng, missing, names, strength)) is None:
-            del missing[next(iter(missing))]  # its levels cannot be combined
+        first = next(iter(missing))
+        if (case := _completed(dict(first), rng, missing, strength)) is None:
+            del missing[first]  # refused, in these levels or in what they leave to others
             continue
-        cases.append(found)
-        for chosen in itertools.combinations(names, strength):
-            missing.pop(tuple((name, found[name]) for name in chosen), None)
+        for part in itertools.combinations(((name, case[name]) for name in FACTORS), strength):
+            missing.pop(part, None)
+        cases.append(case)
     return tuple(cases)
 
 
-def _completed(
-    case: Case, rng: random.Random, missing: Mapping[Any, None], names: list[str], strength: int
-) -> Case | None:
-    rest = [name for name in names if name not in case]
+def _completed(case: Case, rng: random.Random, missing: Mapping[Any, None], strength: int) -> Case | None:
+    """A case with the given levels, and for the other factors, in random order, the levels that add the most."""
+    rest = [name for name in FACTORS if name not in case]
     rng.shuffle(rest)
-    if _clashes(case):
-        return None
     for name in rest:
-        levels = [level for level in FACTORS[name] if not _clashes(case | {name: level})]
+        levels = [level for level in FACTORS[name] if not is_refused(case | {name: level})]
         if not levels:
             return None
         rng.shuffle(levels)
-        known = [other for other in names if other in case]
 
-        def gain(level: str, name: str = name, known: list[str] = known) -> int:
-            full = case | {name: level}
-            count = 0
-            for others in itertools.combinations(known, strength - 1):
-                key = tuple((n, full[n]) for n in names if n == name or n in others)
-                count += key in missing
-            return count
+        def gain(level: str, name: str = name, case: Case = case) -> int:
+            chosen = [(n, level if n == name else case[n]) for n in FACTORS if n == name or n in case]
+            return sum(part in missing for part in itertools.combinations(chosen, strength) if (name, level) in part)
 
         case = case | {name: max(levels, key=gain)}
     return case
 
 
-def _clashes(case: Case) -> bool:
-    return any(all(case.get(name) in levels for name, levels in match.items()) for match, _ in REFUSED)
-
-
 def title(case: Case) -> str:
     """The levels of a case that differ from the plain one."""
     return ", ".join(f"{name}={level}" for name, level in case.items() if level != PLAIN[name]) or "plain"
+
+
+def _bits(enum: Any, flags: int) -> list[int]:
+    return [bit.value for bit in enum.__members__.values() if bit.value.bit_count() == 1 and flags & bit.value]
 
 
 Reader = Callable[[mujoco.MjModel], Any]
@@ -354,7 +359,7 @@ ENUMS: dict[str, Reader] = {
     "mjtCone": lambda m: [m.opt.cone],
     "mjtSolver": lambda m: [m.opt.solver],
     "mjtJacobian": lambda m: [m.opt.jacobian],
-    "mjtEnableBit": lambda m: [bit for bit in mujoco.mjtEnableBit if m.opt.enableflags & bit.value],
-    "mjtDisableBit": lambda m: [bit for bit in mujoco.mjtDisableBit if m.opt.disableflags & bit.value],
+    "mjtEnableBit": lambda m: _bits(mujoco.mjtEnableBit, m.opt.enableflags),
+    "mjtDisableBit": lambda m: _bits(mujoco.mjtDisableBit, m.opt.disableflags),
 }
 """MuJoCo's enums, and how to find their members in a model."""
