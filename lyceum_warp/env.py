@@ -190,6 +190,8 @@ class Env:
             if self.task.dynamics and not _replica:  # later, and in a replica, a bad draw is a fault of its world
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
             self.task.probe(worlds.after, worlds.params, self.device).check_observations()
+            if not _replica:
+                self.engine.check_room()
         except Exception as error:
             if (explained := self.task.explained(error)) is error:
                 raise
