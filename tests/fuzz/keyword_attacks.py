@@ -28,11 +28,11 @@ from lyceum_warp.validate import described
 HERE = Path("keywords").absolute()
 
 OBJECTS: tuple[Any, ...] = (
-    *VALUES, *VALUES, torch.tensor(3), torch.tensor(0.5), torch.zeros(2), torch.zeros(0),
-    torch.tensor([1.0, torch.nan]), torch.tensor(True), np.float32(2), np.float64(np.nan), np.int64(-1), np.int32(2),
-    np.bool_(True), np.zeros(3), np.zeros((2, 2)), np.array("x"), np.array([None]), 1e9, 2.0, 2**40, 1j, b"x", object(), ...,
-    range(3), Path("x"), (1, 2), ("qpos",), ("nothing",), {"iterations": 1e9}, {"x": torch.zeros(2)}, frozenset(), "auto", "hopper",
-    Exception("x"), iter(()), slice(2),
+    *VALUES, *VALUES, torch.tensor(3), torch.tensor(0.5), torch.tensor(True), torch.zeros(2), torch.zeros(0),
+    torch.tensor([1.0, torch.nan]), np.float32(2), np.float64(np.nan), np.int64(-1), np.int32(2), np.bool_(True),
+    np.zeros(3), np.zeros((2, 2)), np.array("x"), np.array([None]), 1e9, 2.0, 2**40, 1j, b"x", object(), ..., range(3),
+    Path("x"), (1, 2), ("qpos",), ("nothing",), {"iterations": 1e9}, {"x": torch.zeros(2)}, frozenset(), "auto",
+    "hopper", Exception("x"), iter(()), slice(2),
 )  # fmt: skip
 """Values that a program may give by mistake."""
 
