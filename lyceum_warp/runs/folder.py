@@ -174,9 +174,12 @@ class Run:
             then = json.loads(path.read_text())
         except (OSError, ValueError):
             then = {}
-        changed = {name: (then.get(name), value) for name, value in now.items() if then.get(name) != value}
+        changed, noted = {}, {}
+        for name, value in now.items():
+            if then.get(name) != value:
+                changed[name], noted[name] = (then.get(name), value), value
         if changed:
-            then.setdefault("resumed", []).append({name: value for name, (_, value) in changed.items()})
+            then.setdefault("resumed", []).append(noted)
             with replaced(path) as temporary:
                 temporary.write_text(json.dumps(then, indent=2))
         return changed
