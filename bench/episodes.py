@@ -24,7 +24,7 @@ from rich.console import Console
 
 import lyceum_warp as lw
 from lyceum_warp.cli.arguments import parameter
-from lyceum_warp.control.control_statistics import wilson
+from lyceum_warp.controllers.control_statistics import wilson
 from lyceum_warp.support.versions import versions
 
 

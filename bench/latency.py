@@ -29,7 +29,7 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 
 import lyceum_warp as lw
-from lyceum_warp.control.control_report import ControlReport
+from lyceum_warp.controllers.control_report import ControlReport
 from lyceum_warp.engines.memory import NotEnoughMemoryError
 from lyceum_warp.machine import cpu_cores
 from lyceum_warp.validate import positive_number, whole_number

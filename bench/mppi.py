@@ -42,7 +42,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from mujoco.batch import Batch
 
 import lyceum_warp as lw
-from lyceum_warp.control.control_statistics import wilson
+from lyceum_warp.controllers.control_statistics import wilson
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.viz.style import finish_axes

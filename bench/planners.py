@@ -30,7 +30,7 @@ from rich.table import Table
 import lyceum_warp as lw
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.binding.registry import find_task
-from lyceum_warp.control.control_statistics import wilson
+from lyceum_warp.controllers.control_statistics import wilson
 
 PLANNERS: dict[str, dict[str, Any]] = {
     "mppi": {"update": "mppi", "include_plan": False},

@@ -1,93 +1,161 @@
-"""Batched MuJoCo worlds for robot learning: one task source, two engines, arrays shared with torch."""
+"""Batched MuJoCo worlds for robot learning: one task source, two engines, arrays shared with torch.
 
-import warp as _wp
+Importing the package loads nothing: a public name loads its module, and with it torch, Warp or MuJoCo, when it is first
+used (PEP 562).
+"""
 
-if _wp.config.log_level == _wp.LOG_INFO:  # Warp's default, at which it greets and reports every kernel
-    _wp.config.log_level = _wp.LOG_WARNING
+import importlib
+from typing import TYPE_CHECKING, Any
 
-from lyceum_warp.actuators import follow_velocity
-from lyceum_warp.algos.cem import CEM
-from lyceum_warp.algos.evaluation import Episodes, evaluate
-from lyceum_warp.algos.learner import Iteration, Learner
-from lyceum_warp.algos.mppi import MPPI
-from lyceum_warp.algos.mppi_config import MPPIConfig
-from lyceum_warp.algos.npg import NPG
-from lyceum_warp.algos.npg_config import NPGConfig
-from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.algos.policy_export import export_policy
-from lyceum_warp.algos.ppo import PPO
-from lyceum_warp.algos.ppo_config import PPOConfig
-from lyceum_warp.algos.predictive_sampling import PredictiveSampling
-from lyceum_warp.algos.rollout_buffer import Rollout
-from lyceum_warp.algos.value import ValueFunction
-from lyceum_warp.binding.registry import register, task_names
-from lyceum_warp.control.control_report import ControlReport, control_report
-from lyceum_warp.control.controller import Controller, PlanningController
-from lyceum_warp.control.episode_collector import ControlProgress
-from lyceum_warp.control.loop import control
-from lyceum_warp.control.real_time import control_async
-from lyceum_warp.control.trajectory import Trajectory
-from lyceum_warp.done import Done
-from lyceum_warp.env import Env, make
-from lyceum_warp.fields import quat, vec10
-from lyceum_warp.kernels.random import normal, uniform
-from lyceum_warp.kernels.rotations import (
-    quat_angle,
-    quat_difference,
-    quat_from_axis_angle,
-    quat_from_euler,
-    quat_from_mat,
-    quat_from_rotvec,
-    quat_inverse,
-    quat_mul,
-    quat_random,
-    quat_rotate,
-    quat_rotate_inverse,
-    quat_to_euler,
-    quat_to_mat,
-    quat_to_rotvec,
-)
-from lyceum_warp.kernels.terms import (
-    Sigmoid,
-    all_inside,
-    angle_between,
-    body_velocity,
-    grasp_terms,
-    inside,
-    local_velocity,
-    put,
-    put_upright,
-    sum_squares,
-    tolerance,
-)
-from lyceum_warp.model_files import ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, package_model
-from lyceum_warp.openloop import OpenLoop
-from lyceum_warp.options import EnvOptions, PhysicsOptions
-from lyceum_warp.runs.folder import load, load_value
-from lyceum_warp.task import (
-    Planning,
-    Row,
-    Task,
-    act,
-    actuator,
-    body,
-    camera,
-    ctrl,
-    dof,
-    equality,
-    geom,
-    joint,
-    mocap,
-    qpos,
-    sensor,
-    site,
-    tendon,
-)
-from lyceum_warp.training import train
-from lyceum_warp.viewer.follow import RunViewer
-from lyceum_warp.viewer.show import view
+if TYPE_CHECKING:
+    from lyceum_warp.actuators import follow_velocity
+    from lyceum_warp.algos.cem import CEM
+    from lyceum_warp.algos.evaluation import Episodes, evaluate
+    from lyceum_warp.algos.learner import Iteration, Learner
+    from lyceum_warp.algos.mppi import MPPI
+    from lyceum_warp.algos.mppi_config import MPPIConfig
+    from lyceum_warp.algos.npg import NPG
+    from lyceum_warp.algos.npg_config import NPGConfig
+    from lyceum_warp.algos.policy import GaussianPolicy
+    from lyceum_warp.algos.policy_export import export_policy
+    from lyceum_warp.algos.ppo import PPO
+    from lyceum_warp.algos.ppo_config import PPOConfig
+    from lyceum_warp.algos.predictive_sampling import PredictiveSampling
+    from lyceum_warp.algos.rollout_buffer import Rollout
+    from lyceum_warp.algos.value import ValueFunction
+    from lyceum_warp.binding.registry import register, task_names
+    from lyceum_warp.controllers.control_report import ControlReport, control_report
+    from lyceum_warp.controllers.controller import Controller, PlanningController
+    from lyceum_warp.controllers.episode_collector import ControlProgress
+    from lyceum_warp.controllers.loop import control
+    from lyceum_warp.controllers.real_time import control_async
+    from lyceum_warp.controllers.trajectory import Trajectory
+    from lyceum_warp.done import Done
+    from lyceum_warp.env import Env, make
+    from lyceum_warp.fields import quat, vec10
+    from lyceum_warp.kernels.random import normal, uniform
+    from lyceum_warp.kernels.rotations import (
+        quat_angle,
+        quat_difference,
+        quat_from_axis_angle,
+        quat_from_euler,
+        quat_from_mat,
+        quat_from_rotvec,
+        quat_inverse,
+        quat_mul,
+        quat_random,
+        quat_rotate,
+        quat_rotate_inverse,
+        quat_to_euler,
+        quat_to_mat,
+        quat_to_rotvec,
+    )
+    from lyceum_warp.kernels.terms import (
+        Sigmoid,
+        all_inside,
+        angle_between,
+        body_velocity,
+        grasp_terms,
+        inside,
+        local_velocity,
+        put,
+        put_upright,
+        sum_squares,
+        tolerance,
+    )
+    from lyceum_warp.model_files import (
+        ModelFile,
+        gymnasium_model,
+        gymnasium_robotics_model,
+        menagerie_model,
+        package_model,
+    )
+    from lyceum_warp.openloop import OpenLoop
+    from lyceum_warp.options import EnvOptions, PhysicsOptions
+    from lyceum_warp.runs.folder import load, load_value
+    from lyceum_warp.task import (
+        Planning,
+        Row,
+        Task,
+        act,
+        actuator,
+        body,
+        camera,
+        ctrl,
+        dof,
+        equality,
+        geom,
+        joint,
+        mocap,
+        qpos,
+        sensor,
+        site,
+        tendon,
+    )
+    from lyceum_warp.training import train
+    from lyceum_warp.viewer.follow import RunViewer
+    from lyceum_warp.viewer.show import view
 
 __version__ = "0.1.0"
+
+_NAMES = {
+    "actuators": "follow_velocity",
+    "algos.cem": "CEM",
+    "algos.evaluation": "Episodes evaluate",
+    "algos.learner": "Iteration Learner",
+    "algos.mppi": "MPPI",
+    "algos.mppi_config": "MPPIConfig",
+    "algos.npg": "NPG",
+    "algos.npg_config": "NPGConfig",
+    "algos.policy": "GaussianPolicy",
+    "algos.policy_export": "export_policy",
+    "algos.ppo": "PPO",
+    "algos.ppo_config": "PPOConfig",
+    "algos.predictive_sampling": "PredictiveSampling",
+    "algos.rollout_buffer": "Rollout",
+    "algos.value": "ValueFunction",
+    "binding.registry": "register task_names",
+    "controllers.control_report": "ControlReport control_report",
+    "controllers.controller": "Controller PlanningController",
+    "controllers.episode_collector": "ControlProgress",
+    "controllers.loop": "control",
+    "controllers.real_time": "control_async",
+    "controllers.trajectory": "Trajectory",
+    "done": "Done",
+    "env": "Env make",
+    "fields": "quat vec10",
+    "kernels.random": "normal uniform",
+    "kernels.rotations": "quat_angle quat_difference quat_from_axis_angle quat_from_euler quat_from_mat "
+    "quat_from_rotvec quat_inverse quat_mul quat_random quat_rotate quat_rotate_inverse quat_to_euler quat_to_mat "
+    "quat_to_rotvec",
+    "kernels.terms": "Sigmoid all_inside angle_between body_velocity grasp_terms inside local_velocity put put_upright "
+    "sum_squares tolerance",
+    "model_files": "ModelFile gymnasium_model gymnasium_robotics_model menagerie_model package_model",
+    "openloop": "OpenLoop",
+    "options": "EnvOptions PhysicsOptions",
+    "runs.folder": "load load_value",
+    "task": "Planning Row Task act actuator body camera ctrl dof equality geom joint mocap qpos sensor site tendon",
+    "training": "train",
+    "viewer.follow": "RunViewer",
+    "viewer.show": "view",
+}
+"""The public names that each module defines, as the imports above have them for type checkers."""
+
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
 
 __all__ = [
     "CEM",

@@ -18,7 +18,7 @@ from lyceum_warp.runs.metrics_table import cut_rows
 from lyceum_warp.runs.saving import Saver
 from lyceum_warp.runs.task_copy import note_changes, run_params, task_copy
 from lyceum_warp.support.versions import versions
-from lyceum_warp.validate import whole_number
+from lyceum_warp.validate import check_flag, check_function, check_kind, whole_number
 from lyceum_warp.viz.cameras import CameraChoice, find_camera
 from lyceum_warp.viz.policy_videos import Videos
 from lyceum_warp.viz.tensorboard import TensorBoard, check_tensorboard
@@ -107,6 +107,11 @@ def train(
         FloatingPointError: The learner's updates are no longer finite; see there.
         Interrupted: One of several processes received a signal.
     """
+    check_kind("learner", learner, Learner, "as lw.NPG(env)")
+    check_kind("folder", folder, str | Path, "as 'runs/mine'")
+    check_function("callback", callback)
+    check_flag("resume", resume)
+    check_flag("tensorboard", tensorboard)
     if target_return is not None and (not isinstance(target_return, (int, float)) or math.isnan(target_return)):
         raise ValueError(f"target_return must be a number, not {target_return!r}")
     settings: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Warp's remarks on the CUDA driver in Python's log."""
+"""Start Warp without its greeting, and send its remarks on the CUDA driver to Python's log."""
 
 import contextlib
 import logging
@@ -17,7 +17,10 @@ _remarks: list[str] | None = None
 
 
 def start_warp() -> list[str]:
-    """Initialise Warp, and send what it finds amiss with the CUDA driver to the log.
+    """Initialise Warp quietly, and log its complaints about the CUDA driver.
+
+    At its default log level Warp prints a greeting and a line for every module that it loads: the level becomes that of
+    warnings. A level that the user has set stays.
 
     Warp's library prints such remarks to stderr on every machine without a GPU, also where only CPUs are used. Other
     output is printed as usual.
@@ -28,7 +31,7 @@ def start_warp() -> list[str]:
     global _remarks
     with _lock:
         if _remarks is None:
-            level = wp.config.log_level
+            level = wp.LOG_WARNING if wp.config.log_level == wp.LOG_INFO else wp.config.log_level
             wp.config.log_level = max(level, wp.LOG_ERROR)  # Python code of Warp repeats one of them
             try:
                 printed = _stderr_of_start()

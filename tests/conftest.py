@@ -13,6 +13,7 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
+from lyceum_warp.warp_log import start_warp
 
 # the tests' batches are too small to divide, and on a busy machine torch's threads wait for each other
 torch.set_num_threads(1)
@@ -102,6 +103,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if (missing := _missing_model(_task(item))) is not None:
             item.add_marker(pytest.mark.skip(reason=missing))
+    start_warp()
     if wp.is_cuda_available():
         return
     skip = pytest.mark.skip(reason="needs a CUDA device")

@@ -1,6 +1,10 @@
 """Who may import whom, what is private to whom, and where tests lie."""
 
 import ast
+import importlib
+import subprocess
+import sys
+import textwrap
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +25,7 @@ LEVELS = {
     "worlds": 4,
     "env": 5,
     "openloop": 6,
-    "algos": 7, "control": 7, "testing": 7,
+    "algos": 7, "controllers": 7, "testing": 7,
     "runs": 8,
     "viz": 10,
     "training": 11,
@@ -32,6 +36,9 @@ LEVELS = {
 
 TESTED_BY = {"done": "test_faults.py", "forks": "test_env.py", "testing": "conformance", "support": "runs"}
 """Tests of rooms that have none of their own name."""
+
+ACROSS = {"browser", "conformance", "fuzz", "gpu", "oracles", "stories"}
+"""Folders of tests that belong to no single room."""
 
 NAMEDTUPLE = {"_fields", "_asdict", "_replace", "_make"}
 """Public in spite of their names."""
@@ -158,9 +165,59 @@ def test_no_module_uses_private_attributes_of_another_modules_objects(name: str)
     assert not found, f"{name} uses private attributes: {'; '.join(found)}"
 
 
-def test_each_public_name_is_there_and_listed_in_order() -> None:
-    assert all(hasattr(lw, name) for name in lw.__all__)
-    assert len(set(lw.__all__)) == len(lw.__all__)
+PUBLIC = {
+    alias.name: str(node.module)
+    for block in TREES["lyceum_warp"].body
+    if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+    for node in ast.walk(block)
+    if isinstance(node, ast.ImportFrom)
+    for alias in node.names
+}
+"""The public names and their modules, as type checkers see them."""
+
+
+def test_public_names_are_the_same_for_type_checkers_and_at_run_time() -> None:
+    assert sorted(lw.__all__) == sorted(PUBLIC)
+    for name, module in PUBLIC.items():
+        assert getattr(lw, name) is getattr(importlib.import_module(module), name)
+
+
+def in_new_process(program: str) -> str:
+    result = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert "Warp" not in result.stderr + result.stdout
+    return result.stdout
+
+
+def test_public_names_stay_when_every_module_is_imported() -> None:
+    """A submodule becomes an attribute of the package, which would hide a function of its name."""
+    program = f"""
+        import importlib, types
+        for name in {[name for name in MODULES if not name.endswith("__main__")]}:
+            importlib.import_module(name)
+        import lyceum_warp as lw
+        print([name for name in lw.__all__ if isinstance(getattr(lw, name), types.ModuleType)])
+    """
+    assert in_new_process(program) == "[]\n"
+
+
+def test_the_import_alone_loads_neither_torch_nor_warp_nor_mujoco() -> None:
+    program = """
+        import sys, lyceum_warp
+        print([name for name in ("torch", "warp", "mujoco", "numpy") if name in sys.modules])
+    """
+    assert in_new_process(program) == "[]\n"
+
+
+@pytest.mark.parametrize("first", ["import warp as wp", "import lyceum_warp as lw", "from lyceum_warp import Row"])
+def test_warp_is_quiet_in_whatever_order_a_task_file_imports(first: str) -> None:
+    program = f"""
+        {first}
+        import warp as wp
+        import lyceum_warp as lw
+        print(lw.make("point_mass", nworld=1).nworld)
+    """
+    assert in_new_process(program) == "1\n"
 
 
 # tests
@@ -170,6 +227,14 @@ def test_each_public_name_is_there_and_listed_in_order() -> None:
 def test_every_room_has_tests_of_its_name(own: str) -> None:
     places = [TESTS / TESTED_BY[own]] if own in TESTED_BY else [TESTS / own, TESTS / f"test_{own}.py"]
     assert any(place.exists() for place in places), f"no tests of {own}: none of {', '.join(map(str, places))}"
+
+
+def test_every_folder_of_tests_belongs_to_a_room_or_goes_across_rooms() -> None:
+    folders = {path.parent.relative_to(TESTS).as_posix() for path in TESTS.rglob("test_*.py")} - {"."}
+    rooms = {room(name) for name in MODULES}
+    assert folders <= rooms | ACROSS | {"bench"}
+    described = (TESTS.parent / "docs" / "architecture.md").read_text()
+    assert all(f"`tests/{name}/`" in described for name in ("conformance", "fuzz", "oracles", "stories"))
 
 
 def test_names_of_test_files_are_unique() -> None:

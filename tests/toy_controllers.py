@@ -7,10 +7,10 @@ from typing import Any
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.control.checked_controller import CheckedController
-from lyceum_warp.control.episode_collector import ControlProgress, EpisodeCollector, TimedPlan
-from lyceum_warp.control.real_time import run_plant
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.checked_controller import CheckedController
+from lyceum_warp.controllers.episode_collector import ControlProgress, EpisodeCollector, TimedPlan
+from lyceum_warp.controllers.real_time import run_plant
+from lyceum_warp.controllers.trajectory import Trajectory
 
 
 def towards(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:

@@ -15,9 +15,9 @@ from rich.table import Table
 from lyceum_warp import training
 from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.algos.policy import Policy
-from lyceum_warp.control.control_report import ControlReport
-from lyceum_warp.control.episode_collector import ControlProgress
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.control_report import ControlReport
+from lyceum_warp.controllers.episode_collector import ControlProgress
+from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.viz.cameras import CameraChoice

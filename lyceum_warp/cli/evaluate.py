@@ -13,8 +13,8 @@ from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.binding.registry import find_task, task_name
 from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, Repeated, given, optional_flags, parameters
 from lyceum_warp.cli.display import make_console, note, policy_video, tried
-from lyceum_warp.control.policy_episodes import policy_episodes
-from lyceum_warp.control.trajectory import source
+from lyceum_warp.controllers.policy_episodes import policy_episodes
+from lyceum_warp.controllers.trajectory import source
 from lyceum_warp.engines.placement import options_for_few_worlds
 from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions

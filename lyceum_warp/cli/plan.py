@@ -24,11 +24,11 @@ from lyceum_warp.cli.arguments import (
     parameters,
 )
 from lyceum_warp.cli.display import PlanDisplay, make_console, report_table, states_video, tried
-from lyceum_warp.control.checked_controller import CheckedController
-from lyceum_warp.control.control_report import control_report
-from lyceum_warp.control.loop import control
-from lyceum_warp.control.real_time import control_async
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.checked_controller import CheckedController
+from lyceum_warp.controllers.control_report import control_report
+from lyceum_warp.controllers.loop import control
+from lyceum_warp.controllers.real_time import control_async
+from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted
 from lyceum_warp.runs.folder import Run, load_value

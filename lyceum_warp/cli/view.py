@@ -13,8 +13,8 @@ from lyceum_warp.binding.registry import find_task, task_name
 from lyceum_warp.cli.arguments import NO_FLAGS, Repeated, given, optional_flags, parameters
 from lyceum_warp.cli.display import note
 from lyceum_warp.cli.plan import Settings
-from lyceum_warp.control.saved_episodes import episode_env, load_episodes
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
+from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.engines.placement import options_for_few_worlds
 from lyceum_warp.env import Env
 from lyceum_warp.interrupts import Interrupted, signals

@@ -24,6 +24,7 @@ from lyceum_warp.runs.checkpoints import (
 )
 from lyceum_warp.runs.metrics_table import read_metrics
 from lyceum_warp.support.versions import versions
+from lyceum_warp.validate import check_kind
 
 _CONFIG, _VERSIONS = "config.json", "versions.json"
 
@@ -306,6 +307,7 @@ def load(
         ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release; or the
             policy in it is of a class of its own and ``policy`` is not given, or does not fit.
     """
+    check_kind("policy", policy, torch.nn.Module | None, "as lw.GaussianPolicy(nobs, nact, network=...)")
     content, path = _content(run, which, device)
     return policy_of(content, path, policy).to(device).eval().requires_grad_(False)
 
@@ -329,6 +331,13 @@ def load_value(run: str | Path | Run, *, which: str | int = "last", device: str 
 
 def _content(run: str | Path | Run, which: str | int, device: str | torch.device) -> tuple[PolicyContent, Path]:
     """A saved policy and its file."""
+    check_kind("run", run, str | Path | Run, "a run's folder")
+    check_kind("which", which, str | int, "as 'last', 'best' or 100")
+    check_kind("device", device, str | torch.device, "as 'cpu' or 'cuda:0'")
+    try:
+        torch.device(device)
+    except RuntimeError as error:
+        raise ValueError(f"there is no device {device!r}: use one as 'cpu' or 'cuda:0'") from error
     if isinstance(run, (str, Path)) and Path(run).is_file():
         if which != "last":
             raise ValueError(f"{run} is a file with one policy: give the run's folder to choose {which!r}")

@@ -5,7 +5,6 @@ import io
 import json
 import logging
 import os
-import sys
 import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Collection, Mapping
@@ -15,13 +14,12 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lyceum_warp.binding.local_modules import local_modules
 from lyceum_warp.binding.models import find_model
+from lyceum_warp.binding.registry import source_files
 from lyceum_warp.env import Env
 from lyceum_warp.model_files import ModelFile, read_spec
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.task import Task
 
 log = logging.getLogger(__name__)
 
@@ -48,19 +46,19 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
         The entry ``kept`` of config.json; and what the folder ``task`` will hold, by path.
     """
     task, given = env.task.task, env.options.model is not None
-    file, own = _file(task), not task.__module__.startswith("lyceum_warp.")
+    loaded, own = source_files(task), not task.__module__.startswith("lyceum_warp.")
+    file = next(iter(loaded), None)
     kept: dict[str, Any] = {"name": env.task.name, "model_hash": _model_hash(env), "model_given": given}
     files: dict[str, Path | bytes] = {}
     if file is not None:
-        kept["source_hash"] = _digest(file.read_bytes())
+        kept["source_hash"] = _digest(loaded[file])
     if own or given:
-        sources = _sources(file) if own and file is not None else {}
+        sources = _sources(file, loaded) if own and file is not None else {}
         main, model = _model_files(env)
         modules = [path for path in sources if path != file]
         names = _names_in_copy([*sources, *model], file, modules)
         if own and file is not None:
             kept["modules"] = {_beside(path, file): _digest(sources[path]) for path in modules}
-            kept["source_hash"] = _digest(sources[file])
             kept["file"], kept["program"] = names[file], task.__module__ == "__main__"
         if main is not None:
             kept["model"] = names[main]
@@ -99,22 +97,13 @@ def _npy(array: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def _file(task: type[Task]) -> Path | None:
-    """The file that defines a task; None in a notebook."""
-    file = getattr(sys.modules.get(task.__module__), "__file__", None)
-    return Path(file).resolve() if file and file.endswith(".py") and Path(file).is_file() else None
-
-
-def _sources(file: Path) -> dict[Path, bytes]:
-    """The contents of a task's file, and of the modules beside it that it imports.
-
-    The modules are left out if they are too many or too large to copy.
-    """
-    modules = [path for path in local_modules(file).values() if path.is_file()]
-    if len(modules) > _MOST_MODULES or sum(path.stat().st_size for path in modules) > _LARGEST_MODULES:
-        log.info("%s imports %d modules from its folder, too many or too large to copy", file, len(modules))
-        modules = []
-    return {path: path.read_bytes() for path in (file, *modules)}
+def _sources(file: Path, loaded: Mapping[Path, bytes]) -> dict[Path, bytes]:
+    """A task's file and the modules beside it, without the modules if they are too many or too large to copy."""
+    size = sum(map(len, loaded.values())) - len(loaded[file])
+    if len(loaded) - 1 <= _MOST_MODULES and size <= _LARGEST_MODULES:
+        return dict(loaded)
+    log.info("%s imports %d modules from its folder, too many or too large to copy", file, len(loaded) - 1)
+    return {file: loaded[file]}
 
 
 # what a later command uses
@@ -170,14 +159,21 @@ def run_env(
     return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
 
 
-def _source_changes(file: Path, kept: Mapping[str, Any]) -> list[str]:
-    """What has happened to a task's file, and to the modules beside it, since the run began."""
+def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, bytes] | None = None) -> list[str]:
+    """What has happened to a task's file, and to the modules beside it, since the run began.
+
+    Args:
+        file: The task's file.
+        kept: What config.json says about it.
+        loaded: The files as they were loaded; by default, and for others, as they are now.
+    """
     changes = []
     for name, hashed in {file.name: kept.get("source_hash"), **kept.get("modules", {})}.items():
         path = file.parent / name
-        if not path.is_file():
+        content = (loaded or {}).get(path)
+        if content is None and not path.is_file():
             changes.append(f"{path} does not exist any more")
-        elif hashed not in (None, _digest(path.read_bytes())):
+        elif hashed not in (None, _digest(path.read_bytes() if content is None else content)):
             changes.append(f"{path} has changed since the run began")
     return changes
 
@@ -190,9 +186,10 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
         env: The environment.
         note: Called with each line.
     """
-    kept, file = run.config.get("kept", {}), _file(env.task.task)
+    kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
+    file = next(iter(loaded), None)
     hashed = None if kept.get("program") else kept.get("source_hash")  # a program that trains changes on its own
-    for change in _source_changes(file, {**kept, "source_hash": hashed}) if file is not None else ():
+    for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
         note(f"{change}: it is used as it is now" if "changed" in change else change)
     if _model_changed(run, env):
         note(f"the model of the task {env.task.name!r} has changed since the run began: it is used as it is now")

@@ -69,7 +69,7 @@ class PolicyControl:
 
 
 class WorldControl:
-    """A controller of one world, as the loops of ``lyceum_warp.control`` call it, whose last plan can be looked at.
+    """A controller of one world, as the loops of ``lyceum_warp.controllers`` call it, whose last plan can be looked at.
 
     It passes every member of the controller on. When asked for, it copies the state, the plan and some samples of the
     next call, in the thread of that call.

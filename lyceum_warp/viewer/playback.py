@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyceum_warp.control.saved_episodes import check_episode
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.saved_episodes import check_episode
+from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.done import Done
 from lyceum_warp.env import Env
 from lyceum_warp.validate import described

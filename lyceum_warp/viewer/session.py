@@ -17,10 +17,10 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from lyceum_warp.control.episode_collector import ControlProgress
-from lyceum_warp.control.loop import control
-from lyceum_warp.control.real_time import Clock, control_async
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.episode_collector import ControlProgress
+from lyceum_warp.controllers.loop import control
+from lyceum_warp.controllers.real_time import Clock, control_async
+from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.engines.placement import options_for_plant
 from lyceum_warp.env import Env
 from lyceum_warp.validate import check_kind, positive_number, whole_number

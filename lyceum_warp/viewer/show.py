@@ -5,7 +5,7 @@ import platform
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.viewer.link import Graphics
 from lyceum_warp.viewer.protocol import Scene

@@ -15,7 +15,7 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos.evaluation import MEAN_SEED
 from lyceum_warp.cli import display
-from lyceum_warp.control.saved_episodes import episode_env, load_episodes
+from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
 from lyceum_warp.runs.folder import load
 from lyceum_warp.viz.cameras import find_camera
 

@@ -7,8 +7,8 @@ import pytest
 from toy_controllers import simulated_run, towards
 
 import lyceum_warp as lw
-from lyceum_warp.control.loop import control
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.loop import control
+from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.viz.control_plot import control_plot
 
 

@@ -9,11 +9,11 @@ from conftest import SharedEnv
 from toy_controllers import SamplingPlanner, towards
 
 import lyceum_warp as lw
-from lyceum_warp.control.control_report import control_report
-from lyceum_warp.control.episode_collector import ControlProgress
-from lyceum_warp.control.loop import control
-from lyceum_warp.control.real_time import control_async
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.control_report import control_report
+from lyceum_warp.controllers.episode_collector import ControlProgress
+from lyceum_warp.controllers.loop import control
+from lyceum_warp.controllers.real_time import control_async
+from lyceum_warp.controllers.trajectory import Trajectory
 
 Run = Callable[..., Trajectory]
 BOTH = pytest.mark.parametrize("run", [control, control_async])

@@ -5,8 +5,8 @@ import torch
 from toy_controllers import StepPlanner, hundredths, towards
 
 import lyceum_warp as lw
-from lyceum_warp.control.episode_collector import ControlProgress
-from lyceum_warp.control.loop import control
+from lyceum_warp.controllers.episode_collector import ControlProgress
+from lyceum_warp.controllers.loop import control
 
 
 @pytest.fixture(scope="module")

@@ -4,18 +4,19 @@ import time
 
 import torch
 
-from lyceum_warp.control.checked_controller import CheckedController
-from lyceum_warp.control.controller import Controller
-from lyceum_warp.control.episode_collector import (
+from lyceum_warp.controllers.checked_controller import CheckedController
+from lyceum_warp.controllers.controller import Controller
+from lyceum_warp.controllers.episode_collector import (
     EpisodeCollector,
     OnAbort,
     OnStep,
     TimedPlan,
     begin_episode,
+    check_plant,
     first_step,
     step_limit,
 )
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.validate import whole_number
 
@@ -54,6 +55,7 @@ def control(
         ValueError: The environment has several worlds or automatic resets, the episode is over or may never end, or
             the controller does not return a finite action of the right shape, or its plan ends before the next one.
     """
+    check_plant(env, reset=reset, on_step=on_step, on_abort=on_abort)
     limit = step_limit(env, steps)
     every = whole_number("replan_every", replan_every, low=1)
     checked = CheckedController(controller, env)

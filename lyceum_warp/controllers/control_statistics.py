@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.trajectory import Trajectory
 
 # the least number of plans for each quantile: of fewer, none is expected beyond it
 _QUANTILES = {"p50": (0.5, 2), "p90": (0.9, 10), "p99": (0.99, 100), "p99_9": (0.999, 1000)}

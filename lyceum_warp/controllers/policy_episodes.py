@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.control.trajectory import Trajectory, provenance
+from lyceum_warp.controllers.trajectory import Trajectory, provenance
 from lyceum_warp.env import Env
 from lyceum_warp.validate import whole_number
 

@@ -12,7 +12,7 @@ from conftest import TaskFile
 from toy_controllers import towards
 
 import lyceum_warp as lw
-from lyceum_warp.control.saved_episodes import check_episode, episode_env, load_episodes
+from lyceum_warp.controllers.saved_episodes import check_episode, episode_env, load_episodes
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.control.control_statistics import (
+from lyceum_warp.controllers.control_statistics import (
     age_statistics,
     differing_names,
     outcome_statistics,
@@ -15,7 +15,7 @@ from lyceum_warp.control.control_statistics import (
     sample_statistics,
     tick_statistics,
 )
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.files import replaced
 from lyceum_warp.validate import positive_number

@@ -6,7 +6,7 @@ from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp.algos.evaluation import evaluation_seed
-from lyceum_warp.control.policy_episodes import policy_episodes
+from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.done import Done
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lyceum_warp.control.control_statistics import differing_names, std, wilson
+from lyceum_warp.controllers.control_statistics import differing_names, std, wilson
 
 
 def test_wilson_interval_matches_published_values() -> None:

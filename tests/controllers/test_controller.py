@@ -7,8 +7,8 @@ import pytest
 from toy_controllers import StepPlanner, towards
 
 import lyceum_warp as lw
-from lyceum_warp.control import checked_controller
-from lyceum_warp.control.controller import PlanningController
+from lyceum_warp.controllers import checked_controller
+from lyceum_warp.controllers.controller import PlanningController
 
 
 def members(protocol: type) -> set[str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lyceum_warp.binding.registry import find_task
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 

@@ -11,9 +11,9 @@ import torch
 from toy_controllers import towards
 
 import lyceum_warp as lw
-from lyceum_warp.control.control_report import control_report
-from lyceum_warp.control.loop import control
-from lyceum_warp.control.trajectory import Trajectory
+from lyceum_warp.controllers.control_report import control_report
+from lyceum_warp.controllers.loop import control
+from lyceum_warp.controllers.trajectory import Trajectory
 
 
 @pytest.fixture(scope="module")
