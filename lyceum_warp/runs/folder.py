@@ -89,10 +89,9 @@ class Run:
         """
         folder = Path(folder)
         if (folder / _CONFIG).exists():
-            raise ValueError(
-                f"{folder} holds a run: give another folder, or continue the run (train --resume {folder}, or "
-                "resume=True in Python)"
-            )
+            way = f", or continue the run (train --resume {folder}, or resume=True in Python)"
+            trained = (folder / "checkpoint.pt").exists()  # unlike a run of plan
+            raise ValueError(f"{folder} holds a run: give another folder{way if trained else ''}")
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise ValueError(f"{folder} exists and is not an empty folder: give another folder")
 
