@@ -2,7 +2,6 @@
 
     python examples/random_search.py
     python examples/random_search.py --task hopper --nworld 64 --iterations 300 --video-every 100
-    lyceum-warp view runs/random-search
 
 The class has no code for files: lw.train writes the folder, with metrics, the best policy, checkpoints and videos.
 """
@@ -64,8 +63,8 @@ class RandomSearch(lw.Learner):
 
 
 def main(
-    task: str = "inverted_pendulum", nworld: int = 32, iterations: int = 10, horizon: int = 200,
-    out: Path = Path("runs/random-search"), resume: bool = False, video_every: int = 0, seed: int = 0,
+    task: str = "inverted_pendulum", nworld: int = 32, horizon: int = 200, iterations: int = 10, seed: int = 0,
+    out: Path = Path("runs/random-search"), resume: bool = False, video_every: int = 0,
 ) -> None:  # fmt: skip
     """Train, or continue a run with --resume."""
     learner = RandomSearch(lw.make(task, nworld=nworld, horizon=horizon, seed=seed), seed=seed)

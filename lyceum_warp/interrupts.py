@@ -44,11 +44,11 @@ def ending() -> Iterator[None]:
     def leave(number: int, frame: Any) -> None:
         raise SystemExit(128 + number)
 
-    numbers = [number for number in _NUMBERS[1:] if signal.getsignal(number) is signal.SIG_DFL]
     previous: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # only the main thread may set handlers
-        for number in numbers:
-            previous[number] = signal.signal(number, leave)
+        for number in _NUMBERS[1:]:
+            if signal.getsignal(number) is signal.SIG_DFL:
+                previous[number] = signal.signal(number, leave)
     try:
         yield
     finally:

@@ -8,8 +8,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from lyceum_warp.algos.evaluation import evaluation_seed
 from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.engines.placement import engine_name
@@ -203,7 +201,7 @@ def _learn(
 def _reopened(folder: Path, learner: Learner, settings: dict[str, Any], note: Callable[[str], None]) -> Run:
     """Open a run that is continued, and put the learner into the state of its checkpoint."""
     run = Run.open(folder)
-    content = run.read(note=note)
+    content = run.read(learner.env.obs.device, note=note)
     reached, target, done = run.config.get("reached"), settings["target_return"], content["iteration"]
     if reached is not None and target is not None and reached["return"] >= target:
         raise ValueError(
@@ -218,7 +216,7 @@ def _reopened(folder: Path, learner: Learner, settings: dict[str, Any], note: Ca
     _check_equal(run, learner)
     note_changes(run, learner.env, note=note)
     try:
-        learner.load_state_dict(_on(learner.env.obs.device, content["state"]))
+        learner.load_state_dict(content["state"])
     except (KeyError, RuntimeError, ValueError) as error:
         text = " ".join(str(error).split())
         raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {text}") from error
@@ -234,37 +232,22 @@ def _reopened(folder: Path, learner: Learner, settings: dict[str, Any], note: Ca
 def _check_equal(run: Run, learner: Learner) -> None:
     """Refuse a learner with other settings than the run's."""
     then, now, env = Configuration.of(run), describe(learner), learner.env
-    pairs = [
-        ("task", run.config.get("kept", {}).get("name", env.task.name), env.task.name),
-        ("engine", *(engine_name(engine, device) for engine, device in (
-            (then.options.engine, then.options.device), (now["engine"], now["device"])))),
-        ("algorithm", then.algorithm, learner.algorithm),
-        ("nworld", then.options.nworld, now["nworld"]),
-    ]  # fmt: skip
+    old, new, algorithm = then.options, env.options, run.config["algorithm"]
+    now["engine"] = engine_name(now["engine"], now["device"])
+    own = {"engine": engine_name(old.engine, old.device), "algorithm": algorithm, "nworld": old.nworld}
     # nthread and graphs do not change the numbers, and the model is compared by its content
-    pairs += [(name, getattr(then.options, name), getattr(env.options, name)) for name in _KEPT_OPTIONS]
-    pairs += [(name, getattr(then.options.physics, name), value) for name, value in vars(env.options.physics).items()]
-    old, new = run_params(run, then.params), now["params"]
-    pairs += [(name, old.get(name), new.get(name)) for name in {**old, **new}]
+    options = {"horizon": old.horizon, "fields": old.fields, "dynamics": old.dynamics}
+    params = dict.fromkeys(now["params"]) | run_params(run, then.params)
     # a run of an earlier release lacks the newest hyperparameters
-    new = json.loads(json.dumps(learner.settings()))  # lists in place of tuples
-    pairs += [(name, value, new.get(name)) for name, value in run.config[then.algorithm].items()]
-    for name, before, after in pairs:
-        if before != after:
-            raise ValueError(
-                f"the run in {run.folder} has {name} {before}, not {after}, and a run keeps its settings: leave that "
-                "out, or begin a new run in another folder"
-            )
-
-
-_KEPT_OPTIONS = ("horizon", "fields", "dynamics")
-"""Options of the environment that a run keeps, beside those of the physics."""
-
-
-def _on(device: torch.device, state: Any) -> Any:
-    """A state with all its tensors on a device."""
-    if isinstance(state, torch.Tensor):
-        return state.to(device)
-    if isinstance(state, Mapping):
-        return {name: _on(device, part) for name, part in state.items()}
-    return [_on(device, part) for part in state] if isinstance(state, list) else state
+    hyperparameters = run.config.get(algorithm, {}), json.loads(json.dumps(learner.settings()))
+    for before, after in (
+        ({"task": run.config.get("kept", {}).get("name", env.task.name)}, {"task": env.task.name}),
+        (own, now), (options, vars(new)), (vars(old.physics), vars(new.physics)), (params, now["params"]),
+        hyperparameters,
+    ):  # fmt: skip
+        for name, value in before.items():
+            if value != after.get(name):
+                raise ValueError(
+                    f"the run in {run.folder} has {name} {value}, not {after.get(name)}, and a run keeps its settings: "
+                    "leave that out, or begin a new run in another folder"
+                )

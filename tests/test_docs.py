@@ -54,8 +54,7 @@ QUICK = {
     "check": ["--nworld", "2", "--rule", "spaces", "--rule", "restoring"],
     "train": ["--iterations", "2", *TINY, "--no-video"],
     "train --algorithm": shlex.split(
-        "--iterations 2 --nworld 4 --horizon 32 --no-video "
-        "--config.hidden 8 --config.value-hidden 8 --config.mean-every 1"
+        "--iterations 2 --nworld 4 --horizon 32 --no-video --hidden 8 --value-hidden 8 --mean-every 1"
     ),
     "train --resume": ["--iterations", "3", "--no-video"],
     "eval": ["--episodes", "2", "--no-video"],

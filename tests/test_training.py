@@ -257,7 +257,7 @@ def test_a_command_begins_with_the_policy_of_a_run(
     assert cli.main(["train", "--resume", str(out), "--iterations", "2", *QUIET]) == 0
     capsys.readouterr()
     for options, words in [
-        (["hopper"], ["takes 6 observations and gives 2 actions", "'hopper' has 11 and 3"]),
+        (["hopper"], ["takes 6 observations", "'hopper' has 11"]),
         (["--hidden", "9"], ["have hidden (8,), not (9,)", "leave out --hidden"]),
         (["--value-group", "critic"], ["have value_group policy, not critic", "leave out --value-group"]),
         (["--which", "5"], ["has no policy '5': it has 'last', 'best', 2, 4, 6"]),

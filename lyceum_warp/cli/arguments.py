@@ -76,8 +76,8 @@ def _is_union(hint: Any) -> bool:
 
 def given(flags: Any) -> dict[str, Any]:
     """The flags that differ from their defaults, by name."""
-    values = {field.name: (getattr(flags, field.name), field.default) for field in dataclasses.fields(flags)}
-    return {name: value for name, (value, default) in values.items() if value != default}
+    fields = flags.__dataclass_fields__
+    return {name: value for name, value in vars(flags).items() if value != fields[name].default}
 
 
 NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "nvtx", "model", "fields", "dynamics", "physics")

@@ -86,7 +86,10 @@ class Display(training.Display):
         result = reward if _missing(row, "return_mean") else f"return {row['return_mean']:.4g}"
         mean = "" if math.isnan(shown) else f"(mean policy {shown:.4g})"
         success = "" if _missing(row, "success") else f"success {row['success']:.0%}"
-        bad = [counted(row.get(column, 0), what) for column, what in _COUNTED.items()]
+        bad = []
+        for column, what in _COUNTED.items():
+            if number := row.get(column):
+                bad.append(counted(number, what))
         rate = "" if _missing(row, "samples_per_second") else f"{row['samples_per_second'] / 1000:.3g}k samples/s"
         if self.console.is_terminal:
             most = [result, mean, success, *bad, rate.replace(" samples", "")]
@@ -120,31 +123,42 @@ _BAR_WIDTH = 36
 
 
 def counted(number: int, what: str) -> str:
-    """A number of things in words; empty for 0."""
-    return f"{number:,d} {what}{'s' if number > 1 else ''}" if number else ""
+    """A number of things in words."""
+    return f"{number:,d} {what}{'s' if number > 1 else ''}"
+
+
+_COLUMNS = [
+    ("iter", "iteration", "d"), ("samples", "samples", ",d"), ("reward\na step", "reward_mean", ".3g"),
+    ("return", "return_mean", ".1f"), ("± std", "return_std", ".1f"), ("mean\npolicy", "mean_return", ".1f"),
+    ("length", "length_mean", ".0f"), ("eval", "eval_mean", ".3g"), ("success", "success", ".0%"),
+    ("KL", "kl", ".3f"), ("samples/s", "samples_per_second", ",.0f"),
+]  # fmt: skip
+"""Headings of the table of a run, columns of metrics.csv, and formats."""
 
 
 def curve_table(rows: list[dict[str, float | None]]) -> Table:
     """A run's iterations, at most 15 of them; columns without a number are left out."""
-    columns = [("iter", "iteration", "d"), ("samples", "samples", ",d"), ("return", "return_mean", ".1f"),
-               ("± std", "return_std", ".1f"), ("mean\npolicy", "mean_return", ".1f"), ("length", "length_mean", ".0f"),
-               ("eval", "eval_mean", ".3g"), ("success", "success", ".0%"), ("KL", "kl", ".3f"),
-               ("samples/s", "samples_per_second", ",.0f")]  # fmt: skip
-    if any(_missing(row, "return_mean") for row in rows):  # no episode ended
-        columns.insert(2, ("reward\na step", "reward_mean", ".3g"))
-    columns = [column for column in columns if not all(_missing(row, column[1]) for row in rows)]
     table = Table(box=rich.box.SIMPLE, padding=0, pad_edge=False)  # whole on 80 columns
-    for heading, _, _ in columns:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row in _spread(rows):
+    shown, columns = _spread(rows), []
+    for heading, name, form in _COLUMNS:
         cells = []
-        for _, name, form in columns:
-            value = math.nan if _missing(row, name) else row[name] or 0.0
-            cells.append("" if math.isnan(value) else format(int(value) if form.endswith("d") else value, form))
-        table.add_row(*cells)
-    totals = [(round(sum(row.get(name + "s") or 0.0 for row in rows)), name) for name in ("fault", "outlier")]
-    if bad := " and ".join(counted(number, name) for number, name in totals if number):
-        table.caption = f"{bad} in all {len(rows)} iterations"
+        for row in shown:
+            value = 0.0 if _missing(row, name) else row[name] or 0.0
+            text = format(int(value) if form.endswith("d") else value, form)
+            cells.append("" if _missing(row, name) else text)
+        if name == "reward_mean" and not any(_missing(row, "return_mean") for row in rows):
+            continue  # it stands for the return until an episode has ended
+        if any(cells):
+            table.add_column(heading, justify="right", no_wrap=True)
+            columns.append(cells)
+    for line in zip(*columns, strict=True):
+        table.add_row(*line)
+    bad = []
+    for what in ("fault", "outlier"):
+        if number := round(sum(row.get(what + "s") or 0.0 for row in rows)):
+            bad.append(counted(number, what))
+    if bad:
+        table.caption = f"{' and '.join(bad)} in all {len(rows)} iterations"
     return table
 
 
@@ -154,10 +168,10 @@ def _missing(row: dict[str, float | None], name: str) -> bool:
 
 
 def _spread(rows: list[dict[str, float | None]]) -> list[dict[str, float | None]]:
-    """At most 15 rows, with the first and the last; where at least 5 have an evaluation, only those between them."""
-    if sum(row.get("mean_return") is not None for row in rows) >= 5:
-        ends = (0, len(rows) - 1)
-        rows = [row for i, row in enumerate(rows) if i in ends or row.get("mean_return") is not None]
+    """At most 15 rows, with the first and the last; if at least 5 have an evaluation, only those between them."""
+    between = [row for row in rows[1:-1] if row.get("mean_return") is not None]
+    if len(between) >= 4:
+        rows = [rows[0], *between, rows[-1]]
     if len(rows) <= _TABLE_ROWS:
         return rows
     return [rows[round(i * (len(rows) - 1) / (_TABLE_ROWS - 1))] for i in range(_TABLE_ROWS)]

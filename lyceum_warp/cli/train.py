@@ -23,6 +23,7 @@ from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import read_checkpoint
 from lyceum_warp.runs.configuration import ALGORITHMS, Configuration, saved_networks
 from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.metrics_table import read_metrics
 from lyceum_warp.runs.task_copy import note_changes
 from lyceum_warp.training import train
 from lyceum_warp.viewer.follow import RunViewer
@@ -39,8 +40,8 @@ _SETTINGS: dict[str, Any] = {
 """Settings that a run may change when it is continued, and their defaults."""
 
 _KEPT = {
-    "task": "TASK", "algorithm": "--algorithm", "seed": "--seed", "threads": "--threads", "out": "--out",
-    "from_run": "--from",
+    "from_run": "--from", "task": "TASK", "algorithm": "--algorithm", "seed": "--seed", "threads": "--threads",
+    "out": "--out",
 }  # fmt: skip
 """Flags that do not go with --resume."""
 
@@ -150,8 +151,9 @@ class Train:
         folder = self.resume or self.from_run
         source = None if folder is None else Run.open(folder)
         saved = {} if source is None else source.config
-        settings = {name: value if (value := getattr(self, name)) is not None else saved.get(name, default)
-                    for name, default in _SETTINGS.items()}  # fmt: skip
+        settings = {}
+        for name, default in _SETTINGS.items():
+            settings[name] = saved.get(name, default) if (value := getattr(self, name)) is None else value
         if self.resume is None:
             settings["target_return"] = self.target_return
         if parsed_camera(self.camera) is not None and not (self.video or settings["video_every"]):
@@ -163,8 +165,10 @@ class Train:
 
     def configuration(self, source: Run | None, team: Team) -> Configuration:
         """What is trained: what the flags say, on top of the configuration of another run, or of the defaults."""
-        words = {name: value for name in ("nworld", "seed") if (value := getattr(self, name)) is not None}
-        words |= given(self.env) | self.physics.given()
+        words = given(self.env) | self.physics.given()
+        for name, value in (("nworld", self.nworld), ("seed", self.seed)):
+            if value is not None:
+                words[name] = value
         if source is None:
             nworld = 4096 * team.size if (self.env.device or "cpu").startswith("cuda") else 64
             options = EnvOptions(nworld=nworld, device="cpu")
@@ -250,7 +254,7 @@ class Train:
     def _report(self, run: Run, learner: Learner, console: Console) -> int:
         """Print the table, evaluate the policy, draw the curve and the video; returns the exit code."""
         env, policy, seed = learner.env, learner.policy, learner.env.options.seed + 1
-        console.print(curve_table(run.rows()))
+        console.print(curve_table(read_metrics(run.metrics)))
         few = evaluation_worlds(env, _FINAL_EPISODES)
         with LongWork("evaluating the mean policy", "steps", console) as work:
             returns = evaluate(few, moved(policy, few), _FINAL_EPISODES, seed=seed, progress=work).returns

@@ -54,11 +54,11 @@ def algorithm_of(name: str) -> tuple[Any, Any]:
 def describe(learner: Learner) -> dict[str, Any]:
     """The configuration of a run as config.json holds it, from which ``Configuration`` makes the same learner."""
     env, options = learner.env, learner.env.options
-    names = ["horizon", "graphs"]
-    if learner.team.neighbours == 1:  # several processes of a machine share its cores, a later one has them all
-        names.append("nthread")
-    others = {name: value for name, value in options.given().items() if name in names}
-    others |= {name: list(names) for name in ("fields", "dynamics") if (names := getattr(options, name))}
+    others = options.given()
+    if learner.team.neighbours > 1:  # several processes of a machine share its cores, a later one has them all
+        others.pop("nthread", None)
+    for name in others.keys() - {"nthread", "horizon", "graphs", "fields", "dynamics"}:
+        del others[name]
     if isinstance(options.model, str | Path):
         others["model"] = str(Path(options.model).absolute()) if Path(options.model).is_file() else str(options.model)
     seed = {} if learner.seed == options.seed else {f"{learner.algorithm}_seed": learner.seed}
@@ -109,7 +109,9 @@ class Configuration:
         try:
             # earlier releases accepted options as --param and stored them under "params", or had no "physics"
             words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
-            base = EnvOptions(**{name: config[name] for name in ("engine", "device", "nworld", "seed")})
+            base = EnvOptions(
+                engine=config["engine"], device=config["device"], nworld=config["nworld"], seed=config["seed"]
+            )  # fmt: skip
             options, params = EnvOptions.split(words, base)
             name: str = config["algorithm"]
             entry: Any = config.get(name)

@@ -89,10 +89,9 @@ class Run:
         """
         folder = Path(folder)
         if (folder / _CONFIG).exists():
-            raise ValueError(
-                f"{folder} holds a run: give another folder, or continue the run (train --resume {folder}, or "
-                "resume=True in Python)"
-            )
+            way = f", or continue the run (train --resume {folder}, or resume=True in Python)"
+            trained = (folder / "checkpoint.pt").exists()  # unlike a run of plan
+            raise ValueError(f"{folder} holds a run: give another folder{way if trained else ''}")
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise ValueError(f"{folder} exists and is not an empty folder: give another folder")
 
@@ -175,9 +174,12 @@ class Run:
             then = json.loads(path.read_text())
         except (OSError, ValueError):
             then = {}
-        changed = {name: (then.get(name), value) for name, value in now.items() if then.get(name) != value}
+        changed, noted = {}, {}
+        for name, value in now.items():
+            if then.get(name) != value:
+                changed[name], noted[name] = (then.get(name), value), value
         if changed:
-            then.setdefault("resumed", []).append({name: value for name, (_, value) in changed.items()})
+            then.setdefault("resumed", []).append(noted)
             with replaced(path) as temporary:
                 temporary.write_text(json.dumps(then, indent=2))
         return changed

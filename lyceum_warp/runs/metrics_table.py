@@ -1,5 +1,6 @@
 """The table of a run's iterations, metrics.csv: rows are appended, read and cut off."""
 
+import contextlib
 import csv
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,21 +16,23 @@ def append_row(path: Path, row: Mapping[str, Any]) -> None:
         path: The table, which need not exist.
         row: Values by the names of their columns. None becomes an empty cell; floats keep all their digits.
     """
-    columns: list[str] = []
+    lines: list[list[str]] = []
     if path.exists():
         with path.open(newline="") as file:
-            columns = next(csv.reader(file), [])
-    if new := [name for name in row if name not in columns]:
-        cells = []
-        if columns:
+            lines = [next(csv.reader(file), [])]
+    known = lines[0] if lines else []
+    columns = list(dict.fromkeys([*known, *row]))
+    if columns != known:
+        if known:
             with path.open(newline="") as file:
-                cells = [line + [""] * len(new) for line in list(csv.reader(file))[1:]]
-        columns += new
+                lines = list(csv.reader(file))
         with replaced(path) as temporary, temporary.open("w", newline="") as file:
-            csv.writer(file).writerows([columns, *cells])
+            writer = csv.writer(file)
+            writer.writerow(columns)
+            for line in lines[1:]:
+                writer.writerow([*line, *[""] * (len(columns) - len(known))])
     with path.open("a", newline="") as file:
-        values = (row.get(name) for name in columns)
-        csv.writer(file).writerow(["" if value is None else value for value in values])
+        csv.writer(file).writerow(map(row.get, columns))  # None becomes an empty cell
 
 
 def read_metrics(path: Path) -> list[dict[str, float | None]]:
@@ -41,7 +44,10 @@ def read_metrics(path: Path) -> list[dict[str, float | None]]:
     with path.open(newline="") as file:
         reader = csv.DictReader(file, strict=True)
         try:
-            return [{key: float(cell) if cell else None for key, cell in row.items()} for row in reader]
+            rows = []
+            for row in reader:
+                rows.append({key: float(cell) if cell else None for key, cell in row.items()})
+            return rows
         except (ValueError, TypeError, csv.Error) as error:
             raise ValueError(f"{path} is not a table of metrics: line {reader.line_num}: {error}") from error
 
@@ -56,23 +62,15 @@ def cut_rows(path: Path, iteration: int) -> None:
     if not path.exists():
         return
     lines = path.read_text().splitlines(keepends=True)
-    column = next((i for i, name in enumerate(_cells(lines[0])) if name == "iteration"), None) if lines else None
-    kept = [
-        line for i, line in enumerate(lines)
-        if line.endswith("\n") and (i == 0 or _number_of_row(line, column, i) <= iteration)
-    ]  # fmt: skip
+    header = next(csv.reader(lines[:1]), [])
+    column = header.index("iteration") if "iteration" in header else None
+    kept = []
+    for i, line in enumerate(lines):
+        number: float = i  # of the row, if its cells do not say it; read_metrics reports a broken line
+        with contextlib.suppress(ValueError, IndexError, csv.Error):
+            number = float(next(csv.reader([line]))[column]) if i and column is not None else i
+        if line.endswith("\n") and (i == 0 or number <= iteration):
+            kept.append(line)
     if kept != lines:
         with replaced(path) as temporary:
             temporary.write_text("".join(kept))
-
-
-def _cells(line: str) -> list[str]:
-    return next(csv.reader([line]), [])
-
-
-def _number_of_row(line: str, column: int | None, otherwise: int) -> float:
-    """The iteration of a row; another number where it has no such column."""
-    try:
-        return otherwise if column is None else float(_cells(line)[column])
-    except (ValueError, IndexError, csv.Error):  # read_metrics names the line
-        return otherwise

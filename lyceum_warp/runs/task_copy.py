@@ -98,12 +98,12 @@ def _npy(array: np.ndarray) -> bytes:
 
 
 def _sources(file: Path, loaded: Mapping[Path, bytes]) -> dict[Path, bytes]:
-    """A task's file, and the modules beside it unless they are too many or too large to copy."""
-    modules = {path: content for path, content in loaded.items() if path != file}
-    if len(modules) > _MOST_MODULES or sum(map(len, modules.values())) > _LARGEST_MODULES:
-        log.info("%s imports %d modules from its folder, too many or too large to copy", file, len(modules))
-        modules = {}
-    return {file: loaded[file], **modules}
+    """A task's file and the modules beside it, without the modules if they are too many or too large to copy."""
+    size = sum(map(len, loaded.values())) - len(loaded[file])
+    if len(loaded) - 1 <= _MOST_MODULES and size <= _LARGEST_MODULES:
+        return dict(loaded)
+    log.info("%s imports %d modules from its folder, too many or too large to copy", file, len(loaded) - 1)
+    return {file: loaded[file]}
 
 
 # what a later command uses
@@ -130,10 +130,21 @@ def run_env(
     """
     if task is not None:
         return Env(task, options, **params)
-    kept, chosen = run.config.get("kept", {}), _run_task(run, note)
-    params = run_params(run, params)
-    copy = run.task_folder / kept["model"] if "model" in kept else None
-    if copy is None or not copy.is_file():
+    kept, chosen = run.config.get("kept", {}), run.config["task"]
+    if chosen is None or kept.get("program"):
+        where = "a notebook" if chosen is None else chosen.partition(":")[0]
+        raise ValueError(
+            f"the task {kept['name']!r} of the run in {run.folder} was defined in {where}, which trained it: give a "
+            "file that only defines it (eval --task my_task.py, train my_task.py --from), or go on there (resume=True)"
+        )
+    path, colon, attribute = chosen.partition(":")
+    copy = run.task_folder / kept.get("file", "-")
+    if copy.is_file() and (changes := _source_changes(Path(path), kept)):
+        new = f"; give {path} as the task to use the new version" if Path(path).is_file() else ""
+        note(f"{changes[0]}: the run's own copy is used, {copy}{new}")
+        chosen = f"{copy}{colon}{attribute}"
+    params, copy = run_params(run, params), run.task_folder / kept.get("model", "-")
+    if not copy.is_file():
         return Env(chosen, options, **params)
     if kept["model_given"] and not isinstance(options.model, str):  # it was made in Python
         return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
@@ -148,27 +159,6 @@ def run_env(
     return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
 
 
-def _run_task(run: Run, note: Note) -> str:
-    """The task, by name or file, that stands for a run's."""
-    task, kept = run.config["task"], run.config.get("kept", {})
-    if task is None or kept.get("program"):
-        where = "a notebook" if task is None else task.partition(":")[0]
-        raise ValueError(
-            f"the task {kept['name']!r} of the run in {run.folder} was defined in {where}, which trained it: give a "
-            "file that only defines it (eval --task my_task.py, train my_task.py --from), or go on there (resume=True)"
-        )
-    path, colon, attribute = task.partition(":")
-    copy = run.task_folder / kept["file"] if "file" in kept else None
-    if copy is None or not copy.is_file():
-        return task
-    changes = _source_changes(Path(path), kept)
-    if not changes:
-        return task
-    new = f"; give {path} as the task to use the new version" if Path(path).is_file() else ""
-    note(f"{changes[0]}: the run's own copy is used, {copy}{new}")
-    return f"{copy}{colon}{attribute}"
-
-
 def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, bytes] | None = None) -> list[str]:
     """What has happened to a task's file, and to the modules beside it, since the run began.
 
@@ -177,9 +167,9 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
         kept: What config.json says about it.
         loaded: The files as they were loaded; by default, and for others, as they are now.
     """
-    known = {file: kept.get("source_hash")} | {file.parent / name: h for name, h in kept.get("modules", {}).items()}
     changes = []
-    for path, hashed in known.items():
+    for name, hashed in {file.name: kept.get("source_hash"), **kept.get("modules", {})}.items():
+        path = file.parent / name
         content = (loaded or {}).get(path)
         if content is None and not path.is_file():
             changes.append(f"{path} does not exist any more")
@@ -207,12 +197,12 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
 
 def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
     """Parameters of a run's task; a table that is not where it was is the run's own copy."""
-
-    def missing(value: Any) -> bool:
-        return isinstance(value, str) and value.endswith(".npy") and not Path(value).is_file()
-
-    copies = {name: run.task_folder / _TABLES / f"{name}.npy" for name, value in params.items() if missing(value)}
-    return {**params, **{name: str(copy) for name, copy in copies.items() if copy.is_file()}}
+    found = dict(params)
+    for name, value in params.items():
+        copy = run.task_folder / _TABLES / f"{name}.npy"
+        if isinstance(value, str) and value.endswith(".npy") and not Path(value).is_file() and copy.is_file():
+            found[name] = str(copy)
+    return found
 
 
 def _model_changed(run: Run, env: Env) -> bool:

@@ -16,7 +16,7 @@ from lyceum_warp.runs.folder import Run
 
 
 class Constant(nn.Module):
-    """A policy that is no Gaussian and cannot be called."""
+    """A policy other than a Gaussian, which cannot be called."""
 
     nobs, nact = 6, 2
 
@@ -71,7 +71,7 @@ def test_a_learner_of_few_lines_resumes_to_the_bit(env: lw.Env) -> None:
         other.load_state_dict(saved | {"env": torch.zeros(3, 1)})
 
 
-def test_a_policy_that_is_no_gaussian_gets_a_run_videos_and_an_export(env: lw.Env, tmp_path: Path) -> None:
+def test_a_policy_other_than_a_gaussian_gets_a_run_and_an_export(env: lw.Env, tmp_path: Path) -> None:
     drift, shown = Drift(env), []
     run = lw.train(drift, tmp_path / "run", iterations=2, callback=shown.append, display=Display(make_console()))
     assert len(shown) == 2 and len(list(curve_table(run.rows()).columns)) == 2

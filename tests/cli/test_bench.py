@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from lyceum_warp.cli import bench as bench_command
 from lyceum_warp.cli import main
 
 
@@ -29,6 +28,6 @@ def test_bench_refuses_unknown_programs(capfd: pytest.CaptureFixture[str]) -> No
 def test_bench_says_that_it_needs_a_checkout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(bench_command.__globals__, "FOLDER", tmp_path / "bench")
+    monkeypatch.setattr("lyceum_warp.cli.bench.FOLDER", tmp_path / "bench")
     assert main(["bench"]) == 2
     assert "the experiments belong to a checkout of the repository" in capfd.readouterr().err

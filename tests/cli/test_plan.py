@@ -219,7 +219,7 @@ def test_a_folder_that_is_not_empty_is_refused(tmp_path: Path, capsys: pytest.Ca
     refused(capsys, "run")
     (tmp_path / "run" / "config.json").write_text("{}")
     assert plan(tmp_path / "run") == 2
-    assert "--resume" not in (error := capsys.readouterr().err) and "holds a run: give another --out" in error
+    assert "--resume" not in (error := capsys.readouterr().err) and "holds a run: give another folder" in error
 
 
 def test_an_unknown_task_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
