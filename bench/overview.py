@@ -18,6 +18,7 @@ def main() -> None:
         table.add_row(name, found.summary, *map(experiment.duration, times))
     Console(width=120).print(table)
     print("\nlyceum-warp bench NAME --help     options of an experiment; every program in bench/ runs in this way")
+    print("lyceum-warp bench compare OLD     every difference, to the bit, between a revision and this working tree")
     print("lyceum-warp bench plot [NAME]     figures from the results alone, as PNG and SVG")
     print("lyceum-warp bench tables [NAME]   tables of bench/README.md from the results alone")
     print("lyceum-warp bench peers [NAME]    virtual environments of peers, ahead of time")

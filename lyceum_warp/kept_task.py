@@ -7,7 +7,6 @@ import json
 import logging
 import os
 import shutil
-import sys
 import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -17,14 +16,12 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lyceum_warp.binding.local_modules import local_modules
 from lyceum_warp.binding.models import find_model
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding.registry import find_task, source_files
 from lyceum_warp.env import Env
 from lyceum_warp.model_files import ModelFile, read_spec
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs import Run
-from lyceum_warp.task import Task
 
 log = logging.getLogger(__name__)
 
@@ -37,12 +34,6 @@ _LARGEST = 512 * 2**20
 """Models with larger files than this, in bytes, are not copied."""
 _MOST_MODULES, _LARGEST_MODULES = 100, 8 * 2**20
 """Modules that a task imports from its folder are not copied if they are more, or larger in bytes."""
-
-
-def _file(task: type[Task]) -> Path | None:
-    """The file that defines a task; None in a notebook."""
-    file = getattr(sys.modules.get(task.__module__), "__file__", None)
-    return Path(file).resolve() if file and file.endswith(".py") and Path(file).is_file() else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,17 +52,18 @@ class KeptTask:
     def of(cls, env: Env) -> "KeptTask":
         """What to keep of an environment's task."""
         task = env.task.task
-        file, own = _file(task), not task.__module__.startswith("lyceum_warp.")
+        loaded, own = source_files(task), not task.__module__.startswith("lyceum_warp.")
+        file = next(iter(loaded), None)
         kept: dict[str, Any] = {"name": env.task.name, "model_hash": _model_hash(env)}
         files: dict[str, Path | bytes | np.ndarray] = {}
         if file is not None:
-            kept["source_hash"] = _digest(file.read_bytes())
+            kept["source_hash"] = _digest(loaded[file])
         sources: dict[Path, Path | bytes] = {}
         modules: list[Path] = []
         if own and file is not None:
-            modules = _module_files(file)
-            sources = {path: path for path in (file, *modules)}
-            kept["modules"] = {_beside(path, file): _digest(path.read_bytes()) for path in modules}
+            modules = _module_files(file, loaded)
+            sources = {path: loaded[path] for path in (file, *modules)}
+            kept["modules"] = {_beside(path, file): _digest(loaded[path]) for path in modules}
         main = None
         if own or env.options.model is not None:
             main, model = _model_files(env)
@@ -187,8 +179,8 @@ def run_task(run: Run, *, note: Note = log.warning) -> str:
         )
     path, colon, attribute = task.partition(":")
     if not path.endswith(".py"):
-        file = _file(find_task(task))
-        if file is not None and kept.get("source_hash") not in (None, _digest(file.read_bytes())):
+        content = next(iter(source_files(find_task(task)).values()), None)
+        if content is not None and kept.get("source_hash") not in (None, _digest(content)):
             note(f"the task {task!r} has changed since the run began: it is used as it is now")
         return task
     copy = run.task_folder / kept["file"] if "file" in kept else None
@@ -202,14 +194,21 @@ def run_task(run: Run, *, note: Note = log.warning) -> str:
     return f"{copy}{colon}{attribute}"
 
 
-def _source_changes(file: Path, kept: Mapping[str, Any]) -> list[str]:
-    """What has happened to a task's file, and to the modules beside it, since the run began."""
+def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, bytes] | None = None) -> list[str]:
+    """What has happened to a task's file, and to the modules beside it, since the run began.
+
+    Args:
+        file: The task's file.
+        kept: What config.json says about it.
+        loaded: The files as they were loaded; by default, and for others, as they are now.
+    """
     known = {file: kept.get("source_hash")} | {file.parent / name: h for name, h in kept.get("modules", {}).items()}
     changes = []
     for path, hashed in known.items():
-        if not path.is_file():
+        content = (loaded or {}).get(path)
+        if content is None and not path.is_file():
             changes.append(f"{path} does not exist any more")
-        elif hashed not in (None, _digest(path.read_bytes())):
+        elif hashed not in (None, _digest(path.read_bytes() if content is None else content)):
             changes.append(f"{path} has changed since the run began")
     return changes
 
@@ -222,9 +221,10 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
         env: The environment.
         note: Called with each line.
     """
-    kept, file = run.config.get("kept", {}), _file(env.task.task)
+    kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
+    file = next(iter(loaded), None)
     hashed = None if kept.get("program") else kept.get("source_hash")  # a program that trains changes on its own
-    for change in _source_changes(file, {**kept, "source_hash": hashed}) if file is not None else ():
+    for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
         note(f"{change}: it is used as it is now" if "changed" in change else change)
     if _model_changed(run, kept, env):
         note(f"the model of the task {env.task.name!r} has changed since the run began: it is used as it is now")
@@ -274,10 +274,10 @@ def _model_hash(env: Env) -> str:
     return found.hexdigest()[:16]
 
 
-def _module_files(file: Path) -> list[Path]:
-    """The modules beside a task's file that it imports; none where they are too many or too large to copy."""
-    found = [path for path in local_modules(file).values() if path.is_file()]
-    if len(found) > _MOST_MODULES or sum(path.stat().st_size for path in found) > _LARGEST_MODULES:
+def _module_files(file: Path, loaded: Mapping[Path, bytes]) -> list[Path]:
+    """The modules beside a task's file that it imports; none if they are too many or too large to copy."""
+    found = [path for path in loaded if path != file]
+    if len(found) > _MOST_MODULES or sum(len(loaded[path]) for path in found) > _LARGEST_MODULES:
         log.info("%s imports %d modules from its folder, too many or too large to copy into the run", file, len(found))
         return []
     return found

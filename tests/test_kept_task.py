@@ -251,3 +251,52 @@ def test_a_task_of_a_program_is_evaluated_with_a_file(tmp_path: Path, capsys: py
         "give a file that only defines it (eval --task my_task.py",
     )
     assert cli.main(["eval", str(tmp_path / "run"), "--task", "point_mass", "--episodes", "2"]) == 0
+
+
+LOCAL = """
+import warp as wp
+
+@wp.func
+def squared(x: float) -> float:
+    return x * x
+"""
+EDITED = SOURCE.replace("import warp as wp", "import warp as wp\nfrom slide_terms import squared", 1).replace(
+    "-wp.abs(s1.qpos[0] - p.goal[0])", "-squared(s1.qpos[0] - p.goal[0])"
+)
+EDITS = [
+    lambda text: "# a new first line\n" * 7 + text,
+    lambda text: text[: len(text) // 2],
+    lambda text: f"{text}\nthis is not Python",
+    lambda text: "",
+    None,
+]
+"""What happens to a task's files while it trains; None is that they are deleted."""
+
+
+def test_a_run_keeps_to_the_source_that_it_was_started_with(folder: Path) -> None:
+    mine = folder / "mine"
+    original = {mine / "slide.py": EDITED, mine / "slide_terms.py": LOCAL}
+    for file, text in original.items():
+        file.write_text(text)
+
+    def run(name: str, edits: list[Any]) -> list[dict[str, str]]:
+        env = lw.make(str(mine / "slide.py"), nworld=2)
+        pending = iter(edits)
+
+        def edit(*_: Any) -> None:
+            for change in [next(pending)] if edits else []:
+                for file, text in original.items():
+                    file.unlink(missing_ok=True) if change is None else file.write_text(change(text))
+            if edits:
+                env.replicate(nworld=1).step()
+
+        edit()
+        lw.train(lw.NPG(env, config=SMALL), folder / name, iterations=len(EDITS) - 1, callback=edit)
+        for file, text in original.items():
+            assert (folder / name / "task" / file.name).read_text() == text
+        return metrics(folder / name)
+
+    edited = run("edited", EDITS)
+    for file, text in original.items():
+        file.write_text(text)
+    assert edited == run("unedited", [])

@@ -12,11 +12,11 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from lyceum_warp.arrays import launch_parts, launch_worlds
 from lyceum_warp.binding import models
 from lyceum_warp.binding.codegen import kernels_of
 from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.parameters import Parameters
+from lyceum_warp.binding.probe import Probe
 from lyceum_warp.binding.registry import task_name
 from lyceum_warp.binding.writes import Rights, check_writes, written_fields
 from lyceum_warp.fields import INITIAL, INPUTS, Field, describe, is_data_field, similar_data_fields, vec10
@@ -29,12 +29,6 @@ _SPELLED = {
     "float32": "float", "int32": "int", "vec3f": "wp.vec3", "vec4f": "lw.quat", "mat33f": "wp.mat33",
     "spatial_vectorf": "wp.spatial_vector",
 }  # fmt: skip
-
-_UNWRITTEN = 7.25e33
-"""A number that no observation is likely to be."""
-
-_SPARE = 64
-"""Places after the end of a row in which a write that goes too far is found."""
 
 _MOST_SUCCESS_STEPS = 2**24
 """Up to here a float32, as counts are kept, holds every whole number."""
@@ -387,78 +381,10 @@ class BoundTask:
             wanted = _SPELLED.get(element, element) if array.ndim == 1 else f"Row[{_SPELLED.get(element, element)}]"
             raise ValueError(f"World.{name} of the task {self.name!r} must be declared as {wanted}")
 
-    def check_results(self, batch: Any, params: wp.array, counters: Any) -> None:
-        """Let functions write their rows with room to spare, where no mistake can do damage, for the first world.
-
-        Raises:
-            ValueError: An observation has more or fewer numbers than ``obs`` declares, or is not-a-number, or
-                ``control`` or ``measure`` writes past the end of its row.
-        """
-        self._check_observations(batch, params, counters)
-        if self.kernels.control_worlds is not None:
-            inputs = self._with_copies(batch, self.writes["control"])
-            last = self._last_written(self.kernels.control_worlds, inputs, params, self.model.nu)
-            if last > self.model.nu:
-                raise ValueError(
-                    f"control of the task {self.name!r} writes {last} numbers into ctrl, but the model has "
-                    f"{self.model.nu}"
-                )
-        if self.kernels.measure_worlds is not None:
-            names = list(self.task.metrics)
-            last = self._last_written(self.kernels.measure_worlds, batch, params, len(names))
-            if last > len(names):
-                raise ValueError(f"measure of the task {self.name!r} writes {last} numbers, but metrics names {names}")
-
-    def _with_copies(self, batch: Any, names: Collection[str]) -> Any:
-        """A batch in which some fields are copies of the first world's."""
-        copied = self.kernels.Batch()
-        for name in self.types:
-            array = getattr(batch, name)
-            setattr(copied, name, wp.clone(array[:1]) if name in names and array.size else array)
-        return copied
-
-    def _last_written(self, kernel: wp.Kernel, batch: Any, params: wp.array, size: int) -> int:
-        """The number of places up to the last one that a function writes in a row of some size, with room to spare."""
-        naction = sum(self.task.actions.values()) if self.task.actions else self.model.nu
-        action = wp.zeros((1, naction), dtype=float, device=params.device)
-        last = 0
-        for unwritten in (math.nan, _UNWRITTEN):
-            row = wp.full((1, size + _SPARE), unwritten, dtype=float, device=params.device)
-            launch_worlds(kernel, 1, [batch, params, action, row], params.device)
-            written = np.flatnonzero(_is_written(row.numpy()[0], unwritten))
-            last = max(last, int(written.max(initial=-1)) + 1)
-        return last
-
-    def _check_observations(self, batch: Any, params: wp.array, counters: Any) -> None:
-        device = params.device
-        mask = wp.full(1, True, dtype=bool, device=device)
-        finite = wp.zeros((len(self.obs_layouts), 1), dtype=bool, device=device)
-        sizes = {group: sum(layout.values()) for group, layout in self.obs_layouts.items()}
-        written = {group: np.zeros(size + _SPARE, dtype=bool) for group, size in sizes.items()}
-        for unwritten in (math.nan, _UNWRITTEN):
-            rows = self.kernels.Observations()
-            for group, size in sizes.items():
-                setattr(rows, group, wp.full((1, size + _SPARE), unwritten, dtype=float, device=device))
-            args = [mask, batch, params, counters, rows, finite, rows, 1]
-            launch_parts(self.kernels.observe_worlds, 1, 1, args, device)
-            found = {group: getattr(rows, group).numpy()[0] for group in sizes}
-            for group, row in found.items():
-                written[group] |= _is_written(row, unwritten)
-        for group, size in sizes.items():
-            self._check_written(observer_name(group), written[group], size, np.isnan(found[group][:size]))
-
-    def _check_written(self, name: str, written: np.ndarray, size: int, bad: np.ndarray) -> None:
-        if written[size:].any():
-            last = int(np.flatnonzero(written).max()) + 1
-            raise ValueError(f"{name} of the task {self.name!r} writes {last} numbers, but obs declares {size}")
-        if not written[:size].all():
-            places = np.flatnonzero(~written[:size]).tolist()
-            raise ValueError(f"{name} of the task {self.name!r} leaves the places {places} of obs unwritten")
-        if bad.any():
-            places = np.flatnonzero(bad).tolist()
-            raise ValueError(f"{name} of the task {self.name!r} writes not-a-number into the places {places} of obs")
-
-
-def _is_written(row: np.ndarray, unwritten: float) -> np.ndarray:
-    """Which places no longer hold the number that says unwritten."""
-    return ~np.isnan(row) if math.isnan(unwritten) else row != np.float32(unwritten)
+    def probe(self, batch: Any, params: wp.array, device: wp.Device) -> Probe:
+        """A run of the functions in the first world of a batch, on rows of their own."""
+        return Probe(
+            self.name, self.kernels, self.writes, batch, params, device, layouts=self.obs_layouts, nu=self.model.nu,
+            naction=sum(self.task.actions.values()) if self.task.actions else self.model.nu,
+            metrics=self.task.metrics,
+        )  # fmt: skip

@@ -7,6 +7,7 @@ one more axis, a view of world w in it, and default functions. It is text, becau
 import dataclasses
 import linecache
 import re
+import threading
 from collections.abc import Mapping
 from typing import Any
 
@@ -76,6 +77,7 @@ def valid_model(s: World, lane: int, lanes: int) -> bool:
 """
 
 _kernels: dict[Any, steps.Kernels] = {}
+_MAKING = threading.RLock()
 _module_names: list[str] = []
 
 
@@ -87,14 +89,15 @@ def kernels_of(source: TaskSource, groups: Mapping[str, wp.Function]) -> steps.K
         groups: The functions that write its groups of observations.
     """
     key = (source.world, source.params, tuple(source.functions.values()), tuple(groups.items()))
-    if key not in _kernels:
-        scope = _generated(source, groups)
-        functions = {name: function or scope[f"no_{name}"] for name, function in source.functions.items()}
-        written = [name for name, function in source.functions.items() if function is not None]
-        given: dict[str, Any] = {"module": _module_name(source.task), "functions": functions, "written": written}
-        names = [field.name for field in dataclasses.fields(steps.TaskCode) if field.name not in given]
-        _kernels[key] = steps.make_kernels(steps.TaskCode(**given, **{name: scope[name] for name in names}))
-    return _kernels[key]
+    with _MAKING:
+        if key not in _kernels:
+            scope = _generated(source, groups)
+            functions = {name: function or scope[f"no_{name}"] for name, function in source.functions.items()}
+            written = [name for name, function in source.functions.items() if function is not None]
+            given: dict[str, Any] = {"module": _module_name(source.task), "functions": functions, "written": written}
+            names = [field.name for field in dataclasses.fields(steps.TaskCode) if field.name not in given]
+            _kernels[key] = steps.make_kernels(steps.TaskCode(**given, **{name: scope[name] for name in names}))
+        return _kernels[key]
 
 
 def _module_name(task: type[Task]) -> str:

@@ -3,14 +3,13 @@
 import ast
 import dataclasses
 import difflib
-import inspect
 import sys
-import textwrap
 from collections.abc import Collection, Mapping
 from typing import Any
 
 import warp as wp
 
+from lyceum_warp.binding.sources import FunctionSource, has_source
 from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, Task, TaskFunction, observer_name
 
 
@@ -177,12 +176,11 @@ def _origin(struct: Any) -> str:
 
 
 def _return_values(function: wp.Function) -> list[ast.expr] | None:
-    """The expressions that a function returns; None where its source is not known."""
-    try:
-        tree = ast.parse(textwrap.dedent(inspect.getsource(function.func)))  # type: ignore[arg-type]
-    except (OSError, SyntaxError, TypeError):
+    """The expressions that a function returns; None for a function without a source in Python."""
+    if not has_source(function):
         return None
-    return [node.value for node in ast.walk(tree) if isinstance(node, ast.Return) and node.value is not None]
+    nodes = ast.walk(FunctionSource(function).tree)
+    return [node.value for node in nodes if isinstance(node, ast.Return) and node.value is not None]
 
 
 def _returns(function: wp.Function) -> bool:

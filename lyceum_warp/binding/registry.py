@@ -3,11 +3,16 @@
 import difflib
 import importlib
 import importlib.util
+import itertools
+import linecache
 import pkgutil
 import re
 import sys
+import threading
 import traceback
+import weakref
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,8 +22,13 @@ from lyceum_warp.task import Task
 
 _tasks: dict[str, type[Task]] = {}
 
-_loaded: dict[str, Stamps] = {}
-"""The files of tasks, and of the modules beside them, as they were when they were last run, by their modules' names."""
+_loaded: dict[str, tuple[str, Stamps]] = {}
+"""By the file of a task: its module's name, and the state of it and of the modules beside it when it was last run."""
+
+_LOADING = threading.RLock()
+"""One file at a time, because imports and linecache belong to the process."""
+
+_sources: "weakref.WeakKeyDictionary[type[Task], Mapping[Path, bytes]]" = weakref.WeakKeyDictionary()
 
 
 def register(task: type[Task]) -> type[Task]:
@@ -98,6 +108,7 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
         FileNotFoundError: There is no such file.
     """
     if isinstance(task, type) and issubclass(task, Task):
+        source_files(task)
         return task
     if isinstance(task, Path):
         task = str(task)
@@ -112,22 +123,40 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
         close = difflib.get_close_matches(task, task_names(), 3)
         hint = f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(task_names())}"
         raise ValueError(f"there is no task {task!r}: {hint} (a task of your own is given as path/to/file.py)")
+    source_files(_tasks[task])
     return _tasks[task]
 
 
-def _run(path: Path, name: str) -> None:
-    """Run a file as a module, which replaces an earlier one of this name."""
+def source_files(task: type[Task]) -> Mapping[Path, bytes]:
+    """The file of a task, first, and the modules beside it that it imports, as they were when the task was loaded.
+
+    Of a class that was imported or defined in the program itself, as they were when ``find_task`` first returned it.
+    Empty for a class without a file, as in a notebook.
+    """
+    if task not in _sources:
+        file = Path(_file(task) or "")
+        known = file.suffix == ".py" and file.is_file()
+        _sources[task] = _read(file, local_modules(file)) if known else {}
+    return _sources[task]
+
+
+def _read(file: Path, modules: Mapping[str, Path]) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in (file.resolve(), *modules.values()) if path.is_file()}
+
+
+def _run(path: Path, name: str, source: bytes) -> None:
+    """Run a file's source as a module."""
     module = ModuleType(name)
     module.__file__ = file = str(path.resolve())
-    before = sys.modules.get(name)
     sys.modules[name] = module
     try:
-        # not through an importer, whose bytecode is of the same second
-        exec(compile(path.read_bytes(), file, "exec"), vars(module))
+        code = compile(source, file, "exec")  # not through an importer, whose bytecode is of the same second
+        # Warp reads the source of each function here, whatever happens to the file meanwhile
+        text = importlib.util.decode_source(source)
+        linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
+        exec(code, vars(module))
     except BaseException as error:
         del sys.modules[name]
-        if before is not None:
-            sys.modules[name] = before
         if not isinstance(error, Exception):
             raise
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
@@ -136,6 +165,8 @@ def _run(path: Path, name: str) -> None:
         if isinstance(error, ImportError):
             raise ImportError(f"{where}: {error}: install what it imports, or put it beside the file") from error
         raise ValueError(f"{where}: {_explained(error)}") from error
+    finally:
+        linecache.cache.pop(file, None)
 
 
 def _explained(error: Exception) -> str:
@@ -152,21 +183,23 @@ def _explained(error: Exception) -> str:
     return text if type(error) is ValueError else f"{type(error).__name__}: {text}"
 
 
-def _task_of_file(path: Path, attribute: str) -> type[Task]:
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no task file {str(path)!r}")
+def _module_name(path: Path) -> str:
+    """A name for the module of a task's file, the same in every process; with a number where the file is run again.
+
+    The functions of existing environments are looked up in the earlier module.
+    """
     name = f"{_FILE}{path.stem}_{zlib.crc32(str(path.resolve()).encode()):08x}"
-    if name not in sys.modules or name not in _loaded or _loaded[name] != stamps(_loaded[name]):
-        modules = local_modules(path)
-        read = stamps([path.resolve(), *modules.values()])
-        with importable(path, modules):
-            _run(path, name)
-        _loaded[name] = read
-    module = sys.modules[name]
+    names = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
+    return next(name for name in names if name not in sys.modules)
+
+
+def _task_of_file(path: Path, attribute: str) -> type[Task]:
+    with _LOADING:
+        module = _module_of_file(path)
     found = {
         key: value
         for key, value in vars(module).items()
-        if isinstance(value, type) and issubclass(value, Task) and value.__module__ == name
+        if isinstance(value, type) and issubclass(value, Task) and value.__module__ == module.__name__
     }
     if attribute:
         if attribute not in found:
@@ -175,3 +208,22 @@ def _task_of_file(path: Path, attribute: str) -> type[Task]:
     if len(found) != 1:
         raise ValueError(f"{path} has {len(found)} tasks ({', '.join(found)}): name one, as in {path}:Name")
     return next(iter(found.values()))
+
+
+def _module_of_file(path: Path) -> ModuleType:
+    """The module of a task's file, which is run if it, or a module beside it, has changed since."""
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no task file {str(path)!r}")
+    file = str(path.resolve())
+    name, read = _loaded.get(file, ("", {}))
+    if name not in sys.modules or read != stamps(read):
+        modules = local_modules(path)
+        read, sources = stamps([path.resolve(), *modules.values()]), _read(path, modules)
+        name = _module_name(path)
+        with importable(path, modules):
+            _run(path, name, sources[path.resolve()])
+        _loaded[file] = name, read
+        for value in vars(sys.modules[name]).values():
+            if isinstance(value, type) and issubclass(value, Task) and value.__module__ == name:
+                _sources[value] = sources
+    return sys.modules[name]

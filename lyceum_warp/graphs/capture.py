@@ -16,6 +16,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from typing import Any
 
 import torch
 import warp as wp
@@ -108,7 +109,26 @@ SECONDS_A_THREAD = 5e-4
 TIMED = 8
 """Calls of which the shortest counts: other programs interrupt some."""
 _CAPTURING = threading.RLock()
-"""Warp captures one graph at a time, while controllers and viewers have environments in threads of their own."""
+"""One capture at a time: controllers and viewers have environments in threads of their own."""
+
+
+class _PerThread(threading.local):
+    """An attribute of Warp's runtime that each thread has for itself, None at first."""
+
+    value: Any = None
+
+    def __get__(self, runtime: object, owner: type) -> Any:
+        return self.value
+
+    def __set__(self, runtime: object, value: Any) -> None:
+        self.value = value
+
+
+# Warp's library records launches on the CPU for the thread that began a capture, but its Python code takes the capture
+# for that of every thread: loops of other threads would become part of the graph, and their launches would replace the
+# arguments of its own.
+for _name in ("_apic_capture", "_apic_graph"):
+    setattr(wp._src.context.Runtime, _name, _PerThread())
 
 
 @contextlib.contextmanager
@@ -170,8 +190,7 @@ class _Graph:
         assert self._workers is not None
         parts = min(self._workers.nthread, int(seconds / SECONDS_A_THREAD))
         if parts > 1:
-            with contextlib.suppress(RuntimeError):  # other code captures now: the graph for all worlds stays
-                self._replay = partial(self._workers.run, [self._capture_part(k, parts) for k in range(parts)])
+            self._replay = partial(self._workers.run, [self._capture_part(k, parts) for k in range(parts)])
 
     def _capture_part(self, part: int, parts: int) -> Callable[[], object]:
         with capturing(), part_of_worlds(part, parts), wp.ScopedCapture(device=self._device) as capture:

@@ -1,0 +1,510 @@
+"""Every difference, to the bit, between the numbers of two checkouts: how to show that a redesign changed nothing.
+
+    lyceum-warp bench compare main
+    lyceum-warp bench compare v0.1.0 HEAD --parts env plans --tasks hopper reach --out differences.json
+    lyceum-warp bench compare ../before ../after --short --ignore '*/metrics.csv/new_column'
+
+OLD and NEW are revisions of git, or folders with a checkout; NEW is this working tree by default. Both compute the same
+units of work side by side, each in a process of its own, with the same Python and the same packages. A unit is a part
+on a task and an engine.
+
+The numbers hold for one processor alone, so that no file of them can take the place of OLD. The program uses the public
+names of the package only (probes/checkout.py). Exit code: 0 without a difference, 1 with differences, 2 for bad input.
+"""
+
+import contextlib
+import dataclasses
+import fnmatch
+import hashlib
+import importlib.metadata
+import io
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tarfile
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+ROOT = Path(__file__).resolve().parents[1]
+PROBE = ROOT / "bench" / "probes" / "checkout.py"
+PACKAGE = "lyceum_warp"
+PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "numpy")
+"""Packages that both checkouts use, whose versions are written into the file of --out."""
+LINES = 12
+"""Differences of a unit that are printed; a file of --out has all."""
+
+Part = Literal["env", "plans", "learners", "commands"]
+PARTS: tuple[Part, ...] = ("env", "plans", "learners", "commands")
+ENGINES = ("mujoco", "warp")
+
+EVERY_VARIANT = ("MPPI", "CEM", "PredictiveSampling", "knots", "plants", "control")
+MANY_PLANNERS = ("point_mass", "reach", "hopper")
+"""Tasks on which every planner is compared; on the others it is MPPI alone."""
+LEARNING = {"mujoco": ("point_mass", "hopper", "go1_velocity"), "warp": ("hopper",)}
+"""Tasks on which learners are compared, by engine."""
+COMMANDS = {"mujoco": ("hopper",), "warp": ("point_mass",)}
+SHORT = ("point_mass", "reach", "hopper", "go1_velocity")
+"""Tasks of --short: without contacts, with a mocap body, with episodes that end early, with everything else."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Report every difference, to the bit, between the numbers of two checkouts."""
+
+    old: tyro.conf.Positional[str]
+    """A revision of git, or a folder with a checkout."""
+    new: tyro.conf.Positional[str] = str(ROOT)
+    """Another one; this working tree by default."""
+    tasks: tuple[str, ...] = ()
+    """Tasks; by default all. Learners and commands by default run on few; of given tasks on those among them, or on
+    all if none is."""
+    engines: tuple[Literal["mujoco", "warp"], ...] = ENGINES
+    """Engines."""
+    device: str = "cpu"
+    """Device of the Warp engine, for example cuda, where its deterministic mode is compared."""
+    parts: tuple[Part, ...] = PARTS
+    """What is compared. env: the compiled model, resets, steps with actions beyond their bounds and short episodes,
+    observations, rewards and evaluations of given states, resets of some worlds, a fault, a rollout of given actions.
+    plans: MPPI, CEM, predictive sampling, plans of knots and of several plants, episodes under lw.control. learners:
+    NPG, and PPO if both checkouts have lw.PPO; the networks afterwards. commands: lyceum-warp train, at once and with
+    a break; metrics.csv and the saved policies."""
+    steps: int = 20
+    """Steps of an environment."""
+    iterations: int = 10
+    """Iterations of a learner."""
+    out: Path | None = None
+    """File (JSON) for every digest and every difference."""
+    ignore: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="PATTERN")] = ()
+    """Names to leave out, as '*/metrics.csv/*' or 'plans/hopper/*'; may be given several times."""
+    short: bool = False
+    """Compare four tasks, and plans on the C engine alone."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Unit:
+    """A unit of work: a part on a task and an engine."""
+
+    part: Part
+    task: str
+    engine: str
+    more: Mapping[str, Any]
+    """Further arguments of the part."""
+    variant: str = ""
+
+    @property
+    def name(self) -> str:
+        return "/".join(filter(None, (self.part, self.task, self.engine, self.variant)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """A difference between two arrays of one name, or between two checkouts."""
+
+    name: str
+    kind: Literal["numbers", "form", "added", "removed", "failure"]
+    text: str
+    """What differs, in a line."""
+    first: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """The first place that differs, by the names of the axes."""
+    old: str = ""
+    """The old number at this place."""
+    new: str = ""
+    largest: float | None = None
+    """The largest absolute difference; None if it is not finite."""
+    count: int = 0
+    """How many elements differ."""
+    size: int = 0
+    """How many elements there are."""
+
+
+# arrays
+
+
+def digest(array: np.ndarray) -> str:
+    """A hash of an array's type, shape and bits."""
+    head = f"{array.dtype.str} {array.shape} ".encode()
+    return hashlib.sha256(head + np.ascontiguousarray(array).tobytes()).hexdigest()
+
+
+def unequal(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """Which elements of two arrays of one type and shape differ in a bit, flat."""
+    rows = [np.ascontiguousarray(a).reshape(-1).view(np.uint8).reshape(a.size, a.itemsize) for a in (old, new)]
+    return (rows[0] != rows[1]).any(axis=1)
+
+
+def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] = ()) -> Difference | None:
+    """The difference between two arrays, None if they are equal to the bit.
+
+    Args:
+        name: Their name.
+        old: An array of numbers or of text.
+        new: The other.
+        axes: Names of their leading axes.
+    """
+    if old.dtype.kind == new.dtype.kind == "U" and old.shape == new.shape:  # types of texts have a length
+        longer = max(old.dtype, new.dtype)
+        old, new = old.astype(longer), new.astype(longer)
+    if (old.dtype, old.shape) != (new.dtype, new.shape):
+        return Difference(name, "form", f"{old.dtype} {old.shape} -> {new.dtype} {new.shape}")
+    if not old.size or not (which := unequal(old, new)).any():
+        return None
+    place = np.unravel_index(int(which.argmax()), old.shape)
+    labels = [axes[i] if i < len(axes) else f"index {i - len(axes)}" for i in range(old.ndim)]
+    if old.ndim == len(axes) + 1:
+        labels[-1] = "index"
+    first = {label: int(i) for label, i in zip(labels, place, strict=True)}
+    where = ", ".join(f"{label} {i}" for label, i in first.items())
+    count, before, after = int(which.sum()), old[place], new[place]
+    text, largest = f"{before} -> {after}" + (f" at {where}" if where else ""), None
+    if old.dtype.kind != "U":
+        with np.errstate(all="ignore"):
+            gaps = np.abs(new.astype(np.float64) - old.astype(np.float64)).reshape(-1)[which]
+        text += f"; max |difference| {gaps.max():.6g}; {count:,} of {old.size:,} differ"
+        largest = float(gaps.max()) if np.isfinite(gaps.max()) else None
+    return Difference(name, "numbers", text, first, str(before), str(after), largest, count, old.size)
+
+
+def differences(
+    unit: str, old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray], axes: Mapping[str, Sequence[str]]
+) -> Iterator[Difference]:
+    """The differences between the arrays of a unit, in the order in which they were computed."""
+    names = [*old, *(name for name in new if name not in old)]
+    for name in names:
+        whole = f"{unit}/{name}"
+        if name not in new:
+            yield Difference(whole, "removed", f"removed: {old[name].dtype} {old[name].shape}")
+        elif name not in old:
+            yield Difference(whole, "added", f"added: {new[name].dtype} {new[name].shape}")
+        elif (found := difference(whole, old[name], new[name], axes.get(name, ()))) is not None:
+            yield found
+
+
+def below(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """The arrays whose names begin with a prefix, by the rest of their names."""
+    return {name.removeprefix(f"{prefix}/"): array for name, array in arrays.items() if name.startswith(f"{prefix}/")}
+
+
+# checkouts
+
+
+@contextlib.contextmanager
+def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
+    """A folder with a checkout, and its description.
+
+    Args:
+        given: A folder, or a revision of git, whose package is unpacked.
+        folder: An empty folder for it.
+
+    Raises:
+        ValueError: There is neither.
+    """
+    if Path(given, PACKAGE, "__init__.py").is_file():
+        yield Path(given).resolve(), str(Path(given).resolve())
+        return
+    git = ["git", "-C", str(ROOT)]
+    found = subprocess.run(
+        [*git, "rev-parse", "--verify", "--quiet", f"{given}^{{commit}}"], capture_output=True, text=True, check=False
+    )
+    if found.returncode:
+        raise ValueError(f"{given!r} is neither a folder with {PACKAGE}/ nor a revision of git: give one of them")
+    commit = found.stdout.strip()
+    packed = subprocess.run([*git, "archive", "--format=tar", commit, PACKAGE], capture_output=True, check=True).stdout
+    with tarfile.open(fileobj=io.BytesIO(packed)) as files:
+        files.extractall(folder, filter="data")
+    yield folder.resolve(), f"{given} ({commit[:10]})"
+
+
+class Side:
+    """A checkout's process. It starts when it is first asked, and again if it has died.
+
+    Args:
+        name: "old" or "new".
+        root: The checkout.
+        folder: An empty folder for its files.
+    """
+
+    def __init__(self, name: str, root: Path, folder: Path) -> None:
+        self.name, self.root, self.folder = name, root, folder
+        self._file, self._log = folder / "arrays.npz", folder / "stderr.txt"
+        self._process: subprocess.Popen[str] | None = None
+
+    def start(self) -> None:
+        path = os.pathsep.join([str(self.root), *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = os.environ | {"PYTHONPATH": path, "CUBLAS_WORKSPACE_CONFIG": ":4096:8"}
+        with self._log.open("w") as log:
+            # -P leaves out bench/, whose programs have names of their own; a session of its own is ended as a whole
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", str(PROBE), str(self._file)], cwd=self.folder, env=environment, text=True,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, start_new_session=True,
+            )  # fmt: skip
+
+    def contents(self) -> dict[str, Any]:
+        """What the checkout has, once its process is there; or a failure."""
+        found = self.answer()
+        if "file" in found and not Path(found["file"]).is_relative_to(self.root):
+            text = f"imports {found['file']} instead of {self.root}"
+            return {"failure": {"text": text, "trace": "", "missing": False}}
+        return found
+
+    def ask(self, unit: Mapping[str, Any]) -> None:
+        self._file.unlink(missing_ok=True)
+        if self._process is None:
+            self.start()
+            self.answer()
+        assert self._process is not None and self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # the answer says why
+            print(json.dumps(unit), file=self._process.stdin, flush=True)
+
+    def answer(self) -> dict[str, Any]:
+        """The process's answer, or how it ended."""
+        assert self._process is not None and self._process.stdout is not None
+        if line := self._process.stdout.readline():
+            return json.loads(line)
+        code = self._process.wait()
+        self.close()
+        trace = self._log.read_text(errors="replace")
+        return {"failure": {"text": f"the process ended with {code}", "trace": trace, "missing": False}}
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays of the last unit."""
+        if not self._file.exists():
+            return {}
+        with np.load(self._file) as file:
+            return dict(file)
+
+    def close(self) -> None:
+        """End the process with those that it started."""
+        if self._process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.communicate()
+            self._process = None
+
+
+# units
+
+
+def units(options: Options, tasks: Sequence[str], learners: Sequence[str]) -> Iterator[Unit]:
+    """The units of work, in the order in which they are compared.
+
+    Args:
+        options: The options.
+        tasks: The tasks that both checkouts have.
+        learners: The learners that both have.
+    """
+    given = set(options.tasks)
+
+    def chosen(default: Sequence[str]) -> list[str]:
+        if given and not given & set(default):
+            return list(tasks)
+        return [task for task in default if task in tasks]
+
+    for part in PARTS:
+        if part not in options.parts:
+            continue
+        for engine in ENGINES:
+            if engine not in options.engines or (options.short and part in ("plans", "commands") and engine == "warp"):
+                continue
+            if part == "env":
+                yield from (Unit(part, task, engine, {"steps": options.steps}) for task in tasks)
+            elif part == "plans":
+                for task in tasks:
+                    variants = EVERY_VARIANT if task in MANY_PLANNERS else EVERY_VARIANT[:1]
+                    yield Unit(part, task, engine, {"variants": variants})
+            elif part == "learners":
+                for task in chosen(LEARNING[engine]):
+                    for learner in learners:
+                        more = {"learner": learner, "iterations": options.iterations}
+                        yield Unit(part, task, engine, more, learner)
+            else:
+                for task in chosen(COMMANDS[engine]):
+                    yield Unit(part, task, engine, {"iterations": options.iterations})
+
+
+@dataclasses.dataclass
+class Report:
+    """What was compared."""
+
+    ignore: Sequence[str]
+    units: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    found: list[Difference] = dataclasses.field(default_factory=list)
+    skipped: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Units that an extra is missing for, and what is missing."""
+    arrays: int = 0
+    """Arrays that were compared."""
+    ignored: int = 0
+    """Names that a pattern left out."""
+
+    def kept(self, name: str) -> bool:
+        """Whether no pattern leaves out a name."""
+        if any(fnmatch.fnmatchcase(name, pattern) for pattern in self.ignore):
+            self.ignored += 1
+            return False
+        return True
+
+    def add(
+        self, name: str, found: Sequence[Difference], seconds: float = 0.0, digests: Mapping[str, Any] | None = None
+    ) -> None:
+        """Take the differences of a unit with the old and the new digest of each array, and print them."""
+        digests = digests or {}
+        self.found += found
+        self.arrays += len(digests)
+        self.units.append({
+            "name": name, "seconds": round(seconds, 3), "digests": digests,
+            "differences": [dataclasses.asdict(each) for each in found],
+        })  # fmt: skip
+        summary = f"{len(found)} differences" if found else "equal"
+        print(f"{name}: {summary}, {len(digests)} arrays, {seconds:.1f} s", flush=True)
+        for each in found[:LINES]:
+            print(f"    {each.name.removeprefix(f'{name}/')}: {each.text}", flush=True)
+        if len(found) > LINES:
+            print(f"    and {len(found) - LINES} more", flush=True)
+
+
+def failures(name: str, answers: Mapping[str, Mapping[str, Any]]) -> list[Difference]:
+    """The failures of a unit, whose text names the checkout. Those of both are listed, too: nothing was compared."""
+    failed = {side: answer["failure"] for side, answer in answers.items() if "failure" in answer}
+    for failure in failed.values():
+        print(failure["trace"], file=sys.stderr)
+    return [Difference(name, "failure", f"{side} failed: {failure['text']}") for side, failure in failed.items()]
+
+
+def compare_unit(unit: Unit, sides: Sequence[Side], device: str, report: Report) -> None:
+    """Let both checkouts compute a unit, and take the differences into the report."""
+    began = time.perf_counter()
+    request = {"part": unit.part, "task": unit.task, "engine": unit.engine, "device": device, **unit.more}
+    for side in sides:
+        side.ask(request)
+    answers = {side.name: side.answer() for side in sides}
+    if all(answer.get("failure", {}).get("missing") for answer in answers.values()):
+        report.skipped[unit.name] = answers["new"]["failure"]["text"]
+        print(f"{unit.name}: skipped, {report.skipped[unit.name]}", flush=True)
+        return
+    old, new = (
+        {name: array for name, array in side.arrays().items() if report.kept(f"{unit.name}/{name}")} for side in sides
+    )
+    axes = {**answers["new"].get("axes", {}), **answers["old"].get("axes", {})}
+    found = [each for each in failures(unit.name, answers) if report.kept(each.name)]
+    if found:  # what a failure left out is not a further difference
+        old, new = ({name: array for name, array in side.items() if name in old and name in new} for side in (old, new))
+    found += differences(unit.name, old, new, axes)
+    for side, arrays in (("old", old), ("new", new)):
+        for whole, other in answers[side].get("equal", ()):
+            under = {name.removeprefix(f"{whole}/"): labels for name, labels in axes.items()}
+            for each in differences(unit.name, below(arrays, whole), below(arrays, other), under):
+                found.append(dataclasses.replace(each, text=f"{side}, {whole} -> {other}: {each.text}"))
+    digests = {name: [digest(side[name]) if name in side else None for side in (old, new)] for name in {**old, **new}}
+    report.add(unit.name, found, time.perf_counter() - began, digests)
+
+
+def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
+    """Compare two checkouts.
+
+    Raises:
+        ValueError: Neither has one of the tasks.
+    """
+    for side in sides:
+        side.start()
+    contents = {side.name: side.contents() for side in sides}
+    if failed := failures("package", contents):
+        report.add("package", failed)
+        return
+    old, new = (contents[side.name]["tasks"] for side in sides)
+    wanted = options.tasks or (SHORT if options.short else sorted({*old, *new}))
+    for task in wanted:
+        if task not in old and task not in new:
+            raise ValueError(f"neither checkout has a task {task!r}: there are {', '.join(sorted({*old, *new}))}")
+    one_sided = [
+        Difference(f"tasks/{task}", *(("added", "added") if task in new else ("removed", "removed")))
+        for task in wanted
+        if (task in old) != (task in new) and report.kept(f"tasks/{task}")
+    ]
+    if one_sided:
+        report.add("tasks", one_sided)
+    tasks = [task for task in wanted if task in old and task in new]
+    learners = [name for name in contents["old"]["learners"] if name in contents["new"]["learners"]]
+    for unit in units(options, tasks, learners):
+        compare_unit(unit, sides, options.device, report)
+
+
+# the program
+
+
+def written(report: Report, options: Options, checkouts: Mapping[str, str], seconds: float) -> dict[str, Any]:
+    """The content of the file."""
+    packages = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return {
+        "checkouts": checkouts,
+        "options": dataclasses.asdict(options) | {"out": str(options.out)},
+        "machine": {"processor": platform.processor() or platform.machine(), "system": platform.platform()},
+        "versions": {
+            "python": platform.python_version(),
+            **{name: importlib.metadata.version(name) for name in packages},
+        },
+        "seconds": round(seconds, 1),
+        "differences": len(report.found),
+        "skipped": report.skipped,
+        "units": report.units,
+    }
+
+
+def run(options: Options) -> int:
+    """Compare, and report; returns the exit code.
+
+    Raises:
+        ValueError: An option is wrong.
+    """
+    if options.steps < 1 or options.iterations < 2:
+        raise ValueError("--steps must be at least 1 and --iterations at least 2, so that a run can have a break")
+    if options.out is not None and not options.out.resolve().parent.is_dir():
+        raise ValueError(f"there is no folder {options.out.resolve().parent} for --out")
+    report, began = Report(options.ignore), time.perf_counter()
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lyceum-warp-compare-")))
+        sides, checkouts = [], {}
+        for name, given in (("old", options.old), ("new", options.new)):
+            for part in ("checkout", "files"):
+                (folder / name / part).mkdir(parents=True)
+            root, checkouts[name] = stack.enter_context(checkout(given, folder / name / "checkout"))
+            print(f"{name}: {checkouts[name]}", flush=True)
+            sides.append(Side(name, root, folder / name / "files"))
+            stack.callback(sides[-1].close)
+        compare(options, sides, report)
+    seconds = time.perf_counter() - began
+    if options.out is not None:
+        options.out.write_text(json.dumps(written(report, options, checkouts, seconds), indent=1) + "\n")
+    differing = sum(bool(unit["differences"]) for unit in report.units)
+    if report.skipped:
+        print(f"skipped, because of missing models: {', '.join(report.skipped)}")
+    if report.ignored:
+        print(f"left out by --ignore: {report.ignored} names")
+    compared = f"{report.arrays:,} arrays in {len(report.units)} units, {seconds:.0f} s"
+    print(f"{len(report.found)} differences in {differing} units; {compared}" if report.found
+          else f"no difference: {compared}")  # fmt: skip
+    return 1 if report.found else 0
+
+
+def main(options: Options) -> int:
+    """The program; returns the exit code: 0, 1 with differences, 2 for bad input, 130 or 143 after a signal."""
+    for number in (signal.SIGTERM, signal.SIGHUP):  # so that temporary folders are removed
+        signal.signal(number, lambda number, frame: sys.exit(128 + number))
+    try:
+        return run(options)
+    except ValueError as error:
+        print(f"compare: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options, prog="lyceum-warp bench compare")))

@@ -1,0 +1,195 @@
+"""Run a task's functions once for one world, on rows of exact size in memory of their own, to find faulty writes."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from lyceum_warp.arrays import launch_parts, launch_worlds
+from lyceum_warp.kernels import steps
+from lyceum_warp.task import MEMORIES, observer_name
+
+_ROOM = 2**18
+"""Bytes before and after every row, in which writes out of range are found and do no damage."""
+
+_ALIGNED = 64
+
+_UNWRITTEN = 0x7FA5C3E1
+"""Bits of a signaling NaN. Arithmetic turns it into another NaN, so that adding to an element counts as writing it."""
+
+
+class RoomyRows:
+    """Rows, (n, ...), with room around each of them.
+
+    Args:
+        shape: The shape of all rows.
+        dtype: Type of an element.
+        device: Where the rows are.
+        values: Their values, at least n rows; by default elements are unwritten.
+    """
+
+    def __init__(self, shape: Sequence[int], dtype: Any, device: wp.Device, values: wp.array | None = None) -> None:
+        self.size = math.prod(shape[1:])
+        self._element = wp.types.type_size_in_bytes(dtype)
+        self._stride = -(-self.size * self._element // _ALIGNED) * _ALIGNED + _ROOM
+        words = np.full((_ROOM + shape[0] * self._stride) // 4, _UNWRITTEN, dtype=np.uint32)
+        self._memory: wp.array = wp.array(words, dtype=wp.uint32, device=device)
+        inner = [self._element * math.prod(shape[axis + 1 :]) for axis in range(1, len(shape))]
+        self.array: Any = wp.array(
+            ptr=self._memory.ptr + _ROOM, dtype=dtype, shape=tuple(shape), strides=(self._stride, *inner),
+            device=device,
+        )  # fmt: skip
+        if values is not None and values.size:
+            wp.copy(self.array, values[: shape[0]])
+
+    def outside(self) -> np.ndarray:
+        """The indices at which something was written outside of a row, in its elements, ascending."""
+        words: np.ndarray = self._memory.numpy()
+        changed = 4 * np.flatnonzero(words != _UNWRITTEN)[:, None] + np.arange(4)
+        unwritten = np.array(_UNWRITTEN, dtype=np.uint32).reshape(1).view(np.uint8)
+        place = changed[words.view(np.uint8)[changed] != unwritten] - _ROOM
+        offset = (place + _ROOM // 2) % self._stride - _ROOM // 2
+        index = offset // self._element
+        return np.unique(index[(index < 0) | (index >= self.size)])
+
+    def written(self) -> np.ndarray:
+        """Which elements of a single row of 32-bit numbers were written."""
+        start = _ROOM // 4
+        written: np.ndarray = self._memory.numpy()[start : start + self.size] != _UNWRITTEN
+        return written
+
+
+class Probe:
+    """The functions of a task in the first world of a batch, whose own arrays they only read.
+
+    Args:
+        name: The task's name, for messages.
+        kernels: The task's kernels.
+        writes: The fields of World that each function writes, by the functions' names.
+        batch: The fields of the worlds.
+        params: The parameters.
+        device: Where all of them are.
+        layouts: The parts of each group of observations and their sizes.
+        nu: Number of controls.
+        naction: Size of an action.
+        metrics: Names of the metrics.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        kernels: Any,
+        writes: Mapping[str, frozenset[str]],
+        batch: Any,
+        params: wp.array,
+        device: wp.Device,
+        *,
+        layouts: Mapping[str, Mapping[str, int]],
+        nu: int,
+        naction: int,
+        metrics: Sequence[str],
+    ) -> None:
+        self._name, self._kernels, self._writes, self._params = name, kernels, writes, params
+        self._metrics, self._device = list(metrics), device
+        self._world, self._fields = kernels.Batch(), {}
+        written = frozenset[str]().union(*writes.values())
+        for field in kernels.Batch.vars:
+            array = getattr(batch, field)
+            if field in written:
+                self._fields[field] = self._rows((1, *array.shape[1:]), array.dtype, array)
+                array = self._fields[field].array
+            setattr(self._world, field, array)
+        self._observations, self._groups = kernels.Observations(), {}
+        for group, layout in layouts.items():
+            self._groups[group] = self._rows((1, sum(layout.values())))
+            setattr(self._observations, group, self._groups[group].array)
+        self._ctrl, self._measured = self._rows((1, nu)), self._rows((1, len(metrics)))
+        self._streams = self._rows((len(layouts), 1), wp.uint32)
+        with wp.ScopedDevice(self._device):
+            self._action = wp.zeros((1, naction), dtype=float)
+            self._yes, self._no = wp.full(1, True, dtype=bool), wp.full(1, False, dtype=bool)
+            self._counters = steps.Counters()
+            self._counters.step, self._counters.episode = wp.zeros(1, dtype=int), wp.zeros(1, dtype=int)
+            self._counters.key = wp.zeros(1, dtype=wp.uint32)
+            self._counters.rng = self._streams.array
+
+    def _rows(self, shape: Sequence[int], dtype: Any = wp.float32, values: wp.array | None = None) -> RoomyRows:
+        return RoomyRows(shape, dtype, self._device, values)
+
+    def check_bounds(self) -> None:
+        """Refuse functions that write out of range.
+
+        Raises:
+            ValueError: A function does so.
+        """
+        kernels, s, p, action, counters = self._kernels, self._world, self._params, self._action, self._counters
+        self._observe()
+        self._launch(kernels.measure_worlds, s, p, action, self._measured.array)
+        self._check("measure", self._measured, "", f"metrics names {self._metrics}")
+        self._launch(kernels.control_worlds, s, p, action, self._ctrl.array)
+        self._check("control", self._ctrl, "ctrl", f"the model has {self._ctrl.size}")
+        self._check_fields("control")
+        self._launch(kernels.substep_memory, s, p)
+        self._check_fields("substep")
+        self._launch(kernels.advance_memory, s, s, p, action, counters)
+        self._check_fields("advance")
+        masks = [wp.clone(self._no) for _ in range(4)]
+        self._launch(kernels.run_events, self._no, s, p, counters, *masks)
+        self._check_fields("event")
+        self._launch(kernels.start_worlds, self._yes, s, p, counters)
+        self._check_fields("startup")
+        for function, random in (("initialize", False), ("randomize", True)):
+            self._launch(kernels.restart, self._yes, random, False, s, p, counters)
+            self._check_fields(function)
+
+    def check_observations(self) -> None:
+        """Refuse observations that are not written as they are declared.
+
+        Raises:
+            ValueError: A function writes out of range, leaves an element unwritten, or writes not-a-number.
+        """
+        self._observe()
+        for group, rows in self._groups.items():
+            written, bad = rows.written(), np.isnan(rows.array.numpy()[0])
+            if not written.all():
+                places = np.flatnonzero(~written).tolist()
+                raise ValueError(
+                    f"{observer_name(group)} of the task {self._name!r} leaves the places {places} of obs unwritten"
+                )
+            if bad.any():
+                places = np.flatnonzero(bad).tolist()
+                raise ValueError(
+                    f"{observer_name(group)} of the task {self._name!r} writes not-a-number into the places {places} "
+                    "of obs"
+                )
+
+    def _observe(self) -> None:
+        finite = wp.zeros((len(self._groups), 1), dtype=bool, device=self._device)
+        rows = self._observations
+        args = [self._yes, self._world, self._params, self._counters, rows, finite, rows, 1]
+        launch_parts(self._kernels.observe_worlds, 1, 1, args, self._device)
+        for group, found in self._groups.items():
+            self._check(observer_name(group), found, "", f"obs declares {found.size}")
+
+    def _launch(self, kernel: wp.Kernel | None, *args: Any) -> None:
+        if kernel is not None:
+            launch_worlds(kernel, 1, args, self._device)
+
+    def _check_fields(self, function: str) -> None:
+        """Look for writes of a function out of the fields that it may write, and of its random stream."""
+        for name in sorted(self._writes.get(function, ())):
+            owner = "task declares" if name in MEMORIES else "model has"
+            self._check(function, self._fields[name], name, f"the {owner} {self._fields[name].size}")
+        self._check(function, self._streams, "rng", "a stream has 1")
+
+    def _check(self, function: str, rows: RoomyRows, target: str, declared: str) -> None:
+        if not (outside := rows.outside()).size:
+            return
+        last = int(outside[-1]) + 1
+        if last > rows.size:
+            text = f"{last} numbers{target and f' into {target}'}"
+        else:  # Warp counts negative indices from the end
+            text = f"at index {int(outside[0]) - rows.size}{target and f' of {target}'}"
+        raise ValueError(f"{function} of the task {self._name!r} writes {text}, but {declared}")

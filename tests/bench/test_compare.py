@@ -1,0 +1,208 @@
+"""The comparison of two checkouts: with itself there is no difference, and a changed line is found where it counts."""
+
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PROGRAM = ROOT / "bench" / "compare.py"
+
+
+@pytest.fixture(scope="module")
+def compare() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("compare", PROGRAM)
+    assert spec is not None and spec.loader is not None
+    module = sys.modules["compare"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def copied(folder: Path, changes: dict[str, tuple[str, str]]) -> Path:
+    """A copy of the package in which files have another text."""
+    shutil.copytree(ROOT / "lyceum_warp", folder / "lyceum_warp", ignore=shutil.ignore_patterns("__pycache__"))
+    for name, (old, new) in changes.items():
+        file = folder / "lyceum_warp" / name
+        text = file.read_text()
+        assert text.count(old) == 1
+        file.write_text(text.replace(old, new))
+    return folder
+
+
+QUICK: dict[str, Any] = {"engines": ("mujoco",), "parts": ("env",), "steps": 3}
+
+
+@pytest.fixture(scope="module")
+def report(compare: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The report on a copy in which a task ends the process, another one raises an error, and point_mass has another
+    reward."""
+    changes = {
+        "tasks/point_mass.py": ("return 1.0 - distance(s1)", "return 2.0 - distance(s1)"),
+        "tasks/cartpole_swingup.py": ("import warp as wp\n", "import os\nos._exit(3)\n"),
+        "tasks/cartpole.py": ("import warp as wp\n", "raise RuntimeError('broken on purpose')\n"),
+    }
+    folder = tmp_path_factory.mktemp("changed")
+    out = folder / "report.json"
+    options = compare.Options(
+        str(ROOT), str(copied(folder / "copy", changes)), tasks=("cartpole_swingup", "cartpole", "point_mass"), out=out,
+        ignore=("*/masked_step/*",), **QUICK,
+    )  # fmt: skip
+    assert compare.run(options) == 1
+    return json.loads(out.read_text())
+
+
+def test_a_changed_reward_is_reported_with_its_numbers_and_nothing_else(report: dict[str, Any]) -> None:
+    (unit,) = (unit for unit in report["units"] if unit["name"] == "env/point_mass/mujoco")
+    found = {each["name"].removeprefix("env/point_mass/mujoco/"): each for each in unit["differences"]}
+    places = ("steps", "of_states", "after_getters", "restored_step", "masked_rand_reset", "fault", "rollout")
+    assert list(found) == [f"{place}/reward" for place in places]
+    steps = found["steps/reward"]
+    assert steps["first"] == {"step": 0, "world": 0} and (steps["count"], steps["size"]) == (12, 12)
+    assert float(steps["new"]) == pytest.approx(float(steps["old"]) + 1.0, abs=1e-6)
+    assert steps["largest"] == pytest.approx(1.0, abs=1e-6)
+    assert found["fault/reward"]["count"] == 2  # the reward of a transition with a fault is 0
+    old, new = unit["digests"]["steps/reward"]
+    assert old != new
+    old, new = unit["digests"]["steps/state/qpos"]
+    assert old == new
+
+
+@pytest.mark.parametrize(
+    "task, text",
+    [("cartpole", "RuntimeError: broken on purpose"), ("cartpole_swingup", "the process ended with 3")],
+)
+def test_a_failure_of_one_checkout_is_reported(task: str, text: str, report: dict[str, Any]) -> None:
+    (unit,) = (unit for unit in report["units"] if unit["name"] == f"env/{task}/mujoco")
+    (failure,) = unit["differences"]
+    assert (failure["kind"], failure["text"]) == ("failure", f"new failed: {text}")
+
+
+def test_a_working_tree_equals_itself(compare: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    options = compare.Options(str(ROOT), tasks=("point_mass",), **(QUICK | {"parts": ("env", "plans")}))
+    assert compare.run(options) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1].startswith("no difference: ") and " arrays in 2 units" in lines[-1]
+
+
+def test_a_package_that_cannot_be_imported_is_reported(
+    compare: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = copied(tmp_path, {"__init__.py": ("import warp as _wp\n", "raise RuntimeError('no package')\n")})
+    assert compare.run(compare.Options(str(ROOT), str(copy), tasks=("point_mass",), **QUICK)) == 1
+    assert "    package: new failed: RuntimeError: no package" in capsys.readouterr().out.splitlines()
+
+
+def test_a_name_of_neither_folder_nor_revision_is_refused(compare: ModuleType) -> None:
+    with pytest.raises(ValueError, match="'no_such_revision' is neither a folder with lyceum_warp/ nor a revision"):
+        compare.run(compare.Options("no_such_revision", str(ROOT)))
+
+
+# arrays
+
+NAN = np.float32(np.nan)
+OTHER_NAN = np.array([0x7FC00001], np.uint32).view(np.float32)[0]
+
+
+@pytest.mark.parametrize(
+    "old, new, first, largest, count",
+    [
+        ([[1.0, 2.0], [3.0, 4.0]], [[1.0, 2.0], [3.5, 2.0]], {"step": 1, "index": 0}, 2.0, 2),
+        ([[0.0]], [[-0.0]], {"step": 0, "index": 0}, 0.0, 1),
+        ([[NAN]], [[OTHER_NAN]], {"step": 0, "index": 0}, None, 1),
+        ([[1.0]], [[np.nextafter(np.float32(1), np.float32(2))]], {"step": 0, "index": 0}, 2.0**-23, 1),
+    ],
+)
+def test_numbers_differ_in_any_bit(
+    compare: ModuleType, old: list, new: list, first: dict[str, int], largest: float | None, count: int
+) -> None:
+    found = compare.difference("a", np.array(old, np.float32), np.array(new, np.float32), ["step"])
+    assert (found.kind, found.first, found.largest, found.count) == ("numbers", first, largest, count)
+    assert compare.difference("a", np.array(old, np.float32), np.array(old, np.float32)) is None
+
+
+def test_form_and_text_are_compared(compare: ModuleType) -> None:
+    assert compare.difference("a", np.zeros(2), np.zeros(3)).text == "float64 (2,) -> float64 (3,)"
+    assert compare.difference("a", np.zeros(2), np.zeros(2, np.float32)).kind == "form"
+    assert compare.difference("a", np.array("ab"), np.array("abc")).text == "ab -> abc"
+    assert compare.difference("a", np.array("ab"), np.array("ab")) is None
+
+
+def test_names_of_one_checkout_alone_are_added_or_removed(compare: ModuleType) -> None:
+    zero = np.zeros(1)
+    found = compare.differences("u", {"both": zero, "gone": zero}, {"new": zero, "both": zero}, {})
+    assert [(each.name, each.kind) for each in found] == [("u/gone", "removed"), ("u/new", "added")]
+
+
+class Saved:
+    """A side that has computed a run and a resumed one."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def ask(self, unit: dict[str, Any]) -> None:
+        pass
+
+    def answer(self) -> dict[str, Any]:
+        return {"axes": {"whole/return": ["row"]}, "equal": [["whole", "resumed"]]}
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {"whole/return": np.array([1.0, 2.0]), "resumed/return": np.array([1.0, 3.0])}
+
+
+def test_a_resumed_run_that_differs_is_reported_in_both_checkouts(compare: ModuleType) -> None:
+    report = compare.Report(())
+    unit = compare.Unit("commands", "point_mass", "mujoco", {})
+    compare.compare_unit(unit, [Saved("old"), Saved("new")], "cpu", report)
+    found = [(each.name, each.first, each.text.partition(";")[0]) for each in report.found]
+    name = "commands/point_mass/mujoco/return"
+    assert found == [
+        (name, {"row": 1}, "old, whole -> resumed: 2.0 -> 3.0 at row 1"),
+        (name, {"row": 1}, "new, whole -> resumed: 2.0 -> 3.0 at row 1"),
+    ]
+
+
+# the whole program
+
+
+@pytest.mark.long
+def test_every_part_of_a_revision_equals_itself(tmp_path: Path) -> None:
+    if not (ROOT / ".git").exists():
+        pytest.skip("needs the repository")
+    options = ["--tasks", "point_mass", "--iterations", "4", "--steps", "4"]
+    done = subprocess.run(
+        [sys.executable, PROGRAM, "HEAD", "HEAD", *options], capture_output=True, text=True, env=environment(tmp_path)
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_both_processes_and_removes_the_folders(number: signal.Signals, tmp_path: Path) -> None:
+    program = subprocess.Popen(
+        [sys.executable, PROGRAM, str(ROOT), "--tasks", "point_mass"], stdout=subprocess.PIPE, text=True,
+        env=environment(tmp_path),
+    )  # fmt: skip
+    assert program.stdout is not None
+    while "env/point_mass" not in program.stdout.readline():
+        assert program.poll() is None
+    program.send_signal(number)
+    assert program.wait() == 128 + number
+    program.stdout.close()
+    assert not any(tmp_path.iterdir())
+    processes = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
+    assert str(tmp_path) not in processes
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """Variables with which a program keeps its temporary files in a folder."""
+    return os.environ | {"TMPDIR": str(folder)}
