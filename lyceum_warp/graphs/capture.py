@@ -23,6 +23,7 @@ import warp as wp
 
 from lyceum_warp.arrays import part_of_worlds
 from lyceum_warp.graphs.workers import Workers
+from lyceum_warp.support.upstream import runtime_class
 
 Calls = tuple[Callable[[], None], ...]
 """The result of ``Graphs.sequence``: functions to call in order."""
@@ -128,7 +129,7 @@ class _PerThread(threading.local):
 # for that of every thread: loops of other threads would become part of the graph, and their launches would replace the
 # arguments of its own.
 for _name in ("_apic_capture", "_apic_graph"):
-    setattr(wp._src.context.Runtime, _name, _PerThread())
+    setattr(runtime_class(), _name, _PerThread())
 
 
 @contextlib.contextmanager

@@ -7,7 +7,8 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 import mujoco_warp as mjw
-from mujoco_warp._src import forward as upstream
+
+from lyceum_warp.support.upstream import forward_functions
 
 Part = Callable[[mjw.Model, mjw.Data], None]
 """A part of a forward pass, in every world of a data."""
@@ -35,7 +36,7 @@ def forward(model: mjw.Model, data: mjw.Data) -> None:
 def inertia(model: mjw.Model, data: mjw.Data) -> None:
     """Compute the inertia matrix, with the armature of tendons and of the actuators that pull at them."""
     mjw.crb(model, data)
-    upstream.smooth.tendon_armature(model, data)
+    forward_functions()["smooth"].tendon_armature(model, data)
 
 
 @functools.cache
@@ -49,19 +50,20 @@ def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
     them only later: it finds the last forward pass's, of another state, or, after a fault, not-a-number. Here they
     follow the positions, in every stage of a Runge-Kutta step.
     """
-    smooth = types.SimpleNamespace(**vars(upstream.smooth) | {part.__name__: _nothing for part in done})
-    positions = _copy(upstream.fwd_kinematics, smooth=smooth)
+    own = forward_functions()
+    smooth = types.SimpleNamespace(**vars(own["smooth"]) | {part.__name__: _nothing for part in done})
+    positions = _copy(own["fwd_kinematics"], smooth=smooth)
 
     def fwd_kinematics(model: mjw.Model, data: mjw.Data) -> None:
         positions(model, data)
         if model.eq_connect_adr.size or model.eq_wld_adr.size:
             mjw.com_vel(model, data)
 
-    fwd_position = _copy(upstream.fwd_position, fwd_kinematics=fwd_kinematics)
-    whole = _copy(upstream._forward, fwd_position=fwd_position)
-    forward = _copy(upstream.forward, _forward=whole)
+    fwd_position = _copy(own["fwd_position"], fwd_kinematics=fwd_kinematics)
+    whole = _copy(own["_forward"], fwd_position=fwd_position)
+    forward = _copy(own["forward"], _forward=whole)
     stage = _without(frozenset())["_forward"] if done else whole
-    step = _copy(upstream.step, forward=forward, rungekutta4=_copy(upstream.rungekutta4, _forward=stage))
+    step = _copy(own["step"], forward=forward, rungekutta4=_copy(own["rungekutta4"], _forward=stage))
     return {"_forward": whole, "forward": forward, "step": step}
 
 
