@@ -1,7 +1,8 @@
 """Algorithms that learn and plan, and the parts that they are made of.
 
-``npg.py``, ``ppo.py`` and ``planner.py`` each hold one algorithm, in the order of its mathematics. None touches the arrays
-behind an environment: NPG and PPO use ``Env``, and the planner also uses ``OpenLoop``, to whose phases it adds its own.
+``npg.py``, ``ppo.py`` and ``planner.py`` each hold one algorithm, in the order of its mathematics. None touches the
+arrays behind an environment: NPG and PPO use ``Env``; the planner also uses ``OpenLoop``, to whose phases it adds its
+own.
 
 What learners share: ``learner`` (what training needs of them), ``rollout_buffer`` (samples), ``policy``, ``value`` and
 ``networks`` (the functions that are learned), ``policy_check`` (checks of given ones), ``evaluation`` (the mean policy

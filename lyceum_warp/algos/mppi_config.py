@@ -92,7 +92,7 @@ class MPPIConfig:
         for name, words in _WORDS.items():
             _one_of(name, getattr(self, name), words)
         if not isinstance(self.update, PlanUpdate):
-            _one_of("update", self.update, UPDATES, ", or an object of a subclass of lw.PlanUpdate")
+            _one_of("update", self.update, _UPDATES, ", or an object of a subclass of lw.PlanUpdate")
         if not isinstance(self.nominal_model, bool):
             raise ValueError(f"nominal_model must be True or False, not {self.nominal_model!r}")
         if self.include_plan is not None and not isinstance(self.include_plan, bool):
@@ -188,7 +188,7 @@ class MPPIConfig:
         return np.clip(np.broadcast_to(fill, space.size), space.low, space.high)
 
 
-UPDATES = ("mppi", "cem", "predictive_sampling")
+_UPDATES = ("mppi", "cem", "predictive_sampling")
 """The names of the updates."""
 
 _WORDS = {

@@ -14,9 +14,16 @@ def builtin_functions() -> Mapping[str, Any]:
     return functions
 
 
+# the C engine does without MuJoCo Warp: its modules are loaded when they are used
+
+
+def forward_functions() -> Mapping[str, Any]:
+    """MuJoCo Warp's functions of a forward pass and a step by name, and the modules that they use."""
+    return vars(importlib.import_module("mujoco_warp._src.forward"))
+
+
 def has_sdf_functions() -> bool:
     """Whether a distance function of SDF plugins was registered with MuJoCo Warp, whose own one only fails."""
-    # the C engine does without MuJoCo Warp: the module is loaded where it is used
     collision_sdf = importlib.import_module("mujoco_warp._src.collision_sdf")
     return bool(collision_sdf.user_sdf.func.__module__ != collision_sdf.__name__)
 

@@ -10,7 +10,7 @@ import warp as wp
 
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
-from lyceum_warp.engines.warp import forward_parts
+from lyceum_warp.engines.warp import forward
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import Stage, describe, early_sensor_columns, state_columns
 
@@ -305,7 +305,7 @@ def test_restarts_in_a_graph_equal_those_outside(sensors: str = "cheap") -> None
 
 
 def test_fields_take_the_parts_that_compute_them() -> None:
-    parts, cheap = forward_parts.forward_parts, model_of(CHEAP)
+    parts, cheap = forward.forward_parts, model_of(CHEAP)
     assert parts(cheap, []) == ()
     assert parts(cheap, ["site_xpos"]) == (mjw.kinematics,)
     assert parts(cheap, ["cam_xpos"]) == (mjw.kinematics, mjw.com_pos, mjw.camlight)

@@ -8,7 +8,7 @@ from checks import check_formula, positions
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-from lyceum_warp.engines.warp.contact_sizes import probe_sizes
+from lyceum_warp.engines.warp.sizes import probe_sizes
 
 OPEN, CLOSED = -1.0, 0.7
 LOW = -1.0  # the gripper around the ball on the floor

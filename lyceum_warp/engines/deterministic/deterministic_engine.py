@@ -13,7 +13,7 @@ import warp as wp
 from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
 from lyceum_warp.engines.deterministic.sort_memory import LARGEST_BUFFER, Scratch, ScratchSizes
 from lyceum_warp.engines.memory import check_fit
-from lyceum_warp.engines.warp import substep
+from lyceum_warp.engines.warp import forward
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import Field
 from lyceum_warp.graphs.capture import capturing
@@ -92,9 +92,9 @@ class DeterministicEngine(WarpEngine):
         model, data, scratch = self._put_model(), self._make_data(nworld), Scratch(self.device)
         with wp.ScopedDevice(self.device), scratch.serving():
             CanonicalOrder(model, data, scratch.open)
-            substep.step(model, data)
+            forward.step(model, data)
             with capturing(), wp.ScopedCapture(self.device):
-                substep.step(model, data)
+                forward.step(model, data)
         return scratch
 
     def _put_model(self) -> mjw.Model:

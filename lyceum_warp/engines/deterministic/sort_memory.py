@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import warp as wp
 
-from lyceum_warp.engines.warp.memory_reserve import Reserve, aligned
+from lyceum_warp.engines.warp.group import Reserve, aligned
 
 LARGEST_BUFFER = 2**31 - 1
 """Bytes of the largest array of bytes that Warp makes: an axis may be no longer."""

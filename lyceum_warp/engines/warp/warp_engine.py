@@ -11,16 +11,19 @@ import warp as wp
 
 from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.engines.warp import overflow, substep
-from lyceum_warp.engines.warp.contact_sizes import probe_sizes, warn_of_little_room, warn_of_unknown_sizes
-from lyceum_warp.engines.warp.data_memory import data_bytes
-from lyceum_warp.engines.warp.forward_parts import forward_parts
-from lyceum_warp.engines.warp.group_turns import group_size
-from lyceum_warp.engines.warp.model_constants import ModelConstants
-from lyceum_warp.engines.warp.model_rows import ModelRows, constants_of, outputs_of, owner, put_varied_model
-from lyceum_warp.engines.warp.partial_forward import Conditional, PartialForward
-from lyceum_warp.engines.warp.static_geoms import StaticGeoms
-from lyceum_warp.engines.warp.substep import Part
+from lyceum_warp.engines.warp import forward, sizes
+from lyceum_warp.engines.warp.forward import Part, PartialForward, forward_parts
+from lyceum_warp.engines.warp.group import Conditional, group_size
+from lyceum_warp.engines.warp.sizes import data_bytes, probe_sizes, warn_of_little_room, warn_of_unknown_sizes
+from lyceum_warp.engines.warp.varied_model import (
+    ModelConstants,
+    ModelRows,
+    StaticGeoms,
+    constants_of,
+    outputs_of,
+    owner,
+    put_varied_model,
+)
 from lyceum_warp.fields import Field, Stage, early_sensor_columns
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_columns, copy_rows, fill_rows, narrow, widen, zero_columns
@@ -43,7 +46,7 @@ class WarpEngine(Engine):
         device: A CUDA device, or the CPU (single-threaded: for tests).
         fields: The fields to keep.
         dynamics: The model fields that differ between worlds; the arrays are MuJoCo Warp's own. Room for
-            contacts and constraints is probed on the model's own values; see ``contact_sizes.probe_sizes``.
+            contacts and constraints is probed on the model's own values; see ``sizes.probe_sizes``.
         initial: The state that ``reset`` puts worlds into, rounded to float32; None for the model's own.
         nconmax: Contacts that each world has room for, on average. None probes the model, and gives all worlds
             together additional room for a single one in which everything touches.
@@ -113,7 +116,7 @@ class WarpEngine(Engine):
         # a step goes on from the parts that were computed for its state, whether a world stepped there or restarted
         moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
         current_parts = () if moved else self._current_parts or ()
-        self._shared = tuple(part for part in current_parts if part in substep.POSITION)
+        self._shared = tuple(part for part in current_parts if part in forward.POSITION)
         # A geom at a place that is not-a-number has contacts with every element of a flex. Their rows of the Jacobian
         # would outlast a reset, because the solver multiplies unused rows by zero: a reset clears them.
         self._jacobian = flat(self.d.efc.J if model.nflex else wp.zeros((nworld, 0), dtype=float, device=device))
@@ -197,7 +200,7 @@ class WarpEngine(Engine):
     def step(self, nstep: int) -> None:
         with self._on_device():
             for i in range(nstep):
-                substep.step(self.m, self.d, self._shared if i == 0 else ())
+                forward.step(self.m, self.d, self._shared if i == 0 else ())
         self._copy_snapshots(self._everyone, self.snapshots)
         self.refresh_current(self._everyone)
 
@@ -215,7 +218,7 @@ class WarpEngine(Engine):
                 for part in parts:
                     part(m, d)
             elif stage == Stage.ACCELERATION:
-                substep.forward(m, d)
+                forward.forward(m, d)
             else:
                 # sensors of limits and contacts are written only where there is one; the others stay as they are
                 wp.launch(zero_columns, (d.nworld, len(self._columns)), [self._columns, d.sensordata])
@@ -260,7 +263,7 @@ class WarpEngine(Engine):
         with self._on_device():
             mjw.get_state(self.m, self.d, states, _SPEC)
             for _ in range(nstep):
-                substep.step(self.m, self.d)
+                forward.step(self.m, self.d)
             mjw.get_state(self.m, self.d, states, _SPEC, mask)
             launch_rows(copy_rows, mask, wp.zeros((self.nworld, 1), dtype=float, device=self.device), states[:, :1])
             mjw.set_state(self.m, self.d, states, _SPEC)
@@ -270,7 +273,7 @@ class WarpEngine(Engine):
 
     def find_faults(self, mask: wp.array) -> None:
         d = self.d
-        bits = [overflow.CONTACT_BITS, overflow.CONSTRAINT_BITS, overflow.IGNORED_BITS]
+        bits = [sizes.CONTACT_BITS, sizes.CONSTRAINT_BITS, sizes.IGNORED_BITS]
         args = [mask, d.qpos, d.qvel, d.act, d.overflow, *bits, self.fault]
         wp.launch(faults.faults_of_fields, self.nworld, args, device=self.device)
 
@@ -314,7 +317,7 @@ class WarpEngine(Engine):
             self._forward(self._reset_parts, self.reset_stage)
         self._copy_snapshots(mask, [field for field in self.snapshots if field.reset > Stage.NONE])
         if self._reset_parts is None:
-            overflow.report_pool_overflow(self.d, mask)
+            sizes.report_pool_overflow(self.d, mask)
 
     def _is_partial(self) -> bool:
         """Whether a group of worlds can be stepped alone."""

@@ -1,10 +1,12 @@
-"""Choose the number of contacts and constraints that worlds have room for, and warn where it is too small."""
+"""Find the sizes of MuJoCo Warp's data, the memory that it takes, and the overflows of what it has room for."""
 
 import contextlib
 import copy
+import dataclasses
 import hashlib
 import logging
 from collections.abc import Collection, Iterable, Mapping
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -12,6 +14,7 @@ import numpy as np
 import warp as wp
 from mujoco.batch import Batch, SimulationError
 
+from lyceum_warp.kernels import faults
 from lyceum_warp.model_fields import ModelField
 
 log = logging.getLogger(__name__)
@@ -168,3 +171,63 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     sizes = tuple(max(low, -(-2 * peak // 8) * 8) for low, peak in zip(least, (contacts, constraints), strict=True))
     log.info("probed peaks of %d contacts and %d constraints: nconmax=%d, njmax=%d", contacts, constraints, *sizes)
     return sizes[0], sizes[1]
+
+
+_TEMPORARIES = 1.25
+"""Ratio of a world's memory to that of MuJoCo Warp's data. The temporary arrays of a step were measured at 1 to 9 % of
+it; the rest is for graphs and for the group of a partial forward pass. Graphs on the CPU, where this engine is for
+tests, keep all temporary arrays and take up to three times as much."""
+
+_TEMPORARIES_CONVEX = 3.5
+"""The same with convex collisions or the noslip solver: on adroit_pen the temporary arrays take 1.5 to 2.4 times the
+memory of the data."""
+
+_CONVEX = {mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_MESH,
+           mujoco.mjtGeom.mjGEOM_HFIELD}  # fmt: skip
+
+
+def data_bytes(model: mujoco.MjModel, nconmax: int, njmax: int) -> int:
+    """Bytes of each world's data, temporary arrays included, for so many contacts and constraints in each world."""
+    sizes = []
+    for nworld in (1, 2):
+        with wp.ScopedDevice("cpu"):
+            data = mjw.make_data(model, nworld=nworld, naconmax=nworld * nconmax, njmax=njmax)
+        sizes.append(_bytes_of(data))
+    return int(_margin(model) * (sizes[1] - sizes[0]))
+
+
+def _bytes_of(data: Any) -> int:
+    """Bytes of all arrays in a data class and in those within it."""
+    total = 0
+    for field in dataclasses.fields(data):
+        value = getattr(data, field.name)
+        if isinstance(value, wp.array):
+            total += value.size * wp.types.type_size_in_bytes(value.dtype)
+        elif dataclasses.is_dataclass(value):
+            total += _bytes_of(value)
+    return total
+
+
+def _margin(model: mujoco.MjModel) -> float:
+    """Ratio of a world's memory to that of its data; larger with convex collisions or the noslip solver."""
+    collides = (model.geom_contype | model.geom_conaffinity) != 0
+    kinds = [int(kind) for kind in model.geom_type[collides]]
+    convex = not _CONVEX.isdisjoint(kinds) or kinds.count(int(mujoco.mjtGeom.mjGEOM_BOX)) > 1
+    return _TEMPORARIES_CONVEX if convex or model.opt.noslip_iterations > 0 else _TEMPORARIES
+
+
+_BITS = mjw.OverflowType
+
+CONTACT_BITS = int(_BITS.BROADPHASE | _BITS.NARROWPHASE)
+CONSTRAINT_BITS = int(_BITS.NEFC | _BITS.NJMAX_NNZ | _BITS.NVMAX)
+IGNORED_BITS = int(_BITS.ITERATIONS | _BITS.LS_ITERATIONS)
+"""A solver that reached its limit of iterations still has an answer."""
+
+
+def report_pool_overflow(data: mjw.Data, mask: wp.array) -> None:
+    """Set the masked worlds' bit of an overflow where a forward pass found no room for contacts.
+
+    ``mujoco_warp.step`` sets it; ``mujoco_warp.forward`` does not.
+    """
+    pool = [data.ncollision, data.nacon, data.naconmax, int(_BITS.NARROWPHASE)]
+    wp.launch(faults.pool_overflow, data.nworld, [mask, *pool, data.overflow], device=mask.device)

@@ -1,4 +1,4 @@
-"""Work on a few worlds of many: the masked ones pass through a small group, in as many turns as it takes."""
+"""Move masked worlds through a small group of worlds, in turns, with memory that graphs may use."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -6,8 +6,41 @@ from collections.abc import Callable, Iterator
 import warp as wp
 
 from lyceum_warp.arrays import flat
-from lyceum_warp.engines.warp import partial_kernels as kernels
-from lyceum_warp.engines.warp.memory_reserve import Reserve, aligned
+from lyceum_warp.engines.warp import warp_kernels as kernels
+
+_ALIGNED = 512
+
+
+class Reserve:
+    """Blocks of memory on a device, with that part of Warp's protocol for allocators which frees memory.
+
+    Blocks stay allocated as long as the reserve, because graphs hold their addresses.
+
+    Args:
+        device: The device.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        self.device = device
+        self.below = device.get_allocator()
+        """The device's allocator, for the blocks and for all memory that is not reserved."""
+        self.blocks: list[wp.array] = []
+
+    def add_block(self, size: int) -> None:
+        """Allocate a block of at least so many bytes."""
+        rows = aligned(max(size, 1)) // _ALIGNED  # an axis may be no longer than 2**31
+        with wp.ScopedAllocator(self.device, self.below):
+            self.blocks.append(wp.empty((rows, _ALIGNED), dtype=wp.uint8, device=self.device))
+
+    def deallocate(self, ptr: int, size_in_bytes: int) -> None:
+        """Free an address, unless it lies in a block."""
+        if not any(block.ptr <= ptr < block.ptr + block.size for block in self.blocks):
+            self.below.deallocate(ptr, size_in_bytes)
+
+
+def aligned(size: int) -> int:
+    """A number of bytes, rounded up to a multiple of the alignment of addresses."""
+    return -(-size // _ALIGNED) * _ALIGNED
 
 
 def group_size(nworld: int, device: wp.Device) -> int:
@@ -127,3 +160,48 @@ class Arena(Reserve):
         if not self.blocks or self._used > self.blocks[-1].size:
             raise RuntimeError("a graph needs more memory than is reserved: call the function once before its capture")
         return int(self.blocks[-1].ptr) + start
+
+
+class Conditional:
+    """Runs launches if a mask holds a world, and costs next to nothing in a graph if it holds none.
+
+    Outside a graph it always runs them, without a look at the mask, which may still be in the making.
+
+    Args:
+        device: Where the launches run.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        self._device = device
+        self._any = wp.zeros(1, dtype=int, device=device)
+        self._arena = None if device.is_cpu else Arena(device)
+        self._inside = False
+
+    def __call__(self, mask: wp.array, run: Callable[[], None]) -> None:
+        """Run launches for the masked worlds, (nworld,) bool, which may not matter to any other world.
+
+        Within such launches, others run unconditionally.
+        """
+        if self._inside:
+            run()
+            return
+        self._inside = True
+        try:
+            with wp.ScopedDevice(self._device):
+                if not self._device.is_capturing:
+                    with self._reserved(capturing=False):
+                        run()
+                    return
+                self._any.zero_()
+                wp.launch(kernels.find_any, len(mask), [mask, self._any])
+                with self._reserved(capturing=True):
+                    wp.capture_if(self._any, on_true=run)
+        finally:
+            self._inside = False
+
+    def _reserved(self, *, capturing: bool) -> contextlib.AbstractContextManager[object]:
+        """Memory for temporary arrays: within a conditional part of a CUDA graph nothing may be allocated."""
+        if self._arena is None:
+            return contextlib.nullcontext()
+        self._arena.open()
+        return self._arena.serving() if capturing else self._arena.counting()

@@ -5,7 +5,7 @@ import pytest
 from conftest import TaskFile
 
 import lyceum_warp as lw
-from lyceum_warp.engines.warp.contact_sizes import probe_sizes
+from lyceum_warp.engines.warp.sizes import probe_sizes
 
 WELDS = "".join(f'<weld body1="b{i}" active="false"/>' for i in range(8))
 BALLS = "".join(f'<body name="b{i}" pos="{i} 0 1"><freejoint/><geom size=".1"/></body>' for i in range(8))
