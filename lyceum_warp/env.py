@@ -183,13 +183,14 @@ class Env:
             if self.engine.capturable and options.graphs:
                 self.engine.prepare_capture()
             self.engine.reset(worlds.everyone)
-            self.task.probe(
-                worlds.after, worlds.params, self.device
-            ).check_bounds()  # before a function writes into an array
+            probe = self.task.probe(worlds.after, worlds.params, self.device)
+            probe.check_bounds()  # before a function writes into an array
             self.rand_reset(options.seed)
             if self.task.dynamics and not _replica:  # later, and in a replica, a bad draw is a fault of its world
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
-            self.task.probe(worlds.after, worlds.params, self.device).check_observations()
+            probe.check_observations()
+            if not _replica:
+                self.engine.check_room()
         except Exception as error:
             if (explained := self.task.explained(error)) is error:
                 raise

@@ -14,7 +14,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.graphs.capture import Calls, Phase
 from lyceum_warp.kernels import planning, state
 from lyceum_warp.task import MEMORIES
-from lyceum_warp.validate import whole_number
+from lyceum_warp.validate import check_flag, check_kind, whole_number
 from lyceum_warp.worlds import own_parts
 
 
@@ -66,6 +66,10 @@ class OpenLoop:
         self, env: Env, horizon: int, *, keys: wp.array | None = None, nominal_model: bool = False,
         models: Mapping[str, wp.array] | None = None, states: int = 1,
     ) -> None:  # fmt: skip
+        check_kind("env of OpenLoop", env, Env, "as lw.make(..., autoreset=False) makes it")
+        check_kind("keys", keys, wp.array | None, "one random key for each world")
+        check_kind("models", models, Mapping | None, "arrays by the names of model fields")
+        check_flag("nominal_model", nominal_model)
         if env.autoreset:
             raise ValueError("open-loop rollouts need worlds that do not reset: make(..., autoreset=False)")
         self.env, self.worlds = env, env.worlds

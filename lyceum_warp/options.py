@@ -15,7 +15,7 @@ import mujoco
 
 from lyceum_warp.docstrings import attribute_docs, document_attributes, listed
 from lyceum_warp.model_files import ModelFile
-from lyceum_warp.validate import check_kind, whole_number
+from lyceum_warp.validate import check_flag, check_kind, described, whole_number
 
 ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
 """Where a model comes from: a file, or an MjSpec."""
@@ -48,8 +48,7 @@ def _whole(options: Any, name: str, low: int) -> None:
 
 def _flags(options: Any, *names: str) -> None:
     for name in names:
-        if not isinstance(value := getattr(options, name), bool):
-            raise ValueError(f"{name} must be True or False, not {value!r}")
+        check_flag(name, getattr(options, name))
 
 
 def _one_of(what: str, name: Any, known: Mapping[str, Any]) -> None:
@@ -159,6 +158,8 @@ class EnvOptions:
         for name, low in (("nworld", 1), ("nthread", 0), ("seed", 0), ("first_world", 0), ("horizon", 0)):
             _whole(self, name, low)
         check_kind("device", self.device, str | None, "as 'cpu' or 'cuda:0'")
+        if not isinstance(self.engine, str) and not callable(self.engine):
+            raise ValueError(f"engine must be 'auto', 'mujoco', 'warp' or a callable, not {described(self.engine)}")
         if self.model is not None and not isinstance(self.model, mujoco.MjModel):  # which has an error of its own
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         check_kind("physics", self.physics, PhysicsOptions, "as lw.PhysicsOptions(cone='elliptic')")

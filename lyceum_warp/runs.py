@@ -24,6 +24,7 @@ from lyceum_warp.checkpoints import (
 )
 from lyceum_warp.files import replaced
 from lyceum_warp.metrics_table import append_row, cut_rows, read_metrics
+from lyceum_warp.validate import check_kind
 from lyceum_warp.versions import versions
 
 _CONFIG, _VERSIONS, _METRICS, _CHECKPOINT = "config.json", "versions.json", "metrics.csv", "checkpoint.pt"
@@ -360,6 +361,7 @@ def load(
         ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release; or the
             policy in it is of a class of its own and ``policy`` is not given, or does not fit.
     """
+    check_kind("policy", policy, GaussianPolicy | None, "as lw.GaussianPolicy(nobs, nact, network=...)")
     content, path = _content(run, which, device)
     return policy_of(content, path, policy).to(device).eval().requires_grad_(False)
 
@@ -385,6 +387,13 @@ def load_value(
 
 def _content(run: str | Path | Run, which: str | int, device: str | torch.device) -> tuple[PolicyContent, Path]:
     """A saved policy and its file."""
+    check_kind("run", run, str | Path | Run, "a run's folder")
+    check_kind("which", which, str | int, "as 'last', 'best' or 100")
+    check_kind("device", device, str | torch.device, "as 'cpu' or 'cuda:0'")
+    try:
+        torch.device(device)
+    except RuntimeError as error:
+        raise ValueError(f"there is no device {device!r}: use one as 'cpu' or 'cuda:0'") from error
     if isinstance(run, (str, Path)) and Path(run).is_file():
         if which != "last":
             raise ValueError(f"{run} is a file with one policy: give the run's folder to choose {which!r}")

@@ -45,6 +45,15 @@ class Space:
         """(size,), or () for a scalar."""
         return (self.size,) if self.parts else ()
 
+    @property
+    def columns(self) -> list[str]:
+        """Names of the numbers: the part's name, or ``name[i]`` in a part of several numbers."""
+        return [
+            name if part.stop - part.start == 1 else f"{name}[{i}]"
+            for name, part in self.parts.items()
+            for i in range(part.stop - part.start)
+        ]
+
     def split(self, values: torch.Tensor) -> dict[str, torch.Tensor]:
         """Views of the parts of (..., size) values, by name."""
         return {name: values[..., part] for name, part in self.parts.items()}

@@ -19,7 +19,7 @@ from lyceum_warp.keeper import Keeper, NotSavedError
 from lyceum_warp.kept_task import KeptTask, given_params, note_changes
 from lyceum_warp.runs import Run
 from lyceum_warp.tensorboard import TensorBoard, check_tensorboard
-from lyceum_warp.validate import whole_number
+from lyceum_warp.validate import check_flag, check_function, check_kind, whole_number
 from lyceum_warp.viz.cameras import CameraChoice, find_camera
 from lyceum_warp.viz.policy_videos import Videos
 from lyceum_warp.viz.video import check_video
@@ -84,6 +84,11 @@ def train(
             algorithms say when they raise it.
         Interrupted: One of several processes received a signal.
     """
+    check_kind("learner", learner, Learner, "as lw.NPG(env)")
+    check_kind("folder", folder, str | Path, "as 'runs/mine'")
+    check_function("callback", callback)
+    check_flag("resume", resume)
+    check_flag("tensorboard", tensorboard)
     iterations = whole_number("iterations", iterations, low=1)
     settings = checked_settings(target_return=target_return, keep_every=keep_every, save_every=save_every)
     team, folder = learner.team, Path(folder)

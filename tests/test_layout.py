@@ -39,6 +39,9 @@ LEVELS = {
 TESTED_BY = {"done": "test_faults.py", "forks": "test_env.py", "testing": "conformance", "versions": "test_runs.py"}
 """Tests of rooms that have none of their own name."""
 
+ACROSS = {"browser", "conformance", "fuzz", "gpu", "oracles", "stories"}
+"""Folders of tests that belong to no single room."""
+
 NAMEDTUPLE = {"_fields", "_asdict", "_replace", "_make"}
 """Public in spite of their names."""
 
@@ -241,6 +244,14 @@ def test_warp_is_quiet_in_whatever_order_a_task_file_imports(first: str) -> None
 def test_every_room_has_tests_of_its_name(own: str) -> None:
     places = [TESTS / TESTED_BY[own]] if own in TESTED_BY else [TESTS / own, TESTS / f"test_{own}.py"]
     assert any(place.exists() for place in places), f"no tests of {own}: none of {', '.join(map(str, places))}"
+
+
+def test_every_folder_of_tests_belongs_to_a_room_or_goes_across_rooms() -> None:
+    folders = {path.parent.relative_to(TESTS).as_posix() for path in TESTS.rglob("test_*.py")} - {"."}
+    rooms = {room(name) for name in MODULES}
+    assert folders <= rooms | ACROSS | {"bench"}
+    described = (TESTS.parent / "docs" / "architecture.md").read_text()
+    assert all(f"`tests/{name}/`" in described for name in ("conformance", "fuzz", "oracles", "stories"))
 
 
 def test_names_of_test_files_are_unique() -> None:

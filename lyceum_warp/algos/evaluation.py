@@ -10,7 +10,7 @@ from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
-from lyceum_warp.validate import whole_number
+from lyceum_warp.validate import check_function, check_kind, described, whole_number
 
 MEAN_SEED = 2**31 - 1
 """Seed of the initial states from which NPG evaluates the mean policy."""
@@ -74,6 +74,11 @@ def evaluate(
     Raises:
         ValueError: The task has no horizon, or the environment was made with ``autoreset=False``.
     """
+    check_kind("env of evaluate", env, Env, "as lw.make(...) makes it")
+    if not callable(policy):
+        raise ValueError(f"policy must be a function of observations, not {described(policy)}")
+    episodes = whole_number("episodes", episodes, low=1)
+    check_function("progress", progress)
     if env.horizon == 0:
         raise ValueError(f"episodes of {env.task.name!r} never end without a horizon: give make() a horizon")
     if not env.autoreset:

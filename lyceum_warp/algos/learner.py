@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.policy import GaussianPolicy
@@ -82,6 +82,7 @@ class LearnerConfig(Protocol):
         """Iterations between two evaluations of the mean policy; 0 for never."""
 
 
+@runtime_checkable
 class Learner(Protocol):
     """A learning algorithm: each ``next`` makes an iteration, after which its state can be saved.
 

@@ -4,13 +4,14 @@ import copy
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Literal, TypeAlias, TypeVar, get_args
+from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
 import torch
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.env import Env
+from lyceum_warp.validate import check_flag, check_kind, described
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -33,6 +34,18 @@ def check_activation(activation: object, name: str = "activation") -> Activation
         if activation == known:
             return known
     raise ValueError(f"{name} must be one of {', '.join(map(repr, get_args(Activation)))}, not {activation!r}")
+
+
+def check_network(normalize: Any, limit: Any, generator: Any) -> None:
+    """Check the arguments that policies and value functions share.
+
+    Raises:
+        ValueError: One is of another type or out of range.
+    """
+    check_flag("normalize", normalize)
+    if not isinstance(limit, (int, float)) or not limit > 0:
+        raise ValueError(f"limit must be a positive number, or inf for none, not {described(limit)}")
+    check_kind("generator", generator, torch.Generator | None, "as torch.Generator()")
 
 
 def mlp(

@@ -42,7 +42,7 @@ from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import returns
-from lyceum_warp.validate import check_kind
+from lyceum_warp.validate import check_kind, whole_number
 
 log = logging.getLogger(__name__)
 
@@ -114,6 +114,8 @@ class NPG:
     ) -> None:
         check_kind("env of NPG", env, Env, "as lw.make(...) makes it")
         check_kind("config of NPG", config, NPGConfig | None, "as lw.NPGConfig(samples=10000)")
+        check_kind("team of NPG", team, Team | None, "as lyceum_warp.algos.distributed.Team() makes it")
+        seed = whole_number("seed", seed, low=0)
         check_kind("value of NPG", value, ValueFunction | None, "as lw.load_value(run) returns it")
         if value is not None:
             _check_value(value, env)

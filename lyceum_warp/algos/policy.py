@@ -8,9 +8,9 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.networks import LIMIT, Activation, Normalizer, mlp
+from lyceum_warp.algos.networks import LIMIT, Activation, Normalizer, check_network, mlp
 from lyceum_warp.docstrings import document_attributes
-from lyceum_warp.validate import described, layer_sizes
+from lyceum_warp.validate import described, finite_number, layer_sizes, whole_number
 
 
 @document_attributes
@@ -56,7 +56,9 @@ class GaussianPolicy(nn.Module):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
+        nobs, nact = whole_number("nobs", nobs, low=1), whole_number("nact", nact, low=1)
         self.nobs, self.nact = nobs, nact
+        check_network(normalize, limit, generator)
         self.normalizer: nn.Module = Normalizer(nobs, limit) if normalize else nn.Identity()
         self.shape = {"nobs": nobs, "nact": nact, "normalize": normalize}
         if limit != LIMIT:  # which files of earlier releases do not name
@@ -72,7 +74,7 @@ class GaussianPolicy(nn.Module):
         if type(self) is not GaussianPolicy:
             self.shape["own"] = _class_name(self)
         self.network = network
-        self.log_std = nn.Parameter(torch.full((nact,), float(log_std)))
+        self.log_std = nn.Parameter(torch.full((nact,), finite_number("log_std", log_std)))
 
     @staticmethod
     def like(shape: Mapping[str, Any]) -> "GaussianPolicy":

@@ -11,9 +11,11 @@ from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.arrays import torch_view
 from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.capture import Graphs, Phase
 from lyceum_warp.kernels import collect
+from lyceum_warp.validate import check_flag, check_kind, whole_number
 
 _LARGE = 1e18
 """Observations beyond it have squares that float32 cannot hold."""
@@ -70,7 +72,11 @@ class Rollout:
     """Faults of each world within these steps, (nworld,) int32."""
 
     def __init__(self, env: Env, steps: int, *, groups: Collection[str] = (), first_only: bool = False) -> None:
-        if unknown := [group for group in groups if group not in env.obs_groups]:
+        check_kind("env of Rollout", env, Env, "as lw.make(...) makes it")
+        check_kind("groups", groups, Collection, "as in groups=['critic']")
+        check_flag("first_only", first_only)
+        steps = whole_number("steps", steps, low=1)
+        if unknown := [group for group in groups if group not in [*env.obs_groups]]:
             raise ValueError(
                 f"the task {env.task.name!r} has no group {unknown[0]!r} of observations: it has {list(env.obs_groups)}"
             )
@@ -78,6 +84,8 @@ class Rollout:
         self.steps = steps
         self._first_only = first_only
         n, nobs, nact = env.nworld, env.obs_space.size, env.action_space.size
+        numbers = len(collect.RolloutArrays.vars) + 2 * nobs + nact  # type: ignore[attr-defined]
+        check_fit(4 * steps * numbers, n, env.device, model=f"{steps} steps")
         last = {"obs": (nobs,), "final_obs": (nobs,), "action": (nact,)}
         flags = {"terminated", "done", "success"}
         self._arrays = collect.RolloutArrays()

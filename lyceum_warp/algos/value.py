@@ -7,9 +7,9 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.networks import LIMIT, Activation, Normalizer, mlp
+from lyceum_warp.algos.networks import LIMIT, Activation, Normalizer, check_network, mlp
 from lyceum_warp.docstrings import document_attributes
-from lyceum_warp.validate import layer_sizes
+from lyceum_warp.validate import check_kind, finite_number, layer_sizes, whole_number
 
 
 @document_attributes
@@ -62,7 +62,12 @@ class ValueFunction(nn.Module):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        self.discount, self.group = discount, group
+        nobs, time_orders = whole_number("nobs", nobs, low=1), whole_number("time_orders", time_orders, low=0)
+        scale = finite_number("scale", scale)
+        check_network(normalize, limit, generator)
+        check_kind("group", group, str, "as 'policy'")
+        self.discount = None if discount is None else finite_number("discount", discount, low=0.0, high=1.0)
+        self.group = group
         self._shape = {
             "nobs": nobs, "hidden": layer_sizes(hidden), "activation": activation, "scale": scale,
             "time_orders": time_orders, "normalize": normalize, "group": group,

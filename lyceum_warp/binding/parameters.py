@@ -214,11 +214,12 @@ class Parameters:
 def _loaded(what: str, path: str | Path) -> np.ndarray:
     """The array in a file that ``numpy.save`` wrote."""
     try:
-        loaded: np.ndarray = np.load(path, allow_pickle=False)
+        # mapped, because a broken header may ask for any amount of memory
+        loaded: np.ndarray = np.load(path, allow_pickle=False, mmap_mode="r")
     except FileNotFoundError:
         raise FileNotFoundError(f"{what}: there is no such file") from None
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # of many types, from numpy and tokenize
         raise ValueError(f"{what} cannot be read: {error}") from error
     if not isinstance(loaded, np.ndarray):
         raise ValueError(f"{what} must be a single array, a .npy file of numpy.save")
-    return loaded
+    return np.array(loaded)

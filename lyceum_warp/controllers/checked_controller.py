@@ -38,7 +38,7 @@ class CheckedController:
                 "control the worlds of an environment, as env.step(plan(env.get_state()))"
             )
         self._controller: Any = controller
-        self._names = list(env.action_space.parts)
+        self._names = env.action_space.columns
         timestep = getattr(controller, "timestep", env.timestep)
         self._ratio = env.timestep / positive_number("the timestep of a controller", timestep, "seconds")
         self._takes_shift = _takes_argument(controller, "shift")

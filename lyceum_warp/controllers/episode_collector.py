@@ -10,7 +10,7 @@ from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.controllers.trajectory import Trajectory, provenance
 from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
-from lyceum_warp.validate import whole_number
+from lyceum_warp.validate import check_flag, check_function, check_kind, whole_number
 
 
 @document_attributes
@@ -49,6 +49,18 @@ class TimedPlan:
     begun: float  # by the clock of the run
     seconds: float
     actions: torch.Tensor  # (horizon, nact)
+
+
+def check_plant(env: Env, *, reset: bool, on_step: OnStep | None, on_abort: OnAbort | None) -> None:
+    """Check the arguments that both loops share.
+
+    Raises:
+        ValueError: One is of another type.
+    """
+    check_kind("env", env, Env, "as lw.make(..., autoreset=False) makes it")
+    check_flag("reset", reset)
+    check_function("on_step", on_step)
+    check_function("on_abort", on_abort)
 
 
 def step_limit(env: Env, steps: int | None) -> int:

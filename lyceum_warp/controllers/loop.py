@@ -12,6 +12,7 @@ from lyceum_warp.controllers.episode_collector import (
     OnStep,
     TimedPlan,
     begin_episode,
+    check_plant,
     first_step,
     step_limit,
 )
@@ -54,6 +55,7 @@ def control(
         ValueError: The environment has several worlds or automatic resets, the episode is over or may never end, or
             the controller does not return a finite action of the right shape, or its plan ends before the next one.
     """
+    check_plant(env, reset=reset, on_step=on_step, on_abort=on_abort)
     limit = step_limit(env, steps)
     every = whole_number("replan_every", replan_every, low=1)
     checked = CheckedController(controller, env)

@@ -22,12 +22,13 @@ from lyceum_warp.controllers.episode_collector import (
     OnStep,
     TimedPlan,
     begin_episode,
+    check_plant,
     first_step,
     step_limit,
 )
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
-from lyceum_warp.validate import positive_number, whole_number
+from lyceum_warp.validate import check_kind, positive_number, whole_number
 
 _SPIN = 0.0005  # seconds before its end that a wait stops sleeping and polls the clock
 _PATIENCE = 0.2  # seconds that an unfinished plan delays an exception at most
@@ -95,9 +96,11 @@ def control_async(
             number is out of range, or the controller does not return a finite action of the right shape.
         Exception: Any exception that the controller raises.
     """
+    check_plant(env, reset=reset, on_step=on_step, on_abort=on_abort)
+    check_kind("clock", clock, Clock | None, "which has now, wait_until and wait_for")
     period = positive_number("period", env.timestep if period is None else period, "seconds")
     if seconds is not None:
-        ticks = max(1, math.ceil(positive_number("seconds", seconds, "seconds") / period - 1e-9))
+        ticks = min(2**31 - 1, max(1, math.ceil(positive_number("seconds", seconds, "seconds") / period - 1e-9)))
         steps = ticks if steps is None else min(whole_number("steps", steps, low=1), ticks)
     limit = step_limit(env, steps)
     checked = CheckedController(controller, env)

@@ -226,7 +226,7 @@ def provenance(env: Env) -> dict[str, Any]:
         "task": env.task.name, "engine": env.engine.name, "params": params, "versions": versions(env.device.alias),
         "state_parts": {name: [part.start, part.stop] for name, part in env.state_space.parts.items()},
         "obs_parts": {name: [part.start, part.stop] for name, part in env.obs_space.parts.items()},
-        "action_names": list(env.action_space.parts), "source": source(env),
+        "action_names": env.action_space.columns, "source": source(env),
     }  # fmt: skip
 
 

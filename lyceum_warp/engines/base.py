@@ -172,6 +172,12 @@ class Engine(abc.ABC):
         Made of Warp launches on every engine.
         """
 
+    def check_room(self) -> None:  # noqa: B027
+        """Log a warning if the worlds' states need more room than the engine has; called once, after the first reset.
+
+        Not made of launches.
+        """
+
     @abc.abstractmethod
     def reset(self, mask: wp.array) -> None:
         """Put the masked worlds into the model's initial state, state fields included.

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from conftest import SharedEnv
 from toy_controllers import SamplingPlanner, StepPlanner
 
 import lyceum_warp as lw
@@ -95,3 +96,12 @@ def test_settings_are_described_as_json_holds_them(env: lw.Env, tmp_path: Path) 
     assert episode.controller["name"] == "SamplingPlanner" and episode.controller["smoothing"] == [1.0, 0.0]
     assert isinstance(episode.controller["odd"], str)
     assert Trajectory.load(episode.save(tmp_path / "a.npz")).controller == episode.controller
+
+
+def test_a_task_with_a_part_of_several_actions_is_controlled(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", engine="mujoco", autoreset=False)
+    trajectory = control(env, lambda state, obs: torch.zeros(12), steps=2, seed=0)
+    assert trajectory.actions.shape == (2, 12)
+    assert trajectory.action_names[0].endswith("[0]") and len(trajectory.action_names) == 12
+    with pytest.raises(ValueError, match=r"action '\w+\[11\]' at step 0 must be finite, not nan"):
+        control(env, lambda state, obs: torch.cat((torch.zeros(11), torch.full((1,), math.nan))), steps=2, seed=0)

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-import mujoco_warp as mjw
 import numpy as np
 import pytest
 import torch
 import warp as wp
 from conftest import TaskFile
+from mujoco_warp._src import solver
 from toy_engine import ToyEngine
 
 import lyceum_warp as lw
@@ -196,7 +196,7 @@ def frames_below(function: str, module: str) -> list[str]:
 def test_step_of_the_engines_calls_mujoco_directly(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """One Python function of ours at most lies between ``Engine.step`` and MuJoCo's own.
 
-    It is the phase between two graphs of copies, or calls the parts of a substep that goes on from the last refresh.
+    It is the phase between two graphs of copies, or finds the substep that goes on from the last refresh.
     """
     seen: list[list[str]] = []
 
@@ -213,11 +213,9 @@ def test_step_of_the_engines_calls_mujoco_directly(task: str, monkeypatch: pytes
     c.step(2)
     assert seen == [["mujoco_engine._advance", "mujoco_engine.step"]]
     warp = lw.make(task, engine="warp", nworld=2).engine
-    for name in ("step", "solve"):
-        monkeypatch.setattr(mjw, name, watched(getattr(mjw, name), "warp_engine"))
+    monkeypatch.setattr(solver, "solve", watched(solver.solve, "warp_engine"))
     warp.step(2)
-    first = ["forward_parts.step_after"] if task == "reach" else []
-    assert seen[1:] == [[*first, "warp_engine.step"], ["warp_engine.step"]]
+    assert seen[1:] == [["substep.step", "warp_engine.step"]] * 2
 
 
 def test_a_reset_leaves_the_faults_of_other_worlds_unchanged() -> None:

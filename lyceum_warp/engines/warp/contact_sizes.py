@@ -1,14 +1,18 @@
-"""The number of contacts and constraints that a model needs, measured on random rollouts."""
+"""Choose the number of contacts and constraints that worlds have room for, and warn where it is too small."""
 
 import contextlib
+import copy
 import hashlib
 import logging
+from collections.abc import Collection, Iterable, Mapping
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 from mujoco.batch import Batch, SimulationError
+
+from lyceum_warp.model_fields import ModelField
 
 log = logging.getLogger(__name__)
 
@@ -18,14 +22,28 @@ _LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
 """The smallest sizes. Contacts of a flex come in bursts that a probe may miss: a geom that is pressed into it touches
 up to 50 of its elements. Those with a flex are MuJoCo Warp's own defaults."""
 
+_FIRST = 32
+"""The most worlds whose first states are looked at."""
+
+_FRICTION = {"dof_frictionloss", "tendon_frictionloss"}
+_LIMITS = {"jnt_range", "jnt_margin", "tendon_range", "tendon_margin", "qpos0"}
+_CONTACTS = set("geom_margin geom_gap geom_size geom_pos geom_quat pair_margin pair_gap body_pos body_quat".split())
+"""Model fields on which the number of constraints or contacts depends, and which may be drawn."""
+
 _known: dict[str, tuple[int, int]] = {}
 
 
-def probe_sizes(model: mujoco.MjModel) -> tuple[int, int]:
-    """Contacts and constraints to make room for in each world: twice the peak of random rollouts.
+def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[int, int]:
+    """Contacts and constraints to make room for in each world.
 
-    32 worlds start in the model's initial state or a keyframe, half of them with random velocities, and take
-    500 substeps on the C engine under random controls held for 20. The result is remembered for each model.
+    Twice the peak of random rollouts, and constraints that a task may turn on: equality constraints that are not
+    active in the model, friction losses where they are drawn, and all limits where their ranges are drawn. In the
+    rollouts 32 worlds start in the model's initial state or a keyframe, half of them with random velocities, and take
+    500 substeps on the C engine under random controls held for 20. Their result is remembered for each model.
+
+    Args:
+        model: The compiled model.
+        varied: The names of the model fields that differ between worlds.
 
     Returns:
         (nconmax, njmax), multiples of 8: each at least 8, with a flex at least 256 and 512.
@@ -33,6 +51,93 @@ def probe_sizes(model: mujoco.MjModel) -> tuple[int, int]:
     Raises:
         NotImplementedError, ValueError: MuJoCo Warp refuses the model.
     """
+    contacts, constraints = _probe_once(_with_friction_losses(model, varied))
+    return contacts, -(-(constraints + _inactive(model) + _limits(model, varied)) // 8) * 8
+
+
+def warn_of_unknown_sizes(varied: Collection[str], nconmax: int, njmax: int) -> None:
+    """Log a warning if the contacts depend on drawn fields, of which a probe knows nothing."""
+    if names := sorted(_CONTACTS.intersection(varied)):
+        log.warning(
+            "nconmax=%d and njmax=%d were measured on the model's own %s, which the task draws: give make() both if "
+            "worlds end with contact_overflow or constraint_overflow", nconmax, njmax, ", ".join(names),
+        )  # fmt: skip
+
+
+def warn_of_little_room(
+    model: mujoco.MjModel,
+    states: np.ndarray,
+    fields: Iterable[ModelField],
+    values: Mapping[str, np.ndarray],
+    *,
+    nconmax: float,
+    njmax: int,
+) -> None:
+    """Log a warning if worlds begin with more contacts or constraints than there is room for.
+
+    Args:
+        model: The compiled model.
+        states: Integration states of worlds, (n, integration size); the first 32 are looked at.
+        fields: The model fields that differ between worlds.
+        values: Their values, (n, ...).
+        nconmax: Contacts that a world has room for, on average.
+        njmax: Constraints that each world has room for.
+    """
+    own = copy.copy(model)
+    data = mujoco.MjData(own)
+    contacts, constraints = [], []
+    fields = [field for field in fields if field.size]
+    for w, state in enumerate(states[:_FIRST].astype(float)):
+        for field in fields:
+            value = values[field.name][w]
+            if field.option:
+                setattr(own.opt, field.name, value if value.size > 1 else float(value[0]))
+            else:
+                field.value(own)[...] = value
+        if fields:
+            mujoco.mj_setConst(own, data)
+        mujoco.mj_setState(own, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        mujoco.mj_forward(own, data)
+        contacts.append(data.ncon)
+        constraints.append(data.nefc)
+    if np.mean(contacts) > nconmax or max(constraints) > njmax:
+        log.warning(
+            "worlds begin with up to %d constraints and %.3g contacts on average, and have room for njmax=%d and "
+            "nconmax=%d: give make() larger ones, or steps end with constraint_overflow or contact_overflow",
+            max(constraints), np.mean(contacts), njmax, nconmax,
+        )  # fmt: skip
+
+
+def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> mujoco.MjModel:
+    """The model with a constraint for every friction loss that may become one in a world."""
+    if names := _FRICTION.intersection(varied):
+        model = copy.copy(model)
+        for name in names:
+            losses = getattr(model, name)
+            losses[losses == 0] = 1e-6
+    return model
+
+
+def _inactive(model: mujoco.MjModel) -> int:
+    """The number of constraints that come with the equality constraints that are not active in the model."""
+    every = copy.copy(model)
+    every.eq_active0[:] = True
+    return _equalities(every) - _equalities(model)
+
+
+def _equalities(model: mujoco.MjModel) -> int:
+    data = mujoco.MjData(model)
+    mujoco.mj_fwdPosition(model, data)
+    return int(data.ne)
+
+
+def _limits(model: mujoco.MjModel, varied: Collection[str]) -> int:
+    """The number of limits, if it depends on drawn fields how many are reached at once."""
+    drawn = not _LIMITS.isdisjoint(varied)
+    return int(model.jnt_limited.sum() + model.tendon_limited.sum()) if drawn else 0
+
+
+def _probe_once(model: mujoco.MjModel) -> tuple[int, int]:
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     key = hashlib.sha256(buffer.tobytes()).hexdigest()

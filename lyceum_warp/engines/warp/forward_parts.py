@@ -1,16 +1,12 @@
-"""The parts of a forward pass that fields and sensors need, and a step that takes over parts that are already done."""
+"""Find the parts of a forward pass that fields and sensors need."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 
 import mujoco
 import mujoco_warp as mjw
-import numpy as np
 
-from lyceum_warp.engines.warp.substep import needs_velocities
+from lyceum_warp.engines.warp.substep import Part, inertia
 from lyceum_warp.fields import Stage
-
-Part = Callable[[mjw.Model, mjw.Data], None]
-"""A part of a forward pass, in every world of a data."""
 
 _NEEDS: dict[Part, tuple[Part, ...]] = {
     mjw.kinematics: (),
@@ -18,7 +14,7 @@ _NEEDS: dict[Part, tuple[Part, ...]] = {
     mjw.camlight: (mjw.com_pos,),
     mjw.flex: (mjw.com_pos,),
     mjw.tendon: (mjw.com_pos,),
-    mjw.crb: (mjw.com_pos,),
+    inertia: (mjw.com_pos, mjw.tendon),
     mjw.transmission: (mjw.com_pos, mjw.tendon),
     mjw.com_vel: (mjw.com_pos,),
     mjw.fwd_velocity: (mjw.com_pos, mjw.flex, mjw.tendon, mjw.transmission),
@@ -33,7 +29,7 @@ _FIELDS: dict[Part, str] = {
     mjw.camlight: "cam_xpos cam_xmat light_xpos light_xdir",
     mjw.flex: "flexvert_xpos flexedge_length",
     mjw.tendon: "ten_length",
-    mjw.crb: "crb",
+    inertia: "crb",
     mjw.transmission: "actuator_length",
     mjw.com_vel: "cvel cdof_dot",
     mjw.fwd_velocity: "ten_velocity actuator_velocity qfrc_bias qfrc_spring qfrc_damper qfrc_gravcomp qfrc_fluid "
@@ -53,7 +49,7 @@ _SENSORS: dict[str, tuple[Part, ...]] = {
     "TENDONPOS": (mjw.tendon,),
     "ACTUATORPOS": (mjw.transmission,),
     "E_POTENTIAL": (mjw.kinematics, mjw.flex, mjw.tendon),
-    "E_KINETIC": (mjw.crb,),
+    "E_KINETIC": (inertia,),
     "VELOCIMETER GYRO FRAMELINVEL FRAMEANGVEL SUBTREELINVEL SUBTREEANGMOM": (mjw.com_vel,),
     "TENDONVEL ACTUATORVEL": (mjw.fwd_velocity,),
 }
@@ -66,9 +62,7 @@ _PARTS_OF_SENSOR = {
 }
 
 
-def forward_parts(
-    model: mujoco.MjModel, names: Collection[str], varied: Collection[str] = ()
-) -> tuple[Part, ...] | None:
+def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, ...] | None:
     """The parts of a forward pass that compute the named fields, in order, without collisions and constraints.
 
     Of ``sensordata`` the parts compute the sensors of the position and velocity stages.
@@ -76,7 +70,6 @@ def forward_parts(
     Args:
         model: The compiled model.
         names: The fields.
-        varied: Names of model fields that differ between worlds.
 
     Returns:
         The parts, or None if the fields need collisions or constraints.
@@ -99,8 +92,6 @@ def forward_parts(
     if mjw.fwd_velocity in wanted:
         wanted.discard(mjw.com_vel)
     if _touching(model) and wanted & {mjw.transmission, mjw.fwd_velocity}:
-        return None
-    if mjw.crb in wanted and _has_armature(model, varied):
         return None
     return (*(part for part in _NEEDS if part in wanted), *sensors)
 
@@ -128,66 +119,6 @@ def _last_stage(model: mujoco.MjModel) -> Stage:
 
 
 def _touching(model: mujoco.MjModel) -> bool:
-    """Whether contacts act on actuators or passive forces: adhesion."""
-    body = mujoco.mjtTrn.mjTRN_BODY
-    return bool((model.actuator_trntype == int(body)).any() or np.any(getattr(model, "geom_adhesion", 0)))
-
-
-def _has_armature(model: mujoco.MjModel, varied: Collection[str]) -> bool:
-    """Whether tendons add to the inertia, which ``mujoco_warp.crb`` leaves to a function that it does not show."""
-    return "tendon_armature" in varied or bool(model.tendon_armature.any())
-
-
-def takes_over(model: mujoco.MjModel, parts: Collection[Part], varied: Collection[str] = ()) -> tuple[Part, ...]:
-    """Those of some parts that ``step_after`` can take over; they are a function of positions alone."""
-    enabled, integrators = mujoco.mjtEnableBit, mujoco.mjtIntegrator
-    flags = enabled.mjENBL_SLEEP | enabled.mjENBL_ENERGY
-    known = (integrators.mjINT_EULER, integrators.mjINT_RK4, integrators.mjINT_IMPLICIT, integrators.mjINT_IMPLICITFAST)
-    if model.opt.enableflags & flags or model.opt.integrator not in [int(i) for i in known]:
-        return ()
-    if _has_armature(model, varied):
-        return ()
-    return tuple(part for part in parts if part in _POSITION)
-
-
-_POSITION = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex, mjw.tendon)
-
-
-def step_after(done: Collection[Part], m: mjw.Model, d: mjw.Data) -> None:
-    """``substep.step``, without those parts that are already done for the current state.
-
-    A step begins with the parts that its state's fields and sensors needed after the last one.
-
-    Args:
-        done: Some of the parts that ``takes_over`` returned for this model.
-        m: MuJoCo Warp's model.
-        d: Its data.
-    """
-    for part in _POSITION:
-        if part not in done:
-            part(m, d)
-    mjw.crb(m, d)
-    if m.opt.run_collision_detection:
-        mjw.collision(m, d)
-    if needs_velocities(m):
-        mjw.com_vel(m, d)
-    mjw.make_constraint(m, d)
-    mjw.transmission(m, d)
-    d.sensordata.zero_()
-    mjw.sensor_pos(m, d)
-    d.energy.zero_()
-    mjw.fwd_velocity(m, d)
-    mjw.sensor_vel(m, d)
-    mjw.fwd_actuation(m, d)
-    mjw.fwd_acceleration(m, d, factorize=True)
-    mjw.solve(m, d)
-    sensors = not m.opt.disableflags & mjw.DisableBit.SENSOR
-    if m.opt.run_rne_postconstraint or (sensors and m.sensor_rne_postconstraint):
-        mjw.rne_postconstraint(m, d)
-    mjw.sensor_acc(m, d, skip_rne_postconstraint=True)
-    if m.opt.integrator == mjw.IntegratorType.EULER:
-        mjw.euler(m, d)
-    elif m.opt.integrator == mjw.IntegratorType.RK4:
-        mjw.rungekutta4(m, d)
-    else:
-        mjw.implicit(m, d)
+    """Whether contacts act on actuators or passive forces: adhesion, and contacts of a flex that are springs."""
+    by_body = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()
+    return bool(by_body or model.flg_adhesion or model.flex_passive.any())

@@ -10,6 +10,7 @@ from lyceum_warp.arrays import flat
 from lyceum_warp.engines.warp.group_turns import Turns, group_size
 from lyceum_warp.engines.warp.model_rows import OUTPUTS, ModelRows, constants_of, outputs_of, owner
 from lyceum_warp.engines.warp.partial_kernels import correct_weights, mark_changed
+from lyceum_warp.engines.warp.static_geoms import StaticGeoms
 from lyceum_warp.model_fields import Constants, ModelField
 
 _GROUPS = {
@@ -29,6 +30,7 @@ class ModelConstants:
         model: The compiled model.
         put: MuJoCo Warp's model, with a row for each world in the fields and in the constants that follow.
         fields: The fields that differ between worlds, with constants that follow.
+        static: Geoms whose poses ``mujoco_warp.set_const`` does not compute, and around which tendons may be wrapped.
         nworld: Number of worlds.
         device: Where they live.
         loop: As for ``Turns``.
@@ -39,6 +41,7 @@ class ModelConstants:
         model: mujoco.MjModel,
         put: mjw.Model,
         fields: Collection[ModelField],
+        static: StaticGeoms,
         nworld: int,
         device: wp.Device,
         *,
@@ -46,6 +49,7 @@ class ModelConstants:
     ) -> None:
         groups = constants_of(fields)
         self._outputs = outputs_of(fields)
+        self._static = static
         self._flags = int(sum(int(flag) for group, flag in _GROUPS.items() if group & groups))
         written = {name for group, names in OUTPUTS.items() if group & groups for name in names}
         size = group_size(nworld, device) if loop else nworld
@@ -57,6 +61,7 @@ class ModelConstants:
             # the bits of a NaN, from which every value differs
             self._applied = [wp.full_like(given, -1) for given in self._given]
             self._changed = wp.zeros(nworld, dtype=bool)
+            self._everyone = wp.full(size, True, dtype=bool)
             # weights that are 0 in MuJoCo stay 0, and bodies with sliders only have those of their mass
             self._weighs: wp.array = wp.array(model.body_invweight0 > 0, dtype=wp.vec2)
             self._sliding: wp.array = wp.array(model.body_simple == 2, dtype=bool)
@@ -73,6 +78,7 @@ class ModelConstants:
     def _turn(self) -> None:
         self._rows.take(self._turns)
         model = self._rows.model
+        self._static.place(model, self._scratch, self._everyone)
         mjw.set_const(model, self._scratch, self._flags, restore=False)
         if "body_invweight0" in self._outputs:
             dim = (self._scratch.nworld, len(self._sliding))

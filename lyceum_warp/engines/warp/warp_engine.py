@@ -1,7 +1,6 @@
 """The Warp engine: MuJoCo Warp, float32, on a CUDA device or on the CPU."""
 
 import contextlib
-import copy
 from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Any
 
@@ -14,14 +13,15 @@ from mujoco_warp._src import collision_sdf
 from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.warp import overflow, substep
-from lyceum_warp.engines.warp.contact_sizes import probe_sizes
+from lyceum_warp.engines.warp.contact_sizes import probe_sizes, warn_of_little_room, warn_of_unknown_sizes
 from lyceum_warp.engines.warp.data_memory import data_bytes
-from lyceum_warp.engines.warp.forward_parts import Part, forward_parts, step_after, takes_over
+from lyceum_warp.engines.warp.forward_parts import forward_parts
 from lyceum_warp.engines.warp.group_turns import group_size
 from lyceum_warp.engines.warp.model_constants import ModelConstants
 from lyceum_warp.engines.warp.model_rows import ModelRows, constants_of, outputs_of, owner, put_varied_model
 from lyceum_warp.engines.warp.partial_forward import Conditional, PartialForward
 from lyceum_warp.engines.warp.static_geoms import StaticGeoms
+from lyceum_warp.engines.warp.substep import Part
 from lyceum_warp.fields import Field, Stage, early_sensor_columns
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_columns, copy_rows, fill_rows, narrow, widen, zero_columns
@@ -42,8 +42,8 @@ class WarpEngine(Engine):
         nworld: Number of worlds.
         device: A CUDA device, or the CPU (single-threaded: for tests).
         fields: The fields to keep.
-        dynamics: The model fields that differ between worlds; the arrays are MuJoCo Warp's own. With them, room for
-            constraints is probed on the model's own values, except that drawn friction losses add their constraints.
+        dynamics: The model fields that differ between worlds; the arrays are MuJoCo Warp's own. Room for
+            contacts and constraints is probed on the model's own values; see ``contact_sizes.probe_sizes``.
         initial: The state that ``reset`` puts worlds into, rounded to float32; None for the model's own.
         nconmax: Contacts that each world has room for, on average. None probes the model, and gives all worlds
             together additional room for a single one in which everything touches.
@@ -80,11 +80,12 @@ class WarpEngine(Engine):
             _check_unrolled(model)
         self.unroll = unroll
         self.nconmax, self.njmax = _sizes(model, nconmax, njmax, self.dynamics)
+        if None in (nconmax, njmax):
+            warn_of_unknown_sizes(self.dynamics, self.nconmax, self.njmax)
         with _refusals():
             self.m = self._put_model()
             self.spare = _contacts_of_one_world(self.m) if nconmax is None else 0
             self.d = self._make_data(nworld)
-        self._needs_velocities = substep.needs_velocities(self.m)
         self.naconmax = self.d.naconmax
         with wp.ScopedDevice(device):
             self._state = wp.zeros((nworld, self.integration_size), dtype=float)
@@ -96,22 +97,23 @@ class WarpEngine(Engine):
         self.ctrl = self.arrays["ctrl"]
         for varied in self.dynamics.values():
             self.arrays[varied.name] = self._alias_model(varied)
-        self._constants = self._model_constants()
         self._static = StaticGeoms(model, self.dynamics, device)
+        self._constants = self._model_constants()
         # the initial state that MuJoCo Warp knows follows model fields, which may differ between worlds
         self._start: wp.array | None = None
         if initial is not None or self.dynamics.keys() & {"qpos0", "body_pos", "body_quat"}:
             self._start = wp.array(self.initial, dtype=float, device=device)
         self._reset = [field.name for field in self.fields.values() if field.reset > Stage.NONE]
         current = [field.name for field in self.fields.values() if field.refresh > Stage.NONE]
-        self._current_parts = forward_parts(model, current, self.dynamics)
+        self._current_parts = forward_parts(model, current)
         self._reset_parts = None
         if self.reset_stage < Stage.ACCELERATION:
-            self._reset_parts = forward_parts(model, self._reset, self.dynamics)
+            self._reset_parts = forward_parts(model, self._reset)
         self._columns: wp.array = wp.array(early_sensor_columns(model), dtype=int, device=device)
         # a step goes on from the parts that were computed for its state, whether a world stepped there or restarted
         moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
-        self._shared = () if moved else takes_over(model, self._current_parts or (), self.dynamics)
+        current_parts = () if moved else self._current_parts or ()
+        self._shared = tuple(part for part in current_parts if part in substep.POSITION)
         # A geom at a place that is not-a-number has contacts with every element of a flex. Their rows of the Jacobian
         # would outlast a reset, because the solver multiplies unused rows by zero: a reset clears them.
         self._jacobian = flat(self.d.efc.J if model.nflex else wp.zeros((nworld, 0), dtype=float, device=device))
@@ -176,7 +178,8 @@ class WarpEngine(Engine):
         fields = [field for field in self.dynamics.values() if field.size and constants_of([field])]
         if not fields:
             return None
-        return ModelConstants(self.model, self.m, fields, self.nworld, self.device, loop=self.partial_refresh)
+        loop = self.partial_refresh
+        return ModelConstants(self.model, self.m, fields, self._static, self.nworld, self.device, loop=loop)
 
     def _alias(self, field: Field) -> wp.array:
         """The memory of a field under the types of ``fields``, which differ from MuJoCo Warp's in name alone."""
@@ -194,12 +197,7 @@ class WarpEngine(Engine):
     def step(self, nstep: int) -> None:
         with self._on_device():
             for i in range(nstep):
-                if i == 0 and self._shared:
-                    step_after(self._shared, self.m, self.d)
-                elif self._needs_velocities:
-                    substep.step(self.m, self.d)
-                else:
-                    mjw.step(self.m, self.d)
+                substep.step(self.m, self.d, self._shared if i == 0 else ())
         self._copy_snapshots(self._everyone, self.snapshots)
         self.refresh_current(self._everyone)
 
@@ -275,6 +273,13 @@ class WarpEngine(Engine):
         bits = [overflow.CONTACT_BITS, overflow.CONSTRAINT_BITS, overflow.IGNORED_BITS]
         args = [mask, d.qpos, d.qvel, d.act, d.overflow, *bits, self.fault]
         wp.launch(faults.faults_of_fields, self.nworld, args, device=self.device)
+
+    def check_room(self) -> None:
+        with self._on_device():
+            mjw.get_state(self.m, self.d, self._state, _SPEC)
+        values = {name: self.arrays[name].numpy() for name in self.dynamics}
+        room = {"nconmax": self.naconmax / self.nworld, "njmax": self.njmax}
+        warn_of_little_room(self.model, self._state.numpy(), self.dynamics.values(), values, **room)
 
     def reset(self, mask: wp.array) -> None:
         with self._on_device():
@@ -368,20 +373,9 @@ def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied
     sizes = [size if size is None else whole_number(name, size, low=1) for name, size in given.items()]
     with _refusals():
         _check_sdf_plugins(model)
-        probed = probe_sizes(_with_friction_losses(model, varied)) if None in sizes else (0, 0)
+        probed = probe_sizes(model, varied) if None in sizes else (0, 0)
     contacts, constraints = (other if size is None else size for size, other in zip(sizes, probed, strict=True))
     return contacts, constraints
-
-
-def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> mujoco.MjModel:
-    """The model with a constraint for every friction loss that may become one in a world."""
-    names = {"dof_frictionloss", "tendon_frictionloss"}.intersection(varied)
-    if names:
-        model = copy.copy(model)
-        for name in names:
-            losses = getattr(model, name)
-            losses[losses == 0] = 1e-6
-    return model
 
 
 def _check_sdf_plugins(model: mujoco.MjModel) -> None:

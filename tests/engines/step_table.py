@@ -1,0 +1,365 @@
+"""Generate models of every element that both engines take, and tables of their combinations."""
+
+import functools
+import itertools
+import random
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import mujoco
+
+Case = dict[str, str]
+"""A level of every factor, by the factors' names."""
+
+GENERAL = "<general {place} {kind} {extra}/>"
+DRIVES = {
+    "motor": GENERAL.replace("{kind}", 'gaintype="fixed" gainprm="1.5"'),
+    "servo": GENERAL.replace("{kind}", 'gaintype="fixed" gainprm="3" biastype="affine" biasprm="0 -3 -.1"'),
+    "damper": GENERAL.replace("{kind}", 'gaintype="affine" gainprm=".1 0 -.5" ctrllimited="true" ctrlrange="0 1"'),
+    "integrator": GENERAL.replace("{kind}", 'dyntype="integrator" gaintype="fixed" gainprm="3" biastype="affine" '
+                                  'biasprm="0 -3 -.1" actlimited="true" actrange="-1 1"'),
+    "filter": GENERAL.replace("{kind}", 'dyntype="filter" dynprm=".02" gaintype="fixed" gainprm="2"'),
+    "filterexact": GENERAL.replace("{kind}", 'dyntype="filterexact" dynprm=".02" gaintype="fixed" gainprm="2" '
+                                   'actearly="true" forcelimited="true" forcerange="-.5 .5"'),
+    "muscle": GENERAL.replace("{kind}", 'dyntype="muscle" gaintype="muscle" biastype="muscle" dynprm=".01 .04 0" '
+                              'gainprm=".75 1.05 5 200 .5 1.6 1.5 1.3 1.2" biasprm=".75 1.05 5 200 .5 1.6 1.5 1.3 1.2" '
+                              'lengthrange=".1 2"'),
+    "dcmotor": '<dcmotor {place} motorconst=".5" resistance="1" {extra}/>',
+    "user": GENERAL.replace("{kind}", 'dyntype="user" gaintype="user" biastype="user" actdim="1"'),
+}  # fmt: skip
+"""Actuators by their dynamics."""
+
+DRIVE_GROUPS = {
+    "instant": ("motor", "servo", "damper"),
+    "filtered": ("integrator", "filter", "filterexact"),
+    "special": ("muscle", "dcmotor", "user"),
+}
+"""Drives of one model, which has each of them on each of the places."""
+
+PLACES = {
+    "joint": 'joint="hip"',
+    "parent": 'jointinparent="ball" gear=".1 .2 .1"',
+    "crank": 'cranksite="crank" slidersite="slider" cranklength=".6"',
+    "cord": 'tendon="cord" gear="2"',
+    "string": 'tendon="string"',
+    "site": 'site="tip" gear="0 0 .3 0 .1 0"',
+    "refsite": 'site="tip" refsite="here" gear="0 0 .3 0 0 0"',
+}
+"""What actuators pull at; bodies follow with adhesion."""
+
+EQUALITIES = {
+    "none": "",
+    "connect": '<connect body1="hand" body2="arm" anchor=".02 0 -.1" {0}/><connect site1="tip" site2="knot" {0}/>',
+    "weld": '<weld body1="cart" body2="target" solref=".05 1" {0}/>'
+    '<weld site1="tip" site2="knot" torquescale=".1" {0}/>',
+    "joint": '<joint joint1="hip" joint2="elbow" polycoef=".1 .5 0 0 0" {0}/>'
+    '<joint joint1="lift" polycoef=".1 0 0 0 0" {0}/>',
+    "tendon": '<tendon tendon1="cord" tendon2="string" polycoef="0 .5 0 0 0" {0}/>',
+}
+SHAPE = '<flexcomp name="soft" type="grid" spacing=".1 .1 .1" radius=".02" mass=".2" '
+LOOSE = '<contact selfcollide="none"/>'
+FLEXES = {
+    "none": "",
+    "rope": SHAPE + f'dim="1" count="4 1 1" pos="0 2 .8">{LOOSE}<edge stiffness="10" damping=".1"/></flexcomp>',
+    "cloth": SHAPE + f'dim="2" count="3 3 1" pos="0 2 .015">{LOOSE}<edge equality="true"/></flexcomp>',
+    "shell": SHAPE + f'dim="2" count="3 3 1" pos="0 2 .015">{LOOSE}'
+    '<elasticity young="1e3" thickness=".01" damping=".01" elastic2d="both"/></flexcomp>',
+    "solid": SHAPE + f'dim="3" count="2 2 2" pos="0 2 .06">{LOOSE}<elasticity young="1e3" damping=".01"/></flexcomp>',
+    "lattice": SHAPE + f'dim="3" count="3 3 3" pos="0 2 .2" dof="trilinear">{LOOSE}'
+    '<elasticity young="1e3" damping=".01"/></flexcomp>',
+    "strain": SHAPE + f'dim="3" count="3 3 3" pos="0 2 .2" dof="trilinear">{LOOSE}<edge equality="strain"/></flexcomp>',
+    "springy": SHAPE + 'dim="2" count="3 3 1" pos="0 2 .015"><contact selfcollide="none" passive="true"/>'
+    '<elasticity young="1e3" thickness=".01" damping=".01" elastic2d="both"/></flexcomp>',
+}
+TENDONS = {
+    "plain": "",
+    "springs": 'stiffness="5" damping=".2" springlength="0 .1"',
+    "armature": 'armature=".2"',
+    "friction": 'frictionloss=".5"',
+    "limits": 'limited="true" range="-.05 .4" margin=".01" actuatorfrclimited="true" actuatorfrcrange="-1 1"',
+}
+SENSORS = {
+    "none": "",
+    "position": """<magnetometer site="tip"/><camprojection site="tip" camera="eye"/><rangefinder site="tip"/>
+    <jointpos joint="hip"/><tendonpos tendon="cord"/><actuatorpos actuator="{drive} joint"/><ballquat joint="ball"/>
+    <framepos objtype="site" objname="tip"/><framequat objtype="body" objname="hand"/>
+    <framexaxis objtype="geom" objname="fist"/><frameyaxis objtype="camera" objname="eye"/>
+    <framezaxis objtype="xbody" objname="hand" reftype="site" refname="here"/><subtreecom body="arm"/>
+    <insidesite site="here" objtype="body" objname="hand"/><e_potential/><clock/>""",
+    "velocity": """<velocimeter site="tip"/><gyro site="tip"/><jointvel joint="hip"/><tendonvel tendon="string"/>
+    <actuatorvel actuator="{drive} cord"/><ballangvel joint="ball"/><framelinvel objtype="site" objname="tip"/>
+    <frameangvel objtype="camera" objname="eye" reftype="body" refname="arm"/><subtreelinvel body="arm"/>
+    <subtreeangmom body="arm"/><e_kinetic/>""",
+    "limits": """<jointlimitpos joint="elbow"/><jointlimitvel joint="elbow"/><jointlimitfrc joint="elbow"/>
+    <tendonlimitpos tendon="stop"/><tendonlimitvel tendon="stop"/><tendonlimitfrc tendon="stop"/>
+    <distance geom1="fist" geom2="floor" cutoff="2"/><normal geom1="fist" geom2="floor" cutoff="2"/>
+    <fromto geom1="fist" geom2="floor" cutoff="2"/>""",
+    "acceleration": """<touch site="foot"/><accelerometer site="tip"/><force site="tip"/><torque site="tip"/>
+    <actuatorfrc actuator="{drive} joint"/><jointactuatorfrc joint="hip"/><tendonactuatorfrc tendon="cord"/>
+    <framelinacc objtype="site" objname="tip"/><frameangacc objtype="body" objname="hand"/>
+    <contact geom1="floor" num="1" data="found force"/>""",
+    "histories": """<jointpos joint="hip" nsample="4" delay=".005"/><gyro site="tip" nsample="4" interval=".006"/>
+    <accelerometer site="tip" nsample="4" delay=".004"/><framepos objtype="site" objname="tip"/>""",
+}
+
+STAGES = {
+    "kinematics": "site_xpos",
+    "com": "subtree_com",
+    "camlight": "cam_xpos light_xdir",
+    "flex": "flexvert_xpos flexedge_length",
+    "tendon": "ten_length",
+    "inertia": "crb",
+    "transmission": "actuator_length",
+    "com velocity": "cvel",
+    "velocity": "ten_velocity actuator_velocity qfrc_bias qfrc_passive",
+    "subtree velocity": "subtree_linvel",
+    "energy": "energy",
+    "acceleration": "qacc qfrc_actuator",
+}
+"""Fields that a task's World may ask for, by the stage that computes them."""
+
+FIELDS = {
+    "nothing": "",
+    "bodies": " ".join(STAGES[name] for name in ("kinematics", "com", "camlight")),
+    "positions": " ".join(STAGES[name] for name in ("camlight", "flex", "tendon", "inertia", "transmission")),
+    "velocities": " ".join(STAGES[name] for name in ("camlight", "com velocity", "velocity")),
+    "everything": " ".join(STAGES.values()).replace("subtree_linvel ", ""),
+}
+"""Fields of several stages."""
+
+FLAGS = {
+    "": "",
+    "energy": 'energy="enable" invdiscrete="enable"',
+    "no springs": 'spring="disable" warmstart="disable" nativeccd="disable" multiccd="disable" filterparent="disable"',
+    "no passive forces": 'spring="disable" damper="disable" gravity="disable" clampctrl="disable" island="disable"',
+    "no limits": 'limit="disable" frictionloss="disable" refsafe="disable" equality="disable" contact="disable"',
+    "no constraints": 'constraint="disable" sensor="disable" actuation="disable" eulerdamp="disable"',
+}
+
+FACTORS: dict[str, tuple[str, ...]] = {
+    "asked": tuple(FIELDS),
+    "drives": tuple(DRIVE_GROUPS),
+    "flags": tuple(FLAGS),
+    "flex": tuple(FLEXES),
+    "equality": tuple(EQUALITIES),
+    "sensors": tuple(SENSORS),
+    "integrator": ("Euler", "RK4", "implicit", "implicitfast", "discrete"),
+    "tendons": tuple(TENDONS),
+    "adhesion": ("none", "actuator", "geom", "pair"),
+    "fluid": ("none", "box", "ellipsoid"),
+    "gravcomp": ("none", "passive", "actuator"),
+    "active": ("true", "false"),
+    "armature": ("none", "motors"),
+    "delay": ("none", "zoh", "linear"),
+    "cone": ("pyramidal", "elliptic"),
+    "solver": ("Newton", "CG"),
+    "jacobian": ("dense", "sparse"),
+    "noslip": ("0", "2"),
+}
+
+PLAIN: Case = {name: levels[0] for name, levels in FACTORS.items()}
+
+REFUSED: list[tuple[Mapping[str, tuple[str, ...]], str]] = [
+    ({"integrator": ("Euler", "RK4", "implicit", "implicitfast"), "flex": ("springy",)},
+     "passive flex contact requires an integrator with the effective metric"),
+    ({"integrator": ("implicit", "implicitfast"), "flex": ("shell", "solid", "lattice")},
+     "flex elasticity is no longer integrated implicitly"),
+    ({"integrator": ("discrete",), "flex": ("rope",)}, "flex edge stiffness and damping are not supported"),
+    ({"integrator": ("discrete",), "noslip": ("2",)}, "noslip solver not implemented for the discrete integrator"),
+]  # fmt: skip
+"""Combinations that MuJoCo or MuJoCo Warp refuses, and the error of each."""
+
+UNKNOWN = {
+    "mjTRN_SO3": "MuJoCo Warp refuses it",
+    "mjDYN_PID": "MuJoCo Warp refuses it",
+    "mjGAIN_PID": "MuJoCo Warp refuses it",
+    "mjGAIN_SO3": "MuJoCo Warp refuses it, because it refuses the transmission",
+    "mjBIAS_SO3": "MuJoCo Warp refuses it",
+    "mjEQ_FLEXVERT": "MuJoCo Warp refuses it",
+    "mjEQ_DISTANCE": "MuJoCo has no such constraint any more",
+    "mjSENS_PLUGIN": "MuJoCo Warp refuses it",
+    "mjSENS_USER": "a callback computes it, and tasks have none",
+    "mjSENS_TACTILE": "it belongs to the acceleration stage and changes nothing else",
+    "mjSOL_PGS": "compile_model replaces it",
+    "mjJAC_AUTO": "it stands for one of the others",
+    "mjWRAP_NONE": "it stands for no object",
+    "mjTRN_UNDEFINED": "it stands for no transmission",
+    "mjENBL_SLEEP": "compile_model turns it off",
+    "mjENBL_OVERRIDE": "MuJoCo Warp refuses it",
+    "mjENBL_FWDINV": "MuJoCo Warp refuses it",
+    "mjENBL_DIAGEXACT": "MuJoCo Warp refuses it",
+    "mjENBL_IPC": "MuJoCo Warp refuses it",
+    "mjENBL_SPECULATIVE": "MuJoCo Warp refuses it",
+    "mjDSBL_MIDPHASE": "MuJoCo Warp refuses it",
+    "mjDSBL_AUTORESET": "MuJoCo Warp refuses it",
+    "mjNDISABLE": "it is a number of flags",
+}
+"""Members of MuJoCo's enums that no model of the table has, with the reason."""
+
+
+def xml(case: Case) -> str:
+    """The model of a case."""
+    delay = "" if case["delay"] == "none" else f'delay=".005" nsample="4" interp="{case["delay"]}"'
+    actuators = []
+    for drive, (name, place) in itertools.product(DRIVE_GROUPS[case["drives"]], PLACES.items()):
+        heavy = case["armature"] == "motors" and "site" not in place  # MuJoCo refuses armature at sites
+        extra = f'armature=".1" damping=".05" {delay}' if heavy else delay
+        actuators.append(DRIVES[drive].format(place=f'name="{drive} {name}" {place}', extra=extra))
+    if case["adhesion"] == "actuator":
+        actuators.append('<adhesion name="sticky" body="cart" gain="2" ctrlrange="0 1"/>')
+    sticky = {"geom": 'adhesion="3"'}.get(case["adhesion"], "")
+    pair = '<contact><pair geom1="box" geom2="floor" adhesion="3"/></contact>' if case["adhesion"] == "pair" else ""
+    fluid = 'density="20" viscosity=".1" wind="1 .5 0"' if case["fluid"] != "none" else ""
+    shape = 'fluidshape="ellipsoid"' if case["fluid"] == "ellipsoid" else ""
+    gravcomp = 'gravcomp=".7"' if case["gravcomp"] != "none" else ""
+    held = 'actuatorgravcomp="true"' if case["gravcomp"] == "actuator" else ""
+    equality = EQUALITIES[case["equality"]].format(f'active="{case["active"]}"')
+    rope = TENDONS[case["tendons"]]
+    wrapped = "" if case["tendons"] == "armature" else rope  # MuJoCo refuses armature of tendons around geoms
+    return f"""
+    <mujoco>
+      <option timestep="0.002" integrator="{case["integrator"]}" cone="{case["cone"]}" solver="{case["solver"]}"
+        jacobian="{case["jacobian"]}" noslip_iterations="{case["noslip"]}" iterations="10" ls_iterations="10" {fluid}>
+        <flag {FLAGS[case["flags"]]}/></option>
+      <worldbody>
+        <geom name="floor" type="plane" size="5 5 1"/>
+        <site name="here" pos=".3 0 1.2" size=".5"/> <site name="crank" pos="-.3 0 .6"/>
+        <geom name="post" type="cylinder" size=".05 .1" pos=".25 .3 .8" contype="0" conaffinity="0"/>
+        <geom name="knob" size=".05" pos=".2 0 1" contype="0" conaffinity="0"/>
+        <light mode="trackcom" pos="0 0 3"/>
+        <camera name="still" mode="targetbody" target="cart" pos="0 -2 1"/>
+        <body name="target" mocap="true" pos=".8 0 .1"/>
+        <body name="arm" pos="0 0 1" {gravcomp}>
+          <joint name="hip" axis="0 1 0" damping=".1" armature=".01" stiffness=".5" {held}/>
+          <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".04" {shape}/>
+          <site name="slider" pos=".1 0 -.1" zaxis="1 0 1"/> <site name="knot" pos=".05 0 -.45"/>
+          <camera name="eye" pos="-1 0 0" xyaxes="0 -1 0 1 0 1" resolution="64 48"/>
+          <body name="hand" pos="0 0 -.4">
+            <joint name="elbow" axis="0 1 0" damping=".1" range="-40 5" limited="true" frictionloss=".3"
+              actuatorfrclimited="true" actuatorfrcrange="-.1 .1"/>
+            <geom name="fist" type="capsule" fromto="0 0 0 .05 0 -.3" size=".03" {shape}/>
+            <site name="tip" pos=".05 0 -.3"/>
+          </body>
+        </body>
+        <body pos="0 .6 .8" {gravcomp}><joint name="ball" type="ball" damping=".1"/>
+          <geom type="box" size=".05 .1 .15" pos="0 0 -.15" {shape}/></body>
+        <body pos="0 -.6 .059"><joint name="lift" type="slide" axis="1 0 1" damping="1" frictionloss="9"/>
+          <geom name="weight" size=".06" solref=".03 1"/></body>
+        <body name="cart" pos=".8 0 .098"><freejoint/><geom name="box" type="box" size=".1 .1 .1" {sticky} {shape}/>
+          <site name="foot" type="box" size=".12 .12 .12"/></body>
+        {FLEXES[case["flex"]]}
+      </worldbody>
+      <tendon>
+        <fixed name="cord" {rope}><joint joint="hip" coef="1"/><joint joint="elbow" coef="-.5"/></fixed>
+        <spatial name="string" {rope}><site site="here"/><site site="tip"/></spatial>
+        <spatial name="block" {wrapped}><site site="crank"/><geom geom="knob" sidesite="here"/><site site="knot"/>
+          <pulley divisor="2"/><site site="knot"/><geom geom="post"/><site site="foot"/></spatial>
+        <fixed name="stop" limited="true" range="-.2 .02"><joint joint="elbow" coef="1"/></fixed>
+      </tendon>
+      {pair}
+      <actuator>{"".join(actuators)}</actuator>
+      <equality>{equality}</equality>
+      <sensor>{SENSORS[case["sensors"]].format(drive=DRIVE_GROUPS[case["drives"]][0])}</sensor>
+    </mujoco>"""
+
+
+def fields_of(case: Case) -> list[str]:
+    """The fields that a case's World asks for."""
+    names = (FIELDS | STAGES)[case["asked"]].split()
+    if SENSORS[case["sensors"]] and case["flags"] != "no constraints":
+        names.append("sensordata")
+    return names
+
+
+def model_of(case: Case) -> mujoco.MjModel:
+    """The compiled model of a case."""
+    spec = mujoco.MjSpec.from_string(xml(case))
+    if "energy" in fields_of(case):
+        spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    if "subtree_linvel" in fields_of(case):
+        spec.add_sensor(type=mujoco.mjtSensor.mjSENS_SUBTREELINVEL, objtype=mujoco.mjtObj.mjOBJ_BODY, objname="arm")
+    return spec.compile()
+
+
+def is_refused(case: Case) -> bool:
+    """Whether a case is among those that MuJoCo or MuJoCo Warp refuses."""
+    return any(all(case.get(name) in levels for name, levels in match.items()) for match, _ in REFUSED)
+
+
+def singles() -> Iterator[Case]:
+    """Every level of every factor beside the first levels of the others."""
+    for name, levels in FACTORS.items():
+        for level in levels:
+            case = PLAIN | {name: level}
+            yield case if not is_refused(case) else case | {"integrator": "discrete"}
+
+
+@functools.cache
+def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
+    """Cases in which any two (or three, ...) levels of different factors that can be combined occur together.
+
+    A greedy search: each case begins with a combination that is still missing, and the other factors take the level
+    that adds the most of those that are missing.
+    """
+    rng = random.Random(seed)
+    missing: dict[tuple[tuple[str, str], ...], None] = {}
+    for chosen in itertools.combinations(FACTORS, strength):
+        for levels in itertools.product(*(FACTORS[name] for name in chosen)):
+            missing[tuple(zip(chosen, levels, strict=True))] = None
+    cases = []
+    while missing:
+        first = next(iter(missing))
+        if (case := _completed(dict(first), rng, missing, strength)) is None:
+            del missing[first]  # refused, in these levels or in what they leave to others
+            continue
+        for part in itertools.combinations(((name, case[name]) for name in FACTORS), strength):
+            missing.pop(part, None)
+        cases.append(case)
+    return tuple(cases)
+
+
+def _completed(case: Case, rng: random.Random, missing: Mapping[Any, None], strength: int) -> Case | None:
+    """A case with the given levels, and for the other factors, in random order, the levels that add the most."""
+    rest = [name for name in FACTORS if name not in case]
+    rng.shuffle(rest)
+    for name in rest:
+        levels = [level for level in FACTORS[name] if not is_refused(case | {name: level})]
+        if not levels:
+            return None
+        rng.shuffle(levels)
+
+        def gain(level: str, name: str = name, case: Case = case) -> int:
+            chosen = [(n, level if n == name else case[n]) for n in FACTORS if n == name or n in case]
+            return sum(part in missing for part in itertools.combinations(chosen, strength) if (name, level) in part)
+
+        case = case | {name: max(levels, key=gain)}
+    return case
+
+
+def title(case: Case) -> str:
+    """The levels of a case that differ from the plain one."""
+    return ", ".join(f"{name}={level}" for name, level in case.items() if level != PLAIN[name]) or "plain"
+
+
+def _bits(enum: Any, flags: int) -> list[int]:
+    return [bit.value for bit in enum.__members__.values() if bit.value.bit_count() == 1 and flags & bit.value]
+
+
+Reader = Callable[[mujoco.MjModel], Any]
+ENUMS: dict[str, Reader] = {
+    "mjtTrn": lambda m: m.actuator_trntype,
+    "mjtDyn": lambda m: m.actuator_dyntype,
+    "mjtGain": lambda m: m.actuator_gaintype,
+    "mjtBias": lambda m: m.actuator_biastype,
+    "mjtEq": lambda m: m.eq_type,
+    "mjtSensor": lambda m: m.sensor_type,
+    "mjtJoint": lambda m: m.jnt_type,
+    "mjtWrap": lambda m: m.wrap_type,
+    "mjtIntegrator": lambda m: [m.opt.integrator],
+    "mjtCone": lambda m: [m.opt.cone],
+    "mjtSolver": lambda m: [m.opt.solver],
+    "mjtJacobian": lambda m: [m.opt.jacobian],
+    "mjtEnableBit": lambda m: _bits(mujoco.mjtEnableBit, m.opt.enableflags),
+    "mjtDisableBit": lambda m: _bits(mujoco.mjtDisableBit, m.opt.disableflags),
+}
+"""MuJoCo's enums, and how to find their members in a model."""

@@ -1,0 +1,118 @@
+"""Room for contacts and constraints: for what a task may turn on, and a warning where that is unknown."""
+
+import logging
+
+import mujoco
+import pytest
+from conftest import TaskFile
+
+import lyceum_warp as lw
+from lyceum_warp.engines.warp.contact_sizes import probe_sizes
+
+WELDS = "".join(f'<weld body1="b{i}" active="false"/>' for i in range(8))
+BALLS = "".join(f'<body name="b{i}" pos="{i} 0 1"><freejoint/><geom size=".1"/></body>' for i in range(8))
+MOTOR = '<actuator><motor site="s"/></actuator>'
+FLOATING = (
+    f'<mujoco><option gravity="0 0 0"/><worldbody>{BALLS}<site name="s"/></worldbody>'
+    f"<equality>{WELDS}</equality>{MOTOR}</mujoco>"
+)
+
+TASK = f'''
+import mujoco
+import warp as wp
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    eq_active: Row[wp.bool]
+    geom_size: Row[wp.vec3]
+
+
+@wp.struct
+class Params:
+    welds: int = 8
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    obs[0] = s.qpos[0]
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    return 1.0
+
+
+@wp.func
+def initialize(s: World, p: Params):
+    for i in range(p.welds):
+        s.eq_active[i] = True
+
+
+class Welded(lw.Task):
+    model = staticmethod(lambda: mujoco.MjSpec.from_string("""{FLOATING}"""))
+    obs = {{"x": 1}}
+    horizon = 0
+'''
+
+
+def test_welds_that_a_task_activates_have_room(task_file: TaskFile, caplog: pytest.LogCaptureFixture) -> None:
+    env = lw.make(task_file("welded.py", TASK), engine="warp", nworld=2)
+    assert env.engine.njmax >= 8 * 6  # type: ignore[attr-defined]
+    for _ in range(2):
+        env.step()
+        assert (env.reward == 1).all() and not env.done_reason.any()
+    assert not caplog.records
+
+
+def test_first_states_without_room_are_warned_of(task_file: TaskFile, caplog: pytest.LogCaptureFixture) -> None:
+    lw.make(task_file("welded.py", TASK), engine="warp", nworld=2, njmax=8)
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert "begin with up to 48 constraints" in record.message and "njmax=8 and nconmax=" in record.message
+
+
+def test_contacts_that_follow_from_drawn_fields_are_warned_of(
+    task_file: TaskFile, caplog: pytest.LogCaptureFixture
+) -> None:
+    drawing = TASK.replace("        s.eq_active[i] = True\n", "        s.geom_size[i][0] = 0.05\n")
+    lw.make(task_file("drawing.py", drawing), engine="warp", nworld=2)
+    (record,) = caplog.records
+    assert "measured on the model's own geom_size, which the task draws" in record.message
+    caplog.clear()
+    lw.make(task_file("drawing.py", drawing), engine="warp", nworld=2, nconmax=16, njmax=64)
+    lw.make(task_file("drawing.py", drawing), nworld=2)
+    assert not caplog.records
+
+
+EQUALITIES = {"connect": 3, "weld": 6, "joint": 1, "tendon": 1}
+JOINED = """<mujoco><option gravity="0 0 0"/><worldbody>
+<body name="a"><joint name="a" range="-1 1" limited="true"/><geom size=".1" contype="0"/></body>
+<body name="b" pos="1 0 0"><joint name="b" range="-1 1" limited="true"/><joint axis="0 1 0"/><joint axis="1 0 0"/>
+<geom size=".1" contype="0"/></body></worldbody>
+<tendon><fixed name="t" limited="true" range="-1 1"><joint joint="a" coef="1"/></fixed></tendon>
+<equality>{}</equality></mujoco>"""
+OBJECTS = {
+    "connect": '<connect body1="a" body2="b" anchor=".1 0 .1" active="{}"/>',
+    "weld": '<weld body1="a" body2="b" active="{}"/>',
+    "joint": '<joint joint1="a" active="{}"/>',
+    "tendon": '<tendon tendon1="t" active="{}"/>',
+}
+
+
+@pytest.mark.parametrize("kind", OBJECTS)
+def test_an_inactive_constraint_of_any_type_adds_its_rows(kind: str) -> None:
+    model = mujoco.MjModel.from_xml_string(JOINED.format(10 * OBJECTS[kind].format("false")))
+    without = mujoco.MjModel.from_xml_string(JOINED.format(""))
+    assert probe_sizes(model)[1] - probe_sizes(without)[1] == -(-10 * EQUALITIES[kind] // 8) * 8
+
+
+def test_drawn_ranges_may_bring_every_limit() -> None:
+    joints = "".join(
+        f'<body pos="{i} 0 0"><joint range="-900 900" limited="true"/><geom size=".1"/></body>' for i in range(20)
+    )
+    model = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 0"/><worldbody>{joints}</worldbody></mujoco>')
+    assert probe_sizes(model)[1] < 20 <= probe_sizes(model, ["jnt_range"])[1]

@@ -1,0 +1,241 @@
+"""The Warp engine's step equals MuJoCo Warp's own to the bit, with any element of a model and any field of World."""
+
+import copy
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import pytest
+import step_table as table
+import warp as wp
+from mujoco_warp._src import constraint
+from step_table import Case
+
+from lyceum_warp.engines.deterministic.deterministic_engine import DeterministicEngine
+from lyceum_warp.engines.warp.warp_engine import WarpEngine
+from lyceum_warp.fields import Stage, describe, early_sensor_columns
+from lyceum_warp.model_fields import _FIELDS, Constants, ModelField, describe_model_field
+
+N = 2
+PARTS = 20
+SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> wp.Device:
+    """A device on which steps repeat to the bit; on a GPU in the deterministic mode."""
+    return wp.get_device(request.param)
+
+
+def make(model: mujoco.MjModel, names: list[str], device: wp.Device, dynamics: Sequence[ModelField] = ()) -> WarpEngine:
+    fields = [describe(model, name) for name in dict.fromkeys(("qpos", "qvel", *names))]
+    kind = DeterministicEngine if device.is_cuda else WarpEngine
+    return kind(model, N, device, fields, dynamics, nconmax=64, njmax=256)
+
+
+def begin(engine: WarpEngine, mask: wp.array, seed: int) -> None:
+    """Episodes in the masked worlds, in states drawn at random."""
+    rng, chosen, model = np.random.default_rng(seed), mask.numpy(), engine.model
+    engine.reset(mask)
+    qpos, qvel = engine.arrays["qpos"].numpy(), engine.arrays["qvel"].numpy()
+    for w in np.flatnonzero(chosen):
+        row = qpos[w].astype(float)
+        mujoco.mj_integratePos(model, row, 0.03 * rng.normal(size=model.nv), 1.0)
+        qpos[w], qvel[w] = row, 0.3 * rng.normal(size=model.nv)
+    engine.arrays["qpos"].assign(qpos)
+    engine.arrays["qvel"].assign(qvel)
+    engine.commit(mask)
+    engine.refresh(mask)
+
+
+def state_of(engine: WarpEngine, m: mjw.Model, d: mjw.Data) -> np.ndarray:
+    state = wp.zeros((N, engine.integration_size), dtype=float, device=engine.device)
+    mjw.get_state(m, d, state, SPEC)
+    return state.numpy()
+
+
+def plain(function: Callable[[mjw.Model, mjw.Data], None], m: mjw.Model, d: mjw.Data) -> None:
+    """A step or a forward pass of MuJoCo Warp's own, with the velocities that its constraints read.
+
+    ``make_constraint`` reads the velocities of bodies that the last forward pass computed. Here they are the current
+    ones, in every stage of a step: the engine's steps are functions of the state alone by design.
+    """
+
+    def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
+        mjw.com_vel(m, d)
+        original(m, d)
+
+    original = constraint.make_constraint
+    with pytest.MonkeyPatch.context() as patch, wp.ScopedDevice(d.qpos.device):
+        patch.setattr(constraint, "make_constraint", make_constraint)
+        function(m, d)
+
+
+def check(case: Case, device: wp.Device) -> None:
+    """Steps and fields of an engine against MuJoCo Warp's own."""
+    model, names = table.model_of(case), table.fields_of(case)
+    engine = make(model, names, device)
+    begin(engine, wp.full(N, True, dtype=bool, device=device), 1)
+    m, d = engine.bare()
+    for t in range(2):
+        if t == 1:
+            begin(engine, wp.array([False, True], dtype=bool, device=device), 3)
+        before = state_of(engine, engine.m, engine.d)
+        set_state(m, d, before)
+        controls = np.random.default_rng(t).uniform(-1, 1, size=engine.ctrl.shape).astype(np.float32)
+        engine.ctrl.assign(controls)
+        d.ctrl.assign(controls)
+        engine.step(1 + t)
+        for _ in range(1 + t):
+            plain(mjw.step, m, d)
+        found, wanted = state_of(engine, engine.m, engine.d), state_of(engine, m, d)
+        assert np.isfinite(wanted).all() and (found != before).any()
+        np.testing.assert_array_equal(found, wanted, err_msg="state")
+    last = {name: getattr(d, name).numpy().copy() for name in names}
+    set_state(m, d, found)
+    plain(mjw.forward, m, d)
+    if "energy" in names:  # MuJoCo Warp's own forward pass loses the kinetic energy that a sensor shows
+        mjw.energy_pos(m, d)
+        mjw.energy_vel(m, d)
+    late = np.setdiff1d(np.arange(model.nsensordata), early_sensor_columns(model))
+    for name in names:
+        value, current = engine.arrays[name].numpy(), getattr(d, name).numpy()
+        if name == "sensordata":
+            current[:, late] = last[name][:, late]
+        elif engine.fields[name].reset == Stage.ACCELERATION:
+            current = last[name]
+        np.testing.assert_array_equal(value, current.reshape(value.shape), err_msg=name)
+
+
+def set_state(m: mjw.Model, d: mjw.Data, state: np.ndarray) -> None:
+    mjw.set_state(m, d, wp.array(state, dtype=float, device=d.qpos.device), SPEC)
+
+
+def check_or_refuse(case: Case, device: wp.Device) -> None:
+    if device.is_cuda and case["flex"] != "none":
+        with pytest.raises(ValueError, match="can't sort the contacts of flexes"):
+            make(table.model_of(case), [], device)
+    else:
+        check(case, device)
+
+
+@pytest.mark.parametrize("case", table.covering(2), ids=table.title)
+def test_a_step_equals_mujoco_warps_own_to_the_bit(case: Case, device: wp.Device) -> None:
+    """With any two levels of the table's factors together."""
+    check_or_refuse(case, device)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("part", range(PARTS))
+def test_a_step_with_any_three_levels_equals_mujoco_warps_own(part: int, device: wp.Device) -> None:
+    for case in table.covering(3)[part::PARTS]:
+        try:
+            check_or_refuse(case, device)
+        except Exception as error:
+            error.add_note(table.title(case))
+            raise
+
+
+LADEN = table.PLAIN | {
+    "armature": "motors", "tendons": "springs", "equality": "weld", "fluid": "ellipsoid", "gravcomp": "passive",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("asked", table.STAGES)
+def test_a_step_goes_on_from_the_fields_of_any_stage(asked: str, device: wp.Device) -> None:
+    """Each alone: the parts that it needs are computed, and those of them that a step begins with are not repeated."""
+    check(LADEN | {"asked": asked}, device)
+
+
+DRAWN = table.PLAIN | {
+    "drives": "filtered", "asked": "bodies", "sensors": "position", "tendons": "limits", "adhesion": "pair",
+    "equality": "connect", "armature": "none",
+}  # fmt: skip
+OF_ANOTHER_MODEL = {
+    "wind": {"fluid": "box"}, "tendon_armature": {"tendons": "plain"}, "tendon_lengthspring": {"tendons": "springs"},
+    "tendon_solref_fri": {"tendons": "friction"}, "tendon_solimp_fri": {"tendons": "friction"},
+    "pair_solreffriction": {"cone": "elliptic"},
+}  # fmt: skip
+"""What a model needs beside ``DRAWN``, so that a field matters."""
+
+
+def touching(model: mujoco.MjModel) -> np.ndarray:
+    """A state at limits, with contacts and saturated actuators, in all worlds, (N, integration size)."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    data.qpos[model.joint("elbow").qposadr[0]] = 0.1
+    data.qvel[:] = 0.05 * rng.normal(size=model.nv)
+    data.act[:] = 1.5
+    data.ctrl[:] = 0.5
+    state = np.empty(mujoco.mj_stateSize(model, SPEC))
+    mujoco.mj_getState(model, data, state, SPEC)
+    return np.tile(state, (N, 1))
+
+
+def drawn_fields() -> list[Any]:
+    """All fields; of those from which nothing follows, MuJoCo Warp takes every world's row, and they take long."""
+    return [name if constants else pytest.param(name, marks=pytest.mark.long) for name, constants in _FIELDS.items()]
+
+
+@pytest.mark.parametrize("name", drawn_fields())
+def test_a_drawn_field_acts_as_in_an_edited_model(name: str, device: wp.Device) -> None:
+    """Also where it is zero in the model. To the bit, unless constants follow from it, in single precision."""
+    case = DRAWN | OF_ANOTHER_MODEL.get(name, {})
+    spec = mujoco.MjSpec.from_string(table.xml(case))
+    for body in spec.bodies[1:]:
+        body.simple = 0
+    model = spec.compile()
+    edited, field = copy.copy(model), describe_model_field(model, name)
+    value = field.value(edited)
+    drawn = value * np.random.default_rng(0).uniform(1.0, 1.1, size=value.shape) + 0.03 * (value == 0)
+    if name.endswith("quat"):
+        drawn = value + 0.05
+        drawn /= np.linalg.norm(drawn, axis=-1, keepdims=True)
+    drawn = drawn.astype(np.float32)
+    if field.option:
+        setattr(edited.opt, name, drawn if drawn.ndim else float(drawn))
+    else:
+        value[...] = drawn
+    mujoco.mj_setConst(edited, mujoco.MjData(edited))
+    names = table.fields_of(case)
+    engine, wanted = make(model, names, device, [field]), make(edited, names, device)
+    rows = engine.arrays[name].numpy()
+    rows[1] = drawn.reshape(rows[1].shape)
+    engine.arrays[name].assign(rows)
+    everyone = wp.full(N, True, dtype=bool, device=device)
+    engine.apply_model(everyone)
+    for made in (engine, wanted):
+        made.reset(everyone)
+        set_state(made.m, made.d, touching(model))
+        made.refresh(everyone)
+        for nstep in (1, 2):
+            made.step(nstep)
+    found, expected = state_of(engine, engine.m, engine.d), state_of(wanted, wanted.m, wanted.d)
+    tolerance = 1e-4 if field.constants & ~Constants.PRIVATE else 0.0
+    same = (found[1] == found[0]).all()
+    np.testing.assert_allclose(found[1], expected[1], rtol=tolerance, atol=tolerance, err_msg="state")
+    for shown in names:
+        pair = [made.arrays[shown].numpy().reshape(N, -1) for made in (engine, wanted)]
+        same &= (pair[0][1] == pair[0][0]).all()
+        scale = tolerance * max(1.0, float(np.abs(pair[1]).max()))
+        np.testing.assert_allclose(pair[0][1], pair[1][1], rtol=tolerance, atol=scale, err_msg=shown)
+    assert same == (name == "geom_gap"), "only contacts within a gap, which exert no force, change nothing"
+
+
+@pytest.mark.parametrize(("levels", "reason"), table.REFUSED)
+def test_refused_combinations_are_refused(levels: dict[str, tuple[str, ...]], reason: str) -> None:
+    for chosen in itertools.product(*levels.values()):
+        with pytest.raises((ValueError, NotImplementedError), match=reason):
+            make(table.model_of(table.PLAIN | dict(zip(levels, chosen, strict=True))), [], wp.get_device("cpu"))
+
+
+def test_the_table_knows_every_member_of_mujocos_enums() -> None:
+    """An element of a new MuJoCo fails here until the table has it, or says why it does not."""
+    models = [table.model_of(case) for case in table.singles()]
+    for enum, members in table.ENUMS.items():
+        found = {int(member) for model in models for member in members(model)}
+        every = {name: member.value for name, member in getattr(mujoco, enum).__members__.items()}
+        missing = {name for name, value in every.items() if value not in found}
+        assert missing == {name for name in table.UNKNOWN if name in every}, enum

@@ -1,0 +1,191 @@
+"""Give random command lines to ``lyceum-warp``.
+
+A case is "COMMAND SEED", or the name of one of the minimal cases in ``known_failures.py``. The flags are read from the
+help texts, so that a new one is attacked, too.
+"""
+
+import contextlib
+import functools
+import io
+import os
+import re
+import shutil
+import warnings
+from pathlib import Path
+from random import Random
+
+import guarded
+import torch
+from guarded import ProblemError
+from mutations import NUMBERS, TEXTS
+
+import lyceum_warp.cli.view
+from lyceum_warp import cli
+
+RUN, HERE = Path("commands/good").absolute(), Path("commands/here").absolute()
+
+SMALL: dict[str, dict[str, tuple[str, ...]]] = {
+    "tasks": {},
+    "new": {"--model": ("gymnasium:hopper.xml",)},
+    "check": {"--nworld": ("2",), "--steps": ("2",), "--rule": ("spaces",)},
+    "train": {
+        "--iterations": ("1",), "--samples": ("8",), "--nworld": ("2",), "--hidden": ("4",), "--value-hidden": ("4",),
+        "--mean-every": ("0",), "--horizon": ("4",), "--out": ("out",), "--no-video": (), "--no-plot": (),
+    },
+    "train --resume good": {"--iterations": ("2",), "--no-video": (), "--no-plot": ()},
+    "train --from good": {"--iterations": ("1",), "--no-video": (), "--no-plot": ()},
+    "eval": {"--episodes": ("2",)},
+    "export": {"--to": ("policy.pt2",)},
+    "plan": {
+        "--steps": ("2",), "--samples": ("2",), "--horizon": ("2",), "--out": ("out",), "--no-video": (),
+        "--no-plot": (),
+    },
+    "view": {"--gfx": ("native",)},
+    "warmup": {"--nworld": ("2",)},
+    "bench": {},
+}  # fmt: skip
+"""Commands with flags that make them short."""
+
+FIRST = {
+    "tasks": "",
+    "new": "my_task",
+    "eval": "good",
+    "export": "good",
+    "train --resume good": "",
+    "train --from good": "",
+}
+"""What follows a command's name; a task by default."""
+
+_OMIT = ("--help", "--video", "--video-every", "--view")
+"""Flags that start other processes, and one that prints."""
+
+
+@functools.cache
+def flags(command: str) -> tuple[str, ...]:
+    """The flags of a command, as its help text lists them."""
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+        cli.main([command.split()[0], "--help"])
+    found = re.findall(r"^\W*(--[\w.-]+(?:, --[\w.-]+)*)", out.getvalue(), re.MULTILINE)
+    return tuple(name for names in found for name in names.split(", ") if name not in _OMIT)
+
+
+def _word(random: Random) -> str:
+    kind = random.randrange(3)
+    if kind == 0:
+        return str(random.choice(NUMBERS))
+    if kind == 1:
+        return random.choice(TEXTS).replace("\0", "\1")  # an argument ends at a null byte
+    return random.choice(_WORDS)
+
+
+_WORDS = (
+    "1", "2", "3", "0.5", "cpu", "cuda:99", "warp", "mujoco", "auto", "True", "None", "last", "best", "good", "here",
+    ".", "point_mass", "hopper.py", "x.onnx", "x.pt2", "free", "azimuth=9", "-", "--", "success_distance=1",
+    "success_distance=nan", "x=1", "=", "a=b=c", "iterations=2", "nworld=3",
+)  # fmt: skip
+
+
+def words(command: str, random: Random) -> list[str]:
+    """A random command line."""
+    name, *rest = command.split()
+    given = dict(SMALL[command])
+    first = FIRST.get(command, "point_mass")
+    others = []
+    known = flags(command)
+    for _ in range(random.choice((1, 1, 2, 3))):
+        kind = random.randrange(12)
+        if kind == 0:
+            first = _word(random)
+        elif kind == 1:
+            others.append(_word(random))
+        elif kind == 2 and known:
+            flag = random.choice(known)
+            given[flag[:-1] if random.random() < 0.5 else flag.replace("-", "_", 3)] = (_word(random),)
+        elif kind == 3 and given:
+            others += [flag := random.choice(list(given)), *given[flag]]
+        elif known:
+            flag = random.choice(known)
+            given.pop(flag.replace("--no-", "--"), None)
+            given.pop(flag.replace("--", "--no-", 1), None)
+            short = flag.startswith("--no-") or f"--no-{flag[2:]}" in known
+            given[flag] = () if short else tuple(_word(random) for _ in range(random.choice((1, 1, 1, 1, 0, 2, 3))))
+    line = [word for flag, values in given.items() for word in (flag, *values)]
+    line = [name, *([first] if first else []), *rest, *line, *others]
+    if random.random() < 0.03:
+        line[0] = random.choice(("trian", "", "--version", "-h", "[red]", "--"))
+    return line
+
+
+def attack(case: str) -> str:
+    """Run a case."""
+    from known_failures import COMMANDS
+
+    if case in COMMANDS:
+        return run(list(COMMANDS[case].words))
+    return run(words(case.rsplit(" ", 1)[0], Random(case)))
+
+
+def run(line: list[str]) -> str:
+    """Run a command line in a folder with a run, and judge its end."""
+    os.chdir(HERE.parent)
+    shutil.rmtree(HERE, ignore_errors=True)
+    HERE.mkdir()
+    shutil.copytree(RUN, HERE / "good")
+    os.chdir(HERE)
+    before = _content()
+    out, err = io.StringIO(), io.StringIO()
+    parsed = True
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            code = cli.main(line)
+        except SystemExit as end:  # of the parser, which explains itself in a box
+            code, parsed = end.code, False
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            raise ProblemError(_spelled(line), error) from error
+    if code in (130, 143):
+        return "interrupted"
+    if code not in (0, 1, 2):
+        raise ProblemError(f"{_spelled(line)} ended with {code}")
+    if code == 2:
+        lines = err.getvalue().splitlines()
+        errors = [text for text in lines if text.startswith("lyceum-warp: ")]
+        if parsed and (not errors or lines[-1] != errors[-1]):
+            raise ProblemError(f"{_spelled(line)}: stderr ends without an error of one line: {lines[-3:]}")
+        if (after := _content()) != before:
+            changed = [name for name in after | before if before.get(name) != after.get(name)]
+            raise ProblemError(f"{_spelled(line)}: ended with 2, but changed {', '.join(changed)}: {lines[-1:]}")
+    return ("worked", "worked", "refused")[code]
+
+
+def _spelled(line: list[str]) -> str:
+    plain = [word[:80] if word.isprintable() and word and " " not in word else repr(word) for word in line]
+    return "lyceum-warp " + " ".join(plain)
+
+
+def _content() -> dict[str, bytes]:
+    return {str(path): path.read_bytes() if path.is_file() else b"" for path in Path(".").rglob("*")}
+
+
+def warm_up() -> None:
+    """Make a run, and run every command once."""
+    lyceum_warp.cli.view.view = lambda *args, **options: None  # the window, beyond everything that is checked
+    torch.set_num_threads(1)
+    HERE.mkdir(parents=True, exist_ok=True)
+    if not RUN.exists():
+        os.chdir(HERE)
+        line = [word for flag, values in SMALL["train"].items() for word in (flag, *values)]
+        assert cli.main(["train", "point_mass", *line]) == 0
+        (HERE / "out").rename(RUN)
+    for command in SMALL:
+        if command != "bench":  # another process
+            first = FIRST.get(command, "point_mass")
+            line = [word for flag, values in SMALL[command].items() for word in (flag, *values)]
+            run([*command.split()[:1], *([first] if first else []), *command.split()[1:], *line])
+
+
+if __name__ == "__main__":
+    guarded.serve(attack, warm_up)

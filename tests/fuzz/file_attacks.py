@@ -1,0 +1,329 @@
+"""Read files that were damaged at random: a run's, saved episodes, models and tables.
+
+A case is "KIND SEED", or the name of one of the minimal cases in ``known_failures.py``.
+"""
+
+import contextlib
+import dataclasses
+import io
+import json
+import re
+import shutil
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from random import Random
+
+import guarded
+import mutations
+import numpy as np
+import torch
+from guarded import ProblemError
+from lyceum_warp.control.saved_episodes import episode_env, load_episodes
+
+import lyceum_warp as lw
+import lyceum_warp.cli.view
+from lyceum_warp import cli
+from lyceum_warp.runs import Run
+from lyceum_warp.viz.video import NoVideoError
+
+REFUSALS = (ValueError, OSError, ImportError, NoVideoError, FloatingPointError)
+"""The errors that the package documents for bad files and arguments."""
+BASE, CASE, CANARY = Path("base").absolute(), Path("case").absolute(), Path("canary").absolute()
+
+TASK = """
+import warp as wp
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    time: float
+
+@wp.struct
+class Params:
+    dt: float
+    motion: wp.array2d[float] = [[0.0, 1.0]]
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    obs[0] = s.qpos[0]
+    obs[1] = p.motion[0, 1]
+
+class Slide(lw.Task):
+    model = "slide.xml"
+    obs = {"x": 1, "reference": 1}
+    horizon = 8
+"""
+SLIDE = """<mujoco model="slide">
+  <option timestep="0.01" integrator="Euler"/>
+  <default><geom density="500"/><default class="ball"><geom size="0.1" rgba="1 0 0 1"/></default></default>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 .1"/>
+    <body name="ball" pos="0 0 1">
+      <joint name="slide" type="slide" axis="1 0 0" range="-1 1" limited="true"/>
+      <geom name="ball" class="ball" type="sphere"/>
+      <site name="tip" pos="0 0 .1"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="slide" gear="2" ctrlrange="-1 1" ctrllimited="true"/></actuator>
+  <sensor><framepos objtype="site" objname="tip"/></sensor>
+  <keyframe><key name="home" qpos="0.1"/></keyframe>
+</mujoco>
+"""
+URDF = """<robot name="arm">
+  <link name="base"><inertial><mass value="1"/>
+    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+  <link name="arm"><inertial><origin xyz="0 0 .5"/><mass value="1"/>
+    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+    <collision><geometry><sphere radius="0.1"/></geometry></collision></link>
+  <joint name="elbow" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+</robot>
+"""
+SIZES = "--samples 16 --nworld 2 --hidden 4 --value-hidden 4 --mean-every 2 --mean-episodes 2 --no-video --no-plot"
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """A kind of file: where a case finds it, how it is damaged, and the ways in which it is read."""
+
+    file: str
+    mutate: Callable[[bytes, Random], bytes]
+    readers: tuple[str, ...]
+    names: tuple[str, ...] = ()
+    """What an error may name instead of the file."""
+
+
+def _checkpoint(data: bytes, random: Random) -> bytes:
+    return mutations.mutated_checkpoint(data, random, CANARY)
+
+
+def _episode(data: bytes, random: Random) -> bytes:
+    return mutations.mutated_episode(data, random, CANARY)
+
+
+def _table(data: bytes, random: Random) -> bytes:
+    return mutations.mutated_table(data, random, CANARY)
+
+
+KINDS = {
+    "config.json": Kind("run/config.json", mutations.mutated_json, ("open", "eval", "resume", "from", "view")),
+    "kept config.json": Kind("kept/config.json", mutations.mutated_json, ("eval kept", "resume kept", "from kept")),
+    "versions.json": Kind("run/versions.json", mutations.mutated_json, ("eval", "resume")),
+    "metrics.csv": Kind("run/metrics.csv", mutations.mutated_csv, ("open", "resume")),
+    "policy.pt": Kind("run/policy.pt", _checkpoint, ("load", "load", "eval", "view", "from")),
+    "best.pt": Kind("run/best.pt", _checkpoint, ("load best", "resume", "from best")),
+    "checkpoint.pt": Kind("run/checkpoint.pt", _checkpoint, ("resume alone", "load alone")),
+    "previous.pt": Kind("run/previous.pt", _checkpoint, ("resume previous",), ("checkpoint.pt",)),
+    "episode.npz": Kind("episodes/episode-000.npz", _episode, ("episodes", "view episodes")),
+    "kept task": Kind("kept/task/slide.py", mutations.mutated_python, ("eval kept",), ("slide", "Slide")),
+    "kept model": Kind("kept/task/slide.xml", mutations.mutated_xml, ("eval kept",), ("slide", "model")),
+    "kept table": Kind("kept/task/tables/motion.npy", _table, ("eval kept",)),
+    "model.xml": Kind("model.xml", mutations.mutated_xml, ("make", "new"), ("model", "slide")),
+    "model.urdf": Kind("model.urdf", mutations.mutated_xml, ("make urdf", "new urdf"), ("model", "slide")),
+    "table.npy": Kind("table.npy", _table, ("table",)),
+}  # fmt: skip
+
+
+# readers: each is a way in which a person reads files of the case
+
+
+def _both(run: Path, which: str = "last") -> None:
+    for load in (lw.load, lw.load_value):
+        network: torch.nn.Module = load(run, which=which)
+        _same_weights(network, run, "best.pt" if which == "best" else "policy.pt")
+
+
+def _same_weights(network: torch.nn.Module, run: Path, name: str) -> None:
+    """The weights that a file was written with, or an error: a reader cannot tell damaged ones."""
+    part = "value" if isinstance(network, lw.ValueFunction) else "policy"
+    saved = torch.load(BASE / run.name / name, weights_only=True)[part]["state"]
+    for key, tensor in network.state_dict().items():
+        if not torch.equal(tensor.cpu(), saved[key]):
+            raise ProblemError(f"other weights than those that were saved were accepted, {key} of the {part}")
+
+
+def _resume(run: Path) -> None:
+    command("train", "--resume", run, "--iterations", "3", "--no-video", "--no-plot")
+
+
+def _episodes(path: Path) -> None:
+    episodes = load_episodes(path)
+    env = episode_env(episodes)
+    for episode in episodes.values():
+        env.set_state(episode.states[:1])
+
+
+def _open(run: Path) -> None:
+    opened = Run.open(run)
+    assert isinstance(opened.task_name, str)
+    opened.rows()
+
+
+def _step(env: lw.Env) -> None:
+    env.rand_reset(0)
+    env.step()
+
+
+READERS: dict[str, Callable[[], object]] = {
+    "open": lambda: _open(CASE / "run"),
+    "load": lambda: _both(CASE / "run"),
+    "load best": lambda: _both(CASE / "run", "best"),
+    "load alone": lambda: _both(CASE / "run"),
+    "eval": lambda: command("eval", CASE / "run", "--episodes", 2),
+    "eval kept": lambda: command("eval", CASE / "kept", "--episodes", 2),
+    "view": lambda: command("view", CASE / "run", "--nworld", 1),
+    "resume": lambda: _resume(CASE / "run"),
+    "resume alone": lambda: _resume(CASE / "run"),
+    "resume previous": lambda: _resume(CASE / "run"),
+    "resume kept": lambda: _resume(CASE / "kept"),
+    "from": lambda: command("train", "--from", CASE / "run", *_NEW),
+    "from best": lambda: command("train", "--from", CASE / "run", "--which", "best", *_NEW),
+    "from kept": lambda: command("train", "--from", CASE / "kept", *_NEW),
+    "episodes": lambda: _episodes(CASE / "episodes"),
+    "view episodes": lambda: command("view", CASE / "episodes"),
+    "make": lambda: _step(lw.make(SLIDE_PY, model=CASE / "model.xml")),
+    "new": lambda: command("new", "case/my_new_task", "--model", CASE / "model.xml"),
+    "make urdf": lambda: _step(lw.make(SLIDE_PY, model=CASE / "model.urdf")),
+    "new urdf": lambda: command("new", "case/my_new_task", "--model", CASE / "model.urdf"),
+    "table": lambda: _step(lw.make(SLIDE_PY, motion=CASE / "table.npy")),
+}  # fmt: skip
+WITHOUT = {"load alone": "run/policy.pt", "resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}
+"""Files that are missing where a reader is to read another one."""
+SLIDE_PY = str(BASE / "slide.py")
+_NEW = ("--out", "case/new", "--iterations", "1", "--no-video", "--no-plot")
+
+
+class RefusedError(Exception):
+    """A command ended with 2 and one line on stderr."""
+
+
+def command(*words: object) -> None:
+    """Run a command in this process.
+
+    Raises:
+        RefusedError: It ended with 2.
+        ProblemError: It ended in another way than a command may.
+    """
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = cli.main([str(word) for word in words])
+    lines = [line for line in err.getvalue().splitlines() if line.startswith("lyceum-warp: ")]
+    if code == 2:
+        raise RefusedError(lines[-1] if lines else "without a line on stderr")
+    if code not in (0, 130):
+        raise ProblemError(f"{words[0]} ended with {code}: {err.getvalue()[-300:]}")
+
+
+# cases
+
+
+def attack(case: str) -> str:
+    """Run a case."""
+    from known_failures import FILES
+
+    if case in FILES:
+        known = FILES[case]
+        return read(known.kind, known.reader, known.change)
+    name = case.rpartition(" ")[0]
+    random = Random(case)
+    kind = KINDS[name]
+    return read(name, random.choice(kind.readers), lambda data: kind.mutate(data, random))
+
+
+def read(name: str, reader: str, change: Callable[[bytes], bytes]) -> str:
+    """Damage a file of a copy of the base, and read it."""
+    kind = KINDS[name]
+    shutil.rmtree(CASE, ignore_errors=True)
+    shutil.copytree(BASE, CASE)
+    file = CASE / kind.file
+    file.write_bytes(change(file.read_bytes()))
+    if reader in WITHOUT:
+        (CASE / WITHOUT[reader]).unlink()
+    before = _content(CASE)
+    did, error = "worked", None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            READERS[reader]()
+        except ProblemError as problem:
+            raise ProblemError(f"{name}, {reader}: {problem}") from problem
+        except (*REFUSALS, RefusedError) as refused:
+            did, error = "refused", refused
+        except KeyboardInterrupt:
+            raise
+        except BaseException as failure:
+            raise ProblemError(f"{name}, {reader}", failure) from failure
+    if CANARY.exists():
+        CANARY.unlink()
+        raise ProblemError(f"{name}, {reader}: code in the file was executed")
+    if error is not None:
+        _check_refusal(f"{name}, {reader}", kind, error, before)
+    return did
+
+
+def _check_refusal(where: str, kind: Kind, error: BaseException, before: Mapping[str, bytes]) -> None:
+    if guarded.out_of_memory(error):
+        raise ProblemError(f"{where} takes too much memory", error)
+    file = Path(kind.file)
+    text = str(error)
+    if not any(name in text for name in (file.name, *kind.names)):
+        raise ProblemError(f"{where}: the message does not name the file", error)
+    after = _content(CASE)
+    changed = [name for name in before | after if before.get(name) != after.get(name)]
+    if changed:
+        raise ProblemError(f"{where}: refused, but it changed {', '.join(changed)}", error)
+
+
+def _content(folder: Path) -> dict[str, bytes]:
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes()
+        for p in folder.rglob("*")
+        if p.is_file() and p.suffix != ".pyc"
+    }
+
+
+# the base
+
+
+def warm_up() -> None:
+    """Make the base, unless an earlier process made it, and run every reader once."""
+    lyceum_warp.cli.view.view = lambda *args, **options: None  # the window, beyond everything that is read
+    torch.set_num_threads(1)
+    if not BASE.exists():
+        making = BASE.with_name("making")
+        shutil.rmtree(making, ignore_errors=True)
+        making.mkdir()
+        _make(making)
+        making.rename(BASE)
+    for reader, name in {reader: name for name, kind in KINDS.items() for reader in kind.readers}.items():
+        did = read(name, reader, lambda data: data)
+        assert did == ("refused" if "urdf" in reader else "worked"), f"{reader} {did} without damage"
+
+
+def _make(folder: Path) -> None:
+    (folder / "slide.py").write_text(TASK)
+    for name, text in (("slide.xml", SLIDE), ("model.xml", SLIDE), ("model.urdf", URDF)):
+        (folder / name).write_text(text)
+    np.save(folder / "table.npy", np.linspace(0.0, 1.0, 80, dtype=np.float32).reshape(40, 2))
+    options = [*SIZES.split(), "--iterations", "2", "--keep-every", "1"]
+    command("train", "point_mass", "--horizon", "8", "--out", folder / "run", *options)
+    command(
+        "train", folder / "slide.py", "--out", folder / "kept", "--param", f"motion={folder / 'table.npy'}", *options
+    )
+    for run in ("run", "kept"):  # the same bytes every time, as far as the file's length goes
+        path = folder / run / "metrics.csv"
+        path.write_text(re.sub(r"\d+\.\d{9,}", lambda found: found[0][:8], path.read_text()))
+    config = json.loads((folder / "kept/config.json").read_text())
+    config |= {"task": "/nowhere/slide.py", "params": {"motion": "/nowhere/table.npy"}}  # so that the copies are read
+    (folder / "kept/config.json").write_text(json.dumps(config, indent=2))
+    plant = lw.make("point_mass", autoreset=False, horizon=4)
+    episode = lw.control(plant, lambda state, obs: torch.zeros(2), seed=1)
+    times = {name: torch.zeros_like(getattr(episode, name)) for name in ("times", "ages", "plan_times", "plan_starts")}
+    dataclasses.replace(episode, wall_seconds=1.0, **times).save(folder / "episodes/episode-000.npz")
+
+
+if __name__ == "__main__":
+    guarded.serve(attack, warm_up)
