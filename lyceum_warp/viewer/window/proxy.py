@@ -247,8 +247,8 @@ class Proxy:
 
     def _check_sender(self, request: web.BaseRequest) -> None:
         """Refuse names that are not this machine's, requests of other sites' pages, and all but a plain GET."""
-        hosts = [value.lower() for value in request.headers.getall("Host", [])]
-        match = _HOST.fullmatch(hosts[0]) if len(hosts) == 1 else None
+        host = request.headers.get("Host", "").lower()
+        match = _HOST.fullmatch(host)
         if match is None:
             raise web.HTTPBadRequest(text="the Host header is missing or malformed\n")
         name = match[1].strip("[]")
@@ -258,7 +258,7 @@ class Proxy:
             if name not in self._names:
                 text = f"{name} is not a name of this machine; use its address instead\n"
                 raise web.HTTPMisdirectedRequest(text=text) from None
-        own = (f"http://{hosts[0]}", f"https://{hosts[0]}")
+        own = (f"http://{host}", f"https://{host}")
         foreign = any(origin.lower() not in own for origin in request.headers.getall("Origin", []))
         # a link on another page may lead here; its token decides
         modes = request.headers.get("Sec-Fetch-Mode"), request.headers.get("Sec-Fetch-Dest")

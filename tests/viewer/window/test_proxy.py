@@ -121,16 +121,16 @@ def entered(proxy: Proxy) -> tuple[str, str]:
     return found[1], found[2]
 
 
-def get(proxy: Proxy, path: str = "/", *headers: str, host: str = "", key: str | None = None) -> bytes:
+def get(
+    proxy: Proxy, path: str = "/", *headers: str, host: str = "", key: str | None = None, whole: bool = False
+) -> bytes:
     """The answer to GET below the right path, with the right cookie or with another one."""
     own, before = entered(proxy)
-    path = path if "token=" in path else before + path
-    lines = [
-        f"GET {path} HTTP/1.1",
-        f"Host: {host or f'127.0.0.1:{proxy.port}'}",
-        f"Cookie: {own if key is None else key}",
-    ]
-    return request(proxy, "\n".join([*lines, *headers]))
+    path = path if "token=" in path or whole else before + path
+    key = f"Cookie: {own if key is None else key}"
+    return request(
+        proxy, "\n".join([f"GET {path} HTTP/1.1", f"Host: {host or f'127.0.0.1:{proxy.port}'}", key, *headers])
+    )
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
@@ -160,28 +160,6 @@ def test_an_address_has_32_random_bytes() -> None:
         assert token(one) != token(other) and len(token(one)) == 43
 
 
-@pytest.mark.usefixtures("untouched")
-@pytest.mark.parametrize("path", ["/", "/?token=", "/?token=WRONG", "/?token=OTHER", "/?token=TOKEN&token=WRONG",
-                                  "/?token=TOKEN&token=TOKEN", "/model", "/model?token=WRONG", "/model?token=TOKEN",
-                                  "/?tokenx=TOKEN", "/?token=token\xe9"])  # fmt: skip
-def test_requests_without_the_right_token_are_refused(proxy: Proxy, path: str) -> None:
-    with Proxy() as other:
-        path = path.replace("TOKEN", token(proxy)).replace("OTHER", token(other))
-        assert status(request(proxy, f"GET {path} HTTP/1.1\nHost: 127.0.0.1")) in (400, 403)
-
-
-@pytest.mark.usefixtures("untouched")
-@pytest.mark.parametrize("key", ["", "lyceum-warp=", "lyceum-warp=wrong", "lyceum-warp=TOKEN", "NAME=VALUEx", "x=VALUE",
-                                 "lyceum-warp=PATH", "lyceum-warp=VALUE\xe9"])  # fmt: skip
-def test_requests_without_the_right_cookie_are_refused(proxy: Proxy, key: str) -> None:
-    own, path = entered(proxy)
-    name, _, value = own.partition("=")
-    for word, meaning in (("NAME", name), ("VALUE", value), ("PATH", path.strip("/")), ("TOKEN", token(proxy))):
-        key = key.replace(word, meaning)
-    assert status(get(proxy, key=key)) == 403
-    assert status(get(proxy, "/ui", *UPGRADE, key=key)) == 403
-
-
 def test_cookies_of_other_servers_do_not_disturb(proxy: Proxy) -> None:
     """Of another viewer and of one that ran before, and malformed ones."""
     with Proxy() as other:
@@ -189,15 +167,6 @@ def test_cookies_of_other_servers_do_not_disturb(proxy: Proxy) -> None:
         foreign = entered(other)[0]
     assert status(get(proxy, key=foreign)) == 403
     assert status(get(proxy, key=f"{foreign}; bad[{{; theme=dark; {entered(proxy)[0]}; lyceum-warp=stale")) == 200
-
-
-@pytest.mark.usefixtures("untouched")
-@pytest.mark.parametrize("path", ["/", "/index.html", "//", "/WRONG/", "/PATH", "/PATHx/", "//PATH/", "/x/../PATH/",
-                                  "/VALUE/", "/model"])  # fmt: skip
-def test_the_cookie_without_the_right_path_is_refused(proxy: Proxy, path: str) -> None:
-    key, before = entered(proxy)
-    path = path.replace("PATH", before.strip("/")).replace("VALUE", key.partition("=")[2])
-    assert status(request(proxy, f"GET {path} HTTP/1.1\nHost: 127.0.0.1\nCookie: {key}")) == 403
 
 
 class Jar(http.cookiejar.CookieJar):
@@ -219,6 +188,73 @@ def test_another_port_of_the_host_is_not_sent_the_cookie(proxy: Proxy) -> None:
         assert jar.sent_to(f"http://127.0.0.1:{proxy.port}{path}/") == cookie
     for other in ("/", "/ui", "/state", "/model", "/lyceum-warp/", "/index.html"):
         assert jar.sent_to(f"http://127.0.0.1:{proxy.port + 1}{other}") is None
+
+
+# attacks: none of them may reach the private server
+
+ORIGINS = ("http://evil.example", "null", "https://127.0.0.1", "http://127.0.0.1:1", "file://",
+           "http://localhost:PORT", "http://127.0.0.1:PORT.evil.example", "http://127.0.0.1:PORT/", "")  # fmt: skip
+EMBEDDED = (("cross-site", "no-cors", "script"), ("same-site", "no-cors", "image"),
+            ("cross-site", "navigate", "iframe"), ("cross-site", "websocket", "websocket"))  # fmt: skip
+FOREIGN = [
+    *[(f"Origin: {origin}",) for origin in ORIGINS],
+    *[(f"Sec-Fetch-Site: {a}", f"Sec-Fetch-Mode: {b}", f"Sec-Fetch-Dest: {c}") for a, b, c in EMBEDDED],
+]
+HOSTS = ("evil.example", "evil.example:PORT", "127.0.0.1.evil.example", "localhost.evil.example:PORT", "localhost.")
+COOKIES = ("", "lyceum-warp=", "lyceum-warp=wrong", "lyceum-warp=TOKEN", "x=VALUE", "lyceum-warp=VALUEx",
+           "lyceum-warp=PATH", "lyceum-warp=VALUE\xe9")  # fmt: skip
+TOKENS = ("/?token=", "/?token=WRONG", "/?token=OTHER", "/?token=TOKEN&token=WRONG", "/?token=TOKEN&token=TOKEN",
+          "/model?token=WRONG", "/model?token=TOKEN", "/?token=token\xe9")  # fmt: skip
+PLACES = ("/", "/index.html", "//", "/WRONG/", "/PATH", "/PATHx/", "//PATH/", "/x/../PATH/", "/VALUE/", "/model",
+          "/?tokenx=TOKEN")  # fmt: skip
+SPELLINGS = ("//drop", "/./drop", "/x/../drop", "/%64rop", "/drop%20", "/..", "/assets/../../x", "/\\drop")
+UPGRADES = [
+    (*(line for line in UPGRADE if line.partition(":")[0] != header.partition(":")[0]), header)
+    for header in ("Upgrade: h2c", "Sec-WebSocket-Key: short", "Sec-WebSocket-Key: ", "Connection: close",
+                   "Sec-WebSocket-Version: 6")
+]  # fmt: skip
+LARGE = ("X: " + "a" * 20_000, "\n".join(f"X-{n}: {n}" for n in range(3000)), "Cookie: " + "a=b; " * 5000)
+ATTACKS: list[tuple[set[int], str, dict[str, object]]] = [
+    *[({400, 403}, path, {}) for path in TOKENS],
+    *[({403}, path, {"whole": True}) for path in PLACES],
+    *[({403}, "/", {"key": key}) for key in COOKIES],
+    *[({403}, "/ui", {"headers": UPGRADE, "key": key}) for key in COOKIES],
+    *[({403}, path, {"headers": headers}) for headers in FOREIGN for path in ("/model", "/?token=TOKEN")],
+    *[({403}, "/state", {"headers": (*headers, *UPGRADE)}) for headers in FOREIGN],
+    ({403}, "/", {"headers": ("Origin: http://127.0.0.1:PORT", "Origin: http://evil.example")}),
+    *[({421}, path, {"host": host}) for host in HOSTS for path in ("/", "/?token=TOKEN")],
+    *[({400}, "/", {"host": host}) for host in ("a@HOST", "HOST/", "HOST\nHost: HOST", " ")],
+    *[({400, 404}, path, {"headers": headers}) for path in SPELLINGS for headers in ((), UPGRADE)],
+    *[({404}, path, {"headers": UPGRADE}) for path in ("/", "/model", "/upload", "/drop", "/drop?sid=1", "/ui/")],
+    *[({400}, "/ui", {"headers": headers}) for headers in UPGRADES],
+    *[({400, 431}, "/", {"headers": (header,)}) for header in LARGE],
+]  # fmt: skip
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize(("codes", "path", "given"), ATTACKS)
+def test_an_attack_is_refused(proxy: Proxy, codes: set[int], path: str, given: dict[str, object]) -> None:
+    cookie, below = entered(proxy)
+    with Proxy() as other:
+        words = {"PORT": str(proxy.port), "PATH": below.strip("/"), "VALUE": cookie.partition("=")[2],
+                 "TOKEN": token(proxy), "OTHER": token(other), "HOST": f"127.0.0.1:{proxy.port}"}  # fmt: skip
+
+    def filled(text: str) -> str:
+        for word, meaning in words.items():
+            text = text.replace(word, meaning)
+        return text
+
+    options = {name: filled(str(given[name])) for name in ("host", "key") if name in given}
+    headers = [filled(line) for line in given.get("headers", ())]  # type: ignore[attr-defined]
+    answer = get(proxy, filled(path), *headers, whole="whole" in given, **options)  # type: ignore[arg-type]
+    assert status(answer) in codes
+
+
+@pytest.mark.usefixtures("untouched")
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "HEAD", "OPTIONS", "TRACE"])
+def test_only_get_is_allowed(proxy: Proxy, method: str) -> None:
+    key, path = entered(proxy)
+    assert status(request(proxy, f"{method} {path}/ HTTP/1.1\nHost: 127.0.0.1\nCookie: {key}")) == 405
 
 
 # what studio's responses may contain
@@ -263,54 +299,12 @@ def test_a_private_server_that_has_ended_is_reported(proxy: Proxy, upstream: Ups
 
 
 @pytest.mark.usefixtures("untouched")
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1", "http://127.0.0.1:1", "file://",
-                                    "http://localhost:PORT", "http://127.0.0.1:PORT.evil.example",
-                                    "http://127.0.0.1:PORT/", ""])  # fmt: skip
-def test_foreign_origins_are_refused(proxy: Proxy, origin: str) -> None:
-    header = f"Origin: {origin.replace('PORT', str(proxy.port))}"
-    assert status(get(proxy, "/model", header)) == 403
-    assert status(get(proxy, "/state", header, *UPGRADE)) == 403
-    assert status(get(proxy, f"/?token={token(proxy)}", header)) == 403
-    assert status(get(proxy, "/model", f"Origin: http://127.0.0.1:{proxy.port}", header)) in (400, 403)
-
-
-@pytest.mark.usefixtures("untouched")
-@pytest.mark.parametrize("headers", [
-    ("Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: no-cors", "Sec-Fetch-Dest: script"),
-    ("Sec-Fetch-Site: same-site", "Sec-Fetch-Mode: no-cors", "Sec-Fetch-Dest: image"),
-    ("Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: navigate", "Sec-Fetch-Dest: iframe"),
-    ("Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: websocket", "Sec-Fetch-Dest: websocket"),
-])  # fmt: skip
-def test_what_another_sites_page_embeds_is_refused(proxy: Proxy, headers: tuple[str, ...]) -> None:
-    assert status(get(proxy, "/model", *headers)) == 403
-    assert status(get(proxy, "/state", *headers, *UPGRADE)) == 403
-
-
-@pytest.mark.usefixtures("untouched")
 def test_a_link_on_another_page_leads_to_the_viewer_if_it_has_the_token(proxy: Proxy) -> None:
     link = ("Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: navigate", "Sec-Fetch-Dest: document")
     assert status(get(proxy, "/", *link, key="")) == 403
     answer = get(proxy, f"/?token={token(proxy)}", *link, key="").decode()
     assert answer.startswith("HTTP/1.1 200 ") and "Set-Cookie: " in answer
     assert f'content="0; url={entered(proxy)[1]}/"' in answer
-
-
-@pytest.mark.usefixtures("untouched")
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:PORT", "127.0.0.1.evil.example",
-                                  "localhost.evil.example:PORT", "localhost."])  # fmt: skip
-def test_names_that_are_not_this_machines_are_refused(proxy: Proxy, host: str) -> None:
-    """A foreign name may resolve to this machine (DNS rebinding)."""
-    host = host.replace("PORT", str(proxy.port))
-    assert status(get(proxy, f"/?token={token(proxy)}", host=host)) == 421
-    assert status(get(proxy, host=host)) == 421
-
-
-@pytest.mark.usefixtures("untouched")
-@pytest.mark.parametrize("hosts", ["", "Host:", "Host: HOST\nHost: HOST", "Host: a@HOST", "Host: HOST/"])
-def test_a_missing_or_malformed_host_is_refused(proxy: Proxy, hosts: str) -> None:
-    key, path = entered(proxy)
-    head = "\n".join(filter(None, [f"GET {path}/ HTTP/1.1", hosts.replace("HOST", "127.0.0.1"), f"Cookie: {key}"]))
-    assert status(request(proxy, head)) == 400
 
 
 @pytest.mark.parametrize(
@@ -331,44 +325,6 @@ def test_pages_are_forwarded_without_the_clients_headers(proxy: Proxy, upstream:
         (received,) = upstream.received
         assert received.startswith(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:".encode())
         assert b"Cookie" not in received and b"X-Forwarded-For" not in received
-
-
-@pytest.mark.usefixtures("untouched")
-@pytest.mark.parametrize("path", ["//drop", "/./drop", "/x/../drop", "/%64rop", "/drop%20", "/..", "/assets/../../x",
-                                  "/\\drop"])  # fmt: skip
-def test_paths_in_other_spellings_are_refused(proxy: Proxy, path: str) -> None:
-    assert status(get(proxy, path)) in (400, 404)
-    assert status(get(proxy, path, *UPGRADE)) in (400, 404)
-
-
-@pytest.mark.usefixtures("untouched")
-@pytest.mark.parametrize("path", ["/", "/model", "/upload", "/drop", "/drop?sid=1", "/ui/"])
-def test_other_websockets_and_dropped_models_are_refused(proxy: Proxy, path: str) -> None:
-    assert status(get(proxy, path, *UPGRADE)) == 404
-
-
-@pytest.mark.usefixtures("untouched")
-@pytest.mark.parametrize("header", ["Upgrade: h2c", "Sec-WebSocket-Key: short", "Sec-WebSocket-Key: ",
-                                    "Connection: close", "Sec-WebSocket-Version: 6"])  # fmt: skip
-def test_other_upgrades_are_refused(proxy: Proxy, header: str) -> None:
-    name = header.partition(":")[0]
-    kept = [line for line in UPGRADE if not line.startswith(name + ":")]
-    assert status(get(proxy, "/ui", *kept, header)) == 400
-
-
-@pytest.mark.usefixtures("untouched")
-@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "HEAD", "OPTIONS", "TRACE"])
-def test_only_get_is_allowed(proxy: Proxy, method: str) -> None:
-    key, path = entered(proxy)
-    assert status(request(proxy, f"{method} {path}/ HTTP/1.1\nHost: 127.0.0.1\nCookie: {key}")) == 405
-
-
-@pytest.mark.usefixtures("untouched")
-@pytest.mark.parametrize("header", ["X: " + "a" * 20_000, "\n".join(f"X-{n}: {n}" for n in range(3000)),
-                                    "Cookie: " + "a=b; " * 5000])  # fmt: skip
-def test_large_heads_are_refused(proxy: Proxy, header: str) -> None:
-    key, path = entered(proxy)
-    assert status(request(proxy, f"GET {path}/ HTTP/1.1\nHost: 127.0.0.1\nCookie: {key}\n{header}")) in (400, 431)
 
 
 def test_an_endless_head_is_refused_without_being_kept(proxy: Proxy) -> None:
