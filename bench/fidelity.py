@@ -41,10 +41,10 @@ from matplotlib.figure import Figure
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.done import FAULTS
-from lyceum_warp.machine import cpu_cores
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.spaces import COUNTERS
-from lyceum_warp.validate import positive_number, whole_number
+from lyceum_warp.support.machine import cpu_cores
+from lyceum_warp.support.validate import positive_number, whole_number
 from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure
 
 ZERO, RANDOM, TRAINED = "zero", "random", "trained"

@@ -29,9 +29,9 @@ import warp as wp
 from mujoco.batch import Batch
 
 import lyceum_warp as lw
-from lyceum_warp.arrays import launch_worlds
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
+from lyceum_warp.support.arrays import launch_worlds
 
 FILES = {"quadruped": Path(__file__).with_name("quadruped.py")}
 """Tasks of this folder."""

@@ -31,8 +31,8 @@ from matplotlib.figure import Figure
 import lyceum_warp as lw
 from lyceum_warp.controllers.control_report import ControlReport
 from lyceum_warp.engines.memory import NotEnoughMemoryError
-from lyceum_warp.machine import cpu_cores
-from lyceum_warp.validate import positive_number, whole_number
+from lyceum_warp.support.machine import cpu_cores
+from lyceum_warp.support.validate import positive_number, whole_number
 from lyceum_warp.viz.style import new_figure
 
 C, WARP = "c", "warp"

@@ -20,7 +20,7 @@ from experiment import Experiment, Row, Table, choose, median_and_range
 from matplotlib.ticker import LogLocator, NullFormatter
 from throughput import COLORS, TASKS
 
-from lyceum_warp.machine import cpu_cores
+from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.viz.style import finish_axes, new_figure
 
 PARTS = {"cores": ("native", "c", "envpool", "gym-async", "dm_control"), "worlds": ("warp", "c")}

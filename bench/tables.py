@@ -13,7 +13,7 @@ from pathlib import Path
 import experiment
 import tyro
 
-from lyceum_warp.files import replaced
+from lyceum_warp.support.files import replaced
 
 
 @dataclasses.dataclass(frozen=True)

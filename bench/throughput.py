@@ -22,7 +22,7 @@ from contestants import LABELS
 from experiment import Experiment, Row, Table, choose, median_and_range
 
 import lyceum_warp as lw
-from lyceum_warp.machine import cpu_cores
+from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.viz.style import finish_axes, new_figure
 
 TASKS = (

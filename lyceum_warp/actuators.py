@@ -2,7 +2,7 @@
 
 import mujoco
 
-from lyceum_warp.validate import positive_number
+from lyceum_warp.support.validate import positive_number
 
 
 def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:

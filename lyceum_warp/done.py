@@ -5,7 +5,7 @@ Both engines report the same bits for the same fault, so that a task, a log and 
 
 import enum
 
-from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.support.docstrings import document_attributes
 
 
 @document_attributes

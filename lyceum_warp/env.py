@@ -10,23 +10,23 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import torch_view
 from lyceum_warp.binding.bound_task import BoundTask, check_field_name
 from lyceum_warp.binding.read_only_model import read_only
 from lyceum_warp.binding.registry import find_task
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.placement import bytes_per_world, find_device, open_engine, options_for_few_worlds
 from lyceum_warp.fields import describe, elements, has_several_rows
-from lyceum_warp.forks import leave_in_parent
 from lyceum_warp.graphs.compile_ahead import compile_ahead
 from lyceum_warp.kernels import steps
 from lyceum_warp.model_fields import describe_model_field, is_model_field
 from lyceum_warp.options import OPTION_DOCS, EnvOptions, signature_of_options
 from lyceum_warp.spaces import Space
+from lyceum_warp.support.arrays import torch_view
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.forks import leave_in_parent
+from lyceum_warp.support.validate import check_kind, check_tensor, described, whole_number
 from lyceum_warp.task import Task
-from lyceum_warp.validate import check_kind, check_tensor, described, whole_number
 from lyceum_warp.world_arrays import own_bytes_per_world
 from lyceum_warp.worlds import Worlds
 

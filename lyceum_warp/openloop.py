@@ -7,14 +7,22 @@ from typing import Any
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import flat, launch_parts, launch_rows, launch_worlds, shared_rows, torch_view, with_memory
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.capture import Calls, Phase
 from lyceum_warp.kernels import planning, state
+from lyceum_warp.support.arrays import (
+    flat,
+    launch_parts,
+    launch_rows,
+    launch_worlds,
+    shared_rows,
+    torch_view,
+    with_memory,
+)
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import check_flag, check_kind, whole_number
 from lyceum_warp.task import MEMORIES
-from lyceum_warp.validate import check_flag, check_kind, whole_number
 from lyceum_warp.world_arrays import own_parts
 
 

@@ -13,9 +13,9 @@ from typing import Any, TypeAlias
 
 import mujoco
 
-from lyceum_warp.docstrings import attribute_docs, document_attributes, listed
 from lyceum_warp.model_files import ModelFile
-from lyceum_warp.validate import check_flag, check_kind, described, whole_number
+from lyceum_warp.support.docstrings import attribute_docs, document_attributes, listed
+from lyceum_warp.support.validate import check_flag, check_kind, described, whole_number
 
 ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
 """Where a model comes from: a file, or an MjSpec."""

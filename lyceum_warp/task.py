@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import mujoco
 import warp as wp
 
-from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.support.docstrings import document_attributes
 
 if TYPE_CHECKING:
     T = TypeVar("T")

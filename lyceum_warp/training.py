@@ -11,14 +11,14 @@ from typing import Any
 from lyceum_warp.algos.evaluation import evaluation_seed
 from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.engines.placement import engine_name
-from lyceum_warp.interrupts import Interrupted, ending, postponed
 from lyceum_warp.runs.configuration import Configuration, describe
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.metrics_table import cut_rows
 from lyceum_warp.runs.saving import Saver
 from lyceum_warp.runs.task_copy import note_changes, run_params, task_copy
+from lyceum_warp.support.interrupts import Interrupted, ending, postponed
+from lyceum_warp.support.validate import check_flag, check_function, check_kind, whole_number
 from lyceum_warp.support.versions import versions
-from lyceum_warp.validate import check_flag, check_function, check_kind, whole_number
 from lyceum_warp.viz.cameras import CameraChoice, find_camera
 from lyceum_warp.viz.policy_videos import Videos
 from lyceum_warp.viz.tensorboard import TensorBoard, check_tensorboard

@@ -7,14 +7,14 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import flat, launch_rows, shared_rows, torch_view, with_memory
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.kernels import state, steps
 from lyceum_warp.spaces import Space, action_space, control_ranges, control_scale, state_space
+from lyceum_warp.support.arrays import flat, launch_rows, shared_rows, torch_view, with_memory
+from lyceum_warp.support.validate import check_tensor
 from lyceum_warp.task import MEMORIES
-from lyceum_warp.validate import check_tensor
 
 
 def own_bytes_per_world(task: BoundTask) -> int:

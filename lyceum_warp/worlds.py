@@ -10,14 +10,6 @@ from functools import partial
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import (
-    flat,
-    launch_lanes,
-    launch_parts,
-    launch_rows,
-    launch_worlds,
-    torch_view,
-)
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.fields import Stage
@@ -25,6 +17,14 @@ from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.graphs.workers import Workers
 from lyceum_warp.kernels import random, rows, state, steps
 from lyceum_warp.options import EnvOptions
+from lyceum_warp.support.arrays import (
+    flat,
+    launch_lanes,
+    launch_parts,
+    launch_rows,
+    launch_worlds,
+    torch_view,
+)
 from lyceum_warp.task import MEMORIES
 from lyceum_warp.world_arrays import WorldArrays
 

@@ -13,7 +13,7 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
-from lyceum_warp.warp_log import start_warp
+from lyceum_warp.support.warp_log import start_warp
 
 # the tests' batches are too small to divide, and on a busy machine torch's threads wait for each other
 torch.set_num_threads(1)

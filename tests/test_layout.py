@@ -17,8 +17,8 @@ ROOT = Path(lw.__file__).parent
 TESTS = Path(__file__).parent
 
 LEVELS = {
-    "docstrings": -1, "arrays": 0, "done": 0, "files": 0, "forks": 0, "interrupts": 0, "machine": 0,
-    "model_files": 0, "mujoco_log": 0, "support": 0, "validate": 0, "warp_log": 0,
+    "support": -1, "done": 0,
+    "model_files": 0,
     "actuators": 1, "fields": 1, "kernels": 1, "model_fields": 1, "options": 1, "task": 1,
     "graphs": 2, "spaces": 2,
     "binding": 3, "engines": 3,
@@ -36,7 +36,7 @@ LEVELS = {
 """The floor of every room: a room imports from lower floors, or from itself."""
 
 TESTED_BY = {
-    "done": "test_faults.py", "forks": "test_env.py", "support": "runs", "testing": "conformance",
+    "done": "test_faults.py", "testing": "conformance",
     "world_arrays": "test_worlds.py",
 }  # fmt: skip
 """Tests of rooms that have none of their own name."""

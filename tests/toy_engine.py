@@ -7,11 +7,11 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from lyceum_warp.arrays import flat, launch_rows, launch_worlds
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
 from lyceum_warp.kernels import faults, state
 from lyceum_warp.model_fields import ModelField
+from lyceum_warp.support.arrays import flat, launch_rows, launch_worlds
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 

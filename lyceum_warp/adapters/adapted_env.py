@@ -6,8 +6,8 @@ from typing import Any
 import torch
 
 from lyceum_warp.env import Env, make
+from lyceum_warp.support.validate import whole_number
 from lyceum_warp.task import Task
-from lyceum_warp.validate import whole_number
 
 _SEEDS = 2**31
 """Seeds of an environment lie below this number."""

@@ -12,8 +12,8 @@ from lyceum_warp.adapters.host_arrays import HostArrays
 from lyceum_warp.adapters.rendering import RENDER_MODES, check_render_mode, frame_rate
 from lyceum_warp.adapters.step_results import Observations, StepResults
 from lyceum_warp.env import Env
+from lyceum_warp.support.validate import check_tensor, described
 from lyceum_warp.task import Task
-from lyceum_warp.validate import check_tensor, described
 from lyceum_warp.viz.cameras import CameraChoice
 from lyceum_warp.viz.pictures import WorldPictures
 

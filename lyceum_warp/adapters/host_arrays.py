@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from lyceum_warp.env import Env
-from lyceum_warp.validate import described
+from lyceum_warp.support.validate import described
 
 
 class HostArrays:

@@ -8,8 +8,8 @@ from lyceum_warp.adapters.adapted_env import environment_of
 from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl
 from lyceum_warp.adapters.step_results import episode_ends, faulty
 from lyceum_warp.env import Env
+from lyceum_warp.support.validate import described
 from lyceum_warp.task import Task
-from lyceum_warp.validate import described
 
 check_rsl_rl()  # its error says more than that of the imports below
 

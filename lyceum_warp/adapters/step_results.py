@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyceum_warp.arrays import torch_view
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
+from lyceum_warp.support.arrays import torch_view
 
 
 class Observations:

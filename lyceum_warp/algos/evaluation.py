@@ -9,9 +9,9 @@ import torch
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import Policy, acting
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
-from lyceum_warp.validate import check_function, check_kind, described, whole_number
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import check_function, check_kind, described, whole_number
 
 MEAN_SEED = 2**31 - 1
 """Seed of the initial states from which NPG evaluates the mean policy."""

@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 import torch
 
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
-from lyceum_warp.validate import whole_number
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import whole_number
 
 METRIC_COLUMN = "metrics/"
 """What the columns of a task's own metrics begin with."""

@@ -20,8 +20,8 @@ from lyceum_warp.binding.registry import task_name
 from lyceum_warp.engines.memory import NotEnoughMemoryError
 from lyceum_warp.engines.placement import place_samples
 from lyceum_warp.options import OPTIONS, EnvOptions, suggestion
+from lyceum_warp.support.validate import described, whole_number
 from lyceum_warp.task import Planning, Task
-from lyceum_warp.validate import described, whole_number
 
 
 def task_config(task: type[Task], value: object = None) -> MPPIConfig:

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from lyceum_warp.algos.plan_update import PlanUpdate
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.kernels.knots import ORDERS
 from lyceum_warp.spaces import Space
-from lyceum_warp.validate import whole_number
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import whole_number
 
 Numbers: TypeAlias = float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray | torch.Tensor
 

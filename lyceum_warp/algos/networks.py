@@ -11,7 +11,7 @@ from torch import nn
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.env import Env
-from lyceum_warp.validate import check_flag, check_kind, described
+from lyceum_warp.support.validate import check_flag, check_kind, described
 
 Module = TypeVar("Module", bound=nn.Module)
 

@@ -37,10 +37,10 @@ from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.timing import PhaseTimer, beside, one_thread
 from lyceum_warp.algos.value import BOUND, ValueFunction, value_group
 from lyceum_warp.algos.value_fit import ValueFit
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import returns
-from lyceum_warp.validate import check_kind, whole_number
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import check_kind, whole_number
 
 log = logging.getLogger(__name__)
 

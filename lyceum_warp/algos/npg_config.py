@@ -5,8 +5,8 @@ import math
 from typing import Literal
 
 from lyceum_warp.algos.networks import Activation, check_activation
-from lyceum_warp.docstrings import document_attributes
-from lyceum_warp.validate import finite_number, layer_sizes, whole_number
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import finite_number, layer_sizes, whole_number
 
 _WHOLE = {
     "samples": 1, "cg_iterations": 1, "value_epochs": 0, "value_batch": 1, "time_orders": 0, "mean_every": 0,

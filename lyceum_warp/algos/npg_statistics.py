@@ -16,7 +16,7 @@ from lyceum_warp.algos.on_policy import (
     metric_means,
     pooled,
 )
-from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.support.docstrings import document_attributes
 
 
 @document_attributes

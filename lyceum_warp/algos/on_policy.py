@@ -9,7 +9,7 @@ import torch
 
 from lyceum_warp.algos.learner import Iteration
 from lyceum_warp.algos.rollout_buffer import Rollout
-from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.support.docstrings import document_attributes
 
 Scalar: TypeAlias = Any
 """A tensor of one number on the device, or, after the copy to the host, a float."""

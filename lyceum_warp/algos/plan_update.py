@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import torch
 import warp as wp
 
-from lyceum_warp.docstrings import document_attributes
+from lyceum_warp.support.docstrings import document_attributes
 
 
 @document_attributes

@@ -43,15 +43,15 @@ from lyceum_warp.algos.plan_update import PlanSamples, PlanUpdate, launch_blocks
 from lyceum_warp.algos.planner_state import checked_state, state_from_parts
 from lyceum_warp.algos.predictive_sampling import BestSample
 from lyceum_warp.algos.value import ValueFunction
-from lyceum_warp.arrays import flat, torch_view
 from lyceum_warp.binding.registry import find_task
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.capture import Calls, Phase
 from lyceum_warp.kernels import knots, planning
 from lyceum_warp.openloop import OpenLoop
+from lyceum_warp.support.arrays import flat, torch_view
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import described, whole_number
 from lyceum_warp.task import Task
-from lyceum_warp.validate import described, whole_number
 
 _BUFFERS = (
     "actions", "nominal", "knot_actions", "standard_noise", "adapted_noise", "sampled", "model_returns", "returns",

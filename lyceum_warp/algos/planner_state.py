@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from lyceum_warp.env import Env
-from lyceum_warp.validate import described
+from lyceum_warp.support.validate import described
 
 
 def state_from_parts(env: Env, initial: torch.Tensor, parts: Mapping[str, Any]) -> torch.Tensor:

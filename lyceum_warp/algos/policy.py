@@ -9,8 +9,8 @@ from torch import nn
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.networks import LIMIT, Activation, Normalizer, check_network, mlp
-from lyceum_warp.docstrings import document_attributes
-from lyceum_warp.validate import described, finite_number, layer_sizes, whole_number
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import described, finite_number, layer_sizes, whole_number
 
 
 @document_attributes

@@ -8,7 +8,7 @@ from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
-from lyceum_warp.validate import described
+from lyceum_warp.support.validate import described
 
 _ROWS = 4
 """Observations that the policy is called with."""

@@ -11,8 +11,8 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.files import replaced
-from lyceum_warp.validate import described
+from lyceum_warp.support.files import replaced
+from lyceum_warp.support.validate import described
 
 EXTRA = "pip install 'lyceum-warp[export]'"
 """Command that installs the packages for ONNX."""

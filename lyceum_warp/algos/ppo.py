@@ -34,10 +34,10 @@ from lyceum_warp.algos.ppo_config import PPOConfig
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.timing import PhaseTimer, one_thread
 from lyceum_warp.algos.value import ValueFunction, value_group
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import returns
-from lyceum_warp.validate import check_kind
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import check_kind
 
 RECENT = 100
 """Episodes in ``return_recent``."""

@@ -5,8 +5,8 @@ import math
 from typing import Any, Literal
 
 from lyceum_warp.algos.networks import Activation, check_activation
-from lyceum_warp.docstrings import document_attributes
-from lyceum_warp.validate import finite_number, layer_sizes, whole_number
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import finite_number, layer_sizes, whole_number
 
 _WHOLE = {"num_steps": 1, "epochs": 1, "minibatches": 1, "mean_every": 0, "mean_episodes": 1}
 """The smallest value of each whole number."""

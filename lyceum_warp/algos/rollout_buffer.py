@@ -9,13 +9,13 @@ import warp as wp
 from lyceum_warp.algos.dense import DensePolicy
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.arrays import torch_view
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.capture import Graphs, Phase
 from lyceum_warp.kernels import collect
-from lyceum_warp.validate import check_flag, check_kind, whole_number
+from lyceum_warp.support.arrays import torch_view
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import check_flag, check_kind, whole_number
 
 _LARGE = 1e18
 """Observations beyond it have squares that float32 cannot hold."""

@@ -22,8 +22,8 @@ from lyceum_warp.binding.writes import Rights, check_writes, written_fields
 from lyceum_warp.fields import INITIAL, INPUTS, Field, describe, is_data_field, similar_data_fields, vec10
 from lyceum_warp.model_fields import describe_model_field, is_model_field, similar_model_fields
 from lyceum_warp.options import ModelSource, PhysicsOptions
+from lyceum_warp.support.validate import whole_number
 from lyceum_warp.task import FUNCTIONS, MEMORIES, RESULTS, Task, TaskFunction, observer_name
-from lyceum_warp.validate import whole_number
 
 _SPELLED = {
     "float32": "float", "int32": "int", "vec3f": "wp.vec3", "vec4f": "lw.quat", "mat33f": "wp.mat33",

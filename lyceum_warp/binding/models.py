@@ -13,8 +13,8 @@ import numpy as np
 from lyceum_warp.fields import ON_DEMAND, SENSED
 from lyceum_warp.model_fields import MOVED_INERTIA
 from lyceum_warp.model_files import ModelFile, gymnasium_model, read_spec
-from lyceum_warp.mujoco_log import quiet
 from lyceum_warp.options import CONES, INTEGRATORS, ModelSource, PhysicsOptions
+from lyceum_warp.support.mujoco_log import quiet
 
 log = logging.getLogger(__name__)
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from lyceum_warp.arrays import launch_parts, launch_worlds
 from lyceum_warp.kernels import steps
+from lyceum_warp.support.arrays import launch_parts, launch_worlds
 from lyceum_warp.task import MEMORIES, observer_name
 
 _ROOM = 2**18

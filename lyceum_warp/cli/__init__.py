@@ -18,7 +18,7 @@ from lyceum_warp.cli.plan import Plan
 from lyceum_warp.cli.train import Train
 from lyceum_warp.cli.view import View
 from lyceum_warp.cli.warmup import Warmup
-from lyceum_warp.interrupts import Interrupted, signals
+from lyceum_warp.support.interrupts import Interrupted, signals
 from lyceum_warp.viz.video import NoVideoError
 
 _Command = Annotated[Tasks, tyro.conf.subcommand("tasks")] \

@@ -10,8 +10,8 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from lyceum_warp.docstrings import attribute_docs
 from lyceum_warp.options import OPTIONS, EnvOptions, PhysicsOptions
+from lyceum_warp.support.docstrings import attribute_docs
 
 Repeated = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")]
 """A flag that may be given several times, each time with one NAME=VALUE."""

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from lyceum_warp.interrupts import Interrupted
+from lyceum_warp.support.interrupts import Interrupted
 
 FOLDER = Path(__file__).resolve().parents[2] / "bench"
 """The programs of a checkout; an installed package comes without them."""

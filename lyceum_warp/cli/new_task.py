@@ -15,9 +15,9 @@ from lyceum_warp.binding.models import compile_model
 from lyceum_warp.binding.registry import find_task, package_task_names, snake_case
 from lyceum_warp.cli.display import make_console
 from lyceum_warp.cli.task_text import literal, task_text
-from lyceum_warp.files import replaced
 from lyceum_warp.model_files import ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, read_spec
 from lyceum_warp.options import PhysicsOptions
+from lyceum_warp.support.files import replaced
 
 _SOURCES: dict[str, Callable[[str], ModelFile]] = {
     "menagerie": menagerie_model,

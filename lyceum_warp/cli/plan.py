@@ -30,9 +30,9 @@ from lyceum_warp.controllers.loop import control
 from lyceum_warp.controllers.real_time import control_async
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
-from lyceum_warp.interrupts import Interrupted
 from lyceum_warp.runs.folder import Run, load_value
-from lyceum_warp.validate import whole_number
+from lyceum_warp.support.interrupts import Interrupted
+from lyceum_warp.support.validate import whole_number
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.control_plot import control_plot
 

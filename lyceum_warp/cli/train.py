@@ -18,13 +18,13 @@ from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.cli.algorithms import Hyperparameters
 from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, Physics, Repeated, given, optional_flags, parameters
 from lyceum_warp.cli.display import Display, curve_table, make_console, note, policy_video, tried
-from lyceum_warp.interrupts import Interrupted
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import read_checkpoint
 from lyceum_warp.runs.configuration import ALGORITHMS, Configuration, saved_networks
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.metrics_table import read_metrics
 from lyceum_warp.runs.task_copy import note_changes
+from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.training import train
 from lyceum_warp.viewer.follow import RunViewer
 from lyceum_warp.viz.cameras import parsed_camera

@@ -17,13 +17,13 @@ from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.engines.placement import options_for_few_worlds
 from lyceum_warp.env import Env
-from lyceum_warp.interrupts import Interrupted, signals
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import check_sizes
 from lyceum_warp.runs.configuration import Configuration
 from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.runs.task_copy import note_changes, run_env
-from lyceum_warp.validate import whole_number
+from lyceum_warp.support.interrupts import Interrupted, signals
+from lyceum_warp.support.validate import whole_number
 from lyceum_warp.viewer.follow import Follower, Parent, wait_for_run
 from lyceum_warp.viewer.session.clock import Watcher
 from lyceum_warp.viewer.session.stage import check_world

@@ -10,7 +10,7 @@ import torch
 
 from lyceum_warp.controllers.controller import Controller
 from lyceum_warp.env import Env
-from lyceum_warp.validate import described, positive_number
+from lyceum_warp.support.validate import described, positive_number
 
 
 class CheckedController:

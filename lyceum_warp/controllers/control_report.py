@@ -16,9 +16,9 @@ from lyceum_warp.controllers.control_statistics import (
     tick_statistics,
 )
 from lyceum_warp.controllers.trajectory import Trajectory
-from lyceum_warp.docstrings import document_attributes
-from lyceum_warp.files import replaced
-from lyceum_warp.validate import positive_number
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.files import replaced
+from lyceum_warp.support.validate import positive_number
 
 
 @document_attributes

@@ -8,9 +8,9 @@ import torch
 
 from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.controllers.trajectory import Trajectory, provenance
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
-from lyceum_warp.validate import check_flag, check_function, check_kind, whole_number
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import check_flag, check_function, check_kind, whole_number
 
 
 @document_attributes

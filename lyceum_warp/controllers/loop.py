@@ -18,7 +18,7 @@ from lyceum_warp.controllers.episode_collector import (
 )
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
-from lyceum_warp.validate import whole_number
+from lyceum_warp.support.validate import whole_number
 
 
 @torch.no_grad()

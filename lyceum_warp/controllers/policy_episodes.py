@@ -8,7 +8,7 @@ import torch
 
 from lyceum_warp.controllers.trajectory import Trajectory, provenance
 from lyceum_warp.env import Env
-from lyceum_warp.validate import whole_number
+from lyceum_warp.support.validate import whole_number
 
 
 @torch.no_grad()

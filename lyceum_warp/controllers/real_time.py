@@ -28,7 +28,7 @@ from lyceum_warp.controllers.episode_collector import (
 )
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
-from lyceum_warp.validate import check_kind, positive_number, whole_number
+from lyceum_warp.support.validate import check_kind, positive_number, whole_number
 
 _SPIN = 0.0005  # seconds before its end that a wait stops sleeping and polls the clock
 _PATIENCE = 0.2  # seconds that an unfinished plan delays an exception at most

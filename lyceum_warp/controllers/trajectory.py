@@ -10,10 +10,10 @@ import numpy as np
 import torch
 
 from lyceum_warp.binding.registry import spelled_task
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.done import Done
 from lyceum_warp.env import Env
-from lyceum_warp.files import newer_format, replaced
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.files import newer_format, replaced
 from lyceum_warp.support.versions import versions
 
 FORMAT = 1

@@ -9,12 +9,12 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from lyceum_warp.arrays import flat, launch_rows
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.fields import Field, Stage, describe
 from lyceum_warp.graphs.capture import Phase
 from lyceum_warp.kernels.state import narrow, widen
 from lyceum_warp.model_fields import ModelField, check_simple
+from lyceum_warp.support.arrays import flat, launch_rows
+from lyceum_warp.support.docstrings import document_attributes
 
 
 @document_attributes
@@ -47,7 +47,7 @@ class Engine(abc.ABC):
     launch_threads: int = 1
     """Threads that may have a part of the worlds each in launches around a step.
 
-    An engine with several of them makes launches for all worlds through ``lyceum_warp.arrays`` alone.
+    An engine with several of them makes launches for all worlds through ``lyceum_warp.support.arrays`` alone.
     """
     capturable: bool
     """Whether every method is made of Warp launches, so that a whole step can be captured as one graph.

@@ -5,7 +5,7 @@ import gc
 import torch
 import warp as wp
 
-from lyceum_warp.machine import free_memory
+from lyceum_warp.support.machine import free_memory
 
 _KEPT_FREE = 0.1
 """The share of the free memory that is left for everything else."""

@@ -13,10 +13,10 @@ import warp as wp
 from lyceum_warp.engines.base import Engine, EngineFactory
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.fields import Field
-from lyceum_warp.machine import cpu_cores
 from lyceum_warp.model_fields import ModelField
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.warp_log import start_warp
+from lyceum_warp.support.machine import cpu_cores
+from lyceum_warp.support.warp_log import start_warp
 
 _ENGINES = {
     "mujoco": ("lyceum_warp.engines.c.mujoco_engine", "MujocoEngine"),

@@ -21,8 +21,8 @@ from typing import Any
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import part_of_worlds
 from lyceum_warp.graphs.workers import Workers
+from lyceum_warp.support.arrays import part_of_worlds
 from lyceum_warp.support.upstream import separate_captures
 
 Calls = tuple[Callable[[], None], ...]

@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from lyceum_warp.graphs.rehearsal import rehearse
-from lyceum_warp.machine import cpu_cores
-from lyceum_warp.warp_log import start_warp
+from lyceum_warp.support.machine import cpu_cores
+from lyceum_warp.support.warp_log import start_warp
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ from torch import nn
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
-from lyceum_warp.files import newer_format, replaced
+from lyceum_warp.support.files import newer_format, replaced
 
 FORMAT = 1
 """Format of a run's folder and of its files. It is raised when an older release could no longer read them."""

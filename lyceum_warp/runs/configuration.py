@@ -16,14 +16,14 @@ from lyceum_warp.algos.npg_config import NPGConfig
 from lyceum_warp.algos.ppo import PPO
 from lyceum_warp.algos.ppo_config import PPOConfig
 from lyceum_warp.binding.registry import spelled_task
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.env import Env
-from lyceum_warp.machine import cpu_cores
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import policy_of, read_checkpoint, value_of
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.task_copy import given_params, run_env
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.machine import cpu_cores
 
 log = logging.getLogger(__name__)
 

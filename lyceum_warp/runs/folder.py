@@ -10,8 +10,6 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.docstrings import document_attributes
-from lyceum_warp.files import replaced
 from lyceum_warp.runs.checkpoints import (
     FORMAT,
     PolicyContent,
@@ -23,8 +21,10 @@ from lyceum_warp.runs.checkpoints import (
     write_content,
 )
 from lyceum_warp.runs.metrics_table import read_metrics
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.files import replaced
+from lyceum_warp.support.validate import check_kind
 from lyceum_warp.support.versions import versions
-from lyceum_warp.validate import check_kind
 
 _CONFIG, _VERSIONS = "config.json", "versions.json"
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.files import replaced
+from lyceum_warp.support.files import replaced
 
 
 def append_row(path: Path, row: Mapping[str, Any]) -> None:

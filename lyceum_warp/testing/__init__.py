@@ -10,9 +10,9 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.engines.base import EngineFactory
 from lyceum_warp.env import Env
+from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.task import Task
 from lyceum_warp.testing import bounds_rules as bounds
 from lyceum_warp.testing import buffer_rules as buffers

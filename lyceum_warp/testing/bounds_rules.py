@@ -6,9 +6,9 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import torch_view
 from lyceum_warp.binding.writes import written_fields
 from lyceum_warp.done import FAULTS
+from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.task import FUNCTIONS, MEMORIES, observer_name
 from lyceum_warp.testing.checked_functions import CheckedFunctions, Unchecked, checked_functions
 from lyceum_warp.testing.context import Context

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyceum_warp.arrays import torch_view
-from lyceum_warp.docstrings import document_attributes
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import steps
+from lyceum_warp.support.arrays import torch_view
+from lyceum_warp.support.docstrings import document_attributes
 
 OUTCOMES = (*steps.OUTCOMES, "obs", "final_obs")
 """The buffers that a step fills."""

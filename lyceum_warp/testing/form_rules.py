@@ -2,10 +2,10 @@
 
 import torch
 
-from lyceum_warp.arrays import launch_worlds, torch_view
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import steps
+from lyceum_warp.support.arrays import launch_worlds, torch_view
 from lyceum_warp.task import FUNCTIONS
 from lyceum_warp.testing.context import SHORT, Context
 

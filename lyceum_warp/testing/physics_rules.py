@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 import torch
 
-from lyceum_warp.arrays import flat, torch_view
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.fields import INPUTS
+from lyceum_warp.support.arrays import flat, torch_view
 from lyceum_warp.testing.context import SHORT, Context
 
 _SMALLEST = 1e-4

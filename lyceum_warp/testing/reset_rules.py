@@ -4,7 +4,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import launch_worlds, torch_view
+from lyceum_warp.support.arrays import launch_worlds, torch_view
 from lyceum_warp.testing.context import Context
 from lyceum_warp.testing.physics_rules import check_closer, predicted
 

@@ -10,8 +10,8 @@ from typing import TypeAlias
 import mujoco
 import numpy as np
 
-from lyceum_warp.docstrings import document_attributes
-from lyceum_warp.validate import positive_number
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import positive_number
 
 
 @document_attributes

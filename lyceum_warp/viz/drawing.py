@@ -16,8 +16,8 @@ from typing import Any, Self
 import mujoco
 import numpy as np
 
-from lyceum_warp.files import replaced
-from lyceum_warp.validate import positive_number
+from lyceum_warp.support.files import replaced
+from lyceum_warp.support.validate import positive_number
 from lyceum_warp.viz import EXTRA
 from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
 from lyceum_warp.viz.render import CANNOT_DRAW, VIDEO, Shot

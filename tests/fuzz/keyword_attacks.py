@@ -23,7 +23,7 @@ from mutations import VALUES
 
 import lyceum_warp as lw
 from lyceum_warp.algos.mppi_config import SETTINGS
-from lyceum_warp.validate import described
+from lyceum_warp.support.validate import described
 
 HERE = Path("keywords").absolute()
 

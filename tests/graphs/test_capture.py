@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 import warp as wp
 
-from lyceum_warp.arrays import launch_worlds
 from lyceum_warp.graphs import capture
 from lyceum_warp.graphs.capture import Graphs, Phase
 from lyceum_warp.graphs.workers import Workers
+from lyceum_warp.support.arrays import launch_worlds
 
 
 @wp.kernel(enable_backward=False)

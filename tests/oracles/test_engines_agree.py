@@ -17,7 +17,7 @@ from form_tasks import Drawn, Pushed
 
 import lyceum_warp as lw
 import lyceum_warp.tasks
-from lyceum_warp.arrays import torch_view
+from lyceum_warp.support.arrays import torch_view
 
 NWORLD = 32
 TASKS = [module.name for module in pkgutil.iter_modules(lyceum_warp.tasks.__path__)]

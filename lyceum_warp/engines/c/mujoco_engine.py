@@ -10,7 +10,6 @@ import numpy as np
 import warp as wp
 from mujoco.batch import Batch
 
-from lyceum_warp.arrays import flat, launch_rows, launch_several_rows, launch_worlds
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.batch_faults import ErrorsAsWarnings
 from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
@@ -36,10 +35,11 @@ from lyceum_warp.kernels.state import (
     widen_bool,
     widen_four,
 )
-from lyceum_warp.machine import cpu_cores
 from lyceum_warp.model_fields import ModelField
-from lyceum_warp.mujoco_log import quiet
-from lyceum_warp.validate import whole_number
+from lyceum_warp.support.arrays import flat, launch_rows, launch_several_rows, launch_worlds
+from lyceum_warp.support.machine import cpu_cores
+from lyceum_warp.support.mujoco_log import quiet
+from lyceum_warp.support.validate import whole_number
 
 _BATCH_BYTES = 150
 """Bytes that ``Batch`` keeps for each world beside its state: warnings, a status, the message of an error."""

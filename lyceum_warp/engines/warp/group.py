@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 
 import warp as wp
 
-from lyceum_warp.arrays import flat
 from lyceum_warp.engines.warp import warp_kernels as kernels
+from lyceum_warp.support.arrays import flat
 
 _ALIGNED = 512
 

@@ -9,7 +9,6 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from lyceum_warp.arrays import flat, launch_rows
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.warp import forward, sizes
 from lyceum_warp.engines.warp.forward import Part, PartialForward, forward_parts
@@ -28,8 +27,9 @@ from lyceum_warp.fields import Field, Stage, early_sensor_columns
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_columns, copy_rows, fill_rows, narrow, widen, zero_columns
 from lyceum_warp.model_fields import ModelField
+from lyceum_warp.support.arrays import flat, launch_rows
 from lyceum_warp.support.upstream import has_sdf_functions
-from lyceum_warp.validate import whole_number
+from lyceum_warp.support.validate import whole_number
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 

@@ -13,7 +13,7 @@ import torch
 from lyceum_warp.controllers.episode_collector import ControlProgress
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
-from lyceum_warp.validate import positive_number
+from lyceum_warp.support.validate import positive_number
 from lyceum_warp.viewer.protocol import Close, Command, Frame, Perturb, SetController, SetGhosts, SetMode, SetVideo
 from lyceum_warp.viewer.session.commands import obey
 from lyceum_warp.viewer.session.drivers import ControllerError, WorldControl

@@ -12,7 +12,7 @@ import torch
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.env import Env
-from lyceum_warp.validate import described
+from lyceum_warp.support.validate import described
 
 MOST_SAMPLES = 24
 """The most samples of a plan whose paths are drawn."""

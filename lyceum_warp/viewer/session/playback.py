@@ -13,7 +13,7 @@ from lyceum_warp.controllers.saved_episodes import check_episode
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.done import Done
 from lyceum_warp.env import Env
-from lyceum_warp.validate import described
+from lyceum_warp.support.validate import described
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import torch
 
 from lyceum_warp.controllers.loop import control
 from lyceum_warp.env import Env
-from lyceum_warp.validate import check_kind, whole_number
+from lyceum_warp.support.validate import check_kind, whole_number
 from lyceum_warp.viewer.protocol import Frame, Mode, Scene, Status
 from lyceum_warp.viewer.session.drivers import Control, ControllerError, PolicyControl, WorldControl, controls
 from lyceum_warp.viewer.session.frames import FrameMaker, model_bytes, past_text

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import flat, torch_view
 from lyceum_warp.env import Env
+from lyceum_warp.support.arrays import flat, torch_view
 from lyceum_warp.viewer.protocol import Pose
 from lyceum_warp.viewer.session.drivers import MOST_SAMPLES, PlanView
 from lyceum_warp.viewer.session.live import pose

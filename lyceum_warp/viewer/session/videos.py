@@ -10,7 +10,7 @@ from typing import Any
 
 import mujoco
 
-from lyceum_warp.interrupts import obeyed
+from lyceum_warp.support.interrupts import obeyed
 from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Camera, Frame
 from lyceum_warp.viz.drawing import NoVideoError
 from lyceum_warp.viz.video import Recorder

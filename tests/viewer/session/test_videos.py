@@ -14,7 +14,7 @@ import pytest
 from conftest import SharedEnv
 from memory_window import MemoryWindow
 
-from lyceum_warp.interrupts import Interrupted, signals
+from lyceum_warp.support.interrupts import Interrupted, signals
 from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Camera, Command, Frame
 from lyceum_warp.viewer.session.clock import Session

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from lyceum_warp.interrupts import Interrupted, obeyed, postponed, signals
+from lyceum_warp.support.interrupts import Interrupted, obeyed, postponed, signals
 
 
 @pytest.fixture(autouse=True)

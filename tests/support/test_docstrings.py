@@ -5,7 +5,7 @@ import pydoc
 import pytest
 
 import lyceum_warp as lw
-from lyceum_warp.docstrings import attribute_docs
+from lyceum_warp.support.docstrings import attribute_docs
 from lyceum_warp.task import FUNCTIONS, Task
 
 

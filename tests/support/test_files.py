@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from lyceum_warp.files import replaced
+from lyceum_warp.support.files import replaced
 
 
 def test_replaced_writes_the_whole_file(tmp_path: Path) -> None:

@@ -4,8 +4,8 @@ import pytest
 import torch
 import warp as wp
 
-from lyceum_warp.arrays import flat, launch_rows, launch_several_rows, torch_view
 from lyceum_warp.kernels import state
+from lyceum_warp.support.arrays import flat, launch_rows, launch_several_rows, torch_view
 
 
 @pytest.mark.parametrize(("dtype", "shape", "columns"), [(float, (2, 3), 3), (wp.vec3, (2, 4), 12), (int, 2, 1)])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lyceum_warp.validate import check_kind, check_tensor, described, finite_number, layer_sizes, whole_number
+from lyceum_warp.support.validate import check_kind, check_tensor, described, finite_number, layer_sizes, whole_number
 
 
 @pytest.mark.parametrize("value", [3, 3.0, np.int64(3), np.float32(3), torch.tensor(3)])

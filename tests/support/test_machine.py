@@ -5,7 +5,7 @@ import os
 import pytest
 import warp as wp
 
-from lyceum_warp.machine import cpu_cores, free_memory
+from lyceum_warp.support.machine import cpu_cores, free_memory
 
 
 def test_cpu_cores_counts_those_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from lyceum_warp.mujoco_log import quiet
+from lyceum_warp.support.mujoco_log import quiet
 
 XML = '<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
 
@@ -18,7 +18,7 @@ def test_a_warning_goes_to_the_log_and_not_to_a_file(
     quiet()
     data = mujoco.MjData(model := mujoco.MjModel.from_xml_string(XML))
     data.qvel[:] = 1e11
-    with caplog.at_level(logging.DEBUG, logger="lyceum_warp.mujoco_log"):
+    with caplog.at_level(logging.DEBUG, logger="lyceum_warp.support.mujoco_log"):
         mujoco.mj_step(model, data)
     assert "MuJoCo: " in caplog.text and "QVEL" in caplog.text
     assert not list(tmp_path.iterdir())

@@ -30,7 +30,7 @@ def test_other_output_of_the_start_and_the_log_keep_everything() -> None:
 import logging, os, sys
 logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
 import lyceum_warp
-from lyceum_warp import warp_log
+from lyceum_warp.support import warp_log
 init = warp_log.wp.init
 def loud():
     os.write(2, b"native line\\nWarp CUDA warning: no driver\\n")
@@ -46,7 +46,7 @@ assert warp_log.start_warp() == warp_log.start_warp()
 
 
 def test_warp_starts_where_stderr_is_closed() -> None:
-    program = "import os; os.close(2); from lyceum_warp import warp_log; print(warp_log.start_warp())"
+    program = "import os; os.close(2); from lyceum_warp.support import warp_log; print(warp_log.start_warp())"
     assert printed(program) == ("[]\n", "")
 
 
