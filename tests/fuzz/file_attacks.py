@@ -19,11 +19,11 @@ import mutations
 import numpy as np
 import torch
 from guarded import ProblemError
-from lyceum_warp.control.saved_episodes import episode_env, load_episodes
 
 import lyceum_warp as lw
 import lyceum_warp.cli.view
 from lyceum_warp import cli
+from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
 from lyceum_warp.runs import Run
 from lyceum_warp.viz.video import NoVideoError
 
