@@ -55,6 +55,12 @@ def frozen(module: nn.Module) -> nn.Module:
     return module.requires_grad_(False)
 
 
+def with_nan() -> lw.GaussianPolicy:
+    policy = lw.GaussianPolicy(6, 2)
+    policy.log_std.data.fill_(torch.nan)
+    return policy
+
+
 def without_log_std() -> lw.GaussianPolicy:
     policy = lw.GaussianPolicy(6, 2)
     policy.log_std = None
@@ -101,7 +107,7 @@ def test_npg_refuses_a_network_in_one_line(shared_env: SharedEnv, network: nn.Mo
         ("policy.pt", "policy must be a GaussianPolicy, not str"),
         (lw.GaussianPolicy(5, 2), "takes 5 observations and gives 2 actions, but the task 'point_mass' has 6 and 2"),
         (without_log_std(), r"log_std must be an nn.Parameter of shape \(2,\), not NoneType None"),
-        (lw.GaussianPolicy(6, 2, log_std=torch.nan), "parameter 'log_std' is not finite: initialise it"),
+        (with_nan(), "parameter 'log_std' is not finite: initialise it"),
     ],
 )
 def test_npg_refuses_a_policy_in_one_line(shared_env: SharedEnv, policy: object, message: str) -> None:
