@@ -9,6 +9,7 @@ import torch
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import Policy, acting
+from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_function, check_kind, described, whole_number
@@ -86,6 +87,7 @@ def evaluate(
     if not env.autoreset:
         raise ValueError("evaluate needs an environment that resets automatically: make it with autoreset=True")
     act, each = acting(policy), -(-episodes // env.nworld)
+    check_fit(8 * (5 + len(env.episode_metrics)) * each, env.nworld, env.device, model=f"{each} episodes")
     env.rand_reset(None if seed is None else evaluation_seed(seed))
     metrics = list(env.episode_metrics.values())
     results = torch.zeros(5 + len(metrics), each, env.nworld, device=env.obs.device)

@@ -100,7 +100,7 @@ def planner_arguments(
     return config, options.changed(place), dict(planning.params if value is None else {}) | rest
 
 
-def plant_seeds(seed: int | Sequence[int], plants: int) -> list[int]:
+def plant_seeds(seed: int | Sequence[int], plants: int) -> Sequence[int]:
     """A seed for each plant, from that of the first one or from a list.
 
     Raises:
@@ -114,7 +114,7 @@ def plant_seeds(seed: int | Sequence[int], plants: int) -> list[int]:
             raise ValueError(f"seed must be a number, or a list with one for each of {plants} plants, not {given!r}")
         return [whole_number("seed", one, low=0) for one in given]
     first = whole_number("seed", given, low=0, high=2**31 - plants)
-    return list(range(first, first + plants))
+    return range(first, first + plants)
 
 
 @contextlib.contextmanager

@@ -12,6 +12,8 @@ from lyceum_warp.algos.networks import LIMIT, Activation, Normalizer, check_netw
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import described, finite_number, layer_sizes, whole_number
 
+_LARGEST = torch.finfo(torch.float32).max
+
 
 @document_attributes
 class GaussianPolicy(nn.Module):
@@ -74,7 +76,10 @@ class GaussianPolicy(nn.Module):
         if type(self) is not GaussianPolicy:
             self.shape["own"] = _class_name(self)
         self.network = network
-        self.log_std = nn.Parameter(torch.full((nact,), finite_number("log_std", log_std)))
+        log_std = finite_number("log_std", log_std, low=-_LARGEST, high=_LARGEST)
+        self.log_std = nn.Parameter(
+            torch.full((nact,), finite_number("log_std", log_std, low=-_LARGEST, high=_LARGEST))
+        )
 
     @staticmethod
     def like(shape: Mapping[str, Any]) -> "GaussianPolicy":

@@ -73,7 +73,7 @@ class Rollout:
 
     def __init__(self, env: Env, steps: int, *, groups: Collection[str] = (), first_only: bool = False) -> None:
         check_kind("env of Rollout", env, Env, "as lw.make(...) makes it")
-        check_kind("groups", groups, Collection, "as in groups=['critic']")
+        check_kind("groups", groups, list | tuple | set | frozenset, "as in groups=['critic']")
         check_flag("first_only", first_only)
         steps = whole_number("steps", steps, low=1)
         if unknown := [group for group in groups if group not in [*env.obs_groups]]:

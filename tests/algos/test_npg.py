@@ -263,7 +263,8 @@ def test_wrong_arguments_are_refused(env: lw.Env) -> None:
         lw.NPG(env, value=torch.nn.Linear(6, 1))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="takes the group 'critic' of observations, which the task 'point_mass' lacks"):
         lw.NPG(env, value=lw.ValueFunction(6, group="critic"))
-    broken = lw.ValueFunction(6, scale=math.nan)
+    broken = lw.ValueFunction(6)
+    broken.scale.fill_(math.nan)
     with pytest.raises(ValueError, match="the value function's 'scale' is not finite: leave it out for a new value"):
         lw.NPG(env, value=broken)
     with pytest.raises(ValueError, match="autoreset=True"):
