@@ -86,7 +86,8 @@ class PhysicsOptions:
     nconmax: int | None = _for_engine(None)
     """Contact capacity per world, on average (Warp engine); by default twice the peak of a probe."""
     njmax: int | None = _for_engine(None)
-    """Constraint capacity of each world (Warp engine); by default twice the peak of a probe."""
+    """Constraint capacity of each world (Warp engine); by default twice the peak of a probe, and room for inactive
+    equality constraints."""
     deterministic: bool = _for_engine(False)
     """Make two runs on a CUDA device equal to the bit. Costs 5 to 18 times the time and 5 to 7 times the memory on
     hopper, half_cheetah and humanoid. Runs on the CPU are always equal to the bit."""

@@ -3,7 +3,7 @@
 import difflib
 import importlib
 import importlib.util
-import itertools
+import io
 import linecache
 import pkgutil
 import re
@@ -22,8 +22,8 @@ from lyceum_warp.task import Task
 
 _tasks: dict[str, type[Task]] = {}
 
-_loaded: dict[str, tuple[str, Stamps]] = {}
-"""By the file of a task: its module's name, and the state of it and of the modules beside it when it was last run."""
+_loaded: dict[str, Stamps] = {}
+"""The files of tasks, and of the modules beside them, as they were when they were last run, by their modules' names."""
 
 _LOADING = threading.RLock()
 """One file at a time, because imports and linecache belong to the process."""
@@ -145,18 +145,21 @@ def _read(file: Path, modules: Mapping[str, Path]) -> dict[Path, bytes]:
 
 
 def _run(path: Path, name: str, source: bytes) -> None:
-    """Run a file's source as a module."""
+    """Run a file's source as a module, which replaces an earlier one of this name."""
     module = ModuleType(name)
     module.__file__ = file = str(path.resolve())
+    before = sys.modules.get(name)
     sys.modules[name] = module
     try:
         code = compile(source, file, "exec")  # not through an importer, whose bytecode is of the same second
         # Warp reads the source of each function here, whatever happens to the file meanwhile
         text = importlib.util.decode_source(source)
-        linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
+        linecache.cache[file] = (len(text), None, list(io.StringIO(text)), file)
         exec(code, vars(module))
     except BaseException as error:
         del sys.modules[name]
+        if before is not None:
+            sys.modules[name] = before
         if not isinstance(error, Exception):
             raise
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
@@ -183,16 +186,6 @@ def _explained(error: Exception) -> str:
     return text if type(error) is ValueError else f"{type(error).__name__}: {text}"
 
 
-def _module_name(path: Path) -> str:
-    """A name for the module of a task's file, the same in every process; with a number where the file is run again.
-
-    The functions of existing environments are looked up in the earlier module.
-    """
-    name = f"{_FILE}{path.stem}_{zlib.crc32(str(path.resolve()).encode()):08x}"
-    names = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
-    return next(name for name in names if name not in sys.modules)
-
-
 def _task_of_file(path: Path, attribute: str) -> type[Task]:
     with _LOADING:
         module = _module_of_file(path)
@@ -214,15 +207,13 @@ def _module_of_file(path: Path) -> ModuleType:
     """The module of a task's file, which is run if it, or a module beside it, has changed since."""
     if not path.is_file():
         raise FileNotFoundError(f"there is no task file {str(path)!r}")
-    file = str(path.resolve())
-    name, read = _loaded.get(file, ("", {}))
-    if name not in sys.modules or read != stamps(read):
+    name = f"{_FILE}{path.stem}_{zlib.crc32(str(path.resolve()).encode()):08x}"
+    if name not in sys.modules or name not in _loaded or _loaded[name] != stamps(_loaded[name]):
         modules = local_modules(path)
         read, sources = stamps([path.resolve(), *modules.values()]), _read(path, modules)
-        name = _module_name(path)
         with importable(path, modules):
             _run(path, name, sources[path.resolve()])
-        _loaded[file] = name, read
+        _loaded[name] = read
         for value in vars(sys.modules[name]).values():
             if isinstance(value, type) and issubclass(value, Task) and value.__module__ == name:
                 _sources[value] = sources

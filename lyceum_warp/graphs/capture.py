@@ -131,6 +131,28 @@ for _name in ("_apic_capture", "_apic_graph"):
     setattr(wp._src.context.Runtime, _name, _PerThread())
 
 
+class _Tiles(threading.local):
+    """Whether this thread has launched a kernel with tiles since the flag was last cleared."""
+
+    launched = False
+
+
+_tiles = _Tiles()
+_TILES_ON_CPU = threading.RLock()
+"""Held while kernels with tiles run on the CPU. A module that Warp compiles for x86 keeps the address of its tiles in a
+variable that all threads share, so that two threads in one such kernel would write each other's tiles."""
+_launch_tiled = wp.launch_tiled
+
+
+def _launch_tiled_alone(*args: Any, **options: Any) -> Any:
+    _tiles.launched = True
+    with _TILES_ON_CPU if wp.get_device(options.get("device")).is_cpu else contextlib.nullcontext():
+        return _launch_tiled(*args, **options)
+
+
+wp.launch_tiled = _launch_tiled_alone
+
+
 @contextlib.contextmanager
 def capturing() -> Iterator[None]:
     """Keep other captures and Python's garbage collection away from a capture.
@@ -193,13 +215,20 @@ class _Graph:
             self._replay = partial(self._workers.run, [self._capture_part(k, parts) for k in range(parts)])
 
     def _capture_part(self, part: int, parts: int) -> Callable[[], object]:
+        _tiles.launched = False
         with capturing(), part_of_worlds(part, parts), wp.ScopedCapture(device=self._device) as capture:
             self._run()
-        return partial(wp.capture_launch, capture.graph)
+        replay = partial(wp.capture_launch, capture.graph)
+        return partial(_alone, replay) if _tiles.launched and self._device.is_cpu else replay
 
     def _run(self) -> None:
         for function in self._functions:
             function()
+
+
+def _alone(replay: Callable[[], object]) -> None:
+    with _TILES_ON_CPU:
+        replay()
 
 
 class _Range:

@@ -16,6 +16,10 @@ NOISE = wp.constant(-2)
 DRAWS = wp.constant(-3)
 """The same for the keys of what a task draws in the samples."""
 
+_TILES = f"{__name__}.tiles"
+"""Warp's module for kernels with tiles. On the CPU all kernels of a module write the variable that holds the tiles'
+address, and only kernels with tiles are kept from running in two threads at once (see ``graphs.capture``)."""
+
 
 @wp.func
 def plant_of(row: int, rows: int, plants: int) -> int:
@@ -256,7 +260,7 @@ def combine_models(world_return_in: wp.array[float], worst: bool, return_out: wp
     return_out[k] = wp.where(wp.isfinite(total), total, -wp.inf)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module=_TILES)
 def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[float], summary_out: wp.array2d[float]):
     """Weigh samples by w = exp((R - max R) / temperature), divided by the sum; launched as one block for each plant.
 
@@ -309,7 +313,7 @@ def rank(return_in: wp.array[float], samples: int, rank_out: wp.array[int]):
     rank_out[k] = better
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module=_TILES)
 def weigh_elites(
     return_in: wp.array[float],
     rank_in: wp.array[int],
@@ -343,7 +347,7 @@ def weigh_elites(
         summary_out[p, 3] = float(n) - good
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module=_TILES)
 def fit_deviation(
     weight_in: wp.array[float],
     action_in: wp.array3d[float],
@@ -375,7 +379,7 @@ def fit_deviation(
         deviation_out[t, p, i] = wp.where(summary_in[p, 0] > -wp.inf, fitted, deviation_in[t, p, i])
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module=_TILES)
 def average(
     weight_in: wp.array[float],
     action_in: wp.array3d[float],

@@ -189,7 +189,8 @@ def test_a_drawn_field_acts_as_in_an_edited_model(name: str, device: wp.Device) 
     model = spec.compile()
     edited, field = copy.copy(model), describe_model_field(model, name)
     value = field.value(edited)
-    drawn = value * np.random.default_rng(0).uniform(1.0, 1.1, size=value.shape) + 0.03 * (value == 0)
+    most = 3.0 if name == "dof_solref" else 1.1  # most joints slip, at a force that is the same for any solref
+    drawn = value * np.random.default_rng(0).uniform(1.0, most, size=value.shape) + 0.03 * (value == 0)
     if name.endswith("quat"):
         drawn = value + 0.05
         drawn /= np.linalg.norm(drawn, axis=-1, keepdims=True)
@@ -214,10 +215,9 @@ def test_a_drawn_field_acts_as_in_an_edited_model(name: str, device: wp.Device) 
             made.step(nstep)
     found, expected = state_of(engine, engine.m, engine.d), state_of(wanted, wanted.m, wanted.d)
     tolerance = 1e-4 if field.constants & ~Constants.PRIVATE else 0.0
-    same = (found[1] == found[0]).all()
-    np.testing.assert_allclose(found[1], expected[1], rtol=tolerance, atol=tolerance, err_msg="state")
-    for shown in names:
-        pair = [made.arrays[shown].numpy().reshape(N, -1) for made in (engine, wanted)]
+    same = np.True_
+    pairs = {shown: [made.arrays[shown].numpy().reshape(N, -1) for made in (engine, wanted)] for shown in names}
+    for shown, pair in {"state": [found, expected], **pairs}.items():
         same &= (pair[0][1] == pair[0][0]).all()
         scale = tolerance * max(1.0, float(np.abs(pair[1]).max()))
         np.testing.assert_allclose(pair[0][1], pair[1][1], rtol=tolerance, atol=scale, err_msg=shown)

@@ -135,6 +135,40 @@ def test_a_graph_holds_the_launches_of_its_own_thread_alone() -> None:
     assert int(turns.numpy()[0]) == 3 and int(own.number.numpy()[0]) == 45
 
 
+@wp.kernel(enable_backward=False, module="lyceum_warp.tests.tiles")
+def add_tiles(number: int, sum_out: wp.array[int]):
+    i, _ = wp.tid()
+    total = int(0)  # noqa: RUF046
+    for _ in range(100):
+        total = total + wp.tile_extract(wp.tile_sum(wp.tile_ones(dtype=int, shape=64)), 0)
+    sum_out[i] = number * total
+
+
+def test_kernels_with_tiles_have_their_own_tiles_in_every_thread() -> None:
+    rounds, wrong = 300, []
+
+    def phase(number: int, sums: wp.array) -> Phase:
+        def run() -> None:
+            wp.launch_tiled(add_tiles, dim=[20], inputs=[number, sums], block_dim=64, device="cpu")
+
+        return Phase("add", run)
+
+    def work(number: int, **options: bool) -> None:
+        sums = wp.zeros(20, dtype=int, device="cpu")
+        (call,) = graphs(**options).sequence([phase(number, sums)])
+        for _ in range(rounds):
+            sums.zero_()
+            call()
+            wrong.extend(sums.numpy()[sums.numpy() != 6400 * number])
+
+    threads = [threading.Thread(target=work, args=(i + 1,), kwargs={"enabled": i < 2}) for i in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
 def test_without_graphs_every_phase_is_called_directly() -> None:
     digits = Digits()
     phases = [digits.phase(1), digits.phase(2)]

@@ -50,27 +50,27 @@ def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
     follow the positions, in every stage of a Runge-Kutta step.
     """
     smooth = types.SimpleNamespace(**vars(upstream.smooth) | {part.__name__: _nothing for part in done})
-    positions = _copy(upstream.fwd_kinematics, smooth=smooth)
+    positions = _copy("fwd_kinematics", smooth=smooth)
 
     def fwd_kinematics(model: mjw.Model, data: mjw.Data) -> None:
         positions(model, data)
         if model.eq_connect_adr.size or model.eq_wld_adr.size:
             mjw.com_vel(model, data)
 
-    fwd_position = _copy(upstream.fwd_position, fwd_kinematics=fwd_kinematics)
-    whole = _copy(upstream._forward, fwd_position=fwd_position)
-    forward = _copy(upstream.forward, _forward=whole)
+    fwd_position = _copy("fwd_position", fwd_kinematics=fwd_kinematics)
+    whole = _copy("_forward", fwd_position=fwd_position)
+    forward = _copy("forward", _forward=whole)
     stage = _without(frozenset())["_forward"] if done else whole
-    step = _copy(upstream.step, forward=forward, rungekutta4=_copy(upstream.rungekutta4, _forward=stage))
+    step = _copy("step", forward=forward, rungekutta4=_copy("rungekutta4", _forward=stage))
     return {"_forward": whole, "forward": forward, "step": step}
 
 
-def _copy(function: Callable[..., Any], **names: Any) -> Callable[..., Any]:
+def _copy(function: str, **names: Any) -> Callable[..., Any]:
     """A copy of a function of MuJoCo Warp's, in which some of its global names stand for other objects."""
-    inner: Any = inspect.unwrap(function)
+    inner: Any = inspect.unwrap(getattr(upstream, function))
     if unknown := names.keys() - set(inner.__code__.co_names):
-        raise ImportError(f"{inner.__name__} of this mujoco_warp uses no {min(unknown)}: use mujoco-warp 4.0")
-    return types.FunctionType(inner.__code__, inner.__globals__ | names, inner.__name__, inner.__defaults__)
+        raise ImportError(f"{function} of this mujoco_warp uses no {min(unknown)}: use mujoco-warp 4.0")
+    return types.FunctionType(inner.__code__, inner.__globals__ | names, function, inner.__defaults__)
 
 
 def _nothing(model: mjw.Model, data: mjw.Data) -> None:
