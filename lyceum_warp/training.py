@@ -31,7 +31,7 @@ Callback = Callable[[Any], Any]
 
 
 class Display:
-    """What a training shows on its way: nothing but log messages. The command line shows more."""
+    """Show a training on its way, by log messages alone. The command line shows more."""
 
     def begin(self, run: Run, learner: Learner, iterations: int) -> None:
         """Training begins, or goes on, up to so many iterations."""

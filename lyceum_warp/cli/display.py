@@ -9,6 +9,7 @@ from typing import Any
 import rich.box
 import torch
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -61,7 +62,7 @@ class Display(training.Display):
         self.console.print(
             f"[bold]{env.task.name}[/]: {env.obs_space.size} observations, {env.action_space.size} actions; "
             f"{env.nworld} worlds{processes}, {env.engine.name} engine on {env.options.device or 'cpu'}, "
-            f"{learner.algorithm}; run in {run.folder}", soft_wrap=True,
+            f"{learner.algorithm}; run in {escape(str(run.folder))}", soft_wrap=True,
         )  # fmt: skip
         self.total = iterations
         self.bar = self.progress.add_task("", total=iterations, completed=learner.iteration, text="")

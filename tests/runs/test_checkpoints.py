@@ -93,7 +93,7 @@ def test_a_module_of_the_package_is_made_again_by_its_class_and_its_shape(tmp_pa
 
 
 @pytest.mark.parametrize("name", ["os.system", "lyceum_warp.cli.main", "lyceum_warp.runs.folder.Run"])
-def test_a_file_makes_nothing_but_modules_of_the_package(name: str, run: Run) -> None:
+def test_a_file_makes_only_modules_of_the_package(name: str, run: Run) -> None:
     content = read_checkpoint(run.policy, parts=("iteration", "policy"))
     content["policy"]["class"] = name
     torch.save(content, run.policy)
