@@ -1,4 +1,4 @@
-"""Hold what is shown: the mode, the controller, the worlds or the episode, and the frames that show them."""
+"""Hold the state of a session: mode, controller, worlds and episode."""
 
 import math
 import time
@@ -20,27 +20,17 @@ from lyceum_warp.viewer.session.playback import Playback, episodes_of
 from lyceum_warp.viewer.session.traces import Traces, TraceThread, rollouts_for, trace_point
 from lyceum_warp.viewer.session.videos import VideoTaker
 
-_OLD = 1.0  # seconds after which paths of samples are no longer shown
+_OLD = 1.0  # seconds after which traces are no longer shown
 
 
 class Stage:
-    """The worlds, controllers and episodes of a session, and which of them are shown.
+    """The worlds, controllers and episodes of a session.
 
     Policies act in all worlds. A controller of one world, such as a planner, acts in the plant, a copy of the shown
-    world, while the others wait.
-
-    Args:
-        env: The worlds.
-        controllers: Controllers by their names; see ``lw.view``.
-        episodes: Episodes to play back.
-        world: The world that is shown first.
-        seed: Seed of a random reset at the start; by default the worlds stay as they are.
-        paused: Whether the session starts paused.
-        trace: The site or body whose path is drawn for a planner's samples.
-        title: The title of the window; by default the task's name.
+    world, while the other worlds wait. The arguments are explained in ``lw.view``.
 
     Raises:
-        ValueError: An argument does not fit.
+        ValueError: An argument is invalid.
     """
 
     def __init__(
@@ -74,14 +64,14 @@ class Stage:
         self.controller: str | None = None
         self.paused, self.speed = bool(paused), 1.0
         self.dragging = False
-        """Whether a person pushes a body."""
+        """Whether the user is pushing a body."""
         self.changed = False
-        """Whether something has changed since the last frame."""
+        """Whether anything has changed since the last frame."""
         modes: list[Mode] = ["playback"] if self.playback.episodes else []
         modes += ["controller"] if self.controllers else []
         modes.append("passive")
         self.scene = Scene(
-            title=title or env.task.name, model=model_bytes(env.task.model), nworld=env.nworld, timestep=env.timestep,
+            title=title or env.task.name, model=model_bytes(env.task.model), nworld=env.nworld,
             modes=tuple(modes), controllers=tuple(self.controllers),
             episodes=tuple(episode.name for episode in self.playback.episodes),
             curves=("reward", "eval", *env.metrics),
@@ -99,7 +89,7 @@ class Stage:
 
     @property
     def control(self) -> Control | None:
-        """The controller that acts."""
+        """The controller in use."""
         return self.controllers[self.controller] if self.mode == "controller" and self.controller else None
 
     def say(self, message: str) -> None:
@@ -125,8 +115,7 @@ class Stage:
         for _ in range(steps):
             self.count_step()
             if self.mode == "playback":
-                self.playback.advance()
-                self.frames.add_point(self.playback)
+                self.seek_episode(self.playback.next_step)
                 continue
             if isinstance(self.control, WorldControl) and not self.live.past.ahead:
                 self._step_plant(self.control)
@@ -139,38 +128,38 @@ class Stage:
         self._steps += 1
 
     def restart_measurement(self) -> None:
-        """Measure the speed from now on."""
+        """Restart the measurement of the speed."""
         self._progress.clear()
 
     def act(self) -> None:
-        """Write the actions of the next step of all worlds."""
+        """Write the actions of all worlds."""
         if isinstance(self.control, PolicyControl):
             self.control.act()
         else:
             self.live.env.action.zero_()
 
     def _step_plant(self, current: WorldControl) -> None:
-        """One step of a plant that waits for its controller."""
+        """Make one step of a plant that waits for its controller."""
         self.begin_due_episode()
         self.live.expect_steps()
         try:
             control(self.live.env, current.new_run(), steps=1, reset=False)
-        except ValueError as error:  # of actions that do not fit
+        except ValueError as error:  # from invalid actions
             raise ControllerError(current.name, error) from error
         self.live.stepped()
 
     def begin_due_episode(self) -> None:
-        """Begin a new episode of the plant, and of its controller, if the last one is over."""
+        """Start a new episode of the plant and its controller if the last episode is over."""
         if self.live.env.done.item():
             self.reset(random=True)
 
     def reset(self, *, random: bool) -> None:
-        """Begin a new episode of the shown world, and of its controller."""
+        """Start a new episode of the shown world and its controller."""
         self.live.reset(random=random)
         self.reset_controller()
 
     def reset_controller(self) -> None:
-        """Call the controller's ``reset``, and drop the traces of its plans."""
+        """Reset the controller, and drop its traces."""
         if isinstance(current := self.control, WorldControl):
             current.reset()
         if (thread := self._threads.get(str(self.controller))) is not None:
@@ -183,16 +172,15 @@ class Stage:
             self.say(f"the past ends here: {past_text(self.live)}")
 
     def seek_episode(self, step: int) -> None:
-        """Show a step of the episode that is played back."""
+        """Show a step of the playback."""
         self.playback.seek(step)
         self.frames.add_point(self.playback)
 
     def end_old_push(self) -> None:
-        """End a push that steps through the past have put back, once the worlds go on from there."""
+        """End a push that was restored with a past state, once the worlds continue from there."""
         live = self.live
         if live.pushed is not None and not self.dragging and not live.past.ahead:
             live.end_push()
-        # a planner does not know of the push
         pushed = self.env.state_space.parts["xfrc_applied"] if live.pushed is not None else None
         for each in self.controllers.values():
             if isinstance(each, WorldControl):
@@ -201,7 +189,7 @@ class Stage:
     # which worlds
 
     def select(self, mode: Mode, controller: str | None) -> None:
-        """Change the mode and the controller; the shown world goes on in the worlds of the new one."""
+        """Change the mode and the controller. The shown world keeps its state."""
         before, chosen = self.live, (self.mode, self.controller)
         self.mode, self.controller = mode, controller
         if self.live is not before:
@@ -219,7 +207,7 @@ class Stage:
             self._threads[current.name] = self._trace_thread(current)
 
     def show_world(self, world: int) -> None:
-        """Show another world; a push ends."""
+        """Show another world, and end a push."""
         before = self.live
         before.end_push()
         self.dragging = False
@@ -232,7 +220,7 @@ class Stage:
         self.frames.forget_seen(self.live)
 
     def go_on_from(self, state: torch.Tensor, live: Live, *, new_episode: bool = False) -> None:
-        """Put the shown world of ``live`` into a state, as one whose episode goes on."""
+        """Set the state of the shown world, and let its episode continue."""
         state = state.clone()
         state[self.env.state_space.parts["done_reason"]] = 0.0
         live.set_row(state, new_episode=new_episode)
@@ -245,7 +233,7 @@ class Stage:
         after.returns[after.world] = before.returns[before.world].item()
 
     def _trace_thread(self, current: WorldControl) -> TraceThread | None:
-        """The thread for a planner's traces; None for a controller without plans."""
+        """Start the thread for a planner's traces; None for a controller without plans."""
         if not hasattr(current.controller, "actions"):
             return None
         rollouts = rollouts_for(current.controller, self.live.env, self._trace)
@@ -255,16 +243,13 @@ class Stage:
     # frames
 
     def frame(self) -> Frame:
-        """What is shown now."""
+        """Make a frame of the present state."""
         if self.mode == "playback":
             return self.frames.of_playback(self.playback, self._status)
-        plan_ms = 1000 * self.control.seconds if self.control else math.nan
-        return self.frames.of_worlds(
-            self.live, self.main, self._traces(), self._status, plan_ms=plan_ms, paused=self.paused
-        )
+        return self.frames.of_worlds(self.live, self.main, self._traces(), self._status, paused=self.paused)
 
     def _traces(self) -> Traces | None:
-        """The newest paths of a planner's samples, if they are to be shown; asks for others."""
+        """The newest traces, if they are shown; requests new ones."""
         thread, current = self._threads.get(str(self.controller)), self.control
         if not self.frames.ghosts.plan or thread is None or not isinstance(current, WorldControl):
             return None
@@ -286,16 +271,13 @@ class Stage:
         return Status(
             mode=self.mode, controller=self.controller if self.mode == "controller" else None,
             episode=self.playback.index if self.mode == "playback" else None, paused=self.paused, speed=self.speed,
-            measured_speed=measured, backwards=self.playback.backwards, video=self.videos.name, **rest,
+            measured_speed=measured, backwards=self.playback.backwards, video=self.videos.name,
+            ghosts=self.frames.ghosts, plan_ms=1000 * self.control.seconds if self.control else math.nan, **rest,
         )  # fmt: skip
 
 
 def check_world(world: Any, nworld: int) -> int:
-    """Check the number of a world.
-
-    Raises:
-        ValueError: There is no such world.
-    """
+    """Check the index of a world; raise ValueError if there is no such world."""
     if not isinstance(world, int) or isinstance(world, bool) or not 0 <= world < nworld:
         known = "is 1 world, number 0" if nworld == 1 else f"are {nworld} worlds, 0 to {nworld - 1}"
         raise ValueError(f"there is no world {world!r}: there {known}")

@@ -43,11 +43,6 @@ def test_a_site_a_body_or_the_tasks_choice_is_traced() -> None:
     with pytest.raises(ValueError, match="no site and no body 'nose' to trace: it has tip, base, upper, hand, ball"):
         trace_point(model, "nose")
 
-    class Traced(lw.Task):
-        trace = "thigh"
-
-    assert Traced.trace == "thigh" and lw.Task.trace is None
-
 
 def test_paths_are_those_that_the_samples_take(shared_env: SharedEnv) -> None:
     """Each path is where the plant itself would go under the actions of the sample."""
