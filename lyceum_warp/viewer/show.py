@@ -93,7 +93,7 @@ def view(
         window = opened(session.stage.scene, graphics, host=host, port=port, browser=browser)
         session.run(window)
     finally:
-        session.close()
+        session.stage.close()
     if window.error is not None:
         raise NoWindowError(f"the viewer's window ended: {window.error}")
 

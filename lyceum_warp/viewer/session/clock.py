@@ -75,7 +75,7 @@ class Session:
         self._next_step = now + self.stage.env.timestep / self.stage.speed
         with contextlib.ExitStack() as ends:  # in reverse order
             ends.enter_context(self.stage.videos.finishing(print))
-            ends.callback(self.close)
+            ends.callback(self.stage.close)
             ends.callback(window.close)
             while True:
                 self._poll()
@@ -88,10 +88,6 @@ class Session:
                         self._tick()
                 except ControllerError as error:
                     self._give_up_control(error)
-
-    def close(self) -> None:
-        """End the threads of the session. A second call does nothing."""
-        self.stage.close()
 
     def _tick(self) -> None:
         """Make the steps that are due, show a frame, and wait."""
@@ -128,7 +124,7 @@ class Session:
             self._next_check = now + _CHECK
             for watch in (*self._watchers, self.stage.videos.completed):
                 for message in watch():
-                    self.stage.say(message)
+                    self.stage.frames.say(message)
 
     def _show_when_due(self, now: float) -> None:
         """Show a frame if one is due, and if something has changed or the last frame is old."""
@@ -147,7 +143,7 @@ class Session:
             videos.add(frame)
         except (NoVideoError, OSError) as error:
             videos.give_up()
-            stage.say(str(error))
+            stage.frames.say(str(error))
 
     # a plant in real time
 
@@ -174,7 +170,7 @@ class Session:
     def _stepped(self, progress: ControlProgress) -> None:
         """Record a step of the plant."""
         self.stage.live.stepped()
-        self.stage.count_step()
+        self.stage.steps += 1
         if time.perf_counter() - self._last_work > 1 / self.fps:  # a plant that is late or fast never waits
             self._work()
 
@@ -204,7 +200,7 @@ class Session:
         try:
             obey(stage, command)
         except (ValueError, OSError, NoVideoError) as error:
-            stage.say(str(error))
+            stage.frames.say(str(error))
         except ControllerError as error:
             self._give_up_control(error)
         stage.end_old_push()
@@ -233,4 +229,4 @@ class Session:
         stage.paused = stage.changed = True
         if stage.mode == "controller":
             stage.select("passive", stage.controller)
-        stage.say(f"{error}; the viewer is paused, without a controller")
+        stage.frames.say(f"{error}; the viewer is paused, without a controller")

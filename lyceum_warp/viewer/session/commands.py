@@ -27,10 +27,10 @@ def obey(stage: Stage, command: protocol.Command) -> None:
             stage.show_world(check_world(world, stage.env.nworld))
         case protocol.SetPaused(paused):
             stage.paused = paused
-            stage.restart_measurement()
+            stage.progress.clear()
         case protocol.SetSpeed(speed):
             stage.speed = min(max(float(speed), SLOWEST), FASTEST)
-            stage.restart_measurement()
+            stage.progress.clear()
         case protocol.StepBy(steps):
             stage.paused = True
             if stage.mode == "playback":

@@ -95,6 +95,8 @@ class WorldControl:
     def __init__(self, name: str, controller: Any) -> None:
         self.name, self.seconds = name, float("nan")
         self.controller = controller
+        self.plans = hasattr(controller, "actions")
+        """Whether it has plans, which can be drawn."""
         self._busy = threading.Lock()
         self._run = self.calls = 0
         self._reset_due = self._wanted = False

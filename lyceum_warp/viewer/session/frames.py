@@ -106,12 +106,7 @@ class FrameMaker:
         )  # fmt: skip
 
     def of_playback(self, playback: Playback, status: Callable[..., Status]) -> Frame:
-        """Make a frame of a playback.
-
-        Args:
-            playback: The playback.
-            status: Completes the status.
-        """
+        """Make a frame of a playback; ``status`` completes the status."""
         episode, state = playback.episode, playback.state
         others = [playback.episodes[index].states for index in self.ghosts.episodes if index != playback.index]
         ghosts = self._coloured(states[min(playback.step, len(states) - 1)] for states in others)

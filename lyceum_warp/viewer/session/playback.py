@@ -83,11 +83,7 @@ def _of_trajectory(name: str, trajectory: Trajectory, env: Env) -> Episode:
 
 
 class Playback:
-    """The position in the episodes.
-
-    Args:
-        episodes: The episodes.
-    """
+    """The episodes, and the shown step of one of them."""
 
     def __init__(self, episodes: Sequence[Episode]) -> None:
         self.episodes = list(episodes)

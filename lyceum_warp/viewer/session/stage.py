@@ -17,7 +17,7 @@ from lyceum_warp.viewer.session.frames import FrameMaker, model_bytes, past_text
 from lyceum_warp.viewer.session.live import Live
 from lyceum_warp.viewer.session.plant import make_plant
 from lyceum_warp.viewer.session.playback import Playback, episodes_of
-from lyceum_warp.viewer.session.traces import Traces, TraceThread, rollouts_for, trace_point
+from lyceum_warp.viewer.session.traces import TraceRollouts, Traces, TraceThread, trace_point
 from lyceum_warp.viewer.session.videos import VideoTaker
 
 _OLD = 1.0  # seconds after which traces are no longer shown
@@ -59,7 +59,7 @@ class Stage:
         planned = any(isinstance(each, WorldControl) for each in self.controllers.values())
         self._plant = make_plant(self.main) if planned else None
         self._trace = trace
-        self._threads: dict[str, TraceThread | None] = {}
+        self._threads: dict[str, TraceThread] = {}
         self.mode: Mode = "passive"
         self.controller: str | None = None
         self.paused, self.speed = bool(paused), 1.0
@@ -78,8 +78,10 @@ class Stage:
         )  # fmt: skip
         self.videos = VideoTaker(env.task.model, self.scene.title)
         self.frames = FrameMaker(env, len(self.scene.curves))
-        self._progress: deque[tuple[float, int]] = deque(maxlen=64)
-        self._steps = 0
+        self.steps = 0
+        """Steps since the session began, for the measured speed."""
+        self.progress: deque[tuple[float, int]] = deque(maxlen=64)
+        """Times of the last frames, with the number of steps by then."""
         self.select(modes[0], next(iter(self.controllers), None))
 
     @property
@@ -92,16 +94,10 @@ class Stage:
         """The controller in use."""
         return self.controllers[self.controller] if self.mode == "controller" and self.controller else None
 
-    def say(self, message: str) -> None:
-        """Show a message in the next frame."""
-        self.frames.say(message)
-
     def close(self) -> None:
         """End the threads. A second call does nothing."""
-        threads, self._threads = self._threads, {}
-        for thread in threads.values():
-            if thread is not None:
-                thread.close()
+        while self._threads:
+            self._threads.popitem()[1].close()
 
     # steps
 
@@ -113,7 +109,7 @@ class Stage:
         """
         self.changed = True
         for _ in range(steps):
-            self.count_step()
+            self.steps += 1
             if self.mode == "playback":
                 self.seek_episode(self.playback.next_step)
                 continue
@@ -122,14 +118,6 @@ class Stage:
             else:
                 self.live.step(self.act)
             self.end_old_push()
-
-    def count_step(self) -> None:
-        """Count a step for the measured speed."""
-        self._steps += 1
-
-    def restart_measurement(self) -> None:
-        """Restart the measurement of the speed."""
-        self._progress.clear()
 
     def act(self) -> None:
         """Write the actions of all worlds."""
@@ -169,7 +157,7 @@ class Stage:
         """Take steps back."""
         done = self.live.back(steps)
         if done < steps:
-            self.say(f"the past ends here: {past_text(self.live)}")
+            self.frames.say(f"the past ends here: {past_text(self.live)}")
 
     def seek_episode(self, step: int) -> None:
         """Show a step of the playback."""
@@ -196,15 +184,17 @@ class Stage:
             self._transfer(before, self.live)
             before.end_push()
         for thread in self._threads.values():
-            if thread is not None:
-                thread.forget()
+            thread.forget()
         if chosen != (mode, controller):
             self.live.past.drop_ahead()
             self.reset_controller()
-            self.restart_measurement()
+            self.progress.clear()
         self.frames.forget_seen(self.live)
-        if isinstance(current := self.control, WorldControl) and current.name not in self._threads:
-            self._threads[current.name] = self._trace_thread(current)
+        current = self.control
+        if isinstance(current, WorldControl) and current.plans and current.name not in self._threads:
+            rollouts = TraceRollouts(current.controller, self.live.env, self._trace)
+            self.frames.text["trace"] = rollouts.point.name
+            self._threads[current.name] = TraceThread(rollouts)
 
     def show_world(self, world: int) -> None:
         """Show another world, and end a push."""
@@ -232,14 +222,6 @@ class Stage:
             after.pushed = after.world
         after.returns[after.world] = before.returns[before.world].item()
 
-    def _trace_thread(self, current: WorldControl) -> TraceThread | None:
-        """Start the thread for a planner's traces; None for a controller without plans."""
-        if not hasattr(current.controller, "actions"):
-            return None
-        rollouts = rollouts_for(current.controller, self.live.env, self._trace)
-        self.frames.text["trace"] = rollouts.point.name
-        return TraceThread(rollouts)
-
     # frames
 
     def frame(self) -> Frame:
@@ -254,8 +236,8 @@ class Stage:
         if not self.frames.ghosts.plan or thread is None or not isinstance(current, WorldControl):
             return None
         if thread.error is not None:
-            self.say(f"no paths of samples: {thread.error}")
-            self._threads[current.name] = None
+            self.frames.say(f"no paths of samples: {thread.error}")
+            thread.error = None
         if (view := current.look()) is not None:
             thread.give(view)
         seen = thread.newest()
@@ -263,11 +245,11 @@ class Stage:
 
     def _status(self, **rest: Any) -> Status:
         now = time.perf_counter()
-        self._progress.append((now, self._steps))
-        begun, steps = self._progress[0]
+        self.progress.append((now, self.steps))
+        begun, steps = self.progress[0]
         measured = math.nan
         if not self.paused and now - begun > 0.1:
-            measured = (self._steps - steps) * self.env.timestep / (now - begun)
+            measured = (self.steps - steps) * self.env.timestep / (now - begun)
         return Status(
             mode=self.mode, controller=self.controller if self.mode == "controller" else None,
             episode=self.playback.index if self.mode == "playback" else None, paused=self.paused, speed=self.speed,

@@ -106,13 +106,17 @@ class TraceRollouts:
     """Rolls out plans and some of their samples in a few worlds.
 
     Args:
-        env: The planner's worlds, or the plant if the planner has none.
-        point: The point whose path is drawn.
-        nominal_model: Whether the planner plans in the nominal model.
+        controller: The planner.
+        plant: The plant.
+        name: Name of a site or a body; None for ``Task.trace``, or the default of ``trace_point``.
     """
 
-    def __init__(self, env: Env, point: TracePoint, *, nominal_model: bool = False) -> None:
-        self.point, self._nominal = point, nominal_model
+    def __init__(self, controller: Any, plant: Env, name: str | None) -> None:
+        own = getattr(controller, "env", None)
+        env = own if isinstance(own, Env) else plant
+        point = trace_point(env.task.model, name if name is not None else env.task.task.trace)
+        self.point = point
+        self._nominal = bool(getattr(getattr(controller, "config", None), "nominal_model", False))
         fields = tuple(dict.fromkeys((*env.options.fields, point.field)))
         threads = {"nthread": 1} if env.engine.name == "mujoco" else {}
         self.env = env.replicate_few(MOST_SAMPLES + 1, autoreset=False, horizon=0, fields=fields, **threads)
@@ -162,12 +166,11 @@ class TraceThread:
 
     Args:
         rollouts: Used only by the thread from then on.
-        share: Maximum share of a core.
     """
 
-    def __init__(self, rollouts: TraceRollouts, share: float = SHARE) -> None:
+    def __init__(self, rollouts: TraceRollouts) -> None:
         self.error: BaseException | None = None
-        self._rollouts, self._share = rollouts, share
+        self._rollouts = rollouts
         self._view: PlanView | None = None
         self._newest: Traces | None = None
         self._wake, self._working, self._ending = threading.Event(), threading.Lock(), False
@@ -208,7 +211,7 @@ class TraceThread:
                 begun = time.thread_time()  # on a busy machine the wall clock would count other work
                 with self._working:
                     self._newest = self._rollouts(view)
-                self._rest((time.thread_time() - begun) / self._share)
+                self._rest((time.thread_time() - begun) / SHARE)
         except BaseException as error:
             self.error = error
 
@@ -216,18 +219,3 @@ class TraceThread:
         end = time.perf_counter() + seconds
         while not self._ending and (left := end - time.perf_counter()) > 0:
             time.sleep(min(left, 0.1))
-
-
-def rollouts_for(controller: Any, plant: Env, name: str | None) -> TraceRollouts:
-    """Make the rollouts for a planner's traces.
-
-    Args:
-        controller: The planner.
-        plant: The plant.
-        name: Name of a site or a body; None for ``Task.trace``, or the default of ``trace_point``.
-    """
-    own = getattr(controller, "env", None)
-    env = own if isinstance(own, Env) else plant
-    point = trace_point(env.task.model, name if name is not None else env.task.task.trace)
-    nominal = bool(getattr(getattr(controller, "config", None), "nominal_model", False))
-    return TraceRollouts(env, point, nominal_model=nominal)

@@ -44,10 +44,7 @@ class Window:
 
     Args:
         scene: The constant part of the display.
-        gfx: "web" serves a page for browsers, which needs no display; "native" opens a window.
-        host: Address to serve the page on. The default is the loopback address, which other machines cannot reach.
-        port: Port of the page; by default the first free port from 8080.
-        browser: Whether to open the page in a browser on this machine.
+        gfx: "web" or "native". This and the further arguments are explained in ``lw.view``.
 
     Raises:
         ValueError: The port is out of range or in use, or the address is not an address of this machine.

@@ -95,8 +95,7 @@ class Proxy:
     Construction opens the port, ``start`` begins to answer, and ``close`` or the end of a ``with`` block closes it.
 
     Args:
-        host: Address or name to listen on. The default is the loopback address, which other machines cannot reach.
-            Traffic is not encrypted: forward the port by ssh rather than listen on another address.
+        host: Address or name to listen on; see ``lw.view``.
         port: Port to listen on; by default the first free port from 8080.
 
     Raises:

@@ -23,8 +23,6 @@ VISIBLE = (
     "mesh_", "skin_", "flex_",
 )  # fmt: skip
 """Prefixes of fields that change the picture."""
-LISTED = 8
-"""Maximum number of listed elements of a field."""
 
 
 # ghosts and traces
@@ -152,8 +150,6 @@ class ModelValues:
         self._values: dict[str, np.ndarray] = {}
         self.model = copy.deepcopy(nominal)
         """The model with the values."""
-        self.differences: list[tuple[str, str]] = []
-        """Elements that differ: name and index, and their value with the nominal value."""
 
     def set(self, values: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
         """Set a world's values; return whether any has changed, and whether one that changes the picture has."""
@@ -165,7 +161,6 @@ class ModelValues:
             self._values = dict(values)
             self.model = copy.deepcopy(self._nominal)
             self.copy_to(self.model)
-            self.differences = [line for name in values for line in self._differences(name)]
         return bool(changed), any(name.startswith(VISIBLE) for name in changed)
 
     def copy_to(self, model: mujoco.MjModel) -> None:
@@ -173,11 +168,6 @@ class ModelValues:
         for name, values in self._values.items():
             field(model, name)[...] = values.reshape(field(model, name).shape)
         mujoco.mj_setConst(model, mujoco.MjData(model))
-
-    def _differences(self, name: str) -> list[tuple[str, str]]:
-        values, nominal = field(self.model, name), field(self._nominal, name)
-        rows = [i for i in range(len(nominal)) if not np.array_equal(values[i], nominal[i])]
-        return [(f"{name}[{i}]", f"{values[i]} ({nominal[i]})") for i in rows[:LISTED]]
 
 
 def field(model: mujoco.MjModel, name: str) -> np.ndarray:

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import MOST_BURST
+from lyceum_warp.viewer.protocol import MAX_POINTS, MOST_BURST
 from lyceum_warp.viewer.window.actions import MANY_STEPS, OTHER_KEYS, SPEEDS, Actions, key_table
 from lyceum_warp.viewer.window.scene import Drawn, ModelValues
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
@@ -183,10 +183,6 @@ class Windows:
                 imgui.TableNextColumn()
                 imgui.TextWrapped(value)
             imgui.EndTable()
-        values = self._values.differences
-        if values and imgui.CollapsingHeader(f"model of this world ({len(values)})"):
-            for name, value in values:
-                imgui.TextUnformatted(f"{name}  {value}")
 
     def dropped(self) -> list[tuple[str, str]]:
         """Ghosts and traces that are left out."""
@@ -375,20 +371,18 @@ class Curves:
 
     Args:
         number: Number of curves.
-        capacity: Maximum number of points.
     """
 
-    def __init__(self, number: int, capacity: int = 20_000) -> None:
+    def __init__(self, number: int) -> None:
         self.rows = np.empty((0, 1 + number))
         """(points, 1 + number): times in seconds, then a value per curve."""
-        self._capacity = capacity
 
     def add(self, rows: np.ndarray) -> None:
         """Append points. If time goes back, as after steps back, later points are dropped."""
         for part in np.split(rows, np.flatnonzero(np.diff(rows[:, 0]) < 0) + 1):
             if len(part):
                 kept = self.rows[: np.searchsorted(self.rows[:, 0], part[0, 0])]
-                self.rows = np.concatenate([kept, part])[-self._capacity :]
+                self.rows = np.concatenate([kept, part])[-MAX_POINTS:]
 
     def thinned(self, points: int) -> np.ndarray:
         """Thin the curves to about ``points`` rows: the minimum and the maximum of each of ``points / 2`` parts."""

@@ -167,7 +167,6 @@ def test_world_of_another_size_gets_a_model_of_its_own(bench: Bench, monkeypatch
     sizes = np.array(bench.model.geom_size)
     sizes[1, 0] = 0.3
     bench.draw(frame_of(bench.model, bench.data, model_fields={"geom_size": sizes}))
-    assert bench.panel.values.differences == [("geom_size[1]", "[0.3 0.  0. ] ([0.1 0.  0. ])")]
     bench.draw(frame_of(bench.model, bench.data))
     assert [model.geom("ball").size[0] for model in bench.models] == pytest.approx([0.3, 0.1])
 
@@ -177,4 +176,3 @@ def test_world_of_another_mass_keeps_the_picture(bench: Bench) -> None:
     bench.draw(frame_of(bench.model, bench.data, model_fields={"body_mass": masses}))
     assert bench.models == []
     np.testing.assert_array_equal(bench.viewer.model.body_mass, masses)
-    assert bench.panel.values.differences[0][0] == "body_mass[1]"

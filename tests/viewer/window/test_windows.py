@@ -11,12 +11,10 @@ def ramp(begin: int, end: int) -> np.ndarray:
 
 
 def test_curves_keep_the_newest_points_in_order() -> None:
-    curves = Curves(1, capacity=10)
-    for i in range(100):
-        curves.add(ramp(i, i + 1))
-    np.testing.assert_array_equal(curves.rows, ramp(90, 100))
-    curves.add(ramp(100, 200))
-    np.testing.assert_array_equal(curves.rows, ramp(190, 200))
+    curves = Curves(1)
+    for i in range(0, 30_000, 1000):
+        curves.add(ramp(i, i + 1000))
+    np.testing.assert_array_equal(curves.rows, ramp(10_000, 30_000))
 
 
 def test_time_that_goes_back_drops_the_points_from_there_on() -> None:
