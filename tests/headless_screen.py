@@ -9,7 +9,7 @@ from mujoco.studio import launch_thread, messages, ux, viewer_protocol
 from lyceum_warp.viewer.protocol import Frame, Opened, Pose, Reply, Scene, Status
 from lyceum_warp.viewer.session.frames import model_bytes
 from lyceum_warp.viewer.window.panel import Panel
-from lyceum_warp.viewer.window.studio import Screen, imgui, implot
+from lyceum_warp.viewer.window.studio import imgui, implot
 
 ROBOT = """
 <mujoco>
@@ -78,7 +78,7 @@ class HeadlessViewer(viewer_protocol.Viewer):
 
 
 class Bench:
-    """A panel in a viewer of its own, with the session's end at hand."""
+    """A panel in a viewer of its own, which keeps what the panel sends."""
 
     def __init__(self, model: mujoco.MjModel, scene: Scene, **options: Any) -> None:
         self.model, self.data = model, mujoco.MjData(model)
@@ -95,12 +95,15 @@ class Bench:
         self.given: Frame | None = None
         self.models: list[mujoco.MjModel] = []
         self.panel = Panel(
-            scene, model, self.sent.append, self.take, ShownModels(self.models), Opened("http://here"), **options
+            scene, model, self.sent.append, self.take, self, Opened("http://here"), **options
         )  # fmt: skip
         here, _ = launch_thread.make_thread_endpoints()
         config = viewer_protocol.ViewerConfig()
         self.viewer = HeadlessViewer(config, here, model=model, plugins=[self.panel])
         self.viewer.dispatch(viewer_protocol.ViewerInitEvent(viewer=self.viewer))
+
+    def show_model(self, model: mujoco.MjModel) -> None:
+        self.models.append(model)
 
     def take(self) -> Frame | None:
         given, self.given = self.given, None
@@ -119,13 +122,3 @@ class Bench:
         self.viewer.dispatch(messages.BuildGuiEvent())
         imgui.Render()
         return self.sent[before:]
-
-
-class ShownModels(Screen):
-    """Takes the models that the panel shows."""
-
-    def __init__(self, shown: list[mujoco.MjModel]) -> None:
-        self.shown = shown
-
-    def show_model(self, model: mujoco.MjModel) -> None:
-        self.shown.append(model)

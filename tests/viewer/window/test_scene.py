@@ -56,27 +56,15 @@ def test_traces_are_lines_between_their_points() -> None:
     np.testing.assert_allclose([geom.size[2] for geom in drawn.geoms], 1.0)
 
 
-def test_too_many_traces_get_fewer_points_before_some_are_dropped() -> None:
-    traces = np.random.default_rng(0).normal(size=(10, 33, 3))
-    drawn = ExtraGeoms(MODEL, 100).draw(pose(0), traces=traces, best=0)
-    assert drawn.traces == 10
-    assert len(drawn.geoms) <= 100
-    few = ExtraGeoms(MODEL, 50).draw(pose(0), traces=traces, best=0)
-    assert 1 < few.traces < 10
-    assert len(few.geoms) <= 50
-
-
-def test_traces_leave_most_geoms_to_ghosts() -> None:
-    traces = np.random.default_rng(0).normal(size=(100, 65, 3))
-    assert len(ExtraGeoms(MODEL, 1024).draw(pose(0), traces=traces, best=0).geoms) <= 160
-
-
-@pytest.mark.parametrize("limit", [1, 3, 10, 64])
+@pytest.mark.parametrize(("limit", "number"), [(1024, 10), (100, 10), (50, 10), (10, 10), (1024, 100), (3, 7), (1, 7)])
 @pytest.mark.parametrize("best", [None, 2])
-def test_limit_is_never_exceeded(limit: int, best: int | None) -> None:
-    traces = np.random.default_rng(0).normal(size=(7, 12, 3))
-    drawn = ExtraGeoms(MODEL, limit).draw(pose(0), [ghost(i) for i in range(20)], traces, best)
-    assert len(drawn.geoms) <= limit
+def test_traces_get_fewer_points_before_some_are_dropped(limit: int, number: int, best: int | None) -> None:
+    traces = np.random.default_rng(0).normal(size=(number, 33, 3))
+    scene = ExtraGeoms(MODEL, limit)
+    drawn = scene.draw(pose(0), traces=traces, best=best)
+    assert len(drawn.geoms) <= min(limit, 160)  # most geoms are left to ghosts
+    assert (drawn.traces == number) == (limit >= 100 and number == 10)
+    assert len(scene.draw(pose(0), [ghost(i) for i in range(20)], traces, best).geoms) <= limit
 
 
 @pytest.mark.parametrize("traces", [np.zeros((0, 5, 3)), np.zeros((3, 1, 3)), None])

@@ -1,4 +1,4 @@
-"""What the viewer uses of mujoco.studio, whose interface is young: these tests fail where a new version changes it."""
+"""Studio's interface, as far as the viewer uses it: these tests fail if a new version changes it."""
 
 import ast
 import inspect
