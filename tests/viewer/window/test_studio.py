@@ -1,4 +1,4 @@
-"""What the viewer uses of mujoco.studio, whose interface is young: these tests fail where a new version changes it."""
+"""Studio's interface, as far as the viewer uses it: these tests fail if a new version changes it."""
 
 import ast
 import inspect
@@ -73,4 +73,4 @@ def test_screen_refuses_to_listen_on_a_socket_of_studio(monkeypatch: pytest.Monk
     for name in ("bind_public_socket", "bind_loopback_socket"):
         monkeypatch.setattr(web_server, name, getattr(web_server, name))
     with socket.socket() as given, pytest.raises(RuntimeError, match="every address"):
-        studio.Screen().run(studio.Plugin(), gfx="web", title="", sock=given)
+        studio.Screen().run(studio.Plugin(), title="", sock=given)
