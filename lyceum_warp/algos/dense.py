@@ -60,13 +60,8 @@ class DensePasses:
         self._allocate(0)
 
     @staticmethod
-    def of(network: nn.Module, last: "DensePasses | None" = None) -> "DensePasses | None":
-        """Passes through a network; None if it is not one of ``mlp`` on the CPU, or its activation is not known here.
-
-        Args:
-            network: The network.
-            last: What an earlier call returned; it is returned once more where it still has the network's parameters.
-        """
+    def of(network: nn.Module) -> "DensePasses | None":
+        """Passes through a network; None if it is not one of ``mlp`` on the CPU with a known activation."""
         if type(network) is not nn.Sequential or len(network) % 2 == 0:
             return None
         layers: list[Any] = list(network)[::2]
@@ -83,8 +78,6 @@ class DensePasses:
             or any(map(_hooked, network.modules()))
         ):
             return None
-        if last is not None and last.activation is kind and _places(last.parameters) == _places(parameters):
-            return last
         return DensePasses(parameters, kind)
 
     def _allocate(self, rows: int) -> None:
@@ -163,30 +156,19 @@ class DensePolicy:
 
     def __init__(self, policy: GaussianPolicy, passes: DensePasses) -> None:
         self.policy, self.passes = policy, passes
-        self.others = _others(policy)
-        self._log_std, *self._statistics = [tensor.numpy() for tensor in self.others]
         self._x = torch.empty(0, policy.nobs)
         self._pulled = [torch.empty_like(parameter) for parameter in passes.parameters]
 
     @staticmethod
-    def of(policy: GaussianPolicy, last: "DensePolicy | None" = None) -> "DensePolicy | None":
-        """The same policy; None if a part of it is of another kind, or some of its network is not learned.
-
-        Args:
-            policy: The policy.
-            last: What an earlier call returned; it is returned once more where it still has the policy's parameters.
-        """
+    def of(policy: GaussianPolicy) -> "DensePolicy | None":
+        """The same policy; None if a part of it is of another kind, or some of its network is not learned."""
         plain = type(policy) is GaussianPolicy and type(policy.normalizer) in (Normalizer, nn.Identity)
         if not plain or _hooked(policy) or _hooked(policy.normalizer):
             return None
         if not all(parameter.requires_grad for parameter in policy.network.parameters()):
             return None
-        passes = DensePasses.of(policy.network, last.passes if last else None)
-        if passes is None:
-            return None
-        kept = last is not None and last.policy is policy and last.passes is passes
-        kept = kept and last is not None and _places(last.others) == _places(_others(policy))
-        return last if kept else DensePolicy(policy, passes)
+        passes = DensePasses.of(policy.network)
+        return None if passes is None else DensePolicy(policy, passes)
 
     def __call__(self, obs: torch.Tensor) -> torch.Tensor:
         """Mean actions, (rows, nact), from observations, (rows, nobs)."""
@@ -196,16 +178,16 @@ class DensePolicy:
         if len(obs) > len(self._x):
             self._x = torch.empty_like(obs)
         x = self._x[: len(obs)]
-        array, (shift, scale) = x.numpy(), self._statistics
-        np.subtract(obs.numpy(), shift, out=array)
-        np.multiply(array, scale, out=array)
+        array = x.numpy()
+        np.subtract(obs.numpy(), normalizer.shift.numpy(), out=array)
+        np.multiply(array, normalizer.scale.numpy(), out=array)
         np.clip(array, -normalizer.limit, normalizer.limit, out=array)
         return self.passes(x)
 
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
         """Draw actions, as ``GaussianPolicy.sample``."""
         action = out.numpy()
-        np.multiply(noise.numpy(), np.exp(self._log_std), out=action)
+        np.multiply(noise.numpy(), np.exp(self.policy.log_std.detach().numpy()), out=action)
         np.add(action, self(obs).numpy(), out=action)
         return out
 
@@ -231,15 +213,12 @@ class DenseValue:
         self.value, self.passes = value, passes
 
     @staticmethod
-    def of(value: ValueFunction, last: "DenseValue | None" = None) -> "DenseValue | None":
-        """The same value function; None if a part of it is of another kind. ``last`` as for a ``DensePolicy``."""
+    def of(value: ValueFunction) -> "DenseValue | None":
+        """The same value function; None if a part of it is of another kind."""
         if type(value) is not ValueFunction or _hooked(value):
             return None
-        passes = DensePasses.of(value.network, last.passes if last else None)
-        if passes is None:
-            return None
-        kept = last is not None and last.value is value and last.passes is passes
-        return last if kept else DenseValue(value, passes)
+        passes = DensePasses.of(value.network)
+        return None if passes is None else DenseValue(value, passes)
 
     def __call__(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Predicted returns, (...,), from observations, (..., nobs), and steps since the reset, (...,)."""
@@ -251,16 +230,3 @@ class DenseValue:
 def _hooked(module: nn.Module) -> bool:
     """Whether more than ``forward`` runs when a module is called."""
     return any(getattr(module, f"_forward{kind}_hooks") for kind in ("", "_pre"))
-
-
-def _others(policy: GaussianPolicy) -> list[torch.Tensor]:
-    """The tensors of a policy that are not its network's."""
-    normalizer = policy.normalizer
-    return [
-        policy.log_std.detach(),
-        *([normalizer.shift, normalizer.scale] if isinstance(normalizer, Normalizer) else []),
-    ]
-
-
-def _places(tensors: Iterable[torch.Tensor]) -> list[int]:
-    return [tensor.data_ptr() for tensor in tensors]

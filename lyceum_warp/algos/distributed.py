@@ -8,10 +8,12 @@ only the rounding of sums.
 import contextlib
 import os
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import torch
 from torch import distributed
+
+from lyceum_warp.graphs.capture import capturing
 
 
 class Team:
@@ -40,12 +42,21 @@ class Team:
         """Whether a CUDA graph can hold the communication of the processes."""
         return self.size == 1 or distributed.get_backend() == "nccl"
 
+    def capture(self, function: Callable[[], object]) -> torch.cuda.CUDAGraph:
+        """Capture calls of torch, and communication, as a CUDA graph; ``release`` resets it."""
+        graph = torch.cuda.CUDAGraph()
+        # other threads, such as NCCL's, call CUDA during the capture
+        with capturing(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            function()
+        self.keep(graph)
+        return graph
+
     def keep(self, graph: torch.cuda.CUDAGraph) -> None:
-        """Register a graph that holds communication, for ``release``."""
+        """Register a graph for ``release``."""
         self._graphs.add(graph)
 
     def release(self) -> None:
-        """Reset all graphs that ``keep`` registered. As long as one exists, NCCL does not shut down."""
+        """Reset all registered graphs. As long as one exists, NCCL does not shut down."""
         for graph in list(self._graphs):
             graph.reset()
 
@@ -132,6 +143,16 @@ class Team:
             raise
         if self.sum(failed).item() > 0:
             raise SystemExit(2)
+
+
+@contextlib.contextmanager
+def side_stream() -> Iterator[None]:
+    """A block on another CUDA stream than the default one, as torch needs before a capture of the same calls."""
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        yield
+    torch.cuda.current_stream().wait_stream(stream)
 
 
 @contextlib.contextmanager

@@ -4,7 +4,7 @@ import abc
 import copy
 import dataclasses
 from collections.abc import Iterator, Mapping
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 
@@ -187,25 +187,3 @@ class Learner(abc.ABC):
             self.generator.set_state(state["generator"].cpu())
         self.env.set_state(state["env"][self._own].to(self.env.obs.device))
         self.iteration, self.samples = state["iteration"], state["samples"]
-
-
-Config = TypeVar("Config")
-
-
-def fitted_config(config: Config, policy_shape: Mapping[str, Any], value_shape: Mapping[str, Any]) -> Config:
-    """Hyperparameters with the sizes and the group of given networks, from which networks like these can be made.
-
-    Args:
-        config: The hyperparameters, a dataclass.
-        policy_shape: The ``shape`` of the policy.
-        value_shape: That of the value function.
-    """
-    assert dataclasses.is_dataclass(config) and not isinstance(config, type)
-    entries = {"hidden": policy_shape.get("hidden"), "activation": policy_shape.get("activation")}
-    entries |= {f"value_{name}": value_shape.get(name) for name in ("hidden", "activation")}
-    entries |= {"normalize": policy_shape.get("normalize"), "time_orders": value_shape.get("time_orders")}
-    if getattr(config, "value_group", None) is not None and value_shape:
-        entries["value_group"] = value_shape.get("group", "policy")
-    known = {field.name for field in dataclasses.fields(config)}
-    changes = {name: entry for name, entry in entries.items() if entry is not None and name in known}
-    return dataclasses.replace(config, **changes)

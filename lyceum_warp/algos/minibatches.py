@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 import torch
 
-from lyceum_warp.algos.distributed import Team
-from lyceum_warp.graphs.capture import capturing
+from lyceum_warp.algos.distributed import Team, side_stream
 
 Samples = Mapping[str, torch.Tensor]
 """Samples by the names of their parts, each (samples, ...)."""
@@ -96,21 +95,12 @@ class Minibatches:
 
     def _run_captured(self) -> None:
         if not self._warm:
-            stream = torch.cuda.Stream()  # a capture needs another one than the default stream
-            stream.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(stream):
+            with side_stream():
                 self._epoch()
-            torch.cuda.current_stream().wait_stream(stream)
             self._warm = True
             return
         if self._graph is None:
-            graph = torch.cuda.CUDAGraph()
-            # other threads, such as NCCL's, call CUDA during the capture
-            with capturing(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
-                self._epoch()
-            if self.team.size > 1:
-                self.team.keep(graph)
-            self._graph = graph
+            self._graph = self.team.capture(self._epoch)
         self._graph.replay()
 
 

@@ -12,7 +12,7 @@ from lyceum_warp.algos.plan_update import PlanUpdate
 from lyceum_warp.kernels.knots import ORDERS
 from lyceum_warp.spaces import Space
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import whole_number
+from lyceum_warp.support.validate import check_flag, check_word, finite_number, whole_number
 
 Numbers: TypeAlias = float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray | torch.Tensor
 
@@ -83,20 +83,21 @@ class MPPIConfig:
             name: whole_number(name, getattr(self, name), low=1)
             for name in ("horizon", "samples", "iterations", "models")
         }
-        checked["temperature"] = _number("temperature", self.temperature, _SMALLEST)
+        checked["temperature"] = finite_number("temperature", self.temperature, low=_SMALLEST)
         checked["noise"] = _noise(self.noise)
         checked["smoothing"] = _smoothing(self.smoothing)
         if self.discount is not None:
-            checked["discount"] = _number("discount", self.discount, 0.0, 1.0)
+            checked["discount"] = finite_number("discount", self.discount, low=0.0, high=1.0)
         checked["fill"] = _fill(self.fill)
-        for name, words in _WORDS.items():
-            _one_of(name, getattr(self, name), words)
+        check_word("termination", self.termination, ("stop", "ignore"))
+        check_word("spline", self.spline, tuple(ORDERS))
+        check_word("risk", self.risk, ("mean", "worst"))
         if not isinstance(self.update, PlanUpdate):
-            _one_of("update", self.update, _UPDATES, ", or an object of a subclass of lw.PlanUpdate")
-        if not isinstance(self.nominal_model, bool):
-            raise ValueError(f"nominal_model must be True or False, not {self.nominal_model!r}")
-        if self.include_plan is not None and not isinstance(self.include_plan, bool):
-            raise ValueError(f"include_plan must be True, False or None, not {self.include_plan!r}")
+            updates = ("mppi", "cem", "predictive_sampling")
+            check_word("update", self.update, updates, ", or an object of a subclass of lw.PlanUpdate")
+        check_flag("nominal_model", self.nominal_model)
+        if self.include_plan is not None:
+            check_flag("include_plan", self.include_plan)
         if self.min_noise is not None:
             checked["min_noise"] = _deviations("min_noise", self.min_noise)
         for name, most in (("elites", "samples"), ("knots", "horizon")):
@@ -188,31 +189,11 @@ class MPPIConfig:
         return np.clip(np.broadcast_to(fill, space.size), space.low, space.high)
 
 
-_UPDATES = ("mppi", "cem", "predictive_sampling")
-"""The names of the updates."""
-
-_WORDS = {
-    "termination": ("stop", "ignore"), "spline": tuple(ORDERS),
-    "risk": ("mean", "worst"),
-}  # fmt: skip
-"""The values of the settings that are words."""
-
 _OF_CEM = ("elites", "min_noise")
 """Settings of CEM alone."""
 
 SETTINGS = tuple(field.name for field in dataclasses.fields(MPPIConfig))
 """Names of the settings."""
-
-
-def _number(name: str, value: Any, low: float, high: float = math.inf) -> float:
-    try:
-        number = math.nan if isinstance(value, (bool, str, bytes)) else float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not (low <= number <= high and math.isfinite(number)):
-        bounds = f"number from {low:g} to {high:g}" if math.isfinite(high) else "finite number above 0"
-        raise ValueError(f"{name} must be a {bounds}, not {value!r}")
-    return number
 
 
 def _array(value: Any) -> np.ndarray | None:
@@ -228,12 +209,6 @@ def _array(value: Any) -> np.ndarray | None:
 def _tuples(array: np.ndarray) -> Any:
     """Numbers of any shape as a float or as tuples, which a frozen dataclass can compare and hash."""
     return array.item() if array.ndim == 0 else tuple(map(_tuples, array))
-
-
-def _one_of(name: str, value: Any, words: Sequence[str], others: str = "") -> None:
-    if not isinstance(value, str) or value not in words:
-        *first, last = map(repr, words)
-        raise ValueError(f"{name} must be {', '.join(first)} or {last}{others}, not {value!r}")
 
 
 def _deviations(name: str, value: Any) -> Any:

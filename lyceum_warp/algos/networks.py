@@ -4,14 +4,14 @@ import copy
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, TypeAlias, TypeVar, get_args
+from typing import Literal, TypeAlias, TypeVar, get_args
 
 import torch
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.env import Env
-from lyceum_warp.support.validate import check_flag, check_kind, described
+from lyceum_warp.support.validate import check_flag, check_kind, check_word, described
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -22,30 +22,6 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {
     "tanh": nn.Tanh, "relu": nn.ReLU, "leaky_relu": nn.LeakyReLU, "elu": nn.ELU, "selu": nn.SELU, "gelu": nn.GELU,
     "silu": nn.SiLU, "softplus": nn.Softplus,
 }  # fmt: skip
-
-
-def check_activation(activation: object, name: str = "activation") -> Activation:
-    """Check the name of an activation, and return it.
-
-    Raises:
-        ValueError: It is not one of the known names.
-    """
-    for known in get_args(Activation):
-        if activation == known:
-            return known
-    raise ValueError(f"{name} must be one of {', '.join(map(repr, get_args(Activation)))}, not {activation!r}")
-
-
-def check_network(normalize: Any, limit: Any, generator: Any) -> None:
-    """Check the arguments that policies and value functions share.
-
-    Raises:
-        ValueError: One is of another type or out of range.
-    """
-    check_flag("normalize", normalize)
-    if not isinstance(limit, (int, float)) or not limit > 0:
-        raise ValueError(f"limit must be a positive number, or inf for none, not {described(limit)}")
-    check_kind("generator", generator, torch.Generator | None, "as torch.Generator()")
 
 
 def mlp(
@@ -66,7 +42,9 @@ def mlp(
     Raises:
         ValueError: The activation is not one of the known names.
     """
-    kind = _ACTIVATIONS[check_activation(activation)]
+    check_word("activation", activation, get_args(Activation))
+    check_kind("generator", generator, torch.Generator | None, "as torch.Generator()")
+    kind = _ACTIVATIONS[activation]
     layers: list[nn.Module] = []
     for i, (n, m) in enumerate(itertools.pairwise(sizes)):
         linear = nn.Linear(n, m)
@@ -156,6 +134,36 @@ class Normalizer(nn.Module):
         """Normalised observations, (..., size)."""
         normalized = (obs - self.shift) * self.scale
         return normalized if self.limit == math.inf else normalized.clamp(-self.limit, self.limit)
+
+
+class Normalized(nn.Module):
+    """Base class of modules that may normalise their observations.
+
+    Args:
+        nobs: Numbers in an observation.
+        normalize: Whether to normalise.
+        limit: As of ``Normalizer``.
+    """
+
+    normalizer: nn.Module
+
+    def __init__(self, nobs: int, normalize: bool, limit: float) -> None:
+        super().__init__()
+        check_flag("normalize", normalize)
+        if not isinstance(limit, (int, float)) or not limit > 0:
+            raise ValueError(f"limit must be a positive number, or inf for none, not {described(limit)}")
+        self.normalizer = Normalizer(nobs, limit) if normalize else nn.Identity()
+
+    def observe(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
+        """Update the statistics that normalise observations, if there are any; this changes the outputs.
+
+        Args:
+            obs: Observations, (..., nobs).
+            team: The processes; each brings the same number of observations.
+            eps: Added to the standard deviations.
+        """
+        if isinstance(self.normalizer, Normalizer):
+            self.normalizer.update(obs, team, eps=eps)
 
 
 def moved(module: Module, env: Env) -> Module:

@@ -6,21 +6,16 @@ step of a fixed length in the metric of the Fisher information.
 """
 
 import copy
-import dataclasses
 import functools
 import logging
-import math
 from typing import Any
 
 import torch
-import warp as wp
 
 from lyceum_warp.algos.dense import DensePolicy, DenseValue
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
-from lyceum_warp.algos.learner import Learner, fitted_config
 from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, score_gradient
-from lyceum_warp.algos.networks import Normalizer, trainable
+from lyceum_warp.algos.networks import Normalizer
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples, least_restarts
 from lyceum_warp.algos.npg_statistics import (
     NPGIteration,
@@ -30,17 +25,14 @@ from lyceum_warp.algos.npg_statistics import (
     prediction_sums,
     summary,
 )
-from lyceum_warp.algos.on_policy import finished, finished_metrics
+from lyceum_warp.algos.on_policy import OnPolicyLearner
 from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.algos.policy_check import check_policy, check_value
-from lyceum_warp.algos.rollout_buffer import Rollout
+from lyceum_warp.algos.rollout_statistics import finished, finished_metrics
 from lyceum_warp.algos.timing import PhaseTimer, beside, one_thread
-from lyceum_warp.algos.value import BOUND, ValueFunction, value_group
+from lyceum_warp.algos.value import BOUND, ValueFunction
 from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.env import Env
-from lyceum_warp.kernels import returns
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_kind, whole_number
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +50,7 @@ _DRIFT = 0.2
 
 
 @document_attributes
-class NPG(Learner):
+class NPG(OnPolicyLearner):
     """Learns a policy; an endless iterator that yields an ``NPGIteration`` each time.
 
     Example:
@@ -83,18 +75,9 @@ class NPG(Learner):
 
     algorithm = "npg"
     """The name of the algorithm in a run's config.json."""
-    policy: GaussianPolicy
-    """The policy that is learned."""
-    value: ValueFunction
-    """The value function that is learned with it."""
+    config_type, twice = NPGConfig, True
     config: NPGConfig
     """Hyperparameters."""
-    generator: torch.Generator
-    """The source of the noise and of the order of samples."""
-    rollout: Rollout
-    """The samples of the last iteration."""
-    count: int
-    """Samples in an iteration, those of all processes."""
     segments: bool
     """Whether an iteration continues the episodes of the last one; False if it begins new ones."""
 
@@ -108,36 +91,11 @@ class NPG(Learner):
         seed: int = 0,
         team: Team | None = None,
     ) -> None:
-        check_kind("env of NPG", env, Env, "as lw.make(...) makes it")
-        check_kind("config of NPG", config, NPGConfig | None, "as lw.NPGConfig(samples=10000)")
-        check_kind("team of NPG", team, Team | None, "as lyceum_warp.algos.distributed.Team() makes it")
-        seed = whole_number("seed", seed, low=0)
-        check_kind("value of NPG", value, ValueFunction | None, "as lw.load_value(run) returns it")
-        if value is not None:
-            check_value(trainable(value), env)
-        super().__init__(env, seed=seed, team=team)
-        if policy is not None:
-            check_policy(trainable(policy), env)
-        self.config = config = config or NPGConfig()
-        team, nworld = self.team, env.nworld * self.team.size
-
-        # networks
-        device = env.obs.device
-        nobs, nact = env.obs_space.size, env.action_space.size
-        group = value_group(env, config.value_group) if value is None else value.group
-        init = torch.Generator().manual_seed(seed)
-        options: dict[str, Any] = dict(normalize=config.normalize, generator=init)
-        self.policy = policy or GaussianPolicy(
-            nobs, nact, config.hidden, activation=config.activation, log_std=config.log_std, **options
-        )
+        super().__init__(env, policy, value, config, seed=seed, team=team)
+        config, team, nworld, device = self.config, self.team, env.nworld * self.team.size, env.obs.device
         self._value_is_new = value is None
-        self.value = value or ValueFunction(
-            env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation,
-            scale=1.0 / max(1.0 - config.gamma, 1e-3), time_orders=config.time_orders, group=group, **options,
-        )  # fmt: skip
-        self.value.discount = config.gamma
-        self.policy.to(device)
-        self.value.to(device)
+        scale = 1.0 / max(1.0 - config.gamma, 1e-3)
+        self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
 
         # decisions of one process on the CPU wait for no device and for no other process
         self._reads_numbers = device.type == "cpu" and team.size == 1
@@ -145,19 +103,16 @@ class NPG(Learner):
         # samples, and whether an iteration begins new episodes or continues those of the last one
         samples = enough_samples(config, nworld)
         steps = -(-samples // nworld)
-        self.count = steps * nworld
         whole = 0 < env.horizon <= steps
         self.segments = config.rollout == "segments" or (config.rollout == "auto" and not whole)
-        self.rollout = Rollout(env, steps, groups=(group,), first_only=not self.segments)
+        self._make_rollout(steps, first_only=not self.segments)
         if not self.segments and not whole and team.leads:
             log.warning(
                 "%d samples of %d worlds are %d steps: no episode will reach its horizon of %d; use fewer worlds, "
                 "more samples, or rollout='segments'", samples, nworld, self.rollout.steps, env.horizon,
             )  # fmt: skip
         self._least_restarts = least_restarts(config, nworld, steps, env.horizon) if self.segments else 0
-        self.noise = torch.empty(self.rollout.steps, nworld, nact, device=device)
-        self._advantage = torch.empty_like(self.rollout.reward)
-        self._return = torch.empty_like(self.rollout.reward)
+        self.noise = torch.empty(steps, nworld, env.action_space.size, device=device)
 
         # parts
         self.fit = ValueFit(
@@ -165,13 +120,7 @@ class NPG(Learner):
             batch=config.value_batch or max(64, self.count // 256), team=team,
         )  # fmt: skip
         self._fisher_count = max(1, round(config.fisher_fraction * self.count))
-        self._evaluate_mean = MeanPolicyEvaluation(env, config.mean_episodes, team)
-        # a seed of its own: the same numbers should not make both the weights and the noise
-        self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
-
-        self._dense_policy: DensePolicy | None = None
-        self._dense_value: DenseValue | None = None
-
+        self._dense: DensePolicy | None = None
         self._skipping = 0
         self.rollout.restart()
         if self.segments:
@@ -199,7 +148,7 @@ class NPG(Learner):
         # 4. Vanilla gradient of E[log pi(a|s) A(s, a)].
         action = rollout.action.flatten(0, 1)
         weight = advantage.flatten() / self.count
-        gradient = team.sum(score_gradient(self.policy, obs, action, weight, dense=self.dense_policy()))
+        gradient = team.sum(score_gradient(self.policy, obs, action, weight, dense=self._dense))
         timer.mark()
 
         # 5. Natural gradient x = F^-1 g, and the step x sqrt(delta / (g.x)), so that step.F.step = delta.
@@ -230,20 +179,14 @@ class NPG(Learner):
         # 7. Every few iterations, the mean policy in whole episodes.
         self.iteration += 1
         self.samples += self.count
-        mean: dict[str, Any] = dict.fromkeys(MEAN_STATISTICS)
-        if config.mean_every and self.iteration % config.mean_every == 0:
-            mean = self._evaluate_mean(self.policy)
+        statistics = self._with_mean_policy(summary(processes, len(obs), self.env.task.task.metrics))
         timer.mark()
 
-        statistics = summary(processes, len(obs), self.env.task.task.metrics)
-        if self.env.task.functions["success"] is None:
-            statistics["success"], mean["mean_success"] = math.nan, None
         time_sample, time_gradient, time_solve, time_value, time_mean = timer.seconds()
         return NPGIteration(
             iteration=self.iteration,
             samples=self.samples,
             **statistics,
-            **mean,
             time_sample=time_sample,
             time_gradient=time_gradient,
             time_solve=time_solve,
@@ -269,12 +212,8 @@ class NPG(Learner):
         """Fill the rollout buffer with steps of the current policy under new noise."""
         with one_thread():
             self.noise.normal_(generator=self.generator)
-            self.rollout.collect(self.dense_policy() or self.policy, self.noise[:, self._own])
-
-    def dense_policy(self) -> DensePolicy | None:
-        """The policy with passes that are written out, where it has such, as the default one has on the CPU."""
-        self._dense_policy = DensePolicy.of(self.policy, self._dense_policy)
-        return self._dense_policy
+            self._dense = DensePolicy.of(self.policy)
+            self.rollout.collect(self._dense or self.policy, self.noise[:, self._own])
 
     @torch.no_grad()
     def advantages(self) -> tuple[torch.Tensor, torch.Tensor, ValueSums, torch.Tensor]:
@@ -294,12 +233,7 @@ class NPG(Learner):
         value = self.predict(rollout.obs_groups[self.value.group], rollout.step)
         next_value = self.predict(rollout.final_obs_groups[self.value.group], rollout.step + 1.0)
         reward = rollout.reward.clamp(-_LARGEST, _LARGEST)
-        arrays = [reward, value, next_value, rollout.terminated, rollout.done]
-        inputs = [wp.from_torch(array) for array in arrays]
-        outputs = [wp.from_torch(self._advantage), wp.from_torch(self._return)]
-        args = [*inputs, config.gamma, config.lam, *outputs]
-        wp.launch(returns.advantages, self.env.nworld, args, device=self.env.device)
-        advantage, target = self._advantage, self._return
+        advantage, target = self._estimate(reward, value, next_value)
         prediction = prediction_sums(target, value)
         self.value.rescale(target, first=self._value_is_new and self.iteration == 0, team=team)
         # the step does not depend on the unit; a power of two rounds nothing
@@ -321,8 +255,7 @@ class NPG(Learner):
             obs: Observations, (..., nobs).
             step: Steps since the reset, (...,).
         """
-        self._dense_value = DenseValue.of(self.value, self._dense_value)
-        value = (self._dense_value or self.value)(obs, step)
+        value = (DenseValue.of(self.value) or self.value)(obs, step)
         return torch.where(value.isfinite(), value, self.value.shift.float())
 
     @torch.no_grad()
@@ -338,7 +271,7 @@ class NPG(Learner):
         Returns:
             The mean actions before, (samples, nact).
         """
-        mean, normalizer = self.dense_policy() or self.policy, self.policy.normalizer
+        mean, normalizer = self._dense or self.policy, self.policy.normalizer
         old_mean = mean(obs).clone()
         if isinstance(normalizer, Normalizer):
             before = normalizer.shift.clone(), normalizer.scale.clone()
@@ -372,7 +305,7 @@ class NPG(Learner):
                 obs, weight = obs[places], own.float()
         return FisherProduct(
             self.policy, obs, self.config.damping, count=self._fisher_count, weight=weight, team=self.team,
-            dense=self.dense_policy(),
+            dense=self._dense,
         )  # fmt: skip
 
     @torch.no_grad()
@@ -402,7 +335,7 @@ class NPG(Learner):
         steps = [part.view_as(p) for part, p in zip(step.split([p.numel() for p in parameters]), old, strict=True)]
         old_log_std = self.policy.log_std.clone()
         lowest = old_log_std.clamp_max(self.config.min_log_std)
-        mean = self.dense_policy() or self.policy
+        mean = self._dense or self.policy
 
         def divergence(fraction: torch.Tensor) -> torch.Tensor:
             for parameter, before, part in zip(parameters, old, steps, strict=True):
@@ -432,22 +365,14 @@ class NPG(Learner):
 
     def settings(self) -> dict[str, Any]:
         """The hyperparameters, with the sizes of the networks, as a run's config.json holds them."""
-        config = fitted_config(self.config, self.policy.shape, self.value.shape)
-        if self.value.group != value_group(self.env, None):
-            config = dataclasses.replace(config, value_group=self.value.group)
-        return dataclasses.asdict(config) | {"samples": enough_samples(config, self.env.nworld * self.team.size)}
+        samples = enough_samples(self.config, self.env.nworld * self.team.size)
+        return super().settings() | {"samples": samples}
 
     def state_dict(self) -> dict[str, Any]:
         """The state on which the next iteration depends; see ``Learner``."""
-        own = {"optimizer": self.fit.state_dict(), "returns": self.team.gather(self.rollout.running_return)}
-        return super().state_dict() | copy.deepcopy(own)
+        return super().state_dict() | {"optimizer": copy.deepcopy(self.fit.state_dict())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken.
-
-        Raises:
-            ValueError: The state has another number of worlds, or does not fit for another reason.
-        """
+        """Continue exactly where ``state_dict`` was taken; see ``Learner``."""
         super().load_state_dict(state)
         self.fit.load_state_dict(state["optimizer"])
-        self.rollout.running_return.copy_(state["returns"][self._own])

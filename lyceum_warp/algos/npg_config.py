@@ -1,33 +1,22 @@
 """Hyperparameters of NPG."""
 
 import dataclasses
-import math
 from typing import Literal
 
-from lyceum_warp.algos.networks import Activation, check_activation
+from lyceum_warp.algos.hyperparameters import LEAST, check_fields
+from lyceum_warp.algos.networks import Activation
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import finite_number, layer_sizes, whole_number
 
-_WHOLE = {
+_BOUNDS: dict[str, float | tuple[float, float]] = {
     "samples": 1, "cg_iterations": 1, "value_epochs": 0, "value_batch": 1, "time_orders": 0, "mean_every": 0,
-    "mean_episodes": 1,
+    "mean_episodes": 1, "gamma": (0.0, 1.0), "lam": (0.0, 1.0), "delta": 0.0, "damping": 0.0,
+    "fisher_fraction": (0.0, 1.0), "kl_limit": 1.0, "log_std": LEAST, "min_log_std": LEAST, "value_rate": 0.0,
+    "min_restarts": 0.0,
 }  # fmt: skip
-"""The smallest value of each whole number."""
-
-_REAL = {
-    "gamma": (0.0, 1.0), "lam": (0.0, 1.0), "delta": (0.0, math.inf), "damping": (0.0, math.inf),
-    "fisher_fraction": (0.0, 1.0), "kl_limit": (1.0, math.inf), "log_std": (-math.inf, math.inf),
-    "min_log_std": (-math.inf, math.inf), "value_rate": (0.0, math.inf),
-    "min_restarts": (0.0, math.inf),
-}  # fmt: skip
-"""The smallest and the largest value of each number."""
 
 _LONG_EPISODE = 20
 """Restarts are on by default if an episode lasts longer than this number of iterations. On a few seeds of hopper, NPG's
 return stayed low for long at 63 and 31 iterations and not at 16 (bench/README.md, "NPG's learning curves")."""
-
-_OPTIONAL = ("samples", "value_batch", "min_restarts")
-"""Numbers that may be None."""
 
 
 @document_attributes
@@ -105,26 +94,7 @@ class NPGConfig:
 
     def __post_init__(self) -> None:
         """Check every value."""
-        checked: dict[str, object] = {}
-        for name, low in _WHOLE.items():
-            if (number := getattr(self, name)) is not None or name not in _OPTIONAL:
-                checked[name] = whole_number(name, number, low=low)
-        for name, (smallest, largest) in _REAL.items():
-            if (number := getattr(self, name)) is not None or name not in _OPTIONAL:
-                checked[name] = finite_number(name, number, low=smallest, high=largest)
-        for name in ("hidden", "value_hidden"):
-            checked[name] = tuple(layer_sizes(getattr(self, name), name))
-        for name in ("activation", "value_activation"):
-            check_activation(getattr(self, name), name)
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
-        if self.rollout not in ("auto", "episodes", "segments"):
-            raise ValueError(f"rollout must be 'auto', 'episodes' or 'segments', not {self.rollout!r}")
-        for name in ("whiten", "normalize"):
-            if not isinstance(flag := getattr(self, name), bool):
-                raise ValueError(f"{name} must be True or False, not {flag!r}")
-        if self.value_group is not None and not isinstance(self.value_group, str):
-            raise ValueError(f"value_group must be the name of a group of observations, not {self.value_group!r}")
+        check_fields(self, _BOUNDS)
         if self.fisher_fraction == 0.0:
             raise ValueError("fisher_fraction must be greater than 0, as in 0.1 for every tenth sample")
         if self.log_std < self.min_log_std:

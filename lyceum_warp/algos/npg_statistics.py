@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from lyceum_warp.algos.on_policy import (
+from lyceum_warp.algos.rollout_statistics import (
     EpisodeSums,
     Moments,
     OnPolicyIteration,
@@ -50,41 +50,30 @@ class NPGIteration(OnPolicyIteration):
 
 
 class UpdateNumbers(NamedTuple):
-    """The policy's update."""
+    """The policy's update, under the names of ``NPGIteration``."""
 
-    finite: Scalar
-    """Whether the step is finite; all processes have the same."""
+    # equal in all processes
+    finite: Scalar  # whether the step is finite
     kl: Scalar
-    """KL divergence from the old to the new policy, averaged over all samples; all processes have the same."""
     step_norm: Scalar
-    """Euclidean length of the full step; all processes have the same."""
     step_fraction: Scalar
-    """Share of the full step that was made; all processes have the same."""
     gradient_norm: Scalar
-    """Euclidean length of the gradient; all processes have the same."""
     std_mean: Scalar
-    """Mean standard deviation of the policy's actions; all processes have the same."""
+    # of the process's own samples
     reward: Scalar
-    """Mean reward of the process's samples."""
     faults: Scalar
-    """Faults of the process's worlds."""
     outliers: Scalar
-    """Samples of the process whose advantage was set to its bound."""
-    fitted: Scalar
-    """Whether the value function's fit is finite; all processes have the same."""
+    # equal in all processes
+    fitted: Scalar  # whether the value function's fit is finite
 
 
 class ValueSums(NamedTuple):
-    """How well the value function predicted the returns of a process's samples."""
+    """Moments of a process's discounted returns, and of the errors (return minus prediction) of a value function."""
 
     return_mean: Scalar
-    """Mean of the discounted returns."""
-    return_square: Scalar
-    """Sum of the squared deviations of the discounted returns from their mean."""
+    return_square: Scalar  # sum of the squared deviations from the mean
     error_mean: Scalar
-    """Mean of the errors, return minus prediction."""
     error_square: Scalar
-    """Sum of the squared deviations of the errors from their mean."""
 
 
 class ProcessNumbers(NamedTuple):

@@ -7,8 +7,7 @@ from typing import Any, TypeAlias
 import torch
 from torch import nn
 
-from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.networks import LIMIT, Activation, Normalizer, check_network, mlp
+from lyceum_warp.algos.networks import LIMIT, Activation, Normalized, mlp
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import described, finite_number, layer_sizes, whole_number
 
@@ -16,7 +15,7 @@ _LARGEST = torch.finfo(torch.float32).max
 
 
 @document_attributes
-class GaussianPolicy(nn.Module):
+class GaussianPolicy(Normalized):
     """Actions from N(mean(obs), exp(log_std)^2), with a log_std that does not depend on the observation.
 
     Example:
@@ -57,11 +56,9 @@ class GaussianPolicy(nn.Module):
         limit: float = LIMIT,
         generator: torch.Generator | None = None,
     ) -> None:
-        super().__init__()
         nobs, nact = whole_number("nobs", nobs, low=1), whole_number("nact", nact, low=1)
+        super().__init__(nobs, normalize, limit)
         self.nobs, self.nact = nobs, nact
-        check_network(normalize, limit, generator)
-        self.normalizer: nn.Module = Normalizer(nobs, limit) if normalize else nn.Identity()
         self.shape = {"nobs": nobs, "nact": nact, "normalize": normalize}
         if limit != LIMIT:  # which files of earlier releases do not name
             self.shape["limit"] = limit
@@ -114,17 +111,6 @@ class GaussianPolicy(nn.Module):
             out: Where to write the actions, (..., nact).
         """
         return torch.addcmul(self(obs), noise, self.log_std.exp(), out=out)
-
-    def observe(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
-        """Take observations into the normaliser's statistics, where it has one; this changes the mean actions.
-
-        Args:
-            obs: Observations, (..., nobs).
-            team: The processes; each brings the same number of observations.
-            eps: Added to the standard deviations.
-        """
-        if isinstance(self.normalizer, Normalizer):
-            self.normalizer.update(obs, team, eps=eps)
 
     def log_prob(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Log-density of actions, (...,)."""

@@ -1,14 +1,13 @@
 """Check networks that a user gave, before an algorithm learns with them."""
 
 import torch
-from torch import nn
 
 from lyceum_warp.algos.natural_gradient import FisherProduct, flatten
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
-from lyceum_warp.support.validate import described
+from lyceum_warp.support.validate import check_group, described
 
 _ROWS = 4
 """Observations that the policy is called with."""
@@ -40,25 +39,13 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
             f"the policy takes {sizes[0]} observations and gives {sizes[1]} actions, but the task {env.task.name!r} "
             f"has {wanted[0]} and {wanted[1]}"
         )
-    _check_parameters(policy)
+    if not any(p.requires_grad for p in policy.parameters() if p is not policy.log_std):
+        raise ValueError("the policy's network has no parameter to learn: unfreeze it with policy.requires_grad_(True)")
     obs = env.obs.repeat(-(-_ROWS // env.nworld), 1)[:_ROWS]
     noise = torch.randn(obs.shape, generator=torch.Generator().manual_seed(0))  # rows differ from each other
     obs = obs + 0.1 * noise.to(obs.device)
     _check_output(policy, obs)
     _check_derivatives(policy, obs, twice=twice)
-
-
-def _check_parameters(policy: GaussianPolicy) -> None:
-    log_std = getattr(policy, "log_std", None)
-    if not isinstance(log_std, nn.Parameter) or log_std.shape != (policy.nact,):
-        raise ValueError(f"policy.log_std must be an nn.Parameter of shape ({policy.nact},), not {described(log_std)}")
-    for name, parameter in policy.named_parameters():
-        if parameter.dtype != torch.float32:
-            raise ValueError(f"the policy's parameter {name!r} must be float32, not {described(parameter)}")
-        if not parameter.isfinite().all():
-            raise ValueError(f"the policy's parameter {name!r} is not finite: initialise it")
-    if not any(p.requires_grad for p in policy.parameters() if p is not log_std):
-        raise ValueError("the policy's network has no parameter to learn: unfreeze it with policy.requires_grad_(True)")
 
 
 @torch.no_grad()
@@ -129,11 +116,7 @@ def check_value(value: ValueFunction, env: Env) -> None:
         ValueError: It takes others, or a number of it is not finite.
     """
     name = env.task.name
-    if value.group not in env.obs_groups:
-        raise ValueError(
-            f"the value function takes the group {value.group!r} of observations, which the task {name!r} lacks: it "
-            f"has {', '.join(env.obs_groups)}"
-        )
+    check_group(value.group, env.obs_groups, name)
     size, wanted = value.shape["nobs"], env.obs_spaces[value.group].size
     if size != wanted:
         raise ValueError(

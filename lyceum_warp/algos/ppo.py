@@ -12,15 +12,15 @@ import math
 from typing import Any
 
 import torch
-import warp as wp
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
-from lyceum_warp.algos.learner import Learner, fitted_config
 from lyceum_warp.algos.minibatches import Minibatches, Samples, precision
-from lyceum_warp.algos.networks import initialize_as_torch, trainable
-from lyceum_warp.algos.on_policy import (
+from lyceum_warp.algos.networks import LIMIT
+from lyceum_warp.algos.on_policy import OnPolicyLearner
+from lyceum_warp.algos.policy import GaussianPolicy, divergence, log_density
+from lyceum_warp.algos.ppo_config import PPOConfig
+from lyceum_warp.algos.rollout_statistics import (
     EpisodeSums,
     OnPolicyIteration,
     episode_statistics,
@@ -28,16 +28,10 @@ from lyceum_warp.algos.on_policy import (
     finished_metrics,
     metric_means,
 )
-from lyceum_warp.algos.policy import GaussianPolicy, divergence, log_density
-from lyceum_warp.algos.policy_check import check_policy, check_value
-from lyceum_warp.algos.ppo_config import PPOConfig
-from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.timing import PhaseTimer, one_thread
-from lyceum_warp.algos.value import ValueFunction, value_group
+from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
-from lyceum_warp.kernels import returns
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_kind
 
 RECENT = 100
 """Episodes in ``return_recent``."""
@@ -75,7 +69,7 @@ class PPOIteration(OnPolicyIteration):
 
 
 @document_attributes
-class PPO(Learner):
+class PPO(OnPolicyLearner):
     """Learns a policy by PPO; an endless iterator that yields a ``PPOIteration`` each time.
 
     Example:
@@ -99,20 +93,11 @@ class PPO(Learner):
 
     algorithm = "ppo"
     """The name of the algorithm in a run's config.json."""
-    policy: GaussianPolicy
-    """The policy that is learned."""
-    value: ValueFunction
-    """The value function that is learned with it."""
+    config_type, twice = PPOConfig, False
     config: PPOConfig
     """Hyperparameters."""
-    generator: torch.Generator
-    """The source of the noise and of the order of samples."""
-    rollout: Rollout
-    """The samples of the last iteration."""
     rate: torch.Tensor
     """The learning rate, on the device."""
-    count: int
-    """Samples in an iteration, those of all processes."""
 
     def __init__(
         self,
@@ -124,51 +109,19 @@ class PPO(Learner):
         seed: int = 0,
         team: Team | None = None,
     ) -> None:
-        check_kind("env of PPO", env, Env, "as lw.make(...) makes it")
-        check_kind("config of PPO", config, PPOConfig | None, "as lw.PPOConfig(num_steps=24)")
-        check_kind("value of PPO", value, ValueFunction | None, "as lw.load_value(run) returns it")
-        super().__init__(env, seed=seed, team=team)
-        self.config = config = config or PPOConfig()
-        team, device, steps = self.team, env.obs.device, config.num_steps
-        self.count = steps * env.nworld * team.size
-        if config.minibatches > self.count:
+        super().__init__(env, policy, value, config, seed=seed, team=team)
+        config, team, device, steps = self.config, self.team, env.obs.device, self.config.num_steps
+        if config.minibatches > (count := steps * env.nworld * team.size):
             raise ValueError(
-                f"{config.minibatches} mini-batches are more than the {self.count} samples: give more worlds, or make "
+                f"{config.minibatches} mini-batches are more than the {count} samples: give more worlds, or make "
                 "minibatches smaller"
             )
-        if value is not None:
-            check_value(trainable(value), env)
-        if policy is not None:
-            check_policy(trainable(policy), env, twice=False)
-
-        # networks
-        nobs, nact = env.obs_space.size, env.action_space.size
-        group = value_group(env, config.value_group) if value is None else value.group
-        init = torch.Generator().manual_seed(seed)
-        options: dict[str, Any] = dict(normalize=config.normalize, generator=init)
-        if config.normalize:
-            options["limit"] = math.inf
-        self.policy = policy or GaussianPolicy(
-            nobs, nact, config.hidden, activation=config.activation, log_std=config.log_std, **options
-        )
-        self.value = value or ValueFunction(
-            env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation, scale=1.0,
-            group=group, **options,
-        )  # fmt: skip
-        for given, module in ((policy, self.policy), (value, self.value)):
-            if given is None:  # a policy's last layer near zero, as NPG's, lets the adaptive rate begin much higher
-                initialize_as_torch(module, init)
-        self.value.discount = config.gamma
-        self.policy.to(device)
-        self.value.to(device)
-
-        # samples
-        self.rollout = Rollout(env, steps, groups=(group,))
-        self.noise = torch.empty(steps, env.nworld * team.size, nact, device=device)
+        # a policy's last layer near zero, as NPG's, lets the adaptive rate begin much higher
+        limit = math.inf if config.normalize else LIMIT
+        self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
+        self._make_rollout(steps)
+        self.noise = torch.empty(steps, env.nworld * team.size, env.action_space.size, device=device)
         self._mean = torch.empty_like(self.rollout.action)
-        self._advantage, self._return = (torch.empty_like(self.rollout.reward) for _ in range(2))
-        # a seed of its own: the same numbers should not make both the weights and the noise
-        self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
 
         # the update
         log_std = self.policy.log_std
@@ -192,7 +145,6 @@ class PPO(Learner):
         )
 
         self._recent: collections.deque[float] = collections.deque(maxlen=RECENT)
-        self._evaluate_mean = MeanPolicyEvaluation(env, config.mean_episodes, team)
         self.rollout.restart()
         if config.stagger:
             self.rollout.stagger(self.generator, team)
@@ -236,21 +188,15 @@ class PPO(Learner):
         # 4. Every few iterations, the mean policy in whole episodes.
         self.iteration += 1
         self.samples += self.count
-        mean: dict[str, Any] = dict.fromkeys(MEAN_STATISTICS)
-        if config.mean_every and self.iteration % config.mean_every == 0:
-            mean = self._evaluate_mean(self.policy)
+        statistics = self._with_mean_policy(episode_statistics(episodes))
         timer.mark()
 
-        statistics: dict[str, Any] = episode_statistics(episodes)
-        if self.env.task.functions["success"] is None:
-            statistics["success"], mean["mean_success"] = math.nan, None
         time_sample, time_update, time_mean = timer.seconds()
         return PPOIteration(
             iteration=self.iteration,
             samples=self.samples,
             reward_mean=sum(process[0] for process in sums) / len(sums),
             **statistics,
-            **mean,
             kl=kl,
             std_mean=std,
             return_recent=sum(self._recent) / len(self._recent) if self._recent else math.nan,
@@ -297,12 +243,8 @@ class PPO(Learner):
         rollout, config, team = self.rollout, self.config, self.team
         obs, final_obs = rollout.obs_groups[self.value.group], rollout.final_obs_groups[self.value.group]
         value, next_value = self.value(obs, rollout.step), self.value(final_obs, rollout.step + 1.0)
-        arrays = [rollout.reward, value, next_value, rollout.terminated, rollout.done]
-        inputs = [wp.from_torch(array) for array in arrays]
-        outputs = [wp.from_torch(self._advantage), wp.from_torch(self._return)]
-        args = [*inputs, config.gamma, config.lam, *outputs]
-        wp.launch(returns.advantages, self.env.nworld, args, device=self.env.device)
-        advantage, target = self._advantage, value + self._advantage
+        advantage, _ = self._estimate(rollout.reward, value, next_value)
+        target = value + advantage
         if not config.whiten_minibatches:
             advantage = advantage - team.sum(advantage.sum()) / self.count
             variance = team.sum(advantage.square().sum()) / max(self.count - 1, 1)
@@ -394,29 +336,17 @@ class PPO(Learner):
         found: list[float] = ended[~ended.isnan()].tolist()
         return found
 
-    def settings(self) -> dict[str, Any]:
-        """The hyperparameters, with the sizes of the networks, as a run's config.json holds them."""
-        config = fitted_config(self.config, self.policy.shape, self.value.shape)
-        if self.value.group != value_group(self.env, None):
-            config = dataclasses.replace(config, value_group=self.value.group)
-        return dataclasses.asdict(config)
-
     def state_dict(self) -> dict[str, Any]:
         """The state on which the next iteration depends; see ``Learner``."""
         own = {
             "optimizer": self.optimizer.state_dict(),
             "std": self.std.detach(),
-            "returns": self.team.gather(self.rollout.running_return),
             "recent": list(self._recent),
         }
         return super().state_dict() | copy.deepcopy(own)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken.
-
-        Raises:
-            ValueError: The state has another number of worlds, or does not fit for another reason.
-        """
+        """Continue exactly where ``state_dict`` was taken; see ``Learner``."""
         super().load_state_dict(state)
         self.optimizer.load_state_dict(state["optimizer"])
         for group in self.optimizer.param_groups:
@@ -424,7 +354,6 @@ class PPO(Learner):
             group["lr"], group["capturable"] = self.rate, self._cuda
         with torch.no_grad():
             self.std.copy_(state["std"])
-        self.rollout.running_return.copy_(state["returns"][self._own])
         self._recent.clear()
         self._recent.extend(state["recent"])
         self.minibatches.forget()  # its graph holds the addresses of the old moments

@@ -1,27 +1,18 @@
 """Hyperparameters of PPO."""
 
 import dataclasses
-import math
 from typing import Any, Literal
 
-from lyceum_warp.algos.networks import Activation, check_activation
+from lyceum_warp.algos.hyperparameters import check_fields
+from lyceum_warp.algos.networks import Activation
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import finite_number, layer_sizes, whole_number
+from lyceum_warp.support.validate import whole_number
 
-_WHOLE = {"num_steps": 1, "epochs": 1, "minibatches": 1, "mean_every": 0, "mean_episodes": 1}
-"""The smallest value of each whole number."""
-
-_REAL = {
-    "gamma": (0.0, 1.0), "lam": (0.0, 1.0), "clip": (0.0, math.inf), "value_coef": (0.0, math.inf),
-    "entropy_coef": (0.0, math.inf), "final_entropy_coef": (0.0, math.inf), "learning_rate": (0.0, math.inf),
-    "desired_kl": (0.0, math.inf), "max_grad_norm": (0.0, math.inf), "log_std": (-13.8, 13.8),
+_BOUNDS: dict[str, float | tuple[float, float]] = {
+    "num_steps": 1, "epochs": 1, "minibatches": 1, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0),
+    "lam": (0.0, 1.0), "clip": 0.0, "value_coef": 0.0, "entropy_coef": 0.0, "final_entropy_coef": 0.0,
+    "learning_rate": 0.0, "desired_kl": 0.0, "max_grad_norm": 0.0, "log_std": (-13.8, 13.8),
 }  # fmt: skip
-"""The smallest and the largest value of each number."""
-
-_CHOICES = {"schedule": ("adaptive", "fixed"), "std_type": ("scalar", "log")}
-"""The values of each choice."""
-
-_FLAGS = ("clip_value_loss", "whiten_minibatches", "normalize", "stagger", "tf32")
 
 
 @document_attributes
@@ -99,27 +90,8 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         """Check every value."""
-        checked: dict[str, Any] = {
-            name: whole_number(name, getattr(self, name), low=low) for name, low in _WHOLE.items()
-        }
-        for name, (smallest, largest) in _REAL.items():
-            if (number := getattr(self, name)) is not None or name != "final_entropy_coef":
-                checked[name] = finite_number(name, number, low=smallest, high=largest)
-        for name in ("hidden", "value_hidden"):
-            checked[name] = tuple(layer_sizes(getattr(self, name), name))
-        checked["entropy_decay"] = _iterations("entropy_decay", self.entropy_decay)
-        for name in ("activation", "value_activation"):
-            check_activation(getattr(self, name), name)
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
-        for name, choices in _CHOICES.items():
-            if (choice := getattr(self, name)) not in choices:
-                raise ValueError(f"{name} must be {' or '.join(map(repr, choices))}, not {choice!r}")
-        for name in _FLAGS:
-            if not isinstance(flag := getattr(self, name), bool):
-                raise ValueError(f"{name} must be True or False, not {flag!r}")
-        if self.value_group is not None and not isinstance(self.value_group, str):
-            raise ValueError(f"value_group must be the name of a group of observations, not {self.value_group!r}")
+        check_fields(self, _BOUNDS)
+        object.__setattr__(self, "entropy_decay", _iterations("entropy_decay", self.entropy_decay))
 
     def entropy_weight(self, iteration: int) -> float:
         """Weight of the policy's entropy in an iteration, of which the first one is 1."""

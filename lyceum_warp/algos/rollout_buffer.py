@@ -2,23 +2,30 @@
 
 import math
 from collections.abc import Collection
+from typing import Any, Protocol
 
 import torch
 import warp as wp
 
-from lyceum_warp.algos.dense import DensePolicy
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.capture import Graphs, Phase
 from lyceum_warp.kernels import collect
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_flag, check_kind, whole_number
+from lyceum_warp.support.validate import check_flag, check_group, check_kind, whole_number
 
 _LARGE = 1e18
 """Observations beyond it have squares that float32 cannot hold."""
+
+
+class Sampler(Protocol):
+    """A policy that a rollout can run: a ``GaussianPolicy``, or one with the same method."""
+
+    def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> Any:
+        """Write actions, (nworld, nact), into ``out``."""
+        ...
 
 
 @document_attributes
@@ -76,10 +83,8 @@ class Rollout:
         check_kind("groups", groups, list | tuple | set | frozenset, "as in groups=['critic']")
         check_flag("first_only", first_only)
         steps = whole_number("steps", steps, low=1)
-        if unknown := [group for group in groups if group not in [*env.obs_groups]]:
-            raise ValueError(
-                f"the task {env.task.name!r} has no group {unknown[0]!r} of observations: it has {list(env.obs_groups)}"
-            )
+        for group in groups:
+            check_group(group, env.obs_groups, env.task.name)
         self.env = env
         self.steps = steps
         self._first_only = first_only
@@ -123,7 +128,7 @@ class Rollout:
         return into[-1].stored
 
     @torch.no_grad()
-    def collect(self, policy: GaussianPolicy | DensePolicy, noise: torch.Tensor) -> None:
+    def collect(self, policy: Sampler, noise: torch.Tensor) -> None:
         """Run the policy for ``steps`` steps from the worlds' current states.
 
         Args:

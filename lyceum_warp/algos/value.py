@@ -7,14 +7,14 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.networks import LIMIT, Activation, Normalizer, check_network, mlp
+from lyceum_warp.algos.networks import LIMIT, Activation, Normalized, mlp
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_kind, finite_number, layer_sizes, whole_number
+from lyceum_warp.support.validate import check_group, check_kind, finite_number, layer_sizes, whole_number
 
 
 @document_attributes
-class ValueFunction(nn.Module):
+class ValueFunction(Normalized):
     """A network that predicts discounted returns.
 
     Args:
@@ -62,10 +62,9 @@ class ValueFunction(nn.Module):
         group: str = "policy",
         generator: torch.Generator | None = None,
     ) -> None:
-        super().__init__()
         nobs, time_orders = whole_number("nobs", nobs, low=1), whole_number("time_orders", time_orders, low=0)
+        super().__init__(nobs, normalize, limit)
         scale = finite_number("scale", scale)
-        check_network(normalize, limit, generator)
         check_kind("group", group, str, "as 'policy'")
         self.discount = None if discount is None else finite_number("discount", discount, low=0.0, high=1.0)
         self.group = group
@@ -75,7 +74,6 @@ class ValueFunction(nn.Module):
         }  # fmt: skip
         if limit != LIMIT:  # which files of earlier releases do not name
             self._shape["limit"] = limit
-        self.normalizer: nn.Module = Normalizer(nobs, limit) if normalize else nn.Identity()
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
         # a last layer of zeros predicts the mean of the returns, whatever their scale
         self.network = mlp([nobs + time_orders, *hidden, 1], activation=activation, last_scale=0.0, generator=generator)
@@ -103,17 +101,6 @@ class ValueFunction(nn.Module):
     def forward(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Predicted returns, (...,)."""
         return self.network(self.features(obs, step)).squeeze(-1) * self.scale.float() + self.shift.float()
-
-    def observe(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
-        """Take observations into the normaliser's statistics, where it has one; this changes the predictions.
-
-        Args:
-            obs: Observations, (..., nobs).
-            team: The processes; each brings the same number of observations.
-            eps: Added to the standard deviations.
-        """
-        if isinstance(self.normalizer, Normalizer):
-            self.normalizer.update(obs, team, eps=eps)
 
     @torch.no_grad()
     def rescale(self, returns: torch.Tensor, *, first: bool = False, team: Team | None = None) -> None:
@@ -172,9 +159,5 @@ def value_group(env: Env, given: str | None) -> str:
         ValueError: The task has no such group.
     """
     group = given or ("critic" if "critic" in env.obs_groups else "policy")
-    if group not in env.obs_groups:
-        raise ValueError(
-            f"the task {env.task.name!r} has no group {group!r} of observations for the value function: it has "
-            f"{', '.join(env.obs_groups)}"
-        )
+    check_group(group, env.obs_groups, env.task.name)
     return group

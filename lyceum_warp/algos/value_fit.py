@@ -6,10 +6,9 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.dense import DensePasses, DenseValue
-from lyceum_warp.algos.distributed import Team
+from lyceum_warp.algos.distributed import Team, side_stream
 from lyceum_warp.algos.timing import one_thread
 from lyceum_warp.algos.value import BOUND, ValueFunction
-from lyceum_warp.graphs.capture import capturing
 
 
 class ValueFit:
@@ -266,18 +265,10 @@ class CapturedStep:
 
         The direct steps allocate lasting memory, such as Adam's moments.
         """
-        stream = torch.cuda.Stream()
-        stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
+        with side_stream():
             for _ in range(times):
                 self.learn()
-        torch.cuda.current_stream().wait_stream(stream)
-        graph = torch.cuda.CUDAGraph()
-        # other threads, such as NCCL's, call CUDA during the capture
-        with capturing(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
-            self.learn()
-        self.fit.team.keep(graph)
-        self.graph = graph
+        self.graph = self.fit.team.capture(self.learn)
 
     def learn(self) -> None:
         """Learn from the next mini-batch."""
