@@ -18,15 +18,11 @@ import numpy as np
 
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import positive_number
-from lyceum_warp.viz import EXTRA
+from lyceum_warp.viz import EXTRA, NoVideoError
 from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
 from lyceum_warp.viz.render import CANNOT_DRAW, VIDEO, Shot
 
 _PATIENCE = 10.0  # seconds that the process gets to end
-
-
-class NoVideoError(RuntimeError):
-    """The machine cannot draw, or lacks a package for videos. The message names it and the fix."""
 
 
 def check_video() -> None:

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from lyceum_warp.env import Env
+from lyceum_warp.viz import NoVideoError
 from lyceum_warp.viz.cameras import CameraChoice
-from lyceum_warp.viz.drawing import DrawingProcess, NoVideoError
+from lyceum_warp.viz.drawing import DrawingProcess
 from lyceum_warp.viz.render import PICTURE, Shot
 from lyceum_warp.viz.video import shots
 

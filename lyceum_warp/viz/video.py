@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import positive_number, whole_number
+from lyceum_warp.viz import NoVideoError
 from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
-from lyceum_warp.viz.drawing import Drawing, NoVideoError, check_video
+from lyceum_warp.viz.drawing import Drawing, check_video
 from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.render import Shot
 

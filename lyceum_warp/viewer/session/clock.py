@@ -19,7 +19,7 @@ from lyceum_warp.viewer.session.commands import obey
 from lyceum_warp.viewer.session.drivers import ControllerError, WorldControl
 from lyceum_warp.viewer.session.plant import POLL, InterruptedByCommand, run_plant
 from lyceum_warp.viewer.session.stage import Stage
-from lyceum_warp.viz.drawing import NoVideoError
+from lyceum_warp.viz import NoVideoError
 
 _LAG = 0.25  # maximum delay of the worlds behind the clock, in seconds; beyond it the clock waits
 _IDLE = 0.5  # seconds between two frames while nothing changes
