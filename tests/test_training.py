@@ -123,12 +123,6 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
         lw.load(six, which="worst")
 
 
-def test_the_best_policy_gives_the_best_return_of_the_evaluations(six: Path) -> None:
-    best = max(float(row["mean_return"]) for row in metrics(six) if row["mean_return"])
-    iteration, score = Run.open(six).best_score() or (0, 0.0)
-    assert score == best and metrics(six)[iteration - 1]["mean_return"] == repr(best)
-
-
 def test_without_evaluations_the_best_policy_sampled_the_best_iteration(tmp_path: Path) -> None:
     """The episodes of an iteration are those of the policy before its step."""
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
@@ -230,14 +224,6 @@ def test_a_run_continues_from_the_last_complete_state_to_the_same_numbers(six: P
 
 
 # a new run from the policy of another
-
-
-def test_a_loaded_policy_learns_further(six: Path, env: lw.Env) -> None:
-    policy, value = lw.load(six), lw.load_value(six)
-    before = mean_action(policy)
-    npg = lw.NPG(env, policy, value, CONFIG)
-    next(npg)
-    assert npg.policy is policy and not torch.equal(mean_action(policy), before)
 
 
 def test_a_command_begins_with_the_policy_of_a_run(

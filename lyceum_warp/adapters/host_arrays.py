@@ -1,4 +1,4 @@
-"""The buffers of an environment as NumPy arrays."""
+"""Copy an environment's buffers to NumPy arrays, and actions back."""
 
 from typing import Any
 
@@ -10,18 +10,18 @@ from lyceum_warp.support.validate import described
 
 
 class HostArrays:
-    """The buffers of an environment as NumPy arrays: actions go in, results come out.
+    """Transfers actions and results between NumPy arrays and an environment's buffers.
 
     Args:
         env: The environment.
-        copy: Whether results are copies. Without, those of an environment on the CPU are its live buffers, which
-            change with the next step.
-        one_world: Whether actions are those of the only world, without its axis.
+        copy: Whether results are copies. Otherwise results of an environment on the CPU are its live buffers, which the
+            next step overwrites.
+        one_world: Whether actions lack the axis of worlds, because there is one world.
     """
 
     def __init__(self, env: Env, *, copy: bool = True, one_world: bool = False) -> None:
         self._env, self._copy = env, copy
-        # an environment on the CPU shares its buffer; for another one the copy to the device starts from pinned memory
+        # on the CPU the array shares the buffer's memory; copies to a GPU start from pinned memory
         pinned = torch.empty(env.action.shape, pin_memory=True) if env.action.is_cuda else None
         self._pinned = pinned
         actions = (env.action if pinned is None else pinned).numpy()
@@ -31,7 +31,7 @@ class HostArrays:
         """Copy actions into the environment, (nworld, nact) or (nact,), float32 or float64.
 
         Raises:
-            ValueError: They are not a NumPy array, or one of another shape or type.
+            ValueError: They are not a NumPy array, or have another shape or type.
         """
         if not isinstance(action, np.ndarray) or action.shape != self._action.shape or action.dtype.kind != "f":
             raise ValueError(f"actions must be a float32 array of shape {self._action.shape}, not {_described(action)}")
@@ -40,7 +40,7 @@ class HostArrays:
             self._env.action.copy_(self._pinned, non_blocking=True)
 
     def of(self, *tensors: torch.Tensor) -> list[np.ndarray]:
-        """The values of some tensors of the environment's device, after at most one wait for it."""
+        """Copy tensors to NumPy arrays, with at most one wait for the device."""
         if self._pinned is None:
             return [tensor.numpy().copy() if self._copy else tensor.numpy() for tensor in tensors]
         copies = [tensor.to("cpu", non_blocking=True) for tensor in tensors]

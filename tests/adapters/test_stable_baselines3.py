@@ -1,6 +1,5 @@
 """Many worlds as Stable-Baselines3's vector environment: its numbers, its learners, its wrappers, its errors."""
 
-import warnings
 from typing import Any
 
 import gymnasium
@@ -9,14 +8,12 @@ import pytest
 import torch
 from full_task import Full
 from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import lyceum_warp as lw
 from lyceum_warp.adapters.stable_baselines3 import StableBaselines3VecEnv
-from lyceum_warp.gym import GymnasiumEnv
 from lyceum_warp.viz.video import NoVideoError
 
 N = 4
@@ -71,13 +68,6 @@ def test_a_fault_truncates_the_episode_with_its_last_good_observation(hopper: St
     np.testing.assert_array_equal(infos[1]["terminal_observation"], before[1])
 
 
-def test_only_ended_worlds_cost_a_dictionary(hopper: StableBaselines3VecEnv) -> None:
-    hopper.reset()
-    *_, first = hopper.step(np.zeros((N, 3), dtype=np.float32))
-    *_, second = hopper.step(np.zeros((N, 3), dtype=np.float32))
-    assert first == [{}] * N and all(a is b for a, b in zip(first, second, strict=True)) and first is not second
-
-
 def test_results_of_a_step_do_not_change_with_the_next(hopper: StableBaselines3VecEnv) -> None:
     hopper.reset()
     obs, reward, *_ = hopper.step(np.ones((N, 3), dtype=np.float32))
@@ -105,12 +95,6 @@ def test_an_off_policy_learner_stores_the_last_observation_and_no_time_limit(ful
     assert len(ended)
     for step, world in ended:  # the next observation is not the first one of the next episode
         assert (buffer.next_observations[step, world] != buffer.observations[step + 1, world]).any()
-
-
-def test_stable_baselines3s_checker_accepts_a_single_world() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(GymnasiumEnv("hopper"), skip_render_check=True)
 
 
 def test_vector_wrappers_work(hopper: StableBaselines3VecEnv) -> None:
@@ -150,21 +134,6 @@ def test_attributes_and_methods_are_those_of_the_worlds() -> None:
     assert env.env_is_wrapped(gymnasium.Wrapper, indices=[0]) == [False]
     with pytest.raises(ValueError, match="'ctrl_cost_weight' belongs to all worlds together: leave indices out"):
         env.set_attr("ctrl_cost_weight", 1.0, indices=[1])
-
-
-@pytest.mark.parametrize(
-    "name, message",
-    [
-        ("ctrl_cost_wieght", "the task 'hopper' has no parameter 'ctrl_cost_wieght': did you mean ctrl_cost_weight"),
-        ("horizon", "'horizon' is an option, not a parameter of the task 'hopper'"),
-        ("reward", "the task 'hopper' has no parameter 'reward': "),
-    ],
-)
-def test_an_attribute_without_effect_is_refused(name: str, message: str, hopper: StableBaselines3VecEnv) -> None:
-    with pytest.raises(ValueError, match=message) as error:
-        hopper.set_attr(name, 5)
-    assert "\n" not in str(error.value) and name not in vars(hopper)
-    hopper.set_attr("render_mode", hopper.render_mode)
 
 
 def test_groups_of_observations_are_a_dict_on_demand(full: StableBaselines3VecEnv) -> None:

@@ -1,7 +1,6 @@
 """Flags made from options, and values as NAME=VALUE."""
 
 import dataclasses
-from pathlib import Path
 from typing import Annotated
 
 import pytest
@@ -44,12 +43,6 @@ def test_a_parameter_is_read_with_its_type(text: str, value: object) -> None:
 def test_a_parameter_written_in_another_way_is_refused(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parameter(text)
-
-
-def test_a_file_with_a_table_gets_its_whole_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    name, path = parameter("motion=here/walk.npy")
-    assert (name, path) == ("motion", str(tmp_path / "here/walk.npy"))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -58,8 +58,12 @@ def test_wrong_options_are_refused(options: list[str], capsys: pytest.CaptureFix
 
 @pytest.mark.parametrize(
     ("argv", "message"),
-    [(["trian", "hopper"], "no command 'trian': did you mean train?"), (["jump"], "there are tasks, new, check"), ([], "which command")],
-)  # fmt: skip
+    [
+        (["trian", "hopper"], "no command 'trian': did you mean train?"),
+        (["jump"], "there are tasks, new, check"),
+        ([], "which command"),
+    ],
+)
 def test_an_unknown_command_is_refused_with_the_closest_one(
     argv: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,7 +15,6 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.viewer import show as views
 from lyceum_warp.viewer.protocol import Frame, Scene
-from lyceum_warp.viewer.session.window_process import Window
 
 
 class Opened:
@@ -68,15 +67,6 @@ def test_a_task_is_shown(opened: Opened) -> None:
     assert scene.title == "point_mass" and scene.nworld == 3 and scene.modes == ("passive",)
     assert opened.options == {"gfx": "web", "host": "127.0.0.1", "port": 8123, "browser": False}
     assert opened.frames[0].status.world == 2
-
-
-def test_the_viewer_is_a_page_also_where_there_is_a_display(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.delenv("SSH_CONNECTION", raising=False)
-    assert cli.main(["view", "point_mass"]) == 0
-    assert opened.options["gfx"] == "web"
-    assert cli.main(["view", "point_mass", "--gfx", "native"]) == 0
-    assert opened.options["gfx"] == "native"
 
 
 def test_a_task_of_your_own_is_shown_under_a_planner(opened: Opened, task_file: TaskFile) -> None:
@@ -171,17 +161,3 @@ def test_a_port_in_use_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
         port = taken.getsockname()[1]
         assert cli.main(["view", "point_mass", "--gfx", "web", "--port", str(port)]) == 2
     refused(capsys, f"port {port} is in use")
-
-
-def test_view_opens_a_page_and_prints_its_address(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: list[Window] = []
-
-    def closing(session: views.Session, window: Window) -> None:
-        made.append(window)
-        window.close()
-
-    monkeypatch.setattr(views.Session, "run", closing)
-    lw.view(lw.make("point_mass"), gfx="web")
-    assert made[0].address in capsys.readouterr().out
