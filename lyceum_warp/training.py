@@ -4,7 +4,7 @@ import contextlib
 import json
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +33,10 @@ Callback = Callable[[Any], Any]
 class Display:
     """Show the progress of a training. This class only logs messages; subclasses show more."""
 
-    def begin(self, run: Run, learner: Learner, iterations: int) -> None:
-        """Training begins or continues."""
+    @contextlib.contextmanager
+    def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
+        """Show a training up to a number of iterations, within the context."""
+        yield
 
     def __call__(self, iteration: Iteration) -> None:
         """An iteration is complete."""
@@ -45,9 +47,6 @@ class Display:
     def note(self, line: str) -> None:
         """Show a message."""
         log.warning(line)
-
-    def end(self) -> None:
-        """Training has ended, possibly with an error."""
 
 
 def train(
@@ -149,8 +148,7 @@ def train(
                 learner, run.folder / "videos", video_every, seed, camera=camera, note=display.note,
                 progress=display.work,
             )  # fmt: skip
-            shown.callback(display.end)
-            display.begin(run, learner, iterations)
+            shown.enter_context(display.training(run, learner, iterations))
             callbacks = [function for function in (board, display, videos, callback) if function is not None]
         try:
             _learn(learner, saver, iterations, callbacks, target_return)

@@ -1,8 +1,9 @@
 """Print the output of commands: progress, tables, and paths of plots and videos."""
 
+import contextlib
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -55,8 +56,9 @@ class Display(training.Display):
             console=console, disable=not console.is_terminal,
         )  # fmt: skip
 
-    def begin(self, run: Run, learner: Learner, iterations: int) -> None:
-        """Print the task, its worlds and the run's folder, and start the bar."""
+    @contextlib.contextmanager
+    def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
+        """Print the task, its worlds and the run's folder, and show the bar within the context."""
         env, size = learner.env, learner.team.size
         processes = f" each in {size} processes" if size > 1 else ""
         self.console.print(
@@ -66,15 +68,10 @@ class Display(training.Display):
         )  # fmt: skip
         self.total = iterations
         self.bar = self.progress.add_task("", total=iterations, completed=learner.iteration, text="")
-        self.progress.start()
+        with self.progress:
+            yield
 
-    def end(self) -> None:
-        """Remove the bar."""
-        self.progress.stop()
-
-    def note(self, line: str) -> None:
-        """Print a line to stderr."""
-        note(line)
+    note = staticmethod(note)
 
     def __call__(self, it: Iteration) -> None:
         """Show an iteration."""

@@ -151,7 +151,28 @@ class Train:
         with join(self.env.device or saved.get("device", "cpu")) as team:
             with team.together():  # every mistake in the options is found before the folder is made
                 learner, folder, entries = self._learner(source, team)
-            return self._train(learner, folder, settings, entries)
+            console, leads, total = make_console(), learner.team.leads, settings["iterations"]
+            try:
+                with RunViewer(folder) if self.view and leads else contextlib.nullcontext():
+                    run = train(
+                        learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
+                        entries=entries, display=Display(console), **settings,
+                    )  # fmt: skip
+            except Interrupted as signalled:
+                if leads and (path := folder / "policy.pt").exists():
+                    done = read_checkpoint(path, parts=("iteration",))["iteration"]
+                    text = f"interrupted by {signal.Signals(signalled.number).name} after {done} of {total} iterations"
+                    if done < total:
+                        text += f"; continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
+                    console.print(text, soft_wrap=True, markup=False)
+                return 128 + signalled.number
+            if not leads:
+                return 0
+            reached = run.config.get("reached", {})
+            if reached.get("iteration") == learner.iteration < total:
+                text = f"the target return is reached: {reached['return']:.6g} in iteration {learner.iteration}"
+                console.print(text, soft_wrap=True, markup=False)
+            return self._report(run, learner, console)
 
     def configuration(self, source: Run | None, team: Team) -> Configuration:
         """The configuration of another run, or the defaults, with the given flags."""
@@ -215,31 +236,6 @@ class Train:
             note_changes(own, learner.env, note=says)
         name = f"{learner.env.task.name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         return learner, self.resume or self.out or Path("runs", name), entries
-
-    def _train(self, learner: Learner, folder: Path, settings: dict[str, Any], entries: dict[str, Any]) -> int:
-        """Train. Rank 0 writes files and messages."""
-        console, leads, total = make_console(), learner.team.leads, settings["iterations"]
-        try:
-            with RunViewer(folder) if self.view and leads else contextlib.nullcontext():
-                run = train(
-                    learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
-                    entries=entries, display=Display(console), **settings,
-                )  # fmt: skip
-        except Interrupted as signalled:
-            if leads and (path := folder / "policy.pt").exists():
-                done = read_checkpoint(path, parts=("iteration",))["iteration"]
-                text = f"interrupted by {signal.Signals(signalled.number).name} after {done} of {total} iterations"
-                if done < total:
-                    text += f"; continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
-                console.print(text, soft_wrap=True, markup=False)
-            return 128 + signalled.number
-        if not leads:
-            return 0
-        reached = run.config.get("reached", {})
-        if reached.get("iteration") == learner.iteration < total:
-            text = f"the target return is reached: {reached['return']:.6g} in iteration {learner.iteration}"
-            console.print(text, soft_wrap=True, markup=False)
-        return self._report(run, learner, console)
 
     def _report(self, run: Run, learner: Learner, console: Console) -> int:
         """Print the table, evaluate the policy, draw the curve and the video; returns the exit code."""

@@ -21,7 +21,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import policy_of, read_checkpoint, value_of
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.task_copy import given_params, run_env
+from lyceum_warp.runs.task_copy import json_value, run_env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.machine import cpu_cores
 
@@ -63,7 +63,7 @@ def describe(learner: Learner) -> dict[str, Any]:
     return {
         "algorithm": learner.algorithm,
         "task": spelled_task(env.task.task),
-        "params": given_params(env),
+        "params": {name: json_value(name, value) for name, value in env.given_params.items()},
         "physics": options.physics.given(),
         "engine": options.engine if isinstance(options.engine, str) else env.engine.name,
         "device": options.device or "cpu",
@@ -166,12 +166,12 @@ class Configuration:
 
 
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
-    """The policy and the value function with which a learner begins, and the number of their iteration.
+    """The initial policy and value function of a learner, and the number of their iteration.
 
     Args:
-        run: The run that has them.
-        which: Which policy of the run; None if the run is continued. Its networks are None then, unless they are others
-            than those that its hyperparameters make: a run that began with another one's, or a policy with a limit.
+        run: The run of the networks.
+        which: Which policy of the run; None if the run is resumed. The networks are then None, unless they differ from
+            the networks of the hyperparameters: in a run that began with another run's, or with a ``limit``.
 
     Raises:
         FileNotFoundError: The run has no such policy.

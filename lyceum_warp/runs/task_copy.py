@@ -67,12 +67,8 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
     return kept, files
 
 
-def given_params(env: Env) -> dict[str, Any]:
-    """The parameters of an environment as JSON values, for config.json."""
-    return {name: _plain(name, value) for name, value in env.given_params.items()}
-
-
-def _plain(name: str, value: Any) -> Any:
+def json_value(name: str, value: Any) -> Any:
+    """A parameter of a task as a value of JSON, for config.json."""
     if (table := _table(value)) is not None:
         return str(value) if isinstance(value, str | Path) else f"{name}.npy" if table.size else []
     if isinstance(value, bool | int | float | str):

@@ -11,7 +11,6 @@ import pytest
 import torch
 from full_task import Full
 from gymnasium import wrappers
-from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 import lyceum_warp as lw
@@ -340,27 +339,6 @@ def test_actions_that_do_not_fit_are_refused(action: Any, message: str, hopper: 
     with pytest.raises(ValueError, match=message) as error:
         hopper.step(action)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("seed", [None, 3])
-def test_a_reset_of_some_worlds_before_one_of_all_is_refused(
-    seed: int | None, vector: Callable[..., GymnasiumVectorEnv]
-) -> None:
-    with pytest.raises(ResetNeeded, match="no reset came before this reset_mask: call reset.. without it first"):
-        vector().reset(seed=seed, options={"reset_mask": np.array([True, False, False, False])})
-
-
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ({"mask": 1}, r"reset has no option 'mask': it takes options={\"reset_mask\": mask}"),
-        ({"reset_mask": np.ones(3, dtype=bool)}, r"the reset_mask must be a bool tensor of shape \(4,\), not a bool"),
-        ({"reset_mask": np.ones(4)}, r"the reset_mask must be a bool tensor of shape \(4,\), not a ndarray"),
-    ],
-)
-def test_options_that_do_not_fit_are_refused(options: dict[str, Any], message: str, hopper: GymnasiumVectorEnv) -> None:
-    with pytest.raises(ValueError, match=message):
-        hopper.reset(options=options)
 
 
 @pytest.mark.parametrize(

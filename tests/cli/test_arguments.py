@@ -72,28 +72,6 @@ def test_flags_are_the_fields_of_the_options_and_none_unless_given() -> None:
     assert given(found) == {"size": 5, "name": "a", "fast": True, "safe": False, "limits": ("1", "2")}
 
 
-@optional_flags(Options, omit=["limits"])
-class FlagsWithDefaults:
-    pass
-
-
-@optional_flags(Options)
-class MoreFlags(FlagsWithDefaults):
-    pass
-
-
-def test_flags_without_a_text_for_their_default_have_those_of_the_options(capsys: pytest.CaptureFixture[str]) -> None:
-    assert vars(FlagsWithDefaults()) == {"size": 3, "name": None, "fast": False, "safe": True}
-    assert tyro.cli(FlagsWithDefaults, args=["--size", "4", "--name", "a"]) == dataclasses.replace(
-        FlagsWithDefaults(), size=4, name="a"  # type: ignore[call-arg]
-    )  # fmt: skip
-    with pytest.raises(SystemExit):
-        tyro.cli(FlagsWithDefaults, args=["--help"])
-    out = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "--size INT Size of it, in metres. (default: 3)" in out and "(default: None)" not in out
-    assert vars(MoreFlags()) == vars(FlagsWithDefaults()) | {"limits": (1.0,)}
-
-
 def test_help_texts_of_flags_are_the_docstrings_of_the_options(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         tyro.cli(Flags, args=["--help"])

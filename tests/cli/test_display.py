@@ -32,16 +32,16 @@ def first(npg: lw.NPG) -> lw.Iteration:
 def shown_on(console: Console, npg: lw.NPG, total: int = 10) -> Iterator[display.Display]:
     """The display of a run, after its first line."""
     shown = display.Display(console)
-    shown.begin(Run(Path("run"), {}), npg, total)
-    console.file.truncate(0)
-    console.file.seek(0)
-    yield shown
-    shown.end()
+    with shown.training(Run(Path("run"), {}), npg, total):
+        console.file.truncate(0)
+        console.file.seek(0)
+        yield shown
 
 
 def test_the_first_line_names_the_task_the_worlds_the_algorithm_and_the_folder(npg: lw.NPG) -> None:
     console = Console(file=io.StringIO(), width=120, highlight=False)
-    display.Display(console).begin(Run(Path("run"), {}), npg, 10)
+    with display.Display(console).training(Run(Path("run"), {}), npg, 10):
+        pass
     expected = "half_cheetah: 17 observations, 6 actions; 4 worlds, mujoco engine on cpu, npg; run in run\n"
     assert console.file.getvalue() == expected
 

@@ -5,9 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import TaskFile
 from memory_window import MemoryWindow
-from tiny_task import TINY
 from toy_controllers import towards
 from training_runs import interrupted, refused, train
 
@@ -69,10 +67,9 @@ def test_a_task_is_shown(opened: Opened) -> None:
     assert opened.frames[0].status.world == 2
 
 
-def test_a_task_of_your_own_is_shown_under_a_planner(opened: Opened, task_file: TaskFile) -> None:
-    file = task_file("viewed.py", TINY)
+def test_a_task_is_shown_under_a_planner(opened: Opened) -> None:
     opened.number = 12
-    assert cli.main(["view", str(file), "--mppi", "--samples", "4", "--horizon", "5", "--paused"]) == 0
+    assert cli.main(["view", "point_mass", "--mppi", "--samples", "4", "--horizon", "5", "--paused"]) == 0
     (scene,) = opened.scenes
     assert scene.controllers == ("mppi",) and scene.modes == ("controller", "passive")
     assert opened.frames[-1].status.paused
