@@ -9,9 +9,8 @@ import torch
 
 from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, per_world, pictures_of
 from lyceum_warp.adapters.gymnasium_spaces import box, observation_space
-from lyceum_warp.adapters.host_arrays import HostArrays
 from lyceum_warp.adapters.libraries import check_library
-from lyceum_warp.adapters.step_results import Infos, Observations, episode_ends
+from lyceum_warp.adapters.step_results import HostArrays, Infos, Observations, episode_ends
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 from lyceum_warp.viz.cameras import CameraChoice

@@ -11,6 +11,7 @@ therefore starts a process for each library that it tries. This file imports not
 that this machine cannot draw with this library; the last line on stderr holds the reason.
 """
 
+import contextlib
 import itertools
 import os
 import pickle
@@ -157,12 +158,15 @@ def main(folder: str) -> int:
         print(str(error).strip() or type(error).__name__, file=sys.stderr)
         return CANNOT_DRAW
     try:
-        with _LastPicture(Path(folder, PICTURE)) if job["fps"] is None else _video(Path(folder, VIDEO), job) as writer:
+        with contextlib.nullcontext() if job["fps"] is None else _video(Path(folder, VIDEO), job) as writer:
             print("ready", flush=True)
             while (shot := pickle.load(source)) is not None:
                 image = painter.draw(shot)
-                for _ in range(shot["frames"]):
-                    writer.append_data(image)
+                if writer is None:
+                    Path(folder, PICTURE).write_bytes(image.tobytes())
+                else:
+                    for _ in range(shot["frames"]):
+                        writer.append_data(image)
                 print("frame", flush=True)
     except (EOFError, pickle.UnpicklingError):
         shutil.rmtree(folder, ignore_errors=True)
@@ -176,23 +180,6 @@ def _video(path: Path, job: dict[str, Any]) -> Any:
 
     options: Any = dict(fps=float(job["fps"]), codec="libx264", pixelformat="yuv420p", quality=8, macro_block_size=2)
     return imageio.get_writer(str(path), format="FFMPEG", **options)
-
-
-class _LastPicture:
-    """A file with the last picture, with the methods of a video writer."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> "_LastPicture":
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        pass
-
-    def append_data(self, image: np.ndarray) -> None:
-        """Replace the picture."""
-        self.path.write_bytes(image.tobytes())
 
 
 if __name__ == "__main__":

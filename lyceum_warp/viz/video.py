@@ -5,7 +5,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -139,8 +139,11 @@ def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
     poses = [states[:, parts.get(name, slice(0))].numpy() for name in _POSES]
     fields = {field.name: states[:, parts[field.name]].numpy() for field in env.task.dynamics}
     for i in range(len(states)):
-        shown = {name: values[i] for name, values in fields.items()}
-        yield _shot((poses[0][i], poses[1][i].reshape(-1, 3), poses[2][i].reshape(-1, 4)), shown)
+        yield Shot(
+            pose=(poses[0][i], poses[1][i].reshape(-1, 3), poses[2][i].reshape(-1, 4)),
+            model_fields={name: values[i] for name, values in fields.items()},
+            camera=None, ghosts=[], lines=[], frames=1,
+        )  # fmt: skip
 
 
 def _shown_progress(progress: Progress | bool) -> contextlib.AbstractContextManager[Progress | None]:
@@ -260,13 +263,13 @@ class Recorder:
         self._check()
         if self._ended:
             raise ValueError(f"the video {self.out} is closed")
-        shot = _shot(
-            self._pose(qpos, mocap_pos, mocap_quat),
-            {name: self._field(name, value) for name, value in (model_fields or {}).items()},
-            None if camera is None else camera_values(find_camera(self.model, camera)),
-            [(self._pose(*ghost[:3]), _colour(ghost[3])) for ghost in ghosts],
-            [(_array("points of a line", points, (-1, 3)), _colour(colour), _LINE_WIDTH) for points, colour in lines],
-            whole_number("frames", frames, low=1),
+        shot = Shot(
+            pose=self._pose(qpos, mocap_pos, mocap_quat),
+            model_fields={name: self._field(name, value) for name, value in (model_fields or {}).items()},
+            camera=None if camera is None else camera_values(find_camera(self.model, camera)),
+            ghosts=[(self._pose(*ghost[:3]), _colour(ghost[3])) for ghost in ghosts],
+            lines=[(_array("points of a line", points, (-1, 3)), _colour(rgba), _LINE_WIDTH) for points, rgba in lines],
+            frames=whole_number("frames", frames, low=1),
         )
         with self._changed:
             self._added += frames
@@ -297,9 +300,15 @@ class Recorder:
             seconds: Timeout.
             progress: As in ``close``.
         """
-        if not self.finished and seconds > 0:
-            with _shown_progress(progress) as report:
-                self._wait(report, time.monotonic() + seconds)
+        shown, until = 0, time.monotonic() + seconds
+        with contextlib.nullcontext() if self.finished or seconds <= 0 else _shown_progress(progress) as report:
+            while (not self.finished or self._drawn > shown) and (left := until - time.monotonic()) > 0:
+                with self._changed:
+                    self._changed.wait(min(left, 0.1))
+                if self._drawn > shown:
+                    shown = self._drawn
+                    if report is not None:
+                        report(shown, self._added)
         return self.finished
 
     def close(self, *, progress: Progress | bool = True) -> Path:
@@ -338,17 +347,6 @@ class Recorder:
             self.end(drop=True)
             self._drawing.abandon()
             self._thread.join(_KILLED)
-
-    def _wait(self, report: Progress | None, until: float) -> None:
-        """Wait until the drawing has ended, or until a time of ``time.monotonic``."""
-        shown = 0
-        while (not self.finished or self._drawn > shown) and (left := until - time.monotonic()) > 0:
-            with self._changed:
-                self._changed.wait(min(left, 0.1))
-            if self._drawn > shown:
-                shown = self._drawn
-                if report is not None:
-                    report(shown, self._added)
 
     def _check(self) -> None:
         if self._error is not None:
@@ -409,17 +407,3 @@ def _array(name: str, value: Any, shape: tuple[int, ...], *, flat: bool = False)
 
 def _colour(value: ArrayLike) -> tuple[float, ...]:
     return tuple(_array("a colour", value, (4,)).tolist())
-
-
-def _shot(
-    pose: tuple[np.ndarray, np.ndarray, np.ndarray],
-    model_fields: dict[str, np.ndarray],
-    camera: tuple[float, ...] | None = None,
-    ghosts: Sequence[Any] = (),
-    lines: Sequence[Any] = (),
-    frames: int = 1,
-) -> Shot:
-    return {
-        "pose": pose, "model_fields": model_fields, "camera": camera, "ghosts": list(ghosts), "lines": list(lines),
-        "frames": frames,
-    }  # fmt: skip
