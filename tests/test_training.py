@@ -107,7 +107,7 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
 
 
 def test_without_evaluations_the_best_policy_sampled_the_best_iteration(tmp_path: Path) -> None:
-    """The episodes of an iteration are those of the policy before its step."""
+    """The policy before an iteration's step samples its episodes."""
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)
     returns = [float(row["return_mean"]) for row in metrics(tmp_path / "run")]
@@ -184,7 +184,7 @@ def test_training_ends_at_the_target_return(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_a_run_continues_from_the_last_complete_state_to_the_same_numbers(six: Path, tmp_path: Path) -> None:
-    """As after kill -9 in iteration 5: the last save is that of iteration 3, the last row that of iteration 4."""
+    """As after kill -9 in iteration 5, with a save of iteration 3 and a row of iteration 4."""
     folder = tmp_path / "run"
     states = {}
 
@@ -282,7 +282,7 @@ def test_ppo_trains_by_the_same_loop_from_the_shell(six: Path, tmp_path: Path) -
     assert metrics(tmp_path / "parts") == metrics(tmp_path / "whole")
     config = Run.open(tmp_path / "parts").config
     assert config["algorithm"] == "ppo" and config["ppo"]["hidden"] == [8] and "npg" not in config
-    assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # the settings of NPG are not those of PPO
+    assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # the settings of NPG do not apply to PPO
 
 
 def test_a_run_notes_what_its_caller_gives_and_shows_its_way(env: lw.Env, tmp_path: Path) -> None:

@@ -61,7 +61,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             for groups in (env.obs_groups, env.final_obs_groups)
         )
         self._metrics = torch.zeros(len(env.metrics), device=self.device)
-        self._episodes = torch.zeros((), device=self.device)  # in the means, at most RECENT or those of the last step
+        self._episodes = torch.zeros((), device=self.device)  # in the means
 
     @property
     def unwrapped(self) -> Env:

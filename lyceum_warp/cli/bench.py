@@ -61,7 +61,7 @@ class Bench:
             code = child.wait()
         except Interrupted:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                child.wait(3.0)  # Ctrl-C in a terminal has reached it, too
+                child.wait(3.0)  # Ctrl-C in a terminal has also reached the child
             child.terminate()
             child.wait()
             raise

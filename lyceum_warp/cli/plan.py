@@ -56,7 +56,7 @@ class Settings:
     risk: Annotated[str | None, tyro.conf.arg(metavar="mean|worst")] = None
 
     def on_top_of(self, config: MPPIConfig) -> MPPIConfig:
-        """Replace settings of a configuration by those that were given.
+        """Replace settings of a configuration by the given flags.
 
         Raises:
             ValueError: A setting is not valid.

@@ -32,7 +32,7 @@ def task_text(file: str, class_name: str, source: str, title: str, model: mujoco
         file: The name of the file.
         class_name: The name of the task's class.
         source: The model as an expression in Python, such as ``"robot.xml"`` with its quotes.
-        title: What the docstring calls the model.
+        title: The model's name in the docstring.
         model: The compiled model.
     """
     fields, parts, put = _observation(model)

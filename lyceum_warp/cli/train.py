@@ -193,7 +193,7 @@ class Train:
         algorithm = self.algorithm or base.algorithm
         if source is not None and self.algorithm is None and algorithm not in ALGORITHMS:
             raise ValueError(
-                f"the run in {source.folder} was trained by {algorithm!r}, a learner of a program: go on there, by "
+                f"the run in {source.folder} was trained by {algorithm!r}, a learner of a program: resume it there, by "
                 "lw.train(..., resume=True)"
             )
         if source is not None and self.resume is not None and (old := source.config["algorithm"]) != algorithm:

@@ -31,9 +31,9 @@ class Warmup:
     nworld: int = 64
     """Number of worlds."""
     plan: bool = False
-    """Whether to compile MPPI's kernels, too."""
+    """Whether to also compile MPPI's kernels."""
     npg: bool = False
-    """Whether to compile NPG's kernels, too."""
+    """Whether to also compile NPG's kernels."""
     param: ParamWords = ()
     env: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)

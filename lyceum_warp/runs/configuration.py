@@ -175,7 +175,7 @@ def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, 
 
     Raises:
         FileNotFoundError: The run has no such policy.
-        ValueError: The file cannot be read, or the policy is of a class of its own.
+        ValueError: The file cannot be read, or the policy has a class outside this package.
     """
     path = run.policy_file("last" if which is None else which)
     content = read_checkpoint(path, parts=("iteration", "policy"))

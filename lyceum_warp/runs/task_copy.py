@@ -234,7 +234,7 @@ def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collecti
     """The paths in the folder ``task`` of a task's file, its modules and its model's files.
 
     Their relative paths stay the same, so that the copied task finds the copied model. If the task's file and its model
-    have distant folders, each is copied to a folder of its own.
+    have distant folders, each gets a separate folder.
     """
     if not paths:
         return {}

@@ -17,7 +17,7 @@ from lyceum_warp.support.validate import positive_number
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FreeCamera:
-    """A camera that looks at a point or follows a body. Defaults are those of MuJoCo's default free camera."""
+    """A camera that looks at a point or follows a body. Defaults come from MuJoCo's default free camera."""
 
     lookat: tuple[float, float, float] | None = None
     """Point to look at, metres. A camera that follows a body looks at the centre of mass of the body's subtree."""

@@ -88,7 +88,7 @@ class DrawingProcess:
                 raise
             self._stop()
             failures.append(f"{library or 'OpenGL'}: {reason}")
-            if code > 0 and code != CANNOT_DRAW:  # another graphics library would fail, too
+            if code > 0 and code != CANNOT_DRAW:  # another graphics library would also fail
                 raise NoVideoError(f"{self.product} could not be written ({reason})")
         raise NoVideoError(
             f"this machine cannot draw off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "

@@ -38,7 +38,7 @@ def draws() -> bool:
 
 
 THEIRS = ("is -infinity. This is probably too low", "is infinity. This is probably too high")
-"""What the checker says of every observation without bounds, those of Gymnasium's own robots included."""
+"""The checker's warnings about observations without bounds, also of Gymnasium's own robots."""
 
 
 def test_gymnasiums_checker_has_no_complaint(hopper: gymnasium.Env, draws: bool) -> None:

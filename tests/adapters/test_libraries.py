@@ -1,4 +1,4 @@
-"""What the adapters say where a library is missing, or of another version."""
+"""Errors of the adapters if a library is missing or has another version."""
 
 import importlib
 import sys

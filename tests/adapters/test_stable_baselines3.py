@@ -125,6 +125,21 @@ def test_attributes_and_methods_are_those_of_the_worlds() -> None:
         env.set_attr("ctrl_cost_weight", 1.0, indices=[1])
 
 
+@pytest.mark.parametrize(
+    "name, message",
+    [
+        ("ctrl_cost_wieght", "the task 'hopper' has no parameter 'ctrl_cost_wieght': did you mean ctrl_cost_weight"),
+        ("horizon", "'horizon' is an option, not a parameter of the task 'hopper'"),
+        ("reward", "the task 'hopper' has no parameter 'reward': "),
+    ],
+)
+def test_an_attribute_without_effect_is_refused(name: str, message: str, hopper: StableBaselines3VecEnv) -> None:
+    with pytest.raises(ValueError, match=message) as error:
+        hopper.set_attr(name, 5)
+    assert "\n" not in str(error.value) and name not in vars(hopper)
+    hopper.set_attr("render_mode", hopper.render_mode)
+
+
 def test_groups_of_observations_are_a_dict_on_demand(full: StableBaselines3VecEnv) -> None:
     assert full.observation_space.shape == (3,)
     env = StableBaselines3VecEnv(full.env, dict_obs=True)

@@ -47,7 +47,7 @@ def test_the_first_line_names_the_task_the_worlds_the_algorithm_and_the_folder(n
 
 
 def line(npg: lw.NPG, iteration: lw.Iteration, **changes: object) -> str:
-    """What is shown of an iteration where there is no terminal."""
+    """The line of an iteration without a terminal."""
     console = Console(file=io.StringIO(), width=120, highlight=False)
     with shown_on(console, npg) as shown:
         shown(dataclasses.replace(iteration, samples_per_second=29_412.0, **changes))

@@ -35,7 +35,7 @@ RICH = text(
     + '<sensor><gyro site="end"/><clock/><touch site="end"/><user dim="2"/></sensor>'
     '<keyframe><key name="home" qpos=".3 -.3  0 0 .1 1 0 0 0  1 0 0 0" ctrl=".5 0 0" mpos=".2 0 .5"/></keyframe>',
 )
-# without those that take long, whatever the model
+# without checks that take long for every model
 QUICK_CHECKS = tuple(check for check in CHECKS if check not in (episodes.check_memory, bounds.check_bounds))
 
 

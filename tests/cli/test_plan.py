@@ -20,7 +20,7 @@ from lyceum_warp import Trajectory, cli
 from lyceum_warp.cli.display import PlanDisplay
 from lyceum_warp.cli.plan import Settings
 
-# tests may run in the background, where a shell makes its children ignore SIGINT
+# a shell makes background processes, such as these tests, ignore SIGINT
 TAKE_SIGINT = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
 SMALL = ["--horizon", "10", "--samples", "8", "--temperature", "0.01", "--noise", "0.3", "--steps", "40"]
 

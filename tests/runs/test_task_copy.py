@@ -319,7 +319,7 @@ EDITS = [
     lambda text: "",
     None,
 ]
-"""What happens to a task's files while it trains; None is that they are deleted."""
+"""Edits of a task's files during training; None deletes them."""
 
 
 def test_a_run_keeps_to_the_source_that_it_was_started_with(folder: Path) -> None:

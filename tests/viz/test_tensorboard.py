@@ -1,7 +1,6 @@
 """Curves for TensorBoard, read back with TensorBoard's own reader."""
 
 import dataclasses
-import math
 import signal
 from pathlib import Path
 
@@ -52,14 +51,6 @@ def test_every_number_of_an_iteration_is_a_curve_in_its_group(first: lw.Iteratio
     assert {name.partition("/")[0] for name in scalars} == {
         "return", "episode", "mean_policy", "policy", "value", "time", "metrics",
     }  # fmt: skip
-
-
-def test_numbers_that_are_absent_or_not_finite_are_left_out(first: lw.Iteration, tmp_path: Path) -> None:
-    with TensorBoard(tmp_path, CONFIG) as board:
-        board(numbered(first, 1, return_mean=math.nan, mean_return=None))
-        board(numbered(first, 2, return_mean=-3.0))
-    assert curve(tmp_path, "return/mean") == [(192, -3.0)]
-    assert curve(tmp_path, "mean_policy/return") == [(192, first.mean_return)]
 
 
 def test_a_resumed_run_replaces_later_points_and_repeats_none(first: lw.Iteration, tmp_path: Path) -> None:

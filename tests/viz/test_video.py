@@ -118,14 +118,6 @@ def test_a_machine_that_cannot_draw_is_reported_with_a_fix(
     assert mp4.finished and not list(tmp_path.iterdir())
 
 
-def test_the_library_in_mujoco_gl_is_tried_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "platform", "linux")
-    monkeypatch.setitem(os.environ, "MUJOCO_GL", "osmesa")
-    assert drawing.libraries() == ["osmesa", "egl"]
-    monkeypatch.delitem(os.environ, "MUJOCO_GL")
-    assert drawing.libraries() == ["egl", "osmesa"]
-
-
 @pytest.mark.parametrize("options, message", [
     ({"size": (31, 20)}, r"size must be two even numbers, .*, not \(31, 20\)"),
     ({"speed": 0.0}, r"speed must be a positive number of simulated seconds per second, not 0.0"),
