@@ -182,7 +182,11 @@ def _planning(task: type[Task]) -> Planning:
         if unknown := [word for word in getattr(planning, part) if word not in names]:
             word = unknown[0]
             belongs = [f"it belongs to {other}" for other in known if word in known[other]]
-            hint = belongs[0] if belongs else suggestion(word, set(names) - set(OPTIONS)) or f"there are {', '.join(names) or 'none'}"
+            hint = (
+                belongs[0]
+                if belongs
+                else suggestion(word, set(names) - set(OPTIONS)) or f"there are {', '.join(names) or 'none'}"
+            )
             raise ValueError(f"{word!r} in planning.{part} of the task {name!r} is unknown: {hint}")
     try:
         _check_options(planning.options)

@@ -20,7 +20,7 @@ from lyceum_warp.viewer.session.drivers import ControllerError, WorldControl
 from lyceum_warp.viewer.session.plant import POLL, InterruptedByCommand, run_plant
 from lyceum_warp.viewer.session.stage import Stage
 from lyceum_warp.viewer.session.window_process import Window
-from lyceum_warp.viz.drawing import NoVideoError
+from lyceum_warp.viz import NoVideoError
 
 _LAG = 0.25  # maximum seconds that the worlds may be behind the clock; beyond it the clock is moved
 _IDLE = 0.5  # seconds between two frames while nothing changes

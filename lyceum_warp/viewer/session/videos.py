@@ -12,7 +12,7 @@ import mujoco
 
 from lyceum_warp.support.interrupts import obeyed
 from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Frame
-from lyceum_warp.viz.drawing import NoVideoError
+from lyceum_warp.viz import NoVideoError
 from lyceum_warp.viz.video import Recorder
 
 FPS = 30
