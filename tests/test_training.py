@@ -1,8 +1,6 @@
 """Training with a run's folder: ended, continued and warm-started."""
 
-import contextlib
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +42,13 @@ def test_a_run_of_python_has_the_numbers_of_the_command(six: Path, tmp_path: Pat
     assert configs[0] == configs[1] | {"threads": 1}
 
 
+def test_a_run_of_python_is_evaluated_and_resumed_by_the_command(six: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(six, tmp_path / "run"))
+    assert cli.main(["eval", str(run), "--episodes", "2", "--which", "best"]) == 0
+    assert cli.main(["train", "--resume", str(run), "--iterations", "7", *QUIET]) == 0
+    assert metrics(run)[:6] == metrics(six)
+
+
 def test_python_resumes_a_run_to_the_same_numbers(six: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=2)
@@ -54,6 +59,18 @@ def test_python_resumes_a_run_to_the_same_numbers(six: Path, tmp_path: Path) -> 
         lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), folder, iterations=9, resume=True)
     with pytest.raises(ValueError, match="already has 6 iterations: give more .*, or iterations=12 in Python"):
         lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
+
+
+def test_python_resumes_the_same_task_on_the_same_engine(six: Path, env: lw.Env, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(six, tmp_path / "other"))
+    Run.open(other).amend(engine="warp")
+    for folder, given, message in [
+        (six, lw.make("point_mass", nworld=2, horizon=9), "has horizon None, not 9, and a run keeps"),
+        (six, lw.make("cartpole", nworld=2), "has task point_mass, not cartpole"),
+        (other, env, "has engine warp, not mujoco"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            lw.train(algorithm(given), folder, iterations=9, resume=True)
 
 
 def test_an_algorithm_that_has_iterated_begins_a_whole_run(six: Path, tmp_path: Path) -> None:
@@ -106,8 +123,14 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
         lw.load(six, which="worst")
 
 
+def test_the_best_policy_gives_the_best_return_of_the_evaluations(six: Path) -> None:
+    best = max(float(row["mean_return"]) for row in metrics(six) if row["mean_return"])
+    iteration, score = Run.open(six).best_score() or (0, 0.0)
+    assert score == best and metrics(six)[iteration - 1]["mean_return"] == repr(best)
+
+
 def test_without_evaluations_the_best_policy_sampled_the_best_iteration(tmp_path: Path) -> None:
-    """The policy before an iteration's step samples its episodes."""
+    """The episodes of an iteration are those of the policy before its step."""
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)
     returns = [float(row["return_mean"]) for row in metrics(tmp_path / "run")]
@@ -184,7 +207,7 @@ def test_training_ends_at_the_target_return(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_a_run_continues_from_the_last_complete_state_to_the_same_numbers(six: Path, tmp_path: Path) -> None:
-    """As after kill -9 in iteration 5, with a save of iteration 3 and a row of iteration 4."""
+    """As after kill -9 in iteration 5: the last save is that of iteration 3, the last row that of iteration 4."""
     folder = tmp_path / "run"
     states = {}
 
@@ -207,6 +230,14 @@ def test_a_run_continues_from_the_last_complete_state_to_the_same_numbers(six: P
 
 
 # a new run from the policy of another
+
+
+def test_a_loaded_policy_learns_further(six: Path, env: lw.Env) -> None:
+    policy, value = lw.load(six), lw.load_value(six)
+    before = mean_action(policy)
+    npg = lw.NPG(env, policy, value, CONFIG)
+    next(npg)
+    assert npg.policy is policy and not torch.equal(mean_action(policy), before)
 
 
 def test_a_command_begins_with_the_policy_of_a_run(
@@ -282,7 +313,7 @@ def test_ppo_trains_by_the_same_loop_from_the_shell(six: Path, tmp_path: Path) -
     assert metrics(tmp_path / "parts") == metrics(tmp_path / "whole")
     config = Run.open(tmp_path / "parts").config
     assert config["algorithm"] == "ppo" and config["ppo"]["hidden"] == [8] and "npg" not in config
-    assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # the settings of NPG do not apply to PPO
+    assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # the settings of NPG are not those of PPO
 
 
 def test_a_run_notes_what_its_caller_gives_and_shows_its_way(env: lw.Env, tmp_path: Path) -> None:
@@ -290,14 +321,14 @@ def test_a_run_notes_what_its_caller_gives_and_shows_its_way(env: lw.Env, tmp_pa
         def __init__(self) -> None:
             self.seen: list[object] = []
 
-        @contextlib.contextmanager
-        def training(self, run: Run, learner: lw.Learner, iterations: int) -> Iterator[None]:
+        def begin(self, run: Run, learner: lw.Learner, iterations: int) -> None:
             self.seen.append((run.folder, learner.iteration, iterations))
-            yield
-            self.seen.append("end")
 
         def __call__(self, iteration: lw.Iteration) -> None:
             self.seen.append(iteration.iteration)
+
+        def end(self) -> None:
+            self.seen.append("end")
 
     display, folder = Seen(), tmp_path / "run"
     lw.train(algorithm(env), folder, iterations=2, entries={"tag": "mine"}, display=display)

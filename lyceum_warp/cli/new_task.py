@@ -1,4 +1,4 @@
-"""Write a task file for a model: lyceum-warp new."""
+"""lyceum-warp new."""
 
 import dataclasses
 import importlib.util
@@ -24,18 +24,19 @@ _SOURCES: dict[str, Callable[[str], ModelFile]] = {
     "gymnasium": gymnasium_model,
     "gymnasium_robotics": gymnasium_robotics_model,
 }
-"""Sources of models, by the prefix of --model before the colon."""
+"""Functions that name a model, by what stands before the colon of --model."""
 
 _TAKEN = ("World", "Params", "Row")
-"""Names that the file uses for other things."""
+"""Names that the file uses itself."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class New:
-    """Write a task file for a model, with a reward of zero. The task can be checked, stepped and trained at once.
+    """Write a task file for a model: it can be checked, stepped and trained at once, with a reward of zero.
 
-    The policy observes positions, velocities, activations and sensors, and acts through the model's actuators. A step
-    takes about 20 ms. Comments in the file explain how to continue.
+    The policy observes positions and velocities and what the model's sensors measure, or only the sensors where they
+    measure every joint. It acts through the model's actuators. A step takes about 20 ms. Comments in the file say how
+    to go on.
 
     $ lyceum-warp new walk --model robots/dog.xml
     $ lyceum-warp new tasks/hop.py --model gymnasium:hopper.xml
@@ -45,9 +46,9 @@ class New:
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
     """The name of the task, in snake_case, for the file TASK.py in the current folder; or the file: path/to/task.py."""
     model: Annotated[str, tyro.conf.arg(metavar="FILE")]
-    """An MJCF or URDF file; menagerie:ROBOT/FILE.xml, in the checkout of MuJoCo Menagerie that the environment variable
-    MENAGERIE_ROOT names; or gymnasium:FILE.xml or gymnasium_robotics:PATH, in these packages. The task file refers to
-    an MJCF or URDF file by a relative path, unless FILE is absolute."""
+    """An MJCF or URDF file; or menagerie:ROBOT/FILE.xml, of the checkout of MuJoCo Menagerie to which the environment
+    variable MENAGERIE_ROOT points; or gymnasium:FILE.xml or gymnasium_robotics:PATH, of these packages. A relative path
+    is written relative to the task file."""
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
@@ -83,7 +84,7 @@ def _class_name(path: Path) -> str:
     """The name of the class in a task file.
 
     Raises:
-        ValueError: The file's name is not a valid name of a task, or another task or module has it.
+        ValueError: The file's name cannot be that of a task, or belongs to another task or module.
     """
     name = path.stem
     class_name = "".join(part[:1].upper() + part[1:] for part in name.split("_"))
@@ -93,7 +94,7 @@ def _class_name(path: Path) -> str:
         or keyword.iskeyword(class_name)
     ):
         raise ValueError(f"a task can't be named {name!r}: use letters, digits and _, as in my_robot")
-    if snake_case(class_name) != name:  # a task is named after its class
+    if snake_case(class_name) != name:  # the class alone has the name of the task
         raise ValueError(f"a task can't be named {name!r}: use {snake_case(class_name)!r}, for the class {class_name}")
     if class_name in _TAKEN:
         raise ValueError(f"a task can't be named {name!r}: its file uses {class_name} for something else")
@@ -106,14 +107,14 @@ def _class_name(path: Path) -> str:
 
 
 def _model(text: str, path: Path) -> tuple[str, str, mujoco.MjSpec]:
-    """A model as an expression for a task file, its title, and its spec.
+    """A model as an expression in a task file, what to call it, and the model itself.
 
     Args:
-        text: The model as given on the command line.
+        text: The model as it is given on the command line.
         path: The task file.
 
     Raises:
-        FileNotFoundError: There is no such file, package or checkout.
+        FileNotFoundError: There is no such file, or its package or checkout is not there.
         ValueError: MuJoCo cannot read the file.
     """
     where, _, file = text.partition(":")
@@ -127,7 +128,7 @@ def _model(text: str, path: Path) -> tuple[str, str, mujoco.MjSpec]:
 
 
 def _title(file: str) -> str:
-    """The name of a model in the docstring of a task file."""
+    """What the docstring of a task file calls a model."""
     plain = file.isprintable() and not set(file) & set('\\"') and len(file) <= 50
     return f"the model {file}" if plain else "a model"
 

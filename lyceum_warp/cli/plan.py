@@ -13,7 +13,7 @@ import tyro
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.mppi_config import MPPIConfig
 from lyceum_warp.algos.planner import MPPI
-from lyceum_warp.binding.registry import find_task, spelled_task, task_name
+from lyceum_warp.binding.registry import find_task, snake_case, spelled_task, task_name
 from lyceum_warp.cli.arguments import (
     CameraWords,
     ParamWords,
@@ -135,6 +135,8 @@ class Plan:
                 f"--replan-every {every} has no effect with --real-time, where plans follow one another without a "
                 "break: leave out one of them"
             )
+        if self.value is not None:
+            _check_value_task(self.value, self.task)
         out = self.out or Path(
             "runs", f"plan-{task_name(find_task(self.task))}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         )
@@ -159,6 +161,30 @@ class Plan:
             "replan_every": every, "seed": self.seed, "real_time": self.real_time, "rate": self.rate,
         }  # fmt: skip
         return _run(Run.create(out, config, device=self.planner.device), plant, planner, self)
+
+
+def _check_value_task(run: Path, task: str) -> None:
+    """Refuse the value function of a run of another task.
+
+    Raises:
+        ValueError: The run's configuration names another task.
+    """
+    try:
+        config = Run.open(run.parent if run.is_file() else run).config
+    except FileNotFoundError:
+        return  # loading reports what is missing, and a file may be anywhere
+    found = str(config.get("task"))
+    names = {_stem(found), snake_case(found.partition(":")[2]), str(config.get("kept", {}).get("name"))}
+    if not names & {_stem(task), task_name(find_task(task))}:
+        raise ValueError(
+            f"--value {run} is a run of the task {found!r}, not of {task!r}: a value function applies to the task that "
+            "it was trained on"
+        )
+
+
+def _stem(task: str) -> str:
+    """The name of a task, or of its file."""
+    return Path(task.partition(":")[0]).stem
 
 
 def _worlds(options: Plan, params: dict[str, Any], planner_params: dict[str, Any]) -> tuple[Env, MPPI]:

@@ -1,18 +1,21 @@
-"""Write the text of a task file for a model, for lyceum-warp new."""
+"""The text of a task file for a model: what lyceum-warp new writes."""
 
 import json
-import textwrap
 
 import mujoco
+import numpy as np
 
 _STEP = 0.02
-"""Seconds in a step, approximately."""
+"""Seconds that a step should take, all its substeps together."""
 
 _EPISODE = 10.0
 """Seconds of an episode."""
 
-_WIDTH = 114
-"""Columns of a comment that lists names."""
+_NAMES = 8
+"""Names of elements of one kind that a comment lists."""
+
+_WIDTH = 118
+"""Columns of a comment after its sign."""
 
 _ELEMENTS = {
     "bodies": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
@@ -22,7 +25,15 @@ _ELEMENTS = {
     "actuators": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nactuator"),
     "keyframes": (mujoco.mjtObj.mjOBJ_KEY, "nkey"),
 }
-"""The kinds of elements whose names a comment lists, with the fields of MjModel that count them."""
+"""The kinds of elements that a comment names, with the fields of MjModel that hold their numbers."""
+
+_Sensor = mujoco.mjtSensor
+
+_UNOBSERVED = (_Sensor.mjSENS_USER, _Sensor.mjSENS_PLUGIN, _Sensor.mjSENS_CLOCK)
+"""Sensors that say nothing about the state of the robot, or nothing without code of the user's own."""
+
+_FREE_SENSORS = (_Sensor.mjSENS_FRAMEQUAT, _Sensor.mjSENS_GYRO, _Sensor.mjSENS_FRAMEANGVEL)
+"""Sensors on a floating body of which one shows that the model's author measures its motion."""
 
 
 def task_text(file: str, class_name: str, source: str, title: str, model: mujoco.MjModel) -> str:
@@ -32,7 +43,7 @@ def task_text(file: str, class_name: str, source: str, title: str, model: mujoco
         file: The name of the file.
         class_name: The name of the task's class.
         source: The model as an expression in Python, such as ``"robot.xml"`` with its quotes.
-        title: The model's name in the docstring.
+        title: What the docstring calls the model.
         model: The compiled model.
     """
     fields, parts, put = _observation(model)
@@ -66,24 +77,77 @@ def _has_other_ranges(model: mujoco.MjModel) -> bool:
 
 
 def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list[str]]:
-    """The fields of World, the parts of the observation with their sizes, and the lines that write it."""
-    found = {"position": ("qpos", model.nq), "velocity": ("qvel", model.nv), "activation": ("act", model.na),
-             "sensors": ("sensordata", model.nsensordata)}  # fmt: skip
-    found = {name: (field, size) for name, (field, size) in found.items() if size}
-    fields = [f"{field}: Row[float]" for field, _ in found.values()]
-    put = [f"k = lw.put(obs, {'k' if i else '0'}, s.{field})" for i, (field, _) in enumerate(found.values())]
+    """The fields of World, the parts of the observation with their sizes, and the lines that write it.
+
+    The sensors alone where they measure every joint; otherwise positions and velocities, with the sensors after them.
+    """
+    fields = ["qpos: Row[float]", "qvel: Row[float]"]
+    sensed = _sensor_places(model)
+    parts: dict[str, int] = {}
+    rows: list[str] = []
+    if not (sensed and _all_joints_are_sensed(model)):
+        parts |= {"position": model.nq, "velocity": model.nv}
+        rows += ["s.qpos", "s.qvel"]
+    if model.na:
+        fields.append("act: Row[float]")
+        parts["activation"] = model.na
+        rows.append("s.act")
+    if sensed:
+        fields.append("sensordata: Row[float]")
+        parts["sensors"] = sum(last - first for first, last in sensed)
+        whole = sensed == [(0, model.nsensordata)]
+        rows += ["s.sensordata"] if whole else [f"s.sensordata, {first}, {last}" for first, last in sensed]
+    at = ["0", *["k"] * (len(rows) - 1)]
+    put = [f"k = lw.put(obs, {k}, {row})" for k, row in zip(at, rows, strict=True)]
     put[-1] = put[-1].removeprefix("k = ")
-    return fields, {name: size for name, (_, size) in found.items()}, put
+    return fields, parts, put
+
+
+def _sensor_places(model: mujoco.MjModel) -> list[tuple[int, int]]:
+    """The places in sensordata that are observed, as (first, last), with first <= i < last."""
+    places: list[tuple[int, int]] = []
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
+        return places
+    for kind, start, size in np.stack([model.sensor_type, model.sensor_adr, model.sensor_dim], axis=1).tolist():
+        if kind in _UNOBSERVED or not size:
+            continue
+        if places and places[-1][1] == start:
+            places[-1] = places[-1][0], start + size
+        else:
+            places.append((start, start + size))
+    return places
+
+
+def _all_joints_are_sensed(model: mujoco.MjModel) -> bool:
+    """Whether sensors measure the position and the velocity of every joint, and the motion of every floating body."""
+    sensors = list(zip(model.sensor_type.tolist(), model.sensor_objtype.tolist(), model.sensor_objid.tolist(),
+                       strict=True))  # fmt: skip
+    objects = {kind: {i for found, _, i in sensors if found == kind} for kind in set(model.sensor_type.tolist())}
+    bodies = set()
+    for kind, objtype, i in sensors:
+        if kind in _FREE_SENSORS:
+            bodies.add(int(model.site_bodyid[i]) if objtype == mujoco.mjtObj.mjOBJ_SITE else i)
+    wanted = {
+        mujoco.mjtJoint.mjJNT_HINGE: (_Sensor.mjSENS_JOINTPOS, _Sensor.mjSENS_JOINTVEL),
+        mujoco.mjtJoint.mjJNT_SLIDE: (_Sensor.mjSENS_JOINTPOS, _Sensor.mjSENS_JOINTVEL),
+        mujoco.mjtJoint.mjJNT_BALL: (_Sensor.mjSENS_BALLQUAT, _Sensor.mjSENS_BALLANGVEL),
+    }
+    for joint, kind in enumerate(model.jnt_type.tolist()):
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            if int(model.jnt_bodyid[joint]) not in bodies:
+                return False
+        elif not all(joint in objects.get(int(sensor), ()) for sensor in wanted[mujoco.mjtJoint(kind)]):
+            return False
+    return True
 
 
 def _elements(model: mujoco.MjModel) -> str:
-    """A comment with the names of the model's elements, and an example of their use."""
+    """A comment that names the model's elements, with an example of their use."""
     names = {kind: [name for name in _names(model, kind) if name.isprintable() and name] for kind in _ELEMENTS}
     names["bodies"] = [name for name in names["bodies"] if name != "world"]
     mocap = {name for i, name in enumerate(_names(model, "bodies")) if model.body_mocapid[i] >= 0}
     names["mocap bodies"] = [name for name in names["bodies"] if name in mocap]
-    lines = [textwrap.shorten(f"{kind}: {', '.join(found)}", _WIDTH, placeholder=" ...")
-             for kind, found in names.items() if found]  # fmt: skip
+    lines = [line for kind, found in names.items() for line in _listed(kind, found)]
     if not lines:
         return ""
     element, field = ("site", "site_xpos") if names["sites"] else ("body", "xpos")
@@ -93,15 +157,25 @@ def _elements(model: mujoco.MjModel) -> str:
         "Names in the model. A default in Params turns one into an index, as in",
         f"    {example}",
         f"with {field} in World, s.{field}[p.tip] then is a position; lw.joint, lw.sensor, ... find the other kinds",
-        *(f"  {line}" for line in lines),
+        *lines,
     ]
     return "".join(f"# {line}\n" for line in comment) + "\n\n"
 
 
 def _names(model: mujoco.MjModel, kind: str) -> list[str]:
-    """Names of all elements of a kind; "" for an element without a name."""
+    """Names of all elements of a kind; empty for those without one."""
     objtype, count = _ELEMENTS[kind]
     return [mujoco.mj_id2name(model, objtype, i) or "" for i in range(getattr(model, count))]
+
+
+def _listed(kind: str, names: list[str]) -> list[str]:
+    """A line with the first names of a kind, as many as fit; no line where there are no names."""
+    for shown in range(min(len(names), _NAMES), 0, -1):
+        rest = f", ... ({len(names)} in all)" if shown < len(names) else ""
+        line = f"  {kind}: {', '.join(names[:shown])}{rest}"
+        if len(line) <= _WIDTH:
+            return [line]
+    return []
 
 
 def _indented(lines: list[str]) -> str:
@@ -109,7 +183,7 @@ def _indented(lines: list[str]) -> str:
 
 
 def literal(text: str) -> str:
-    """Format a text as a Python literal in double quotes."""
+    """A text as a literal of Python, in double quotes."""
     return json.dumps(text, ensure_ascii=False)
 
 

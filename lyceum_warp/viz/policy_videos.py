@@ -1,4 +1,4 @@
-"""Write videos of a policy during and after its training."""
+"""Videos of a policy, at the end of its training and on the way."""
 
 import logging
 from collections.abc import Callable
@@ -13,22 +13,23 @@ from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import Policy
 from lyceum_warp.env import Env
 from lyceum_warp.viz.cameras import CameraChoice
+from lyceum_warp.viz.tensorboard import TensorBoard
 from lyceum_warp.viz.video import Progress, episode, write_video
 
 log = logging.getLogger(__name__)
 
 NamedProgress: TypeAlias = Callable[[str, str, int, int], object]
-"""Called with the name of the work, its unit, the number of units done, and their total number."""
+"""Called with what is done, the unit in which it is counted, how much is done, and how much there is in all."""
 
 
 def policy_states(env: Env, policy: Policy, seed: int, *, progress: Progress | None = None) -> tuple[Env, torch.Tensor]:
-    """Run an episode of a policy in a new world; returns its environment, and the states for ``write_video``.
+    """Run an episode of a policy in a world of its own; returns its environment, and the states for ``write_video``.
 
     Args:
         env: An environment of the policy's task.
         policy: The policy.
         seed: Seed of the initial state.
-        progress: Called regularly with the number of steps so far and the horizon.
+        progress: Called now and then with the number of steps so far and the horizon.
     """
     one = evaluation_worlds(env, 1, autoreset=False)
     policy = moved(policy, one) if isinstance(policy, torch.nn.Module) else policy
@@ -36,27 +37,28 @@ def policy_states(env: Env, policy: Policy, seed: int, *, progress: Progress | N
 
 
 class Videos:
-    """Writes a video of the mean policy every few iterations.
+    """Writes a video of the mean policy every few iterations, and shows it in TensorBoard.
 
-    If a video fails, for example on a machine that cannot draw, ``note`` gets one line, there are no further videos,
-    and training continues.
+    An error, as on a machine that cannot draw a video or convert it for TensorBoard, is reported once; there are no
+    further videos then, and training goes on.
 
     Args:
         learner: The algorithm.
-        folder: Folder of the videos, whose names are the numbers of their iterations.
+        folder: Folder of the videos, which have the numbers of their iterations.
         every: Iterations between two videos; 0 for none.
-        seed: Seed of the initial state in all videos.
+        seed: Seed of the initial state, the same for all videos.
+        board: TensorBoard's writer, if there is one.
         camera: The camera; see ``write_video``.
         note: Called with the line that reports an error.
-        progress: Called regularly while a video is made.
+        progress: Called now and then while a video is made.
     """
 
     def __init__(
-        self, learner: Learner, folder: Path, every: int, seed: int, *,
+        self, learner: Learner, folder: Path, every: int, seed: int, board: TensorBoard | None, *,
         camera: CameraChoice = None, note: Callable[[str], object] = log.warning,
         progress: NamedProgress | None = None,
     ) -> None:  # fmt: skip
-        self.learner, self.folder, self.every, self.seed = learner, folder, every, seed
+        self.learner, self.folder, self.every, self.seed, self.board = learner, folder, every, seed, board
         self.camera, self.note, self.progress = camera, note, progress
 
     def __call__(self, iteration: Iteration) -> None:
@@ -69,7 +71,9 @@ class Videos:
                 self.learner.env, self.learner.policy, self.seed, progress=self._progress("running an episode", "steps")
             )
             write_video(env, states, path, camera=self.camera, progress=self._progress("drawing the video", "frames"))
-        except Exception as error:  # a failed video must not end the training
+            if self.board is not None:
+                self.board.video(path, iteration.samples)
+        except Exception as error:  # of any kind: the training is worth more than its video
             self.note(f"no further videos ({one_line(error)})")
             self.every = 0
 

@@ -1,12 +1,14 @@
-"""Write a run's curves and hyperparameters for TensorBoard, with the extra ``tensorboard``.
+"""Curves, hyperparameters and videos of a run for TensorBoard. They need the extra ``tensorboard``.
 
-``metrics.csv`` holds the same numbers.
+``metrics.csv`` holds the same numbers; the files written here are a copy for another viewer.
 """
 
 import importlib.util
 import json
 import math
 import os
+import struct
+import subprocess
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -20,7 +22,7 @@ EXTRA = "pip install 'lyceum-warp[tensorboard]'"
 _GROUPS = {
     "mean_": "mean_policy", "return_": "return", "value_": "value", "time_": "time", "metrics/": "metrics",
 }  # fmt: skip
-"""Groups of curves, by prefixes of columns in metrics.csv."""
+"""Groups of curves by the beginnings of their columns in metrics.csv."""
 
 _TAGS = {
     "iteration": "time/iteration", "samples": "time/samples", "samples_per_second": "time/samples_per_second",
@@ -29,19 +31,22 @@ _TAGS = {
     "skipped_updates": "policy/skipped_updates", "reward_mean": "return/reward",
     "explained_variance": "value/explained_variance",
 }  # fmt: skip
-"""Names of the other curves, by column."""
+"""Names of curves that do not follow from the columns."""
 
 _COMPARED = ("return/mean", "mean_policy/return", "episode/eval", "episode/success")
-"""The curves whose last values appear in the tab HPARAMS."""
+"""The curves whose last values the tab of hyperparameters shows."""
+
+_VIDEO_WIDTH, _VIDEO_RATE = 320, 15
 
 
 class TensorBoard:
-    """Writes the iterations of a run for TensorBoard. The horizontal axis counts samples.
+    """Writes a run's iterations where TensorBoard reads them; the horizontal axis counts samples.
 
-    Every number of an iteration is a curve in one of the groups return/, episode/, mean_policy/, policy/, value/, time/
+    Every number of an iteration is a curve, named by its group: return/, episode/, mean_policy/, policy/, value/, time/
     and metrics/. The hyperparameters appear in the tabs HPARAMS and TEXT.
 
-    If the folder already holds curves, new iterations replace their points from the same samples on.
+    In a folder that already holds curves, the curves continue: what they hold from the samples of the first new
+    iteration on is replaced.
 
     Example:
         >>> with TensorBoard(Path("runs/mine"), {"gamma": 0.99}) as board:
@@ -49,7 +54,7 @@ class TensorBoard:
         ...         board(it)
 
     Args:
-        folder: The folder, or a new one, for ``tensorboard --logdir``.
+        folder: The folder; it is made if it does not exist. ``tensorboard --logdir`` takes it, or one above it.
         config: The hyperparameters, which may be nested.
 
     Raises:
@@ -69,37 +74,58 @@ class TensorBoard:
         self.close()
 
     def __call__(self, iteration: Iteration) -> None:
-        """Add an iteration, without numbers that are not finite, such as the return before an episode has ended."""
-        from tensorboard.compat.proto.event_pb2 import Event
+        """Add an iteration. Numbers that are not finite, such as returns where no episode ended, are left out."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         values = []
         for column, number in iteration.row().items():
             if number is not None and math.isfinite(number):
                 values.append(Summary.Value(tag=tag(column), simple_value=number))
-        if self._file is None:
-            self._open(iteration.samples)
-        self._add(Event(step=iteration.samples, summary=Summary(value=values)))
-        self._file.flush()
+        self._write(Summary(value=values), iteration.samples, replaced=iteration.samples)
+
+    def video(self, path: str | Path, samples: int) -> None:
+        """Add a video, reduced to a picture of 320 pixels and 15 frames per second that the tab IMAGES plays.
+
+        Args:
+            path: An mp4 file.
+            samples: Samples in all iterations so far.
+
+        Raises:
+            ImportError: The package imageio-ffmpeg is not installed.
+            ValueError: The file is not a video.
+        """
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        picture = _animation(Path(path))
+        width, height = struct.unpack("<HH", picture[6:10])
+        image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=picture)
+        video = Summary(value=[Summary.Value(tag="video", image=image)])
+        self._write(video, samples, replaced=samples + 1)  # the curves of this iteration stay
 
     def close(self) -> None:
-        """Close the file. The next iteration opens another one."""
+        """Close the file. A later iteration opens another one."""
         if self._file is not None:
             file, self._file = self._file, None
             file.close()
 
+    def _write(self, summary: Any, samples: int, *, replaced: int) -> None:
+        from tensorboard.compat.proto.event_pb2 import Event
+
+        if self._file is None:
+            self._open(replaced)
+        self._add(Event(step=samples, summary=summary))
+        self._file.flush()
+
     def _open(self, replaced: int) -> None:
-        """Open a file. The writers of torch and TensorBoard write in a thread, and lose errors of a full disk."""
+        """Open a file. torch's and TensorBoard's own writers would write it in a thread, which hides a full disk."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
         from torch.utils.tensorboard import RecordWriter
 
-        number = len(
-            list(self._folder.glob("events.out.tfevents.*"))
-        )  # TensorBoard reads files in the order of their names
+        number = len(list(self._folder.glob("events.out.tfevents.*")))  # files are read in the order of their names
         name = f"events.out.tfevents.{int(time.time()):010d}.{number:04d}.{os.getpid()}"
         self._file = RecordWriter((self._folder / name).open("xb"))
         self._add(Event(file_version="brain.Event:2"))
-        if number:  # TensorBoard drops points of earlier files from this step on
+        if number:  # TensorBoard leaves out points of earlier files from this step on
             self._add(Event(step=replaced, session_log=SessionLog(status=SessionLog.START)))
         else:
             for summary in _hyperparameters(self._config):
@@ -121,7 +147,7 @@ def check_tensorboard() -> None:
 
 
 def tag(column: str) -> str:
-    """The name of a curve for a column of ``metrics.csv``."""
+    """The name of a curve, by the column of ``metrics.csv`` that has its numbers."""
     if column in _TAGS:
         return _TAGS[column]
     for beginning, group in _GROUPS.items():
@@ -131,7 +157,7 @@ def tag(column: str) -> str:
 
 
 def _hyperparameters(config: Mapping[str, Any]) -> list[Any]:
-    """The summaries of the tabs HPARAMS and TEXT."""
+    """What the tabs HPARAMS and TEXT show."""
     from tensorboard.plugins.hparams.summary_v2 import HParam, Metric, hparams_config_pb, hparams_pb
     from tensorboard.plugins.text.summary_v2 import text_pb
 
@@ -142,9 +168,25 @@ def _hyperparameters(config: Mapping[str, Any]) -> list[Any]:
 
 
 def _flat(config: Mapping[str, Any]) -> Iterator[tuple[str, bool | float | str]]:
-    """Flatten the hyperparameters for TensorBoard, without None."""
+    """The hyperparameters without nesting, as TensorBoard takes them; None is left out."""
     for name, value in config.items():
         if isinstance(value, Mapping):
             yield from _flat(value)
         elif value is not None:
             yield name, value if isinstance(value, (bool, int, float, str)) else str(value)
+
+
+def _animation(path: Path) -> bytes:
+    """A small GIF of a video."""
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+    except ImportError as error:
+        raise ImportError("videos for TensorBoard need imageio-ffmpeg: pip install 'lyceum-warp[viz]'") from error
+    colours = "split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
+    filters = f"fps={_VIDEO_RATE},scale={_VIDEO_WIDTH}:-2,{colours}"
+    command = [get_ffmpeg_exe(), "-v", "error", "-i", str(path), "-filter_complex", filters, "-f", "gif", "-"]
+    done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL)
+    if done.returncode or not done.stdout.startswith(b"GIF8"):
+        lines = done.stderr.decode(errors="replace").strip().splitlines() or ["ffmpeg gave no picture"]
+        raise ValueError(f"{path} is not a video that ffmpeg reads ({lines[-1][:160]})")
+    return done.stdout

@@ -38,13 +38,21 @@ def draws() -> bool:
 
 
 THEIRS = ("is -infinity. This is probably too low", "is infinity. This is probably too high")
-"""The checker's warnings about observations without bounds, also of Gymnasium's own robots."""
+"""What the checker says of every observation without bounds, those of Gymnasium's own robots included."""
 
 
 def test_gymnasiums_checker_has_no_complaint(hopper: gymnasium.Env, draws: bool) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(hopper.unwrapped, skip_render_check=not draws)
+    said = [str(warning.message) for warning in caught]
+    assert not [text for text in said if not any(known in text for known in THEIRS)]
+
+
+def test_the_checker_accepts_groups_of_observations() -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(GymnasiumEnv(Full), skip_render_check=True)
     said = [str(warning.message) for warning in caught]
     assert not [text for text in said if not any(known in text for known in THEIRS)]
 
@@ -87,6 +95,13 @@ def test_wrappers_of_gymnasium_work(hopper: gymnasium.Env) -> None:
     assert info["episode"]["l"] == 5
 
 
+def test_gymnasiums_own_vector_environments_take_it() -> None:
+    envs = gymnasium.make_vec("lyceum_warp.gym:lyceum/PointMass-v0", num_envs=2, vectorization_mode="sync")
+    obs, _ = envs.reset()
+    assert (obs[0] != obs[1]).any()
+    envs.step(envs.action_space.sample())
+
+
 def test_a_maximal_number_of_steps_is_gymnasiums(hopper: gymnasium.Env) -> None:
     env = gymnasium.make("lyceum_warp.gym:lyceum/Hopper-v0", max_episode_steps=2)
     env.reset(seed=0)
@@ -96,6 +111,21 @@ def test_a_maximal_number_of_steps_is_gymnasiums(hopper: gymnasium.Env) -> None:
     envs.reset(seed=0)
     ends = [envs.step(np.zeros((2, 3), dtype=np.float32))[3].all() for _ in range(2)]
     assert ends == [False, True]
+
+
+@pytest.mark.parametrize(
+    "action, message",
+    [
+        (np.zeros(2, dtype=np.float32), r"float32 array of shape \(3,\), not a float32 array of shape \(2,\)"),
+        (np.zeros((1, 3), dtype=np.float32), r"not a float32 array of shape \(1, 3\)"),
+        (np.zeros(3, dtype=int), r"float32 array of shape \(3,\), not a int64 array of shape \(3,\)"),
+        (torch.zeros(3), r"not a float32 tensor of shape \(3,\)"),
+    ],
+)
+def test_an_action_that_does_not_fit_is_refused(action: Any, message: str, hopper: gymnasium.Env) -> None:
+    hopper.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        hopper.unwrapped.step(action)
 
 
 def test_a_step_before_a_reset_is_refused() -> None:

@@ -3,6 +3,7 @@
 import gc
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -11,6 +12,7 @@ import pytest
 import torch
 from full_task import Full
 from gymnasium import wrappers
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 import lyceum_warp as lw
@@ -124,6 +126,15 @@ def check_final(infos: dict[str, Any], step: dict[str, np.ndarray], tensors: boo
             np.testing.assert_array_equal(final["critic"], step["final_critic"][world])
 
 
+def test_results_of_a_step_do_not_change_with_the_next(hopper: GymnasiumVectorEnv) -> None:
+    hopper.reset(seed=0)
+    first = hopper.step(np.ones((N, 3), dtype=np.float32))
+    before = [value.copy() for value in first[:4]]
+    second = hopper.step(np.ones((N, 3), dtype=np.float32))
+    assert all(np.array_equal(a, b) for a, b in zip(before, first, strict=False))
+    assert not np.shares_memory(first[0], second[0])
+
+
 def test_without_copies_results_are_the_buffers(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(torch=True, copy=False)
     obs, _ = envs.reset(seed=0)
@@ -151,6 +162,15 @@ def test_a_disabled_reset_leaves_ended_worlds_until_the_mask_resets_them(
     assert (reset["policy"][ended] != obs["policy"][ended]).any()
     assert not envs.env.done.any() and (infos["done_reason"] == 0).all()
     assert (envs.env.episode_step.numpy()[ended] == 0).all()
+
+
+def test_a_mask_may_be_a_tensor(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    envs = vector(torch=True)
+    before, _ = envs.reset(seed=1)
+    mask = torch.tensor([True, False, False, True])
+    after, _ = envs.reset(options={"reset_mask": mask})
+    torch.testing.assert_close(after["policy"][~mask], before["policy"][~mask], rtol=0, atol=0)
+    assert (after["policy"][mask] != before["policy"][mask]).any()
 
 
 @pytest.mark.parametrize("tensors", [False, True], ids=["numpy", "torch"])
@@ -217,6 +237,19 @@ def test_the_first_reset_without_a_seed_draws_one(hopper: GymnasiumVectorEnv) ->
     np.testing.assert_array_equal(first(seed=3), first(seed=3))
 
 
+def test_spaces_have_the_bounds_of_the_environment(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    envs = vector()
+    assert envs.single_action_space == gymnasium.spaces.Box(-1, 1, (3,), np.float32)
+    assert {name: space.shape for name, space in envs.observation_space.items()} == {
+        "policy": (N, 3),
+        "critic": (N, 10),
+    }
+    obs, _ = envs.reset(seed=0)
+    assert obs in envs.observation_space
+    assert vector(dict_obs=False).single_observation_space.shape == (3,)
+    assert GymnasiumVectorEnv("hopper", dict_obs=True).single_observation_space["policy"].shape == (11,)
+
+
 # Gymnasium's wrappers
 
 
@@ -234,6 +267,18 @@ def test_statistics_of_episodes_are_those_of_the_steps(hopper: GymnasiumVectorEn
             np.testing.assert_array_equal(infos["episode"]["l"][ended], lengths[ended])
         returns[ended], lengths[ended], episodes = 0, 0, episodes + ended.sum()
     assert episodes > 3 and envs.episode_count == episodes
+
+
+def test_a_wrapper_passes_the_mask_of_a_partial_reset_on(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    envs = wrappers.vector.RecordEpisodeStatistics(vector(autoreset_mode=AutoresetMode.DISABLED))
+    envs.reset(seed=5)
+    lengths = []
+    for action in actions():
+        *_, terminated, truncated, infos = envs.step(action)
+        if (ended := terminated | truncated).any():
+            lengths += infos["episode"]["l"][ended].tolist()
+            envs.reset(options={"reset_mask": ended})
+    assert len(lengths) > 3 and max(lengths) == 20
 
 
 OBSERVATION_WRAPPERS = {
@@ -294,6 +339,10 @@ def test_a_picture_shows_each_world_as_it_is(vector: Callable[..., GymnasiumVect
     envs.close()
 
 
+def test_without_a_render_mode_there_is_no_picture(hopper: GymnasiumVectorEnv) -> None:
+    assert hopper.render() is None
+
+
 # cost
 
 
@@ -342,6 +391,59 @@ def test_actions_that_do_not_fit_are_refused(action: Any, message: str, hopper: 
 
 
 @pytest.mark.parametrize(
+    "action, message",
+    [
+        (
+            torch.zeros(4, 2),
+            r"actions must be a float32 tensor of shape \(4, 3\), not a float32 tensor of shape \(4, 2\)",
+        ),
+        (torch.zeros(4, 3, dtype=torch.float64), r"actions must be a float32 tensor .*, not a float64 tensor"),
+        (torch.zeros(4, 3, device="meta"), r"actions must lie on cpu, not on meta: move it with .to\(\)"),
+        (np.zeros((4, 3), dtype=np.float32), r"actions must be a float32 tensor .*, not a ndarray .*: torch=True"),
+    ],
+)
+def test_tensors_that_do_not_fit_are_refused(
+    action: Any, message: str, vector: Callable[..., GymnasiumVectorEnv]
+) -> None:
+    envs = vector(torch=True)
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        envs.step(action)
+
+
+def test_a_step_before_a_reset_is_refused(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+    with pytest.raises(ResetNeeded, match="there was no reset before this step: call reset"):
+        vector().step(np.zeros((N, 3), dtype=np.float32))
+
+
+@pytest.mark.parametrize("seed", [None, 3])
+def test_a_reset_of_some_worlds_before_one_of_all_is_refused(
+    seed: int | None, vector: Callable[..., GymnasiumVectorEnv]
+) -> None:
+    with pytest.raises(ResetNeeded, match="no reset came before this reset_mask: call reset.. without it first"):
+        vector().reset(seed=seed, options={"reset_mask": np.array([True, False, False, False])})
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"mask": 1}, r"reset has no option 'mask': it takes options={\"reset_mask\": mask}"),
+        ({"reset_mask": np.ones(3, dtype=bool)}, r"the reset_mask must be a bool tensor of shape \(4,\), not a bool"),
+        ({"reset_mask": np.ones(4)}, r"the reset_mask must be a bool tensor of shape \(4,\), not a ndarray"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(options: dict[str, Any], message: str, hopper: GymnasiumVectorEnv) -> None:
+    with pytest.raises(ValueError, match=message):
+        hopper.reset(options=options)
+
+
+@pytest.mark.parametrize("seed", [-1, [1, 2, 3, 4], 0.5])
+def test_a_seed_that_is_not_a_whole_number_is_refused(seed: Any, hopper: GymnasiumVectorEnv) -> None:
+    with pytest.raises(ValueError, match="seed must be a whole number"):
+        hopper.reset(seed=seed)
+
+
+@pytest.mark.parametrize(
     "options, message",
     [
         ({"num_envs": 0}, "num_envs must be a whole number from 1"),
@@ -366,3 +468,16 @@ def test_an_environment_that_does_not_fit_is_refused(made: Callable[..., lw.Env]
     with pytest.raises(ValueError, match="has autoreset=True: make it with autoreset=False"):
         GymnasiumVectorEnv(made(), autoreset_mode=AutoresetMode.DISABLED)
     assert GymnasiumVectorEnv(made(autoreset=False)).autoreset_mode is AutoresetMode.DISABLED
+
+
+@pytest.mark.parametrize("argument", ["wrappers", "vector_kwargs"])
+def test_arguments_for_another_vector_environment_are_refused(argument: str) -> None:
+    given: Any = {"wrappers": [gymnasium.wrappers.ClipAction], "vector_kwargs": {"copy": False}}[argument]
+    with pytest.raises(gymnasium.error.Error, match=f"{argument}") as error:
+        gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=2, **{argument: given})
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_with_a_task_makes_a_vector_environment(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="there is no task file"):
+        GymnasiumVectorEnv(str(tmp_path / "none.py"))

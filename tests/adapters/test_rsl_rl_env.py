@@ -1,5 +1,9 @@
 """An environment under rsl_rl's own runner, and what its VecEnv gives."""
 
+import importlib
+import importlib.metadata
+import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -30,6 +34,11 @@ def test_a_step_gives_all_groups_and_the_buffers(env: lw.Env) -> None:
     for group in ("policy", "critic"):
         assert torch.equal(obs[group], env.obs_groups[group])
         assert torch.equal(extras["final_obs"][group], env.final_obs_groups[group])
+
+
+def test_a_task_is_made_with_its_options() -> None:
+    worlds = RslRlVecEnv(Metered, 3, horizon=7, far=2.0)
+    assert (worlds.num_envs, worlds.max_episode_length, worlds.cfg["params"]) == (3, 7, {"far": 2.0})
 
 
 def test_observations_survive_the_next_step(env: lw.Env) -> None:
@@ -143,7 +152,36 @@ def test_rsl_rls_own_runner_learns(tmp_path: Path) -> None:
     assert list(tmp_path.glob("model_*.pt"))  # its own checkpoints
 
 
+def test_rsl_rls_writer_gets_the_metrics(env: lw.Env, tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    config = runner_config(env, lw.PPOConfig(hidden=(8,), value_hidden=(8,), num_steps=10))
+    OnPolicyRunner(RslRlVecEnv(env), config, str(tmp_path), "cpu").learn(2)
+    found = EventAccumulator(str(tmp_path)).Reload().Tags()["scalars"]
+    assert {"metrics/forward", "metrics/effort", "faults/worlds", "Train/mean_reward"} <= set(found)
+
+
 # what is installed
+
+
+@pytest.mark.parametrize("release, found", [
+    (None, "this adapter needs the package rsl-rl-lib: "),
+    ("5.3.0", "this adapter needs rsl-rl-lib from 5.4.2 to below 6, and 5.3.0 is installed: "),
+    ("6.0.0", "this adapter needs rsl-rl-lib from 5.4.2 to below 6, and 6.0.0 is installed: "),
+])  # fmt: skip
+def test_a_missing_extra_and_another_major_version_are_one_line(
+    release: str | None, found: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def version(name: str) -> str:
+        if release is None:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return release
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    for name in [name for name in sys.modules if name.startswith("lyceum_warp.adapters.rsl_rl")]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(ImportError, match=f"^{re.escape(found)}pip install 'lyceum-warp.rsl-rl.'$"):
+        importlib.import_module("lyceum_warp.adapters.rsl_rl_env")
 
 
 @pytest.mark.gpu

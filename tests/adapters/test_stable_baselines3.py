@@ -1,17 +1,23 @@
 """Many worlds as Stable-Baselines3's vector environment: its numbers, its learners, its wrappers, its errors."""
 
+import warnings
+from typing import Any
+
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from full_task import Full
 from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import lyceum_warp as lw
 from lyceum_warp.adapters.stable_baselines3 import StableBaselines3VecEnv
+from lyceum_warp.gym import GymnasiumEnv
+from lyceum_warp.viz.video import NoVideoError
 
 N = 4
 
@@ -65,6 +71,21 @@ def test_a_fault_truncates_the_episode_with_its_last_good_observation(hopper: St
     np.testing.assert_array_equal(infos[1]["terminal_observation"], before[1])
 
 
+def test_only_ended_worlds_cost_a_dictionary(hopper: StableBaselines3VecEnv) -> None:
+    hopper.reset()
+    *_, first = hopper.step(np.zeros((N, 3), dtype=np.float32))
+    *_, second = hopper.step(np.zeros((N, 3), dtype=np.float32))
+    assert first == [{}] * N and all(a is b for a, b in zip(first, second, strict=True)) and first is not second
+
+
+def test_results_of_a_step_do_not_change_with_the_next(hopper: StableBaselines3VecEnv) -> None:
+    hopper.reset()
+    obs, reward, *_ = hopper.step(np.ones((N, 3), dtype=np.float32))
+    kept = obs.copy(), reward.copy()
+    hopper.step(np.ones((N, 3), dtype=np.float32))
+    assert np.array_equal(kept[0], obs) and np.array_equal(kept[1], reward)
+
+
 def test_ppo_updates_its_policy_and_keeps_statistics_of_episodes(hopper: StableBaselines3VecEnv) -> None:
     model = PPO("MlpPolicy", hopper, n_steps=64, batch_size=64, n_epochs=2, seed=0, device="cpu")
     before = [parameter.clone() for parameter in model.policy.parameters()]
@@ -84,6 +105,12 @@ def test_an_off_policy_learner_stores_the_last_observation_and_no_time_limit(ful
     assert len(ended)
     for step, world in ended:  # the next observation is not the first one of the next episode
         assert (buffer.next_observations[step, world] != buffer.observations[step + 1, world]).any()
+
+
+def test_stable_baselines3s_checker_accepts_a_single_world() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(GymnasiumEnv("hopper"), skip_render_check=True)
 
 
 def test_vector_wrappers_work(hopper: StableBaselines3VecEnv) -> None:
@@ -147,6 +174,30 @@ def test_groups_of_observations_are_a_dict_on_demand(full: StableBaselines3VecEn
     assert obs["critic"].shape == (N, 10) and env.observation_space["critic"].shape == (10,)
     model = PPO("MultiInputPolicy", env, n_steps=25, batch_size=50, n_epochs=1, device="cpu")
     model.learn(100)
+
+
+def test_a_picture_shows_all_worlds() -> None:
+    env = StableBaselines3VecEnv("hopper", N, render_mode="rgb_array", render_size=(64, 48))
+    try:
+        assert env.render().shape == (2 * 48, 2 * 64, 3)
+    except NoVideoError as error:
+        pytest.skip(str(error))
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize(
+    "action, message",
+    [
+        (np.zeros((N, 2), dtype=np.float32), r"float32 array of shape \(4, 3\), not a float32 array of shape \(4, 2\)"),
+        (np.zeros((N, 3), dtype=int), r"not a int64 array of shape \(4, 3\)"),
+        (torch.zeros(N, 3), r"not a float32 tensor of shape \(4, 3\)"),
+    ],
+)
+def test_actions_that_do_not_fit_are_refused(action: Any, message: str, hopper: StableBaselines3VecEnv) -> None:
+    hopper.reset()
+    with pytest.raises(ValueError, match=message):
+        hopper.step(action)
 
 
 def test_a_step_before_a_reset_and_unknown_options_are_refused(full: StableBaselines3VecEnv) -> None:

@@ -8,8 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
-from arbitrary_models import ARM, BALL, MODEL_CHECKS, MOVING, SENSING, actuated, text
+from arbitrary_models import ARM, BALL, MODEL_CHECKS, MOVING, PLUGINS, SENSING, actuated, text
 from training_runs import refused
 
 import lyceum_warp as lw
@@ -35,7 +34,15 @@ RICH = text(
     + '<sensor><gyro site="end"/><clock/><touch site="end"/><user dim="2"/></sensor>'
     '<keyframe><key name="home" qpos=".3 -.3  0 0 .1 1 0 0 0  1 0 0 0" ctrl=".5 0 0" mpos=".2 0 .5"/></keyframe>',
 )
-# without checks that take long for every model
+SENSED = text(
+    ARM + '<body name="robot" pos="0 0 .1"><freejoint/><geom size=".1"/><site name="imu"/></body>',
+    actuated('<motor joint="hinge"/>')
+    + '<sensor><gyro site="imu"/><jointpos joint="hinge"/><jointvel joint="hinge"/><jointpos joint="wrist"/>'
+    '<jointvel joint="wrist"/></sensor>',
+)
+"""Its sensors measure every joint, and the motion of the body that floats."""
+
+# without those that take long, whatever the model
 QUICK_CHECKS = tuple(check for check in CHECKS if check not in (episodes.check_memory, bounds.check_bounds))
 
 
@@ -63,17 +70,37 @@ def test_a_new_task_keeps_the_rules_on_both_engines(engine: str, folder: Path) -
     check_task(str(file), engine=engine, nworld=2, horizon=6, frame_skip=1, checks=MODEL_CHECKS)
 
 
-def test_a_new_task_observes_the_state_and_the_sensors(folder: Path) -> None:
+def test_a_new_task_observes_the_state_and_those_sensors_that_measure_it(folder: Path) -> None:
     env = lw.make(str(new("everything", RICH)), nworld=2, seed=3)
     task = env.task.task
-    assert task.obs == {"position": 13, "velocity": 11, "activation": 1, "sensors": 7}
+    assert task.obs == {"position": 13, "velocity": 11, "activation": 1, "sensors": 4}
     assert (task.frame_skip, task.horizon, task.keyframe, task.action_range) == (4, 500, "home", (-1.0, 1.0))
     assert env.field("qpos", "hinge")[0] == pytest.approx(0.3)
-    wanted = [env.field(name)[0].float() for name in ("qpos", "qvel", "act", "sensordata")]
-    torch.testing.assert_close(env.obs[0], torch.cat(wanted))
+    state = [env.field(name)[0].float() for name in ("qpos", "qvel", "act")]
+    measured = env.field("sensordata")[0]  # the gyro's three numbers, the clock, the touch, and two of the user
+    wanted = [*(value for field in state for value in field.tolist()), *measured[:3].tolist(), measured[4].item()]
+    assert env.obs[0].tolist() == pytest.approx(wanted)
     assert env.obs[0, 13:24].abs().max() > 0  # worlds start with different velocities
     env.step()
     assert env.reward.tolist() == [0.0, 0.0]
+
+
+def test_a_model_whose_sensors_measure_every_joint_is_observed_through_them_alone(folder: Path) -> None:
+    task = find_task(new("sensed", SENSED))
+    assert task.obs == {"sensors": 7}
+    unsensed = SENSED.replace('<gyro site="imu"/>', '<gyro site="end"/>')  # the floating body is not measured
+    assert list(find_task(new("unsensed", unsensed)).obs) == ["position", "velocity", "sensors"]
+
+
+@pytest.mark.parametrize("model", [*MOVING.values(), *SENSING.values(), *PLUGINS.values()],
+                         ids=[*MOVING, *SENSING, *PLUGINS])  # fmt: skip
+def test_any_model_gets_a_task_that_fits_it(model: str, folder: Path) -> None:
+    task = BoundTask(find_task(new("walk", model)))
+    sizes = {"position": task.model.nq, "velocity": task.model.nv, "activation": task.model.na}
+    found = dict(task.obs_layout)
+    assert found.pop("sensors", 0) <= task.model.nsensordata
+    assert all(sizes[part] == size for part, size in found.items())
+    assert task.timestep == pytest.approx(0.02)
 
 
 @pytest.mark.long
@@ -82,6 +109,24 @@ def test_a_new_task_observes_the_state_and_the_sensors(folder: Path) -> None:
 def test_a_new_task_of_any_model_keeps_the_rules(model: str, engine: str, folder: Path) -> None:
     file = new("walk", model)
     check_task(str(file), engine=engine, nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
+
+
+def package_models() -> list[Path]:
+    """Models that gymnasium, dm_control and MuJoCo Warp ship, except those without actuators or without their files."""
+    folders = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite", "mujoco_warp": "test_data"}
+    found: list[Path] = []
+    for package, within in folders.items():
+        spec = importlib.util.find_spec(package)
+        if spec is not None and spec.submodule_search_locations:
+            found += sorted(Path(spec.submodule_search_locations[0], within).rglob("*.xml"))
+    return [path for path in found if path.parent.name != "common" and "<actuator" in path.read_text()]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("model", package_models(), ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_a_new_task_of_a_package_s_model_keeps_the_rules(model: Path, folder: Path) -> None:
+    assert cli.main(["new", "walk", "--model", str(model)]) == 0
+    check_task("walk.py", engine="mujoco", nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
 
 
 def test_functions_in_comments_work_once_they_are_taken_in(folder: Path) -> None:
@@ -103,10 +148,10 @@ def test_new_files_are_formatted(folder: Path) -> None:
         pytest.skip("ruff is not installed")
     names = "abcdefghijklmnopqrstuvwxyz"
     many = "".join(f'<site name="{letter * 15}" pos="0 0 1"/>' for letter in names)
-    for name, xml in (("everything", RICH), ("crowd", text(ARM + many))):
+    for name, xml in (("everything", RICH), ("sensed", SENSED), ("crowd", text(ARM + many))):
         new(name, xml)
     assert "  sites: here, aaaaaaaaaaaaaaa, bbb" in Path("crowd.py").read_text()
-    assert " ...\n" in Path("crowd.py").read_text()
+    assert "... (29 in all)" in Path("crowd.py").read_text()
     settings = ["--isolated", "--line-length", "120", "--target-version", "py311"]
     for command in (["format", "--check", *settings], ["check", "--select", "E,W,F,UP,B,SIM", *settings]):
         done = subprocess.run([sys.executable, "-m", "ruff", *command, "."], capture_output=True, text=True)
@@ -160,10 +205,15 @@ def test_a_model_of_a_package_or_of_menagerie_is_named_by_its_source(
         ("hopper", ["'hopper' is taken by a task of the package"]),
         ("2walk", ["can't be named '2walk'", "letters, digits and _"]),
         ("my-walk", ["can't be named 'my-walk'"]),
+        ("class", ["can't be named 'class'"]),
+        ("true", ["can't be named 'true'"]),
         ("größe", ["can't be named 'größe'"]),
+        ("MyWalk", ["can't be named 'MyWalk'", "use 'my_walk'"]),
         ("walk_2", ["can't be named 'walk_2'", "use 'walk2'"]),
         ("world", ["can't be named 'world'", "uses World"]),
         ("torch", ["can't be named 'torch'", "hide the Python module"]),
+        ("random", ["can't be named 'random'", "hide the Python module"]),
+        ("", ["can't be named '.py'"]),
         ("old", ["old.py exists"]),
         ("nowhere/walk", ["no folder nowhere"]),
         ("/proc/walk", ["can't write /proc/walk.py"]),

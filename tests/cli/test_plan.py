@@ -1,6 +1,7 @@
 """lyceum-warp plan, called as a shell would."""
 
 import dataclasses
+import inspect
 import json
 import re
 import signal
@@ -12,21 +13,35 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from conftest import TaskFile
 from rich.console import Console
 from training_runs import QUIET, TINY, interrupted, refused
 
 import lyceum_warp as lw
 from lyceum_warp import Trajectory, cli
+from lyceum_warp.binding.registry import find_task
 from lyceum_warp.cli.display import PlanDisplay
 from lyceum_warp.cli.plan import Settings
 
-# a shell makes background processes, such as these tests, ignore SIGINT
+# tests may run in the background, where a shell makes its children ignore SIGINT
 TAKE_SIGINT = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
 SMALL = ["--horizon", "10", "--samples", "8", "--temperature", "0.01", "--noise", "0.3", "--steps", "40"]
 
 
 def plan(out: Path, *options: str, task: str = "point_mass") -> int:
     return cli.main(["plan", task, "--out", str(out), *SMALL, *options])
+
+
+def test_help_shows_examples_and_every_setting(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["plan", "--help"])
+    assert ended.value.code == 0
+    out = capsys.readouterr().out
+    assert "$ lyceum-warp plan reach" in out
+    settings = [field.name for field in dataclasses.fields(lw.MPPIConfig)]
+    for name in (*settings, "value", "rate", "integrator"):
+        assert f"--{name.replace('_', '-')}" in out, name
+    assert "--real-time, --no-real-time" in out and "(default: the task's)" in out
 
 
 def test_a_run_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -60,6 +75,19 @@ def test_a_video_is_made_of_the_first_episode(tmp_path: Path, capsys: pytest.Cap
     assert Path(video).read_bytes()[4:8] == b"ftyp"
 
 
+def test_an_unknown_camera_is_refused_before_the_folder_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for flags, message in (
+        (["--camera", "side"], "there is no camera 'side': the model has "),
+        (["--camera", "track=elbow"], "the camera cannot track the body 'elbow'"),
+        (["--no-video", "--camera", "0"], "--camera has no effect with --no-video"),
+    ):
+        assert plan(tmp_path / "run", *flags) == 2
+        refused(capsys, message)
+    assert not (tmp_path / "run").exists()
+
+
 def test_real_time_keeps_the_rate_of_the_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path / "run", *QUIET, "--real-time", "--rate", "10") == 0
     assert "async" in capsys.readouterr().out
@@ -82,7 +110,9 @@ def test_a_value_function_of_a_run_changes_plans(tmp_path: Path, capsys: pytest.
     refused(capsys, "nowhere")
     assert not (tmp_path / "none").exists()
     assert plan(tmp_path / "none", "--value", str(run), task="reach") == 2
-    refused(capsys, "value takes 6 observations, and the task 'reach' has 20")
+    refused(capsys, f"--value {run} is a run of the task 'point_mass', not of 'reach'")
+    with pytest.raises(ValueError, match="value takes 6 observations, and the task 'reach' has 20"):
+        lw.MPPI("reach", value=lw.load_value(run))
 
 
 def test_a_planner_param_changes_the_planner_alone(tmp_path: Path) -> None:
@@ -132,26 +162,46 @@ def test_every_update_plans_and_is_named(tmp_path: Path, capsys: pytest.CaptureF
 
 
 @pytest.mark.parametrize("options, words", [
+    (["--horizon", "0"], ["horizon", "0"]),
     (["--samples", "0"], ["samples", "0"]),
     (["--temperature", "0"], ["temperature", "0"]),
+    (["--temperature", "inf"], ["temperature", "inf"]),
     (["--smoothing", "0.25", "0.8", "0.3"], ["smoothing", "unstable"]),
+    (["--noise", "-1"], ["noise", "-1"]),
     (["--noise", "1", "2", "3"], ["noise", "2"]),
+    (["--discount", "1.5"], ["discount", "1.5"]),
     (["--fill", "hold"], ["fill", "hold"]),
+    (["--termination", "maybe"], ["termination", "maybe"]),
     (["--update", "cma"], ["update", "cma", "'cem'"]),
     (["--elites", "3"], ["elites=3", "update='cem'"]),
+    (["--update", "cem", "--elites", "9"], ["elites=9", "samples, which is 8"]),
+    (["--update", "cem", "--min-noise", "1", "2", "3"], ["min_noise", "2 of them"]),
+    (["--knots", "11"], ["knots=11", "horizon, which is 10"]),
     (["--spline", "zero"], ["spline='zero'", "knots=4"]),
+    (["--models", "3"], ["models=3", "'point_mass' draws none"]),
+    (["--risk", "worst"], ["risk='worst'", "models=4"]),
+    (["--replan-every", "0"], ["replan_every", "0"]),
     (["--replan-every", "11"], ["replan_every=11", "a plan of 10 actions"]),
     (["--replan-every", "2", "--real-time"], ["--replan-every 2", "--real-time"]),
     (["--episodes", "0"], ["episodes", "0"]),
+    (["--steps", "0"], ["steps", "0"]),
     (["--rate", "0"], ["rate", "0"]),
     (["--param", "mass=2"], ["mass"]),
+    (["--planner-param", "mass=2"], ["mass"]),
     (["--param", "horizon=9"], ["horizon is an option", "use --steps"]),
+    (["--param", "nthread=2"], ["nthread is an option", "use --nthread"]),
+    (["--param", "frame_skip=3"], ["frame_skip is an option", "use --frame-skip"]),
     (["--planner-param", "horizon=9"], ["horizon is an option", "use --horizon"]),
     (["--planner-param", "nworld=9"], ["nworld is an option", "use --samples"]),
+    (["--nthread", "-1"], ["nthread", "-1"]),
     (["--planner-model", "nowhere.xml"], ["there is no file", str(Path("nowhere.xml").resolve())]),
+    (["--fill", "1", "2", "3"], ["fill", "2 of them"]),
     (["--fill", "1", "zero"], ["fill", "1 zero"]),
+    (["--seed", "-1"], ["seed", "-1"]),
     (["--seed", "2147483647", "--episodes", "2"], ["seed of the last episode", "2147483648"]),
+    (["--engine", "bullet"], ["bullet"]),
     (["--integrator", "rk5"], ["no integrator 'rk5'", "'euler'"]),
+    (["--solver", "iterations=0"], ["solver's iterations", "not 0"]),
     (["--device", "cuda:7"], ["cuda:7"]),
 ])  # fmt: skip
 def test_an_option_out_of_range_is_one_line_and_leaves_no_folder(
@@ -170,6 +220,11 @@ def test_a_folder_that_is_not_empty_is_refused(tmp_path: Path, capsys: pytest.Ca
     (tmp_path / "run" / "config.json").write_text("{}")
     assert plan(tmp_path / "run") == 2
     assert "--resume" not in (error := capsys.readouterr().err) and "holds a run: give another folder" in error
+
+
+def test_an_unknown_task_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["plan", "no_such_task"]) == 2
+    refused(capsys, "no_such_task")
 
 
 def test_an_interrupt_keeps_whole_episodes(tmp_path: Path) -> None:
@@ -211,12 +266,59 @@ def test_an_interrupt_keeps_the_interrupted_episode(
     assert not (out / "report.json").exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "fill"), [(["-0.5"], -0.5), (["-0.5", "0.25"], [-0.5, 0.25]), (["repeat"], "repeat")]
+)
+def test_fill_is_a_word_or_one_number_or_an_action(words: list[str], fill: object, tmp_path: Path) -> None:
+    assert plan(tmp_path / "run", *QUIET, "--steps", "1", "--fill", *words) == 0
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["planner"]["fill"] == fill
+
+
+def test_settings_that_are_not_given_are_those_of_the_task(tmp_path: Path) -> None:
+    argv = ["plan", "reach", "--out", str(tmp_path / "run"), *QUIET, "--steps", "1", "--samples", "7"]
+    assert (
+        cli.main([*argv, "--noise", "0.3", "0.4", "0.5", "0.6", "0.7", "0.8", "0.9", "--smoothing", "1", "0", "0"]) == 0
+    )
+    settings = json.loads((tmp_path / "run" / "config.json").read_text())["planner"]
+    assert (settings["samples"], settings["horizon"], settings["temperature"]) == (7, 16, 0.2)
+    assert settings["noise"] == [0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9] and settings["smoothing"] == [1, 0, 0]
+
+
 def test_every_setting_has_a_flag() -> None:
     flags = [field.name for field in dataclasses.fields(Settings)]
     assert flags == [field.name for field in dataclasses.fields(lw.MPPIConfig)]
     assert Settings().on_top_of(lw.MPPIConfig(horizon=3)) == lw.MPPIConfig(horizon=3)
     given = Settings(noise=(0.25,), fill=("0.5",), horizon=4)  # type: ignore[call-arg]
     assert given.on_top_of(lw.MPPIConfig(samples=3)) == lw.MPPIConfig(samples=3, noise=0.25, fill=0.5, horizon=4)
+
+
+def test_a_parameter_with_the_name_of_a_setting_is_given_by_param(task_file: TaskFile, tmp_path: Path) -> None:
+    origin = Path(inspect.getfile(find_task("point_mass")))
+    source = origin.read_text().replace('"point_mass.xml"', repr(str(origin.with_name("point_mass.xml"))))
+    source = source.replace("@lw.register\n", "").replace("success_distance", "temperature")
+    file = task_file("warm_mass.py", source)
+    options = ["--param", "temperature=0.5", "--temperature", "0.25", "--planner-param", "temperature=0.75"]
+    assert plan(tmp_path / "run", *QUIET, "--steps", "1", *options, task=str(file)) == 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["planner"]["temperature"] == 0.25 and config["params"] == {"temperature": 0.5}
+    assert Trajectory.load(tmp_path / "run" / "episode-000.npz").params["temperature"] == 0.5
+
+
+def test_nthread_is_that_of_the_planner(tmp_path: Path, made_envs: list[lw.Env]) -> None:
+    assert plan(tmp_path / "run", *QUIET, "--steps", "1", "--nthread", "2", "--engine", "mujoco") == 0
+    assert [env.options.nthread for env in made_envs] == [1, 2]
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (config["engine"], config["device"], config["nthread"]) == ("mujoco", "cpu", 2)
+
+
+def test_the_live_display_shows_steps_reward_and_rate(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console(force_terminal=True, width=120)
+    env = lw.make("point_mass", autoreset=False, horizon=3)
+    with PlanDisplay(console, 0, 1, 3, env.timestep) as display:
+        lw.control(env, lambda state, obs: torch.zeros(2), seed=0, on_step=display)
+        display.progress.refresh()
+    shown = capsys.readouterr().out
+    assert all(word in shown for word in ("3/3", "reward", "eval", "Hz", "real time"))
 
 
 def test_the_live_display_shows_the_real_time_factor_or_the_age(capsys: pytest.CaptureFixture[str]) -> None:

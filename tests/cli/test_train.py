@@ -95,6 +95,19 @@ def test_a_video_that_fails_is_one_line_of_a_successful_run(
     assert load(out) is not None
 
 
+def test_an_unknown_camera_is_refused_before_the_folder_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for flags, message in (
+        (["--camera", "side"], "there is no camera 'side': the model has "),
+        (["--camera", "0", "--no-video"], "--camera has no effect with --no-video"),
+        (["--video-every", "-1"], "video_every must be a whole number from 0"),
+    ):
+        assert cli.main(["train", "point_mass", "--out", str(tmp_path / "run"), *TINY, *flags]) == 2
+        refused(capsys, message)
+    assert not (tmp_path / "run").exists()
+
+
 def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     resume = ["train", "--resume", str(trained), *QUIET]
     before = {path: path.read_bytes() for path in trained.iterdir()}
@@ -114,6 +127,23 @@ def test_resume_refuses_other_settings(trained: Path, tmp_path: Path, capsys: py
     assert before == {path: path.read_bytes() for path in trained.iterdir()}
     assert cli.main(["train", "--resume", str(tmp_path / "none")]) == 2
     refused(capsys, "there is no run in")
+
+
+def test_a_resumed_run_shows_the_same(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    pytest.importorskip("tensorboard")
+    assert train(out, "--iterations", "1", "--tensorboard", "--video-every", "50") == 0
+    resume = ["train", "--resume", str(out), *QUIET, "--iterations"]
+    assert cli.main([*resume, "2"]) == 0
+    assert len(list(out.glob("events.out.tfevents.*"))) == 2
+    config = Run.open(out).config
+    assert (config["tensorboard"], config["video_every"]) == (True, 50)
+    assert cli.main([*resume, "3", "--no-tensorboard", "--video-every", "0"]) == 0
+    assert len(list(out.glob("events.out.tfevents.*"))) == 2
+    config = Run.open(out).config
+    assert (config.pop("tensorboard"), config.pop("video_every")) == (False, 0)
+    (out / "config.json").write_text(json.dumps(config))  # of an earlier release
+    assert cli.main([*resume, "4"]) == 0
 
 
 def physics(env: lw.Env) -> tuple[int, int, int, bool]:
@@ -153,6 +183,54 @@ def changed_config(trained: Path, folder: Path, change: Any) -> list[str]:
     return ["train", "--resume", str(folder), "--iterations", "5", *QUIET]
 
 
+def test_a_run_without_saved_physics_has_that_of_the_model(
+    trained: Path, tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]
+) -> None:
+    resume = changed_config(trained, tmp_path / "run", lambda config: config.pop("physics"))
+    assert cli.main([*resume, "--integrator", "rk4"]) == 2
+    refused(capsys, "has integrator None, not rk4")
+    made_envs.clear()
+    assert cli.main(resume) == 0
+    assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2"]) == 0
+    assert {physics(env) for env in made_envs} == {physics(lw.make("point_mass"))}
+
+
+def test_a_run_keeps_the_options_of_its_environment(
+    tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert train(out, "--iterations", "1", "--horizon", "32", "--nthread", "2") == 0
+    config = Run.open(out).config
+    assert (config["options"], config["params"]) == ({"horizon": 32, "nthread": 2}, {})
+    resume = ["train", "--resume", str(out), *QUIET, "--iterations"]
+    assert cli.main([*resume, "2"]) == 0
+    assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
+    assert {(env.horizon, env.options.nthread) for env in made_envs} == {(32, 2)}
+    made_envs.clear()
+    assert cli.main(["eval", str(out), "--episodes", "2", "--horizon", "16", "--nthread", "1"]) == 0
+    assert {(env.horizon, env.options.nthread) for env in made_envs} == {(16, 1)}
+    capsys.readouterr()
+    assert cli.main([*resume, "3", "--horizon", "16"]) == 2
+    refused(capsys, "has horizon 32, not 16")
+
+
+def test_a_run_with_options_among_its_parameters_resumes_and_is_evaluated(
+    trained: Path, tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Earlier releases accepted them as --param."""
+    saved = {"frame_skip": 5, "horizon": 256, "nthread": 1, "graphs": False}
+    resume = changed_config(trained, tmp_path / "run", lambda config: config["params"].update(saved))
+    assert cli.main([*resume, "--horizon", "9"]) == 2
+    refused(capsys, "has horizon 256, not 9")
+    made_envs.clear()
+    assert cli.main(resume) == 0
+    assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2"]) == 0
+    assert made_envs
+    for env in made_envs:
+        assert (env.horizon, env.options.nthread, env.options.graphs) == (256, 1, False)
+        assert env.options.physics.frame_skip == 5
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_hyperparameter_has_a_flag(algorithm: str) -> None:
     _, config = ALGORITHMS[algorithm]
@@ -175,6 +253,14 @@ def test_a_flag_of_the_other_algorithm_is_refused(capsys: pytest.CaptureFixture[
         refused(capsys, message)
 
 
+def test_hyperparameters_are_shown_by_help_with_their_algorithms(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for words in ("--whiten, --no-whiten", "(npg 0.995, ppo 0.99)", "(npg 64 64, ppo 512 256 128)", "(ppo 24)"):
+        assert words in shown
+
+
 @pytest.mark.parametrize("change, words", [
     (lambda config: config["npg"].update(fisher_fraction=0.0), "fisher_fraction must be greater than 0"),
     (lambda config: config["npg"].update(momentum=0.9), "momentum"),
@@ -187,6 +273,13 @@ def test_a_configuration_that_does_not_fit_is_one_line(
 ) -> None:
     assert cli.main(changed_config(trained, tmp_path / "run", change)) == 2
     refused(capsys, "config.json is not the configuration of a training run (", words)
+
+
+def test_a_configuration_of_an_earlier_release_has_the_defaults_of_newer_hyperparameters(
+    trained: Path, tmp_path: Path
+) -> None:
+    resume = changed_config(trained, tmp_path / "run", lambda config: config["npg"].pop("time_orders"))
+    assert cli.main(resume) == 0
 
 
 def test_resume_refuses_broken_checkpoints(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -225,22 +318,31 @@ def test_train_refuses_to_overwrite_a_run(trained: Path, capsys: pytest.CaptureF
 @pytest.mark.parametrize(
     "task, options, words",
     [
-        ("point_mass", ["--camera", "side"], ["--camera has no effect with --no-video"]),
-        ("point_mass", ["--video", "--camera", "side"], ["there is no camera 'side': the model has "]),
-        ("point_mass", ["--video-every", "-1"], ["video_every must be a whole number from 0"]),
         ("point_mas", [], ["no task 'point_mas'", "did you mean point_mass?"]),
         ("nowhere.py", [], ["no task file 'nowhere.py'"]),
+        ("point_mass", ["--engine", "bullet"], ["no engine 'bullet'", "'mujoco'"]),
         ("point_mass", ["--device", "cuda:77"], ["no device 'cuda:77'"]),
+        ("point_mass", ["--nworld", "0"], ["nworld", "not 0"]),
+        ("point_mass", ["--threads", "0"], ["threads", "not 0"]),
         ("point_mass", ["--iterations", "0"], ["iterations", "not 0"]),
+        ("point_mass", ["--seed", "-1"], ["seed", "-1"]),
         ("point_mass", ["--algorithm", "rsl-rl"], ["no algorithm 'rsl-rl'", "npg or ppo"]),
         ("point_mass", ["--gamma", "1.5"], ["gamma must be", "from 0 to 1, not 1.5"]),
+        ("point_mass", ["--log-std", "nan"], ["log_std must be", "not nan"]),
+        ("point_mass", ["--hidden", "8", "0"], ["hidden must be", "not (8, 0)"]),
         ("point_mass", ["--param", "distance=1"], ["no parameter 'distance'"]),
         ("point_mass", ["--param", "nworld=2"], ["nworld is an option", "use --nworld"]),
+        ("point_mass", ["--param", "horizon=5"], ["horizon is an option", "use --horizon"]),
         ("point_mass", ["--param", "autoreset=false"], ["autoreset is an option", "no flag"]),
+        ("point_mass", ["--horizon", "-1"], ["horizon", "-1"]),
+        ("point_mass", ["--nthread", "-1"], ["nthread", "-1"]),
         ("point_mass", ["--param", "success_distance"], ["NAME=VALUE", "'success_distance'"]),
+        ("point_mass", ["--param", "success_distance="], ["NAME=VALUE"]),
         ("point_mass", ["--param", "success_distance=near"], ["'success_distance=near'", "number"]),
         ("point_mass", ["--integrator", "rk5"], ["no integrator 'rk5'", "'euler'"]),
         ("point_mass", ["--solver", "iteration=3"], ["no limit 'iteration'", "'iterations'"]),
+        ("point_mass", ["--solver", "iterations=0"], ["solver's iterations", "not 0"]),
+        ("point_mass", ["--solver", "iterations"], ["'iterations'", "NAME=VALUE"]),
     ],
 )
 def test_a_bad_option_is_one_line_and_leaves_no_folder(
@@ -249,6 +351,11 @@ def test_a_bad_option_is_one_line_and_leaves_no_folder(
     assert train(tmp_path / "run", *options, task=task) == 2
     refused(capsys, *words)
     assert not (tmp_path / "run").exists()
+
+
+def test_train_without_a_task_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["train"]) == 2
+    refused(capsys, "train needs a task", "hopper")
 
 
 def test_a_return_that_is_too_small_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -298,13 +405,13 @@ def test_a_terminated_run_continues(trained: Path, tmp_path: Path) -> None:
     assert_continues(out, rest, trained)
 
 
-@pytest.mark.parametrize("moment", ["step", "save"])
+@pytest.mark.parametrize("moment", ["step", "move", "state_dict", "save"])
 def test_an_interrupted_run_ends_after_the_iteration_and_continues(
     moment: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In this process, while it samples or writes. Another test sends the signal from outside."""
+    """Within this process: while it samples, learns, or writes. The tests of plan interrupt a command from outside."""
     out = tmp_path / "run"
-    owner: Any = {"step": lw.Env, "save": Run}[moment]
+    owner: Any = {"step": lw.Env, "save": Run}.get(moment, lw.NPG)
     original, calls = getattr(owner, moment), []
 
     def interrupting(*args: Any, **words: Any) -> Any:

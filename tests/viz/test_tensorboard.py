@@ -1,12 +1,19 @@
 """Curves for TensorBoard, read back with TensorBoard's own reader."""
 
 import dataclasses
+import io
+import math
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from training_runs import QUIET, train
 
 import lyceum_warp as lw
+from lyceum_warp.cli import main
+from lyceum_warp.runs.folder import Run
 from lyceum_warp.viz import tensorboard as module
 from lyceum_warp.viz.tensorboard import TensorBoard, tag
 
@@ -53,6 +60,14 @@ def test_every_number_of_an_iteration_is_a_curve_in_its_group(first: lw.Iteratio
     }  # fmt: skip
 
 
+def test_numbers_that_are_absent_or_not_finite_are_left_out(first: lw.Iteration, tmp_path: Path) -> None:
+    with TensorBoard(tmp_path, CONFIG) as board:
+        board(numbered(first, 1, return_mean=math.nan, mean_return=None))
+        board(numbered(first, 2, return_mean=-3.0))
+    assert curve(tmp_path, "return/mean") == [(192, -3.0)]
+    assert curve(tmp_path, "mean_policy/return") == [(192, first.mean_return)]
+
+
 def test_a_resumed_run_replaces_later_points_and_repeats_none(first: lw.Iteration, tmp_path: Path) -> None:
     with TensorBoard(tmp_path, CONFIG) as board:
         for i in (1, 2, 3, 4):
@@ -62,6 +77,13 @@ def test_a_resumed_run_replaces_later_points_and_repeats_none(first: lw.Iteratio
             board(numbered(first, i, return_mean=100.0))
     assert curve(tmp_path, "policy/kl") == [(96 * i, 0.01 * i) for i in (1, 2, 3, 4, 5)]
     assert [value for _, value in curve(tmp_path, "return/mean")] == [first.return_mean] * 2 + [100.0] * 3
+
+
+def test_points_are_in_the_file_before_it_is_closed(first: lw.Iteration, tmp_path: Path) -> None:
+    board = TensorBoard(tmp_path, CONFIG)
+    board(numbered(first, 1))
+    assert curve(tmp_path, "policy/kl") == [(96, 0.01)]
+    board.close()
 
 
 def test_the_tab_of_hyperparameters_has_them_once_with_the_curves_to_compare(first, tmp_path: Path) -> None:
@@ -79,6 +101,25 @@ def test_the_tab_of_hyperparameters_has_them_once_with_the_curves_to_compare(fir
     compared = {info.name.tag for info in experiment.metric_infos}
     assert {"return/mean", "mean_policy/return"} <= compared <= set(read(tmp_path).Tags()["scalars"])
     assert "config" in read(tmp_path).Tags()["tensors"]
+
+
+def test_a_video_becomes_an_animated_picture(first: lw.Iteration, tmp_path: Path) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    image = pytest.importorskip("PIL.Image")
+    mp4 = tmp_path / "video.mp4"
+    make = ["-v", "error", "-f", "lavfi", "-i", "testsrc=duration=2:size=640x480:rate=30", "-pix_fmt", "yuv420p"]
+    subprocess.run([ffmpeg, *make, str(mp4)], check=True)
+    with TensorBoard(tmp_path / "run", CONFIG) as board:
+        board(numbered(first, 1))
+        board.close()
+        board.video(mp4, 96)
+        with pytest.raises(ValueError, match=r"nothing.mp4 is not a video that ffmpeg reads \(.*\)$"):
+            board.video(tmp_path / "nothing.mp4", 96)
+    assert curve(tmp_path / "run", "policy/kl") == [(96, 0.01)]  # the later file of the video leaves it
+    (video,) = read(tmp_path / "run").Images("video")
+    assert (video.step, video.width, video.height) == (96, 320, 240)
+    animation = image.open(io.BytesIO(video.encoded_image_string))
+    assert animation.format == "GIF" and animation.n_frames == 30  # 2 seconds of 15 frames
 
 
 def test_a_full_disk_is_an_error_of_the_call(first: lw.Iteration, tmp_path: Path) -> None:
@@ -102,3 +143,19 @@ def test_a_missing_package_is_one_line_with_the_command(tmp_path: Path, monkeypa
     with pytest.raises(ImportError, match=r"need the package tensorboard: pip install 'lyceum-warp\[tensorboard\]'$"):
         TensorBoard(tmp_path / "run", CONFIG)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_ffmpeg_is_one_line_with_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ImportError, match=r"need imageio-ffmpeg: pip install 'lyceum-warp\[viz\]'$"):
+        TensorBoard(tmp_path, CONFIG).video(tmp_path / "video.mp4", 0)
+
+
+def test_train_writes_the_numbers_of_metrics_csv_also_after_it_resumes(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert train(run, "--tensorboard", "--iterations", "2") == 0
+    assert main(["train", "--resume", str(run), "--tensorboard", "--iterations", "3", *QUIET]) == 0
+    rows = Run.open(run).rows()
+    for column in ("kl", "return_mean", "explained_variance"):
+        assert curve(run, tag(column)) == [(row["samples"], pytest.approx(row[column])) for row in rows]
+    assert [step for step, _ in curve(run, "mean_policy/return")] == [1024]
