@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 import lyceum_warp as lw
-from lyceum_warp.runs.checkpoints import policy_content, serialized
+from lyceum_warp.runs.checkpoints import policy_content, write_content
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +120,7 @@ def run(options: Options, seed: int) -> tuple[Result, list[dict[str, Any]]]:
     if options.keep is not None:
         path = options.keep / f"{seed}.pt"
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(serialized(policy_content(made.iteration, made.policy, made.value)))
+        write_content(path, policy_content(made.iteration, made.policy, made.value))
     sampling = sum(row["time_sample"] for row in rows)
     last = rows[-1]["return_recent"]
     return Result(seed, reached, len(rows), made.samples, seconds, sampling, seconds - sampling, last), rows

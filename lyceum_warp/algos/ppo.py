@@ -237,8 +237,10 @@ class PPO(OnPolicyLearner):
     def evaluated_samples(self) -> dict[str, torch.Tensor]:
         """The samples with what the update needs of the old networks, each (steps, nworld, ...).
 
-        At a time limit, after a fault and at the end of the rollout, the value of the final observation stands for the
-        rest of the episode. The value function's targets are its predictions plus the advantages.
+        Every transition bootstraps from the observation that it led to, before events of the task: a push or a new
+        command between two steps changes the value of the state, but no action caused that change, so advantages and
+        targets leave it out. So do time limits, faults and the end of the rollout. The value function's targets are its
+        predictions plus the advantages.
         """
         rollout, config, team = self.rollout, self.config, self.team
         obs, final_obs = rollout.obs_groups[self.value.group], rollout.final_obs_groups[self.value.group]

@@ -96,7 +96,7 @@ def test_a_working_tree_equals_itself(compare: ModuleType, capsys: pytest.Captur
 def test_a_package_that_cannot_be_imported_is_reported(
     compare: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    copy = copied(tmp_path, {"__init__.py": ("import warp as _wp\n", "raise RuntimeError('no package')\n")})
+    copy = copied(tmp_path, {"__init__.py": ("import importlib\n", "raise RuntimeError('no package')\n")})
     assert compare.run(compare.Options(str(ROOT), str(copy), tasks=("point_mass",), **QUICK)) == 1
     assert "    package: new failed: RuntimeError: no package" in capsys.readouterr().out.splitlines()
 

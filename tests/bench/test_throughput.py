@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import lyceum_warp as lw
-from lyceum_warp.runs.checkpoints import policy_content, serialized
+from lyceum_warp.runs.checkpoints import policy_content, write_content
 
 BENCH = Path(__file__).parents[2] / "bench"
 
@@ -60,7 +60,7 @@ def test_actions_of_a_policy_are_stepped_beside_the_bare_engine(
     env = lw.make("cartpole", nworld=2)
     npg = lw.NPG(env, config=lw.NPGConfig(samples=64, mean_every=0))
     policy, out = tmp_path / "policy.pt", tmp_path / "throughput.jsonl"
-    policy.write_bytes(serialized(policy_content(0, npg.policy, npg.value)))
+    write_content(policy, policy_content(0, npg.policy, npg.value))
     words = f"--tasks cartpole --contestants c --threads 1 --parts kept --worlds 16 --policy {policy}".split()
     assert run(bench, "throughput", out, *words) == 0
     (row,) = lines(out)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.runs.checkpoints import policy_content, serialized
+from lyceum_warp.runs.checkpoints import policy_content, write_content
 
 BENCH = Path(__file__).parents[2] / "bench"
 METERED = Path(__file__).parents[1] / "metered_task.py"
@@ -52,7 +52,7 @@ def test_walking_measures_what_the_task_says(
     path, out = tmp_path / "still.pt", tmp_path / "walking.json"
     env = lw.make("go1_velocity", nworld=2)
     npg = lw.NPG(env, config=lw.NPGConfig(samples=64, mean_every=0, log_std=-2.0))
-    path.write_bytes(serialized(policy_content(0, npg.policy, npg.value)))
+    write_content(path, policy_content(0, npg.policy, npg.value))
     run(monkeypatch, "walking.py", path, "--nworld", 8, "--steps", 100, "--seed", 3, "--out", out)
     assert "rad/s" in capsys.readouterr().out
     (row,) = json.loads(out.read_text())["rows"]
