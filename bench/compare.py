@@ -443,15 +443,12 @@ def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
 
 def written(report: Report, options: Options, checkouts: Mapping[str, str], seconds: float) -> dict[str, Any]:
     """The content of the file."""
-    packages = {name: importlib.metadata.version(name) for name in PACKAGES}
     return {
         "checkouts": checkouts,
         "options": dataclasses.asdict(options) | {"out": str(options.out)},
         "machine": {"processor": platform.processor() or platform.machine(), "system": platform.platform()},
-        "versions": {
-            "python": platform.python_version(),
-            **{name: importlib.metadata.version(name) for name in packages},
-        },
+        "versions": {name: importlib.metadata.version(name) for name in PACKAGES}
+        | {"python": platform.python_version()},
         "seconds": round(seconds, 1),
         "differences": len(report.found),
         "skipped": report.skipped,
