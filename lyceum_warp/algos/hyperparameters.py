@@ -1,4 +1,4 @@
-"""Check and convert the fields of a configuration by their annotations and bounds."""
+"""Check the fields of a configuration by their annotations and bounds."""
 
 import dataclasses
 import math
@@ -10,18 +10,18 @@ from typing import Any, Literal
 from lyceum_warp.support.validate import check_flag, check_word, finite_number, layer_sizes, whole_number
 
 LEAST = -math.inf
-"""The bound of numbers that may be negative."""
+"""Lower bound of numbers that may be negative."""
 
 
 def check_fields(config: Any, bounds: Mapping[str, float | tuple[float, float]]) -> None:
-    """Check every field of a frozen dataclass, and convert numbers to the annotated type.
+    """Check the fields of a frozen dataclass, and convert numbers to their annotated types.
 
-    Checked by their annotations: numbers, flags, literals, widths of hidden layers (``tuple[int, ...]``), and the group
-    of observations (``str | None``). None is accepted if the annotation has it.
+    Supported annotations are numbers, bool, ``Literal``, widths of hidden layers (``tuple[int, ...]``) and the name of
+    a group of observations (``str | None``). None is valid if the annotation includes it.
 
     Args:
-        config: The dataclass; its ``__post_init__`` calls this function.
-        bounds: The smallest value of each number, or the smallest and the largest one.
+        config: The dataclass, in its ``__post_init__``.
+        bounds: Lower bound of each number, or lower and upper bound.
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.

@@ -180,14 +180,10 @@ def _planning(task: type[Task]) -> Planning:
     known = {"settings": SETTINGS, "options": OPTIONS, "params": _parameter_names(task)}
     for part, names in known.items():
         if unknown := [word for word in getattr(planning, part) if word not in names]:
-            word = unknown[0]
-            belongs = [f"it belongs to {other}" for other in known if word in known[other]]
-            hint = (
-                belongs[0]
-                if belongs
-                else suggestion(word, set(names) - set(OPTIONS)) or f"there are {', '.join(names) or 'none'}"
-            )
-            raise ValueError(f"{word!r} in planning.{part} of the task {name!r} is unknown: {hint}")
+            hints = [f"it belongs to {other}" for other in known if unknown[0] in known[other]]
+            hints += [suggestion(unknown[0], set(names) - set(OPTIONS)), f"there are {', '.join(names) or 'none'}"]
+            hint = next(filter(None, hints))
+            raise ValueError(f"{unknown[0]!r} in planning.{part} of the task {name!r} is unknown: {hint}")
     try:
         _check_options(planning.options)
         EnvOptions().changed(planning.options)

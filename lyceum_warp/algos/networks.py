@@ -1,4 +1,4 @@
-"""Networks that policies and value functions are made of."""
+"""Build the networks and observation normalisers of policies and value functions."""
 
 import copy
 import itertools
@@ -31,11 +31,11 @@ def mlp(
     last_scale: float = 1.0,
     generator: torch.Generator | None = None,
 ) -> nn.Sequential:
-    """A network of fully connected layers with Glorot-uniform weights and zero biases.
+    """Make a fully connected network with Glorot-uniform weights and zero biases.
 
     Args:
-        sizes: Widths of all layers, the input and the output included.
-        activation: What follows each layer but the last one.
+        sizes: Widths of all layers, including input and output.
+        activation: Activation after each layer except the last.
         last_scale: Factor of the last layer's initial weights.
         generator: Draws the initial weights.
 
@@ -69,13 +69,13 @@ def initialize_as_torch(network: nn.Module, generator: torch.Generator) -> None:
 
 
 LIMIT = 10.0
-"""The largest normalised observation, unless another limit is given."""
+"""Default limit of normalised observations."""
 
 _Applied: TypeAlias = tuple[torch.Tensor, torch.Tensor]
 
 
 class Normalizer(nn.Module):
-    """Normalises observations by their running mean and variance; the identity until the first update.
+    """Normalises observations by their running mean and variance; the identity before the first update.
 
     Args:
         size: Numbers in an observation.
@@ -99,12 +99,12 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def update(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
-        """Take observations into the mean and variance (Chan et al. 1983, parallel mean and variance).
+        """Update mean and variance with a batch of observations (Chan et al. 1983, parallel mean and variance).
 
         Args:
             obs: Observations, (..., size).
             team: The processes; each brings the same number of observations.
-            eps: Added to the standard deviations that observations are divided by.
+            eps: Added to the standard deviations.
         """
         team = team or Team()
         obs = obs.reshape(-1, obs.shape[-1]).double()
@@ -120,30 +120,24 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def interpolate(self, before: _Applied, after: _Applied, part: torch.Tensor) -> None:
-        """Apply only a part of an update: the running mean and variance stay, and later updates make the rest.
+        """Apply a fraction of an update to ``shift`` and ``scale``; mean and variance keep the whole update.
 
         Args:
             before: ``shift`` and ``scale`` before the update.
             after: ``shift`` and ``scale`` after it.
-            part: The part of the change that is applied, from 0 to 1.
+            part: The fraction, from 0 to 1.
         """
         self.shift.copy_(torch.lerp(before[0], after[0], part))
         self.scale.copy_(torch.lerp(before[1].log(), after[1].log(), part).exp())
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        """Normalised observations, (..., size)."""
+        """Normalise observations, (..., size)."""
         normalized = (obs - self.shift) * self.scale
         return normalized if self.limit == math.inf else normalized.clamp(-self.limit, self.limit)
 
 
 class Normalized(nn.Module):
-    """Base class of modules that may normalise their observations.
-
-    Args:
-        nobs: Numbers in an observation.
-        normalize: Whether to normalise.
-        limit: As of ``Normalizer``.
-    """
+    """Base class of modules with an optional normaliser of observations; see ``Normalizer``."""
 
     normalizer: nn.Module
 
@@ -155,7 +149,7 @@ class Normalized(nn.Module):
         self.normalizer = Normalizer(nobs, limit) if normalize else nn.Identity()
 
     def observe(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
-        """Update the statistics that normalise observations, if there are any; this changes the outputs.
+        """Update the normaliser, if there is one; this changes the outputs.
 
         Args:
             obs: Observations, (..., nobs).
@@ -167,7 +161,7 @@ class Normalized(nn.Module):
 
 
 def moved(module: Module, env: Env) -> Module:
-    """The module itself if its parameters are on the device of an environment's observations, else a copy there."""
+    """Copy a module to the device of an environment's observations, unless it is already there."""
     device = env.obs.device
     if all(parameter.device == device for parameter in module.parameters()):
         return module
@@ -175,7 +169,7 @@ def moved(module: Module, env: Env) -> Module:
 
 
 def trainable(module: Module) -> Module:
-    """The module, whose parameters are learned again if all of them are frozen, as ``lw.load`` leaves them."""
+    """Unfreeze a module if all its parameters are frozen, as after ``lw.load``; returns the module."""
     if isinstance(module, nn.Module) and not any(parameter.requires_grad for parameter in module.parameters()):
         module.requires_grad_(True)
     return module

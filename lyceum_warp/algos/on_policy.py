@@ -1,4 +1,4 @@
-"""Share between NPG and PPO: networks, samples, evaluations of the mean policy, and the common part of a checkpoint."""
+"""Share networks, rollouts, advantages, evaluation and checkpoints between NPG and PPO."""
 
 import dataclasses
 import math
@@ -23,7 +23,7 @@ from lyceum_warp.support.validate import check_kind
 
 @document_attributes
 class OnPolicyLearner(Learner):
-    """Base class of NPG and PPO, which learn a Gaussian policy and a value function from the samples of a rollout.
+    """Base class of NPG and PPO, which learn a Gaussian policy and a value function from a rollout buffer.
 
     Raises:
         ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy
@@ -37,13 +37,13 @@ class OnPolicyLearner(Learner):
     policy: GaussianPolicy
     """The policy that is learned."""
     value: ValueFunction
-    """The value function that is learned with it."""
+    """The value function."""
     generator: torch.Generator
-    """The source of the noise and of the order of samples."""
+    """The random generator of the noise and of the order of samples."""
     rollout: Rollout
     """The samples of the last iteration."""
     count: int
-    """Samples in an iteration, those of all processes."""
+    """Samples in an iteration, of all processes."""
 
     def __init__(
         self,
@@ -96,11 +96,11 @@ class OnPolicyLearner(Learner):
         self.value.discount = config.gamma
         self.policy.to(device)
         self.value.to(device)
-        # a seed of its own: the same numbers should not make both the weights and the noise
+        # a separate seed, so that weights and noise are independent
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
 
     def _make_rollout(self, steps: int, *, first_only: bool = False) -> None:
-        """Make the rollout buffer for a number of steps, and the buffers of its advantages and returns."""
+        """Allocate the rollout buffer, and the buffers of advantages and returns."""
         self.count = steps * self.env.nworld * self.team.size
         self.rollout = Rollout(self.env, steps, groups=(self.value.group,), first_only=first_only)
         self._advantage, self._return = (torch.empty_like(self.rollout.reward) for _ in range(2))
@@ -109,7 +109,7 @@ class OnPolicyLearner(Learner):
     def _estimate(
         self, reward: torch.Tensor, value: torch.Tensor, next_value: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Generalised advantages and discounted returns of the rollout (``kernels/returns.py``), (steps, nworld)."""
+        """Compute generalised advantages and discounted returns, (steps, nworld), by ``kernels/returns.py``."""
         arrays = (reward, value, next_value, self.rollout.terminated, self.rollout.done)
         outputs = [wp.from_torch(self._advantage), wp.from_torch(self._return)]
         args = [*map(wp.from_torch, arrays), self.config.gamma, self.config.lam, *outputs]
@@ -117,7 +117,7 @@ class OnPolicyLearner(Learner):
         return self._advantage, self._return
 
     def _with_mean_policy(self, statistics: dict[str, Any]) -> dict[str, Any]:
-        """The statistics of the samples with those of the mean policy, which every few iterations is evaluated."""
+        """Add the statistics of the mean policy, evaluated every ``mean_every`` iterations, to those of the samples."""
         every = self.config.mean_every
         mean: dict[str, Any] = dict.fromkeys(MEAN_STATISTICS)
         if every and self.iteration % every == 0:
@@ -127,7 +127,7 @@ class OnPolicyLearner(Learner):
         return statistics | mean
 
     def settings(self) -> dict[str, Any]:
-        """The hyperparameters, with the sizes of the networks, as a run's config.json holds them."""
+        """The hyperparameters with the sizes of the networks, for a run's config.json."""
         policy, value = self.policy.shape, self.value.shape
         found = {name: policy.get(name) for name in ("hidden", "activation", "normalize")}
         found |= {f"value_{name}": value[name] for name in ("hidden", "activation")}
@@ -138,10 +138,10 @@ class OnPolicyLearner(Learner):
         return dataclasses.asdict(dataclasses.replace(self.config, **own))
 
     def state_dict(self) -> dict[str, Any]:
-        """The state on which the next iteration depends; see ``Learner``."""
+        """Copy the complete state; see ``Learner``."""
         return super().state_dict() | {"returns": self.team.gather(self.rollout.running_return).clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken; see ``Learner``."""
+        """Resume from a state of ``state_dict``; see ``Learner``."""
         super().load_state_dict(state)
         self.rollout.running_return.copy_(state["returns"][self._own])

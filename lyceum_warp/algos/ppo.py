@@ -1,8 +1,8 @@
-"""Proximal policy optimisation, in the order of its mathematics.
+"""Learn policies by proximal policy optimisation (PPO).
 
-Schulman et al. (2017, "Proximal Policy Optimization Algorithms"), with the choices of rsl_rl (Rudin et al. 2022,
-"Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement Learning"): a clipped value loss, a learning
-rate that follows the KL divergence, and the same mini-batches in every epoch.
+The algorithm of Schulman et al. (2017, "Proximal Policy Optimization Algorithms") as implemented in rsl_rl (Rudin et
+al. 2022, "Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement Learning"): with a clipped value
+loss, a learning rate that follows the KL divergence, and the same mini-batches in every epoch.
 """
 
 import collections
@@ -37,12 +37,12 @@ RECENT = 100
 """Episodes in ``return_recent``."""
 
 _EPS = 1e-2
-"""Added to the standard deviations that normalise observations, as in rsl_rl."""
+"""Added to the standard deviations of the normaliser, as in rsl_rl."""
 
 _SMALLEST_STD = 1e-6
 
 _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
-"""Limits of the adaptive learning rate, and the factor by which it changes."""
+"""Lower and upper limit of the adaptive learning rate, and the factor by which it changes."""
 
 
 @document_attributes
@@ -50,12 +50,12 @@ _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
 class PPOIteration(OnPolicyIteration):
     """Statistics of one iteration of PPO.
 
-    Numbers about episodes cover those that ended in the iteration; they are nan if none ended. The first episodes of
-    the worlds, which may begin at a random step, do not count.
+    Numbers about episodes cover the episodes that ended in the iteration; they are nan if none ended. The worlds' first
+    episodes are not counted if they started at a random step (``stagger``).
     """
 
     return_recent: float
-    """Mean return of the last 100 episodes that ended, in this iteration or before."""
+    """Mean return of the last 100 episodes, of this iteration or earlier ones."""
     learning_rate: float
     """Learning rate after the iteration."""
     surrogate_loss: float
@@ -65,12 +65,12 @@ class PPOIteration(OnPolicyIteration):
     value_loss: float
     """Mean of the value function's loss over the mini-batches."""
     time_update: float
-    """Seconds of the update."""
+    """Seconds for the update."""
 
 
 @document_attributes
 class PPO(OnPolicyLearner):
-    """Learns a policy by PPO; an endless iterator that yields a ``PPOIteration`` each time.
+    """Learns a policy by PPO; an infinite iterator of ``PPOIteration``.
 
     Example:
         >>> for it in PPO(env, config=PPOConfig(hidden=(64, 64))):
@@ -78,12 +78,12 @@ class PPO(OnPolicyLearner):
 
     Args:
         env: The environment; do not step it between iterations.
-        policy: The policy; a new one by default. ``GaussianPolicy(nobs, nact, network=...)`` has a network of your own.
+        policy: The policy; a new one by default. ``GaussianPolicy(nobs, nact, network=...)`` wraps any network.
         value: The value function; a new one by default.
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
-        team: The processes that learn together, each with an environment of its share of the worlds. All of them must
-            make the same calls with the same arguments; all get the same numbers.
+        team: The processes that learn together, each with its share of the worlds. All processes must make the same
+            calls with the same arguments, and get the same statistics.
 
     Raises:
         ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy
@@ -116,7 +116,7 @@ class PPO(OnPolicyLearner):
                 f"{config.minibatches} mini-batches are more than the {count} samples: give more worlds, or make "
                 "minibatches smaller"
             )
-        # a policy's last layer near zero, as NPG's, lets the adaptive rate begin much higher
+        # with a last layer near zero, as NPG's, the adaptive learning rate would start much too high
         limit = math.inf if config.normalize else LIMIT
         self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
         self._make_rollout(steps)
@@ -133,7 +133,7 @@ class PPO(OnPolicyLearner):
         self.rate = torch.tensor(config.learning_rate, device=device)
         self._cuda = device.type == "cuda"
         self.optimizer = torch.optim.Adam(self._parameters, lr=self.rate, fused=True, capturable=self._cuda)
-        # gradients, KL divergence and losses are parts of one tensor, which the processes sum in one call
+        # gradients, KL divergence and losses are views of one tensor, for a single all-reduce
         sizes = [p.numel() for p in self._parameters]
         self._sums = self._parameters[0].new_zeros(sum(sizes) + 4)
         for parameter, part in zip(self._parameters, self._sums[:-4].split(sizes), strict=True):
@@ -153,18 +153,18 @@ class PPO(OnPolicyLearner):
         config, rollout, team = self.config, self.rollout, self.team
         timer = PhaseTimer(self.env.obs.device)
         with precision(tf32=config.tf32 and self._cuda):
-            # 1. Samples of the current policy.
+            # 1. Sample with the current policy.
             self.sample()
 
-            # 2. Values and advantages, from the value function that was not yet fitted to these samples.
+            # 2. Values and advantages, from the value function before its fit to these samples.
             samples = self.evaluated_samples()
             timer.mark()
 
-            # 3. Epochs of mini-batches: a step on the clipped surrogate, the value loss and the entropy in each.
+            # 3. Epochs of mini-batches; each is a step on the clipped surrogate, the value loss and the entropy.
             self.update(samples)
             kl = self.divergence()
 
-        # One copy brings the numbers of all processes to the host, and another one the returns.
+        # One copy transfers the statistics of all processes to the host, another one the returns.
         losses = self._losses / (config.epochs * config.minibatches)
         finite = torch.stack([numbers.isfinite().all() for numbers in (losses, *self._parameters)]).all()
         numbers = [
@@ -185,7 +185,7 @@ class PPO(OnPolicyLearner):
                 "smaller"
             )
 
-        # 4. Every few iterations, the mean policy in whole episodes.
+        # 4. Every few iterations, evaluate the mean policy in whole episodes.
         self.iteration += 1
         self.samples += self.count
         statistics = self._with_mean_policy(episode_statistics(episodes))
@@ -214,10 +214,10 @@ class PPO(OnPolicyLearner):
 
     @torch.no_grad()
     def sample(self) -> None:
-        """Fill the rollout buffer with steps of the current policy under new noise.
+        """Fill the rollout buffer with the current policy and new noise.
 
-        The observations that each step leads to are taken into the statistics that normalise them. A step computes
-        nothing else but its actions: values and densities follow once for all steps.
+        Each step updates the normalisers with its observations. Values and densities are computed for all steps at once
+        in ``evaluated_samples``.
         """
         env, rollout, std = self.env, self.rollout, self.policy.log_std.exp()
         with one_thread():
@@ -235,12 +235,12 @@ class PPO(OnPolicyLearner):
 
     @torch.no_grad()
     def evaluated_samples(self) -> dict[str, torch.Tensor]:
-        """The samples with what the update needs of the old networks, each (steps, nworld, ...).
+        """Compute the inputs of the update from the samples and the old networks, each (steps, nworld, ...).
 
         Every transition bootstraps from the observation that it led to, before events of the task: a push or a new
         command between two steps changes the value of the state, but no action caused that change, so advantages and
-        targets leave it out. So do time limits, faults and the end of the rollout. The value function's targets are its
-        predictions plus the advantages.
+        targets leave it out. Time limits, faults and the end of the rollout bootstrap in the same way. The value
+        function's targets are its predictions plus the advantages.
         """
         rollout, config, team = self.rollout, self.config, self.team
         obs, final_obs = rollout.obs_groups[self.value.group], rollout.final_obs_groups[self.value.group]
@@ -259,7 +259,7 @@ class PPO(OnPolicyLearner):
         }  # fmt: skip
 
     def update(self, samples: Samples) -> None:
-        """Learn from samples of ``evaluated_samples`` in epochs of mini-batches."""
+        """Learn from the samples of ``evaluated_samples`` in epochs of mini-batches."""
         config, team = self.config, self.team
         parts = self.minibatches.shuffle(samples, self.generator)
         if config.whiten_minibatches:
@@ -275,11 +275,11 @@ class PPO(OnPolicyLearner):
         self._apply_std()
 
     def learn(self, samples: Samples, weight: torch.Tensor) -> None:
-        """One step of Adam on a mini-batch.
+        """Make one step of Adam on a mini-batch.
 
         Args:
             samples: This process's samples of the mini-batch, each (samples, ...).
-            weight: Their weights, (samples,), whose sum over all processes is 1.
+            weight: Weights of the samples, (samples,), which sum to 1 over all processes.
         """
         config, clip = self.config, self.config.clip
         mean, log_std = self.policy(samples["obs"]), self._log_std()
@@ -294,7 +294,7 @@ class PPO(OnPolicyLearner):
         entropy = (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
         losses = torch.stack([(weight * error).sum(), (weight * surrogate).sum(), weight.sum() * entropy])
         loss = config.value_coef * losses[0] + losses[1] - self._entropy_coef * losses[2]
-        # not backward(), whose sums of gradients belong to the stream of the first call
+        # not backward(), which accumulates gradients on the stream of the first call
         gradients = torch.autograd.grad(loss, self._parameters)
 
         with torch.no_grad():
@@ -316,7 +316,7 @@ class PPO(OnPolicyLearner):
         self.rate.copy_(torch.where(kl > wanted * 2.0, lower, raised))
 
     def _log_std(self) -> torch.Tensor:
-        """Logarithms of the standard deviations that Adam learns, (nact,)."""
+        """Logarithms of the learned standard deviations, (nact,)."""
         if self.config.std_type == "log":
             return self.std.clamp_min(math.log(_SMALLEST_STD))
         return self.std.clamp_min(_SMALLEST_STD).log()
@@ -327,19 +327,19 @@ class PPO(OnPolicyLearner):
 
     @torch.no_grad()
     def divergence(self) -> torch.Tensor:
-        """KL divergence from the policy that sampled to the present one, averaged over the samples."""
+        """KL divergence from the policy that sampled to the current policy, averaged over the samples."""
         kl = divergence(self._mean, self._old_log_std, self.policy(self.rollout.obs), self.policy.log_std).mean()
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
-        """Returns of the episodes of all processes that ended in the iteration and count, in the order of the steps."""
+        """Returns of the counted episodes of all processes that ended in the iteration, in the order of the steps."""
         ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
         ended = self.team.gather(ended.T).T
         found: list[float] = ended[~ended.isnan()].tolist()
         return found
 
     def state_dict(self) -> dict[str, Any]:
-        """The state on which the next iteration depends; see ``Learner``."""
+        """Copy the complete state; see ``Learner``."""
         own = {
             "optimizer": self.optimizer.state_dict(),
             "std": self.std.detach(),
@@ -348,7 +348,7 @@ class PPO(OnPolicyLearner):
         return super().state_dict() | copy.deepcopy(own)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken; see ``Learner``."""
+        """Resume from a state of ``state_dict``; see ``Learner``."""
         super().load_state_dict(state)
         self.optimizer.load_state_dict(state["optimizer"])
         for group in self.optimizer.param_groups:
@@ -358,4 +358,4 @@ class PPO(OnPolicyLearner):
             self.std.copy_(state["std"])
         self._recent.clear()
         self._recent.extend(state["recent"])
-        self.minibatches.forget()  # its graph holds the addresses of the old moments
+        self.minibatches.forget()  # the graph holds the addresses of the old moments

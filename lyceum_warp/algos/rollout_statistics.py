@@ -1,4 +1,4 @@
-"""Compute the statistics that on-policy learners share: those of the episodes that ended in a rollout."""
+"""Compute statistics of the episodes that ended in a rollout."""
 
 import dataclasses
 import math
@@ -12,15 +12,15 @@ from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.support.docstrings import document_attributes
 
 Scalar: TypeAlias = Any
-"""A tensor of one number on the device, or, after the copy to the host, a float."""
+"""A scalar tensor on the device or, after the transfer to the host, a float."""
 
 
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OnPolicyIteration(Iteration):
-    """Statistics of one iteration of a learner that samples with a diagonal Gaussian.
+    """Statistics of one iteration of NPG or PPO.
 
-    Numbers about episodes cover those that ended in the iteration; they are nan where none ended.
+    Numbers about episodes cover the episodes that ended in the iteration; they are nan if none ended.
     """
 
     kl: float
@@ -28,22 +28,22 @@ class OnPolicyIteration(Iteration):
     std_mean: float
     """Mean standard deviation of the policy's actions."""
     faults: int
-    """Faults of worlds in this iteration."""
+    """Number of faults of worlds in this iteration."""
     time_sample: float
-    """Seconds of sampling."""
+    """Seconds for sampling."""
     time_mean: float
-    """Seconds of evaluating the mean policy."""
+    """Seconds for the evaluation of the mean policy."""
     samples_per_second: float
-    """Samples divided by the seconds of sampling."""
+    """Samples divided by ``time_sample``."""
 
     def row(self) -> dict[str, Any]:
-        """The numbers by the names of their columns in metrics.csv; those that are None are columns, too."""
+        """Convert to a row of metrics.csv: numbers by column, including None."""
         names = [field.name for field in dataclasses.fields(self) if field.name not in ("metrics", "numbers")]
         return {name: getattr(self, name) for name in names} | super().row()
 
 
 class EpisodeSums(NamedTuple):
-    """Sums over the episodes that ended in a process's worlds."""
+    """Sums over the episodes that ended in one process's worlds."""
 
     episodes: Scalar
     """Number of episodes."""
@@ -52,9 +52,9 @@ class EpisodeSums(NamedTuple):
     return_square: Scalar
     """Sum of the squared deviations of their returns from their mean."""
     return_min: Scalar
-    """Smallest return; infinity where no episode ended."""
+    """Smallest return; infinity if no episode ended."""
     return_max: Scalar
-    """Largest return; minus infinity where no episode ended."""
+    """Largest return; minus infinity if no episode ended."""
     length: Scalar
     """Sum of their lengths."""
     terminal_reward: Scalar
@@ -66,7 +66,7 @@ class EpisodeSums(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """Number, mean and sum of squared deviations from the mean of a set of numbers."""
+    """Count, mean and sum of squared deviations from the mean of a set of numbers."""
 
     n: float
     mean: float
@@ -74,7 +74,7 @@ class Moments(NamedTuple):
 
 
 def finished(rollout: Rollout) -> EpisodeSums:
-    """Sums over the episodes that ended within a rollout, scalar tensors on its device."""
+    """Compute sums over the episodes that ended within a rollout, scalar tensors on its device."""
     ended = _ended(rollout)
     returns = rollout.episode_return.double()
     infinity = torch.inf
@@ -98,22 +98,22 @@ def finished(rollout: Rollout) -> EpisodeSums:
 
 
 def finished_metrics(rollout: Rollout) -> tuple[torch.Tensor, ...]:
-    """Sums of the task's metrics over the episodes that ended within a rollout, scalar tensors on its device."""
+    """Sum the task's metrics over the episodes that ended within a rollout, scalar tensors on its device."""
     ended = _ended(rollout)
     return tuple(sums.double().masked_fill(~ended, 0.0).sum() for sums in rollout.episode_metrics.values())
 
 
 def _ended(rollout: Rollout) -> torch.Tensor:
-    """The last steps of the episodes that count, (steps, nworld) bool."""
+    """Mask of the last steps of counted episodes, (steps, nworld) bool."""
     return rollout.done & ~rollout.episode_return.isnan()
 
 
 def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, float]:
-    """Means of the task's metrics over the episodes that ended; nan where none ended.
+    """Compute means of the task's metrics over the episodes that ended; nan if none ended.
 
     Args:
         episodes: Number of episodes of all processes.
-        sums: The sums over the episodes of each process, in the order of the names.
+        sums: The sums of each process, in the order of the names.
         names: Names of the metrics.
     """
     totals = (sum(parts) for parts in zip(*sums, strict=True))
@@ -121,7 +121,7 @@ def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequen
 
 
 def episode_statistics(sums: Sequence[EpisodeSums]) -> dict[str, float]:
-    """Statistics of finished episodes from the sums of all processes; nan where none ended."""
+    """Compute statistics of finished episodes from the sums of all processes; nan if none ended."""
     episodes, mean, square = pooled([Moments(part.episodes, part.return_mean, part.return_square) for part in sums])
     if not episodes:
         return dict.fromkeys(_EPISODE_STATISTICS, math.nan)
@@ -144,7 +144,7 @@ _EPISODE_STATISTICS = (
 
 
 def pooled(parts: Sequence[Moments]) -> Moments:
-    """The moments of several sets of numbers together, from the moments of each."""
+    """Combine the moments of several sets of numbers."""
     n = sum(part.n for part in parts)
     mean = sum(part.n * part.mean for part in parts) / n if n else 0.0
     return Moments(n, mean, sum(part.square + part.n * (part.mean - mean) ** 2 for part in parts))
