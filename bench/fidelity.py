@@ -46,7 +46,7 @@ class Options(experiment.Options):
     """Agreement of the engines."""
 
     steps: int = 1000
-    """Steps over which trajectories are compared, at most those of an episode."""
+    """Steps over which trajectories are compared, at most an episode's."""
     nworld: int = 128
     """Number of worlds."""
 

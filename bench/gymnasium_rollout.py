@@ -42,7 +42,7 @@ class GymnasiumRollout(Rollout):
         self.running_return.zero_()
 
     def stagger(self, generator: torch.Generator, team: Team | None = None) -> None:
-        raise NotImplementedError("the clocks of Gymnasium's environments are set once, to those of our environment")
+        raise NotImplementedError("the clocks of Gymnasium's environments are set only once")
 
     def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
         raise NotImplementedError("worlds of Gymnasium's environments restart at the end of their episodes alone")

@@ -1,4 +1,4 @@
-"""Measure what an environment's step costs beside the bare engine on the same states.
+"""Measure the cost of an environment's step beside the bare engine on the same states.
 
 Environment and bare engine alternate every ten steps. The states from which the environment steps are copied to the
 bare engine, outside the clock, so that both step the same states, resets included, under the same load of the machine.

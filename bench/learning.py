@@ -4,10 +4,10 @@
     lyceum-warp bench learning --tasks go1_velocity --algorithm npg --device cuda
 
 The clock includes captures of graphs, sampling and updates; it excludes the compilation of kernels and evaluations. The
-mean return is that of the last 100 episodes (without each world's first episode, which begins at a random step), or of
-16 separate episodes of the stochastic policy every few iterations if iterations have too few steps for their own
-episodes to represent it. A return of go1_velocity is also that of a robot that stands: its mean policy walks for 10 s
-in new worlds, with noise and pushes, and its tracking errors and falls are measured.
+mean return covers the last 100 episodes, without each world's first episode, which begins at a random step. If
+iterations have too few steps for whole episodes, it covers 16 separate episodes of the stochastic policy every few
+iterations. On go1_velocity a robot that stands still also reaches high returns: the mean policy therefore walks for
+10 s in new worlds, with noise and pushes, and its tracking errors and falls are measured.
 """
 
 import collections
@@ -48,7 +48,7 @@ class Options(experiment.Options):
     """Seconds until NPG or PPO reaches a return."""
 
     algorithm: Literal["npg", "ppo"] | None = None
-    """Algorithm; by default that of each task."""
+    """Algorithm; by default the task's."""
     settings: tuple[str, ...] = ("default",)
     """Settings: default, desired_kl 0.01 (PPO)."""
     seconds: float = 300.0

@@ -1,4 +1,4 @@
-"""Measure NPG's learning curves on our environments and on Gymnasium's, beside PPO and TRPO (the paper's figure 2).
+"""Measure NPG's learning on lyceum_warp's and Gymnasium's environments, beside PPO and TRPO (the paper's figure 2).
 
     lyceum-warp bench npg --threads 2 --jobs 16
 
@@ -50,11 +50,12 @@ CONTESTANTS = {
     "ppo_sb3": "PPO, stable-baselines3",
     "trpo_sb3": "TRPO, sb3-contrib",
     "npg_gpu": "NPG, lyceum_warp on a GPU",
-    "ppo_rsl_rl": "PPO, lyceum_warp on a GPU",  # the stored runs are of rsl_rl's PPO, whose updates lw.PPO makes
+    "ppo_gpu": "PPO, lyceum_warp on a GPU",
+    "ppo_rsl_rl": "rsl_rl's PPO, lyceum_warp on a GPU",  # stored results of an earlier commit
 }
-ON_CPU, ON_GPU, YARDSTICKS = tuple(CONTESTANTS)[:4], tuple(CONTESTANTS)[4:], ("ppo_sb3", "trpo_sb3")
+ON_CPU, ON_GPU, YARDSTICKS = tuple(CONTESTANTS)[:4], tuple(CONTESTANTS)[4:6], ("ppo_sb3", "trpo_sb3")
 
-GPU_WORLDS = {"npg_gpu": 2048, "ppo_rsl_rl": 4096}
+GPU_WORLDS = {"npg_gpu": 2048, "ppo_gpu": 4096}
 
 EVERY_100K = tuple(range(100_000, 1_000_001, 100_000))
 """Samples at which the curves are compared."""
@@ -125,7 +126,7 @@ class Case:
 def cases(options: Options) -> list[Case]:
     """List the runs: contestants that are compared follow one another, and runs on a GPU come last."""
     short, cuda = options.short, options.device.startswith("cuda")
-    contestants = choose(options.contestants, CONTESTANTS, ON_CPU + (ON_GPU if cuda else ()), what="contestant")
+    contestants = choose(options.contestants, ON_CPU + ON_GPU, ON_CPU + (ON_GPU if cuda else ()), what="contestant")
     for name in contestants:
         if name in ON_GPU and not cuda:
             raise ValueError(f"{name} needs a GPU: give --device cuda")
@@ -215,7 +216,7 @@ class Curve:
         self._stopped += time.perf_counter() - before
 
 
-# NPG, on our environments and on Gymnasium's
+# NPG on lyceum_warp's and on Gymnasium's environments
 
 
 def mean_action(policy: torch.nn.Module) -> Act:
@@ -326,7 +327,7 @@ def stable_baselines3(case: Case, options: Options, curve: Curve) -> dict[str, A
     return {}
 
 
-RUN = {"npg": npg, "npg_gymnasium": npg, "npg_gpu": npg, "ppo_rsl_rl": ppo, "ppo_sb3": stable_baselines3,
+RUN = {"npg": npg, "npg_gymnasium": npg, "npg_gpu": npg, "ppo_gpu": ppo, "ppo_sb3": stable_baselines3,
        "trpo_sb3": stable_baselines3}  # fmt: skip
 
 
@@ -485,7 +486,7 @@ def draw(axes: Any, group: Sequence[Row], name: str, x: int) -> None:
 
 
 EXPERIMENT = experiment.Experiment(
-    name="npg", summary="NPG's learning curves on our environments and on Gymnasium's, beside PPO and TRPO.",
+    name="npg", summary="NPG's learning curves on lyceum_warp's and on Gymnasium's environments, beside PPO and TRPO.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, figure=figure, options=Options,
     packages=("stable-baselines3", "sb3-contrib"), apart=True,
 )  # fmt: skip
