@@ -29,7 +29,7 @@ def test_help_of_a_command_shows_examples_and_options(command: str, capsys: pyte
     if command == "train":
         assert all(f"--{name}" in out for name in ("iterations", "resume", "gamma", "value-hidden", "require-return"))
         assert all(f"--{name}" in out for name in ("integrator", "solver", "deterministic"))
-        assert "Discount." in out
+        assert "Discount factor." in out
 
 
 @pytest.mark.parametrize("option", ["--help", "--version"])
