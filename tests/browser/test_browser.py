@@ -343,19 +343,6 @@ def test_an_episode_is_scrubbed_and_played(tab: Tab) -> None:
     tab.press("Space", lambda: viewer.status.step < STEPS / 2)
 
 
-def test_two_tabs_show_the_same_and_one_controls(tab: Tab, context: BrowserContext) -> None:
-    viewer = tab.viewer
-    second = Tab(context.new_page(), viewer)
-    second.logs("role=spectator")
-    tab.press("Control+ArrowLeft", lambda: viewer.status.mode == "controller")
-    tab.press("Shift+ArrowRight", lambda: viewer.status.step >= 50)
-    second.wait(lambda: abs(second.place() - tab.place()) < 0.02)
-    step = viewer.status.step
-    second.page.keyboard.press("ArrowRight")
-    second.frames(10)
-    assert viewer.status.step == step
-
-
 def test_another_browser_controls_after_one_is_closed_or_killed(
     viewer: Viewer, launch: Callable[[], Browser], context: BrowserContext, shared_tab: Tab
 ) -> None:

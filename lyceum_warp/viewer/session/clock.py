@@ -168,7 +168,7 @@ class Session:
         self._next_step = time.perf_counter()
 
     def _stepped(self, progress: ControlProgress) -> None:
-        """Record a step of the plant."""
+        """Account for a step of the plant."""
         self.stage.live.stepped()
         self.stage.steps += 1
         if time.perf_counter() - self._last_work > 1 / self.fps:  # a plant that is late or fast never waits
