@@ -133,7 +133,7 @@ class Session:
         if now < self._next_frame or not (videos.due or self._window.wants_frame):
             return
         self._next_frame = max(self._next_frame + 1 / self.fps, now)
-        changed = stage.changed or stage.frames.has_messages or videos.due
+        changed = stage.changed or bool(stage.frames.messages) or videos.due
         if stage.paused and not changed and now - self._last_frame < _IDLE:
             return
         frame = stage.frame()
