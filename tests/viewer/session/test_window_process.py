@@ -116,7 +116,7 @@ def test_show_never_waits_for_a_window_that_hangs(shared_window: Window) -> None
         began = time.monotonic()
         for _ in range(2000):
             shared_window.show(frame)
-        assert time.monotonic() - began < 20  # the pipe is full
+        assert time.monotonic() - began < 20  # the pipe is full and stays full
     finally:
         os.kill(process_of(shared_window), signal.SIGCONT)
 
