@@ -113,7 +113,7 @@ class Status:
     backwards: bool
     """Whether the playback runs backwards."""
     video: str | None
-    """Name of the video that is being recorded."""
+    """Name of the current video; None without one."""
     ghosts: SetGhosts = SetGhosts()
     """The ghosts that are drawn."""
     seekable: tuple[int, int] = (0, 0)

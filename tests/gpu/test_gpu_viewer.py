@@ -32,7 +32,7 @@ def test_steps_and_frames_are_asked_for_without_waiting() -> None:
 def test_any_world_is_shown_a_frame_later() -> None:
     env = lw.make("hopper", nworld=4096, device="cuda")
     session = Session(env, controllers={"policy": pushing}, world=3000, seed=0)
-    assert session.stage.live.past.bytes <= 256 * 2**20
+    assert session.stage.live.past.states.nbytes <= 256 * 2**20
     session.stage.frame()
     session.stage.advance(5)
     session.stage.frame()

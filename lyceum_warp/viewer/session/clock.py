@@ -133,7 +133,7 @@ class Session:
         if now < self._next_frame or not (videos.due or self._window.wants_frame):
             return
         self._next_frame = max(self._next_frame + 1 / self.fps, now)
-        changed = stage.changed or stage.frames.has_messages or videos.due
+        changed = stage.changed or bool(stage.frames.messages) or videos.due
         if stage.paused and not changed and now - self._last_frame < _IDLE:
             return
         frame = stage.frame()
@@ -168,7 +168,7 @@ class Session:
         self._next_step = time.perf_counter()
 
     def _stepped(self, progress: ControlProgress) -> None:
-        """Record a step of the plant."""
+        """Account for a step of the plant."""
         self.stage.live.stepped()
         self.stage.steps += 1
         if time.perf_counter() - self._last_work > 1 / self.fps:  # a plant that is late or fast never waits

@@ -15,7 +15,7 @@ def obey(stage: Stage, command: protocol.Command) -> None:
 
     Raises:
         ValueError: The command is invalid; the message is for the user.
-        NoVideoError: A video cannot be recorded.
+        NoVideoError: A video cannot be made.
         ControllerError: A controller raised an exception.
     """
     match command:

@@ -34,19 +34,15 @@ class FrameMaker:
         """The ghosts that are drawn."""
         self.text: dict[str, str] = {}
         """Further lines of the panel."""
+        self.messages: list[str] = []
+        """Messages of the next frame."""
         self._env, self._curves = env, curves
-        self._messages: list[str] = []
         self._points: list[list[float]] = []
         self._seen_end = self._seen_fault = 0.0
 
     def say(self, text: str) -> None:
         """Show a message in the next frame."""
-        self._messages.append(text)
-
-    @property
-    def has_messages(self) -> bool:
-        """Whether the next frame has messages."""
-        return bool(self._messages)
+        self.messages.append(text)
 
     def forget_seen(self, live: Live) -> None:
         """Report only ends and faults from now on."""
@@ -167,7 +163,7 @@ class FrameMaker:
         return found
 
     def _take_messages(self) -> tuple[str, ...]:
-        messages, self._messages = self._messages, []
+        messages, self.messages = self.messages, []
         return tuple(messages)
 
 

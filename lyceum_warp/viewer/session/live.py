@@ -118,7 +118,7 @@ class Live:
         self._times: list[float] = []
         self._state = env.get_state()
         self._reading: tuple[tuple[int, ...], list[float], list[torch.Tensor]] | None = None  # worlds, times, rows
-        self._copied = torch.cuda.Event() if device.type == "cuda" else None
+        self._event = torch.cuda.Event() if device.type == "cuda" else None
         # before the current step
         self._length, self._over = env.episode_step.clone(), env.done.clone()
         self._number = torch.arange(n, device=device)
@@ -159,7 +159,7 @@ class Live:
         self._before_step()
 
     def stepped(self) -> None:
-        """Record a step that other code made."""
+        """Account for a step that other code made."""
         self._keep(self._state)
         self._after_step()
         self.env.get_state(out=self._state)
@@ -197,7 +197,7 @@ class Live:
         self._times.append(self._clock * env.timestep)
 
     def _note_ends(self, ended: torch.Tensor) -> None:
-        """Record ends of episodes and faults, without waiting for the device."""
+        """Save ends of episodes and faults, without waiting for the device."""
         env, reason = self.env, self.env.done_reason
         made = torch.full_like(self.returns, self.made)
         end = torch.stack([made, reason.double(), self.returns, self._length + 1.0], dim=1)
@@ -345,16 +345,16 @@ class Live:
             self._ends[self.world], self._fault, self._curves,
         ]  # fmt: skip
         self._reading, self._times = (shown, self._times, [_to_host(part) for part in parts]), []
-        if self._copied is not None:
-            self._copied.record()
+        if self._event is not None:
+            self._event.record()
 
     def take(self) -> Rows | None:
         """Wait for the requested rows, and return them; None without a request."""
         if self._reading is None:
             return None
         (worlds, times, parts), self._reading = self._reading, None
-        if self._copied is not None:
-            self._copied.synchronize()
+        if self._event is not None:
+            self._event.synchronize()
         states, back, returned, end, fault, curves = (part.numpy() for part in parts)
         numbers = np.arange(len(times))[-len(curves) :]
         points = np.column_stack([np.array(times, dtype=float)[numbers], curves[numbers % len(curves)]])

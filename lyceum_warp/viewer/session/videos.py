@@ -1,4 +1,4 @@
-"""Record videos of the viewer; subprocesses draw them."""
+"""Make videos of the viewer in subprocesses."""
 
 import contextlib
 import datetime
@@ -22,7 +22,7 @@ _GRACE = 5.0  # further seconds to complete the files with what is drawn
 
 
 class VideoTaker:
-    """Records one video at a time; earlier videos may still be drawn.
+    """Makes one video at a time; earlier videos may still be drawn.
 
     Args:
         model: The model.
@@ -38,7 +38,7 @@ class VideoTaker:
 
     @property
     def name(self) -> str | None:
-        """Name of the video that is being recorded."""
+        """Name of the current video; None without one."""
         return None if self._running is None else self._running.out.name
 
     @property
@@ -98,7 +98,7 @@ class VideoTaker:
         return [_completed(video) for video in done]
 
     def give_up(self) -> None:
-        """Discard the video that is being recorded."""
+        """Discard the current video."""
         if self._running is not None:
             self._running.cancel()
             self._running = None

@@ -190,7 +190,7 @@ class ViewCameras:
     def __init__(self, viewer: Any, values: ModelValues) -> None:
         self.viewer, self.values = viewer, values
         self.state = ux.UxState()
-        """Studio's record of the choice."""
+        """Studio's own state of the choice."""
 
     def choose(self, index: int) -> None:
         """Choose studio's free, flying or tracking camera, or a camera of the model."""

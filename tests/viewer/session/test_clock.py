@@ -33,23 +33,6 @@ def test_speed_and_pause_hold(shared_env: SharedEnv) -> None:
     assert len({frame.status.step for frame in window.frames if frame.status.paused}) == 1
 
 
-def test_an_exception_does_not_wait_for_videos(
-    shared_env: SharedEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    session = Session(shared_env("point_mass"), seed=0)
-
-    def interrupted(frame: Frame, number: int) -> list[Command]:
-        if frame.status.video is None:
-            return [protocol.SetVideo(True)]
-        raise KeyboardInterrupt
-
-    begun = time.monotonic()
-    with pytest.raises(KeyboardInterrupt):
-        session.run(MemoryWindow(interrupted))  # type: ignore[arg-type]
-    assert time.monotonic() - begun < 20
-
-
 @pytest.mark.parametrize("call", ["__init__", "add"])
 def test_a_video_that_cannot_be_written_is_a_message(
     shared_env: SharedEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str

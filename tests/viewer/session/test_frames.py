@@ -13,7 +13,7 @@ from lyceum_warp.viewer.session.clock import Session
 
 
 def test_rows_that_come_later_are_shown_a_frame_later(shared_env: SharedEnv) -> None:
-    """As those of worlds on a GPU."""
+    """As on a GPU."""
     env = shared_env("hopper", nworld=4)
     session = Session(env, controllers={"policy": pushing}, seed=0)
     session.stage.live.asynchronous = True

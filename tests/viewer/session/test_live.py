@@ -1,6 +1,5 @@
 """Steps, the history of worlds, and their returns."""
 
-import numpy as np
 import pytest
 import torch
 from conftest import SharedEnv
@@ -9,7 +8,7 @@ from toy_controllers import towards
 
 import lyceum_warp as lw
 from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import Perturb, StepBy
+from lyceum_warp.viewer.protocol import StepBy
 from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viewer.session.live import HISTORY_BYTES, PLANT_HISTORY_BYTES, Live
 
@@ -38,36 +37,6 @@ def test_steps_back_and_forth_restore_the_states_to_the_bit(shared_env: SharedEn
     session.obey(protocol.SetMode("passive"))  # drops the steps ahead
     session.obey(StepBy(1))
     assert session.stage.live.past.ahead == 0 and not torch.equal(env.get_state(), restored)
-
-
-def test_a_planners_steps_are_restored(shared_env: SharedEnv) -> None:
-    env = shared_env("point_mass", autoreset=False)
-    plan = lw.MPPI("point_mass", horizon=8, samples=6, temperature=0.01, noise=0.3)
-    session = Session(env, controllers={"mppi": plan}, paused=True, seed=0)
-    states = [env.get_state()]
-    for _ in range(6):
-        session.stage.advance()
-        states.append(env.get_state())
-    for steps, expected in ((-4, 2), (4, 6)):
-        session.obey(StepBy(steps))
-        assert torch.equal(env.get_state(), states[expected])
-
-
-def test_a_push_is_restored_with_its_step(shared_env: SharedEnv) -> None:
-    env = shared_env("hopper", nworld=2)
-    session = Session(env, paused=True, seed=2)
-    session.stage.advance(2)
-    force = np.zeros((env.model.nbody, 6))
-    force[1, 0] = 50.0
-    session.obey(Perturb(force))
-    session.stage.advance(2)
-    session.obey(Perturb(0 * force))
-    session.stage.advance(2)
-    last = env.get_state()
-    session.obey(StepBy(-3))
-    assert env.get_state()[0, env.state_space.parts["xfrc_applied"]].any()
-    session.obey(StepBy(3))
-    assert torch.equal(env.get_state(), last)
 
 
 def test_the_history_is_bounded_and_a_message_says_where_it_ends(shared_env: SharedEnv) -> None:

@@ -1,7 +1,5 @@
 """Paths of a planner's samples."""
 
-import time
-
 import mujoco
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp.viewer.session.drivers import WorldControl
-from lyceum_warp.viewer.session.traces import TraceRollouts, TraceThread, trace_point
+from lyceum_warp.viewer.session.traces import TraceRollouts, trace_point
 
 ARM = """<mujoco><worldbody><body name="base"><body name="upper"><joint name="a" axis="0 1 0"/><geom size=".1"/>
 <body name="hand" pos="0 0 1"><joint name="b" axis="0 1 0"/><geom size=".1"/>{site}</body></body></body>
@@ -71,21 +69,3 @@ def test_paths_are_those_that_the_samples_take(shared_env: SharedEnv) -> None:
     qpos = plant.get_state()[0, plant.state_space.parts["qpos"]]
     np.testing.assert_allclose(traces.final.qpos, qpos, atol=1e-6)
     assert control.look() is None  # nothing new
-
-
-def test_the_thread_keeps_the_newest_plan_and_forgets_on_request(shared_env: SharedEnv) -> None:
-    plant = shared_env("point_mass", autoreset=False)
-    control = WorldControl("mppi", lw.MPPI("point_mass", samples=4, horizon=3))
-    control.look()
-    control.new_run()(plant.get_state()[0], plant.obs[0])
-    view = control.look()
-    assert view is not None
-    thread = TraceThread(TraceRollouts(control.controller, plant, "agent"))
-    thread.give(view)
-    end = time.monotonic() + 10
-    while (traces := thread.newest()) is None and time.monotonic() < end:
-        time.sleep(0.01)
-    assert traces is not None and thread.error is None
-    thread.forget()
-    assert thread.newest() is None
-    thread.close()

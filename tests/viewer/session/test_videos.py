@@ -1,6 +1,5 @@
 """Videos of the viewer."""
 
-import dataclasses
 import os
 import signal
 import threading
@@ -16,7 +15,7 @@ from memory_window import MemoryWindow
 
 from lyceum_warp.support.interrupts import Interrupted, signals
 from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Command, Frame
+from lyceum_warp.viewer.protocol import Command, Frame
 from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viewer.session.videos import VideoTaker
 from lyceum_warp.viz import drawing
@@ -47,16 +46,6 @@ def test_a_video_of_the_session_is_written_and_reported(
     assert f"video: {video.name}" in printed and video.read_bytes()[4:8] == b"ftyp"
 
 
-def test_a_missing_package_is_a_message(shared_env: SharedEnv, monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing() -> None:
-        raise NoVideoError("videos need imageio: pip install 'lyceum-warp[viz]'")
-
-    monkeypatch.setattr("lyceum_warp.viz.drawing.check_video", missing)
-    session = Session(shared_env("hopper"), paused=True)
-    session.obey(protocol.SetVideo(True))
-    assert session.stage.frame().messages == ("videos need imageio: pip install 'lyceum-warp[viz]'",)
-
-
 @pytest.fixture
 def frame(shared_env: SharedEnv) -> Frame:
     return Session(shared_env("hopper"), paused=True).stage.frame()
@@ -69,7 +58,7 @@ def taker(shared_env: SharedEnv, tmp_path: Path) -> VideoTaker:
 
 
 def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Record a video on a machine that draws two poses a second, until one pose is drawn and others wait."""
+    """Make a video on a machine that draws two poses a second, until one pose is drawn and others wait."""
     drawn, draw = threading.Event(), drawing.Drawing.draw
 
     def slow(self: drawing.Drawing, shot: Any) -> None:
@@ -131,12 +120,3 @@ def test_a_video_that_cannot_be_drawn_is_reported_once(tmp_path: Path) -> None:
         taker.finish(lines.append)
         taker.cancel()
     assert len(lines) == 2 and all(line.startswith("no video: ") for line in lines)
-
-
-def test_traces_have_the_colours_of_the_page(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
-    shots: list[Any] = []
-    monkeypatch.setattr("lyceum_warp.viz.video.Recorder.add", lambda self, *pose, **shown: shots.append(shown))
-    taker.begin(None)
-    taker.add(dataclasses.replace(frame, traces=np.zeros((2, 3, 3)), best=1))
-    taker.cancel()
-    assert [tuple(colour) for _, colour in shots[0]["lines"]] == [TRACE_COLOUR, BEST_COLOUR]

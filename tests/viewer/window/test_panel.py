@@ -30,11 +30,6 @@ def pressed(bench: Bench, key: str, **status: object) -> list[object]:
 # frames and windows
 
 
-def test_address_is_reported_when_the_window_runs(bench: Bench) -> None:
-    assert bench.sent == [Opened("http://here")]
-    assert bench.draw() == []  # before the first frame
-
-
 @pytest.mark.parametrize("mode", ["passive", "controller", "playback"])
 def test_panel_draws_every_mode_with_all_windows_open(bench: Bench, mode: str) -> None:
     bench.panel.actions.windows |= set(WINDOWS)
@@ -42,15 +37,11 @@ def test_panel_draws_every_mode_with_all_windows_open(bench: Bench, mode: str) -
         bench.model, bench.data, status_of(mode=mode, episode=1, video="video.mp4", seekable=(0, 20)),
         samples=np.array([[0.0, 1.0, np.nan], [0.1, 2.0, 3.0]]), messages=("world 3: terminated",),
     )  # fmt: skip
-    assert bench.draw(frame) == []
-    assert bench.draw() == []
-
-
-def test_scene_with_one_world_and_no_curves_draws() -> None:
-    model = robot()
-    bench = Bench(model, scene_of(model, nworld=1, modes=("passive",), controllers=(), episodes=(), curves=()))
-    bench.panel.actions.windows |= set(WINDOWS)
-    assert bench.draw(frame_of(model, bench.data, status_of(controller=None, world=0))) == []
+    assert bench.sent == [Opened("http://here")]
+    assert bench.draw() == bench.draw(frame) == bench.draw() == []  # before the first frame, with it and after it
+    small = Bench(bench.model, scene_of(bench.model, nworld=1, controllers=(), episodes=(), curves=()))
+    small.panel.actions.windows |= set(WINDOWS)
+    assert small.draw(frame_of(small.model, small.data, status_of(controller=None, world=0))) == []
 
 
 def test_state_of_the_frame_is_drawn_if_it_is_finite(bench: Bench) -> None:
@@ -59,12 +50,6 @@ def test_state_of_the_frame_is_drawn_if_it_is_finite(bench: Bench) -> None:
     bench.data.qpos[0] = np.nan
     bench.show(status_of())
     np.testing.assert_allclose(bench.viewer.data.body("ball").xpos, [1, 2, 3])
-
-
-def test_messages_of_frames_are_kept_in_order(bench: Bench) -> None:
-    bench.draw(frame_of(bench.model, bench.data, messages=("one", "two")))
-    bench.draw(frame_of(bench.model, bench.data, messages=("three",)))
-    assert list(bench.panel.actions.messages) == ["one", "two", "three"]
 
 
 def ghost_beside(data: mujoco.MjData) -> Ghost:
@@ -90,7 +75,9 @@ def test_dropped_model_is_refused_with_a_message(bench: Bench) -> None:
     bench.show(status_of())
     bench.viewer.dropped = "/tmp/mujoco_drop_1/other.xml"
     assert bench.draw() == []
-    assert bench.panel.actions.messages[-1].startswith("other.xml was not loaded")
+    bench.draw(frame_of(bench.model, bench.data, messages=("one", "two")))
+    (refusal, *others) = bench.panel.actions.messages
+    assert refusal.startswith("other.xml was not loaded") and others == ["one", "two"]
 
 
 # keys
@@ -140,7 +127,7 @@ def test_keys_are_unique_and_known_to_studio() -> None:
 # cameras and videos
 
 
-def test_the_first_camera_tracks_the_body_of_a_tracking_camera_and_records_videos(bench: Bench) -> None:
+def test_the_first_camera_tracks_the_body_of_a_tracking_camera_and_takes_videos(bench: Bench) -> None:
     ball = bench.model.body("ball").id
     (command,) = pressed(bench, "Ctrl+V")
     assert isinstance(command, SetVideo) and command.on and command.camera is not None

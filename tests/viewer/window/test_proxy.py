@@ -79,22 +79,15 @@ def proxy(upstream: Upstream) -> Iterator[Proxy]:
         yield opened
 
 
-@pytest.fixture
-def untouched(upstream: Upstream) -> Iterator[None]:
-    """Nothing of the test may reach the private server."""
-    yield
-    assert not upstream.received
-
-
 def token(proxy: Proxy) -> str:
     return proxy.address.partition("token=")[2]
 
 
-def request(proxy: Proxy, head: str, *, rest: bytes = b"") -> bytes:
-    """Everything that the proxy answers to a head, whose lines are separated by line breaks."""
+def answer_to(proxy: Proxy, lines: list[str], *, rest: bytes = b"") -> bytes:
+    """Everything that the proxy answers to the lines of a head."""
     with socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client:
-        lines = head.split("\n")
-        lines.append("Connection: close" if "Connection: " not in head else "X: y")
+        if not any("Connection: " in line for line in lines):
+            lines = [*lines, "Connection: close"]
         client.sendall("\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + rest)
         answer = b""
         while data := client.recv(65536):
@@ -107,23 +100,25 @@ def status(answer: bytes) -> int:
 
 
 def entered(proxy: Proxy) -> tuple[str, str]:
-    """The cookie that the token is exchanged for, and the path that it belongs to."""
-    answer = request(proxy, f"GET /?token={token(proxy)} HTTP/1.1\nHost: 127.0.0.1").decode()
+    """The cookie that the token is exchanged for, and its path."""
+    answer = answer_to(proxy, [f"GET /?token={token(proxy)} HTTP/1.1", "Host: 127.0.0.1"]).decode()
     found = re.search(r"\r\nSet-Cookie: ([^;]*); Path=(/[^;]*)/;", answer)
     assert found is not None
     return found[1], found[2]
 
 
 def get(
-    proxy: Proxy, path: str = "/", *headers: str, host: str = "", key: str | None = None, whole: bool = False
-) -> bytes:
-    """The answer to GET below the right path, with the right cookie or with another one."""
-    own, before = entered(proxy)
-    path = path if "token=" in path or whole else before + path
-    key = f"Cookie: {own if key is None else key}"
-    return request(
-        proxy, "\n".join([f"GET {path} HTTP/1.1", f"Host: {host or f'127.0.0.1:{proxy.port}'}", key, *headers])
-    )
+    proxy: Proxy, path: str = "/PATH/", *headers: str, host: str = "HOST", cookie: str = "lyceum-warp=VALUE",
+    method: str = "GET", rest: bytes = b"",
+) -> bytes:  # fmt: skip
+    """The answer to a request, in which words in capitals stand for the proxy's port, path, cookie and token."""
+    own, below = entered(proxy)
+    words = {"HOST": "127.0.0.1:PORT", "PORT": str(proxy.port), "PATH": below.strip("/"), "TOKEN": token(proxy),
+             "VALUE": own.partition("=")[2]}  # fmt: skip
+    lines = [f"{method} {path} HTTP/1.1", f"Host: {host}", f"Cookie: {cookie}", *headers]
+    for word, meaning in words.items():
+        lines = [line.replace(word, meaning) for line in lines]
+    return answer_to(proxy, lines, rest=rest)
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
@@ -137,7 +132,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 def test_the_token_becomes_a_cookie_and_leaves_the_address(proxy: Proxy, upstream: Upstream) -> None:
-    answer = request(proxy, f"GET /?token={token(proxy)} HTTP/1.1\nHost: localhost:{proxy.port}").decode()
+    answer = get(proxy, "/?token=TOKEN", host="localhost:PORT", cookie="").decode()
     assert answer.startswith("HTTP/1.1 303 ") and len(token(proxy)) == 43  # 32 bytes
     target = re.search(r"\r\nLocation: (/[\w-]{43}/)\r\n", answer)
     given = re.search(r"\r\nSet-Cookie: lyceum-warp=([\w-]{43})(.*)\r\n", answer)
@@ -149,8 +144,8 @@ def test_the_token_becomes_a_cookie_and_leaves_the_address(proxy: Proxy, upstrea
         assert token(other) != token(proxy)
         other.start(("127.0.0.1", 1))
         foreign = entered(other)[0]
-    assert status(get(proxy, key=foreign)) == 403
-    assert get(proxy, key=f"{foreign}; bad[{{; theme=dark; {entered(proxy)[0]}; lyceum-warp=stale").endswith(b"robot")
+    assert status(get(proxy, cookie=foreign)) == 403
+    assert get(proxy, cookie=f"{foreign}; bad[{{; theme=dark; lyceum-warp=VALUE; lyceum-warp=x").endswith(b"robot")
 
 
 class Jar(http.cookiejar.CookieJar):
@@ -187,8 +182,8 @@ FOREIGN = [
 HOSTS = ("evil.example", "evil.example:PORT", "127.0.0.1.evil.example", "localhost.evil.example:PORT", "localhost.")
 COOKIES = ("", "lyceum-warp=", "lyceum-warp=wrong", "lyceum-warp=TOKEN", "x=VALUE", "lyceum-warp=VALUEx",
            "lyceum-warp=PATH", "lyceum-warp=VALUE\xe9")  # fmt: skip
-TOKENS = ("/?token=", "/?token=WRONG", "/?token=OTHER", "/?token=TOKEN&token=WRONG", "/?token=TOKEN&token=TOKEN",
-          "/model?token=WRONG", "/model?token=TOKEN", "/?token=token\xe9")  # fmt: skip
+TOKENS = ("/?token=", "/?token=WRONG", "/?token=TOKEN&token=WRONG", "/?token=TOKEN&token=TOKEN", "/model?token=WRONG",
+          "/model?token=TOKEN", "/?token=token\xe9")  # fmt: skip
 PLACES = ("/", "/index.html", "//", "/WRONG/", "/PATH", "/PATHx/", "//PATH/", "/x/../PATH/", "/VALUE/", "/model",
           "/?tokenx=TOKEN")  # fmt: skip
 SPELLINGS = ("//drop", "/./drop", "/x/../drop", "/%64rop", "/drop%20", "/..", "/assets/../../x", "/\\drop")
@@ -197,70 +192,49 @@ UPGRADES = [
     for header in ("Upgrade: h2c", "Sec-WebSocket-Key: short", "Sec-WebSocket-Key: ", "Connection: close",
                    "Sec-WebSocket-Version: 6")
 ]  # fmt: skip
-LARGE = ("X: " + "a" * 20_000, "\n".join(f"X-{n}: {n}" for n in range(3000)), "Cookie: " + "a=b; " * 5000)
-ATTACKS: list[tuple[set[int], str, dict[str, object]]] = [
-    *[({400, 403}, path, {}) for path in TOKENS],
-    *[({403}, path, {"whole": True}) for path in PLACES],
-    *[({403}, "/", {"key": key}) for key in COOKIES],
-    *[({403}, "/ui", {"headers": UPGRADE, "key": key}) for key in COOKIES],
-    *[({403}, path, {"headers": headers}) for headers in FOREIGN for path in ("/model", "/?token=TOKEN")],
-    *[({403}, "/state", {"headers": (*headers, *UPGRADE)}) for headers in FOREIGN],
-    ({403}, "/", {"headers": ("Origin: http://127.0.0.1:PORT", "Origin: http://evil.example")}),
-    *[({421}, path, {"host": host}) for host in HOSTS for path in ("/", "/?token=TOKEN")],
-    *[({400}, "/", {"host": host}) for host in ("a@HOST", "HOST/", "HOST\nHost: HOST", " ")],
-    *[({400, 404}, path, {"headers": headers}) for path in SPELLINGS for headers in ((), UPGRADE)],
-    *[({404}, path, {"headers": UPGRADE}) for path in ("/", "/model", "/upload", "/drop", "/drop?sid=1", "/ui/")],
-    *[({400}, "/ui", {"headers": headers}) for headers in UPGRADES],
-    *[({400, 431}, "/", {"headers": (header,)}) for header in LARGE],
+LARGE = ("X: " + "a" * 20_000, "\r\n".join(f"X-{n}: {n}" for n in range(3000)), "Cookie: " + "a=b; " * 5000)
+BODIES = ("Content-Length: 44", "Transfer-Encoding: chunked", "Content-Length: 0\r\nTransfer-Encoding: chunked")
+LINK = ("Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: navigate", "Sec-Fetch-Dest: document")
+ATTACKS: list[tuple[set[int], str, tuple[str, ...], dict[str, str]]] = [
+    *[({400, 403}, path, (), {}) for path in TOKENS],
+    *[({403}, path, (), {}) for path in PLACES],
+    *[({403}, "/PATH/", headers, {"cookie": cookie}) for cookie in COOKIES for headers in ((), LINK)],
+    *[({403}, "/PATH/ui", UPGRADE, {"cookie": cookie}) for cookie in COOKIES],
+    *[({403}, path, headers, {}) for headers in FOREIGN for path in ("/PATH/model", "/?token=TOKEN")],
+    *[({403}, "/PATH/state", (*headers, *UPGRADE), {}) for headers in FOREIGN],
+    ({403}, "/PATH/", ("Origin: http://127.0.0.1:PORT", "Origin: http://evil.example"), {}),
+    *[({421}, path, (), {"host": host}) for host in HOSTS for path in ("/PATH/", "/?token=TOKEN")],
+    *[({400}, "/PATH/", (), {"host": host}) for host in ("a@HOST", "HOST/", "HOST\r\nHost: HOST", " ")],
+    *[({400, 404}, f"/PATH{path}", headers, {}) for path in SPELLINGS for headers in ((), UPGRADE)],
+    *[({404}, f"/PATH/{path}", UPGRADE, {}) for path in ("", "model", "upload", "drop", "drop?sid=1", "ui/")],
+    *[({400}, "/PATH/ui", headers, {}) for headers in UPGRADES],
+    *[({400, 431}, "/PATH/", (header,), {}) for header in LARGE],
+    *[({405}, "/PATH/", (), {"method": method}) for method in ("POST", "PUT", "DELETE", "HEAD", "OPTIONS", "TRACE")],
+    *[({400}, "/PATH/", (header,), {}) for header in BODIES],
 ]  # fmt: skip
 
 
-@pytest.mark.usefixtures("untouched")
-@pytest.mark.parametrize(("codes", "path", "given"), ATTACKS)
-def test_an_attack_is_refused(proxy: Proxy, codes: set[int], path: str, given: dict[str, object]) -> None:
-    cookie, below = entered(proxy)
-    with Proxy() as other:
-        words = {"PORT": str(proxy.port), "PATH": below.strip("/"), "VALUE": cookie.partition("=")[2],
-                 "TOKEN": token(proxy), "OTHER": token(other), "HOST": f"127.0.0.1:{proxy.port}"}  # fmt: skip
-
-    def filled(text: str) -> str:
-        for word, meaning in words.items():
-            text = text.replace(word, meaning)
-        return text
-
-    options = {name: filled(str(given[name])) for name in ("host", "key") if name in given}
-    headers = [filled(line) for line in given.get("headers", ())]  # type: ignore[attr-defined]
-    answer = get(proxy, filled(path), *headers, whole="whole" in given, **options)  # type: ignore[arg-type]
-    assert status(answer) in codes
-
-
-REST = b"0\r\n\r\nGET /drop HTTP/1.1\r\n\r\n"
-
-
-@pytest.mark.usefixtures("untouched")
-@pytest.mark.parametrize(("method", "header", "code"), [
-    *[(method, "X: y", 405) for method in ("POST", "PUT", "DELETE", "HEAD", "OPTIONS", "TRACE")],
-    *[("GET", header, 400) for header in ("Content-Length: 44", "Transfer-Encoding: chunked",
-                                          "Content-Length: 0\nTransfer-Encoding: chunked")],
-])  # fmt: skip
-def test_other_methods_and_requests_with_a_body_are_refused(proxy: Proxy, method: str, header: str, code: int) -> None:
-    key, path = entered(proxy)
-    head = f"{method} {path}/ HTTP/1.1\nHost: 127.0.0.1\nCookie: {key}\n{header}"
-    answer = request(proxy, head, rest=REST if code == 400 else b"")
-    assert status(answer) == code and len(re.findall(rb"HTTP/1\.[01] \d", answer)) == 1
+@pytest.mark.parametrize(("codes", "path", "headers", "options"), ATTACKS)
+def test_an_attack_is_refused(
+    proxy: Proxy, upstream: Upstream, codes: set[int], path: str, headers: tuple[str, ...], options: dict[str, str]
+) -> None:
+    smuggled = b"0\r\n\r\nGET /drop HTTP/1.1\r\n\r\n" if headers and headers[0] in BODIES else b""
+    answer = get(proxy, path, *headers, rest=smuggled, **options)  # type: ignore[arg-type]
+    assert status(answer) in codes and len(re.findall(rb"HTTP/1\.[01] \d", answer)) == 1
+    assert not upstream.received
 
 
 # what studio's responses may contain
 
 
 def test_other_sites_cannot_read_or_embed_the_page_and_studio_sets_no_cookies(proxy: Proxy) -> None:
-    for answer in (get(proxy, "/model"), get(proxy, key=""), request(proxy, "GET / HTTP/1.1\nHost: x")):
+    for answer in (get(proxy, "/PATH/model"), get(proxy, cookie=""), get(proxy, host="x")):
         head = answer.partition(b"\r\n\r\n")[0].decode().lower()
         for line in ("x-frame-options: deny", "cross-origin-resource-policy: same-origin",
                      "referrer-policy: no-referrer"):  # fmt: skip
             assert head.count(f"\r\n{line}") == 1
         assert "access-control-" not in head and "set-cookie" not in head
-    assert b"\r\nCache-Control: no-cache\r\n" in get(proxy, "/model")
+    assert b"\r\nCache-Control: no-cache\r\n" in get(proxy, "/PATH/model")
 
 
 def test_the_page_asks_below_its_path() -> None:
@@ -285,33 +259,27 @@ def test_a_broken_or_missing_response_is_reported(answer: bytes | None) -> None:
         assert status(get(proxy)) == 502
 
 
-# other sites
+# requests
 
 
-@pytest.mark.usefixtures("untouched")
-def test_a_link_on_another_page_leads_to_the_viewer_if_it_has_the_token(proxy: Proxy) -> None:
-    link = ("Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: navigate", "Sec-Fetch-Dest: document")
-    assert status(get(proxy, "/", *link, key="")) == 403
-    answer = get(proxy, f"/?token={token(proxy)}", *link, key="").decode()
-    assert answer.startswith("HTTP/1.1 200 ") and "Set-Cookie: " in answer
+def test_a_link_on_another_page_leads_to_the_viewer_if_it_has_the_token(proxy: Proxy, upstream: Upstream) -> None:
+    answer = get(proxy, "/?token=TOKEN", *LINK, cookie="").decode()
+    assert answer.startswith("HTTP/1.1 200 ") and "Set-Cookie: " in answer and not upstream.received
     assert f'content="0; url={entered(proxy)[1]}/"' in answer
 
 
 @pytest.mark.parametrize(
-    "host", ["127.0.0.1", "127.0.0.1:9000", "localhost:9000", "LOCALHOST:80", "[::1]:9000", "192.168.0.7:8080"]
+    "host", ["127.0.0.1", "127.0.0.1:9000", "localhost:9000", "Localhost:80", "[::1]:9000", "192.168.0.7:8080"]
 )
 def test_addresses_of_this_machine_are_accepted_at_any_port(proxy: Proxy, host: str) -> None:
     """A port may be forwarded."""
-    assert status(get(proxy, "/", f"Origin: http://{host.lower()}", host=host)) == 200
-
-
-# requests
+    assert status(get(proxy, "/PATH/", f"Origin: http://{host.lower()}", host=host)) == 200
 
 
 def test_pages_are_forwarded_without_the_clients_headers(proxy: Proxy, upstream: Upstream) -> None:
     for path in ("/index.html", "/model?crc32=1&total_bytes", "/assets/AtkinsonHyperlegibleNext[wght].ttf"):
         upstream.received.clear()
-        assert get(proxy, path, "X-Forwarded-For: 1").endswith(b"\r\n\r\nrobot")
+        assert get(proxy, f"/PATH{path}", "X-Forwarded-For: 1").endswith(b"\r\n\r\nrobot")
         (received,) = upstream.received
         assert received.startswith(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:".encode())
         assert b"Cookie" not in received and b"X-Forwarded-For" not in received
@@ -327,11 +295,8 @@ def test_an_endless_head_is_refused_without_being_kept(proxy: Proxy) -> None:
 
 
 def test_a_second_request_on_a_connection_is_checked_again(proxy: Proxy, upstream: Upstream) -> None:
-    key, path = entered(proxy)
-    answer = request(
-        proxy, f"GET {path}/ HTTP/1.1\nHost: 127.0.0.1\nCookie: {key}\nConnection: keep-alive",
-        rest=b"GET /model HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n",
-    )  # fmt: skip
+    second = b"GET /model HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+    answer = get(proxy, "/PATH/", "Connection: keep-alive", rest=second)
     assert [int(code) for code in re.findall(rb"HTTP/1.1 (\d+)", answer)] == [200, 403]
     assert len(upstream.received) == 1
 

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from lyceum_warp.viewer.window.actions import SPEEDS
-from lyceum_warp.viewer.window.windows import Curves, numbers, speed_name
+from lyceum_warp.viewer.window.windows import Curves, numbers
 
 
 def ramp(begin: int, end: int) -> np.ndarray:
@@ -38,10 +37,6 @@ def test_thinned_curve_keeps_its_extremes() -> None:
     assert len(thin) == 50
     assert (thin[:, 1].min(), thin[:, 1].max()) == (-7, 5)
     assert (np.diff(thin[:, 0]) >= 0).all()
-
-
-def test_speeds_are_named_as_fractions() -> None:
-    assert [speed_name(speed) for speed in SPEEDS] == ["1/16", "1/8", "1/4", "1/2", "1", "2", "4", "8", "16"]
 
 
 def test_numbers_and_ranges_are_read_once_each() -> None:
