@@ -4,6 +4,7 @@ import copy
 import multiprocessing
 import pickle
 import sys
+import traceback
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,33 @@ import torch
 import lyceum_warp as lw
 
 PACKAGE = Path(lw.__file__).parent
+
+
+def own_frames() -> list[tuple[str, str]]:
+    """The files and functions of the package on the stack, outermost first."""
+    frames = [(Path(frame.filename), frame.name) for frame in traceback.extract_stack()]
+    return [(str(path.relative_to(PACKAGE)), name) for path, name in frames if path.is_relative_to(PACKAGE)]
+
+
+class Spy:
+    """Passes everything on, and keeps the stack of calls of ``step``."""
+
+    def __init__(self, batch: Any) -> None:
+        self.batch, self.stacks = batch, []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.batch, name)
+
+    def step(self, *args: Any, **kwargs: Any) -> Any:
+        self.stacks.append(own_frames())
+        return self.batch.step(*args, **kwargs)
+
+
+def test_a_step_reaches_the_c_engine_through_two_functions() -> None:
+    env = lw.make("hopper", nworld=2)
+    env.engine.batch = spy = Spy(env.engine.batch)  # type: ignore[attr-defined]
+    env.step()
+    assert spy.stacks == [[("env.py", "step"), ("engines/c/mujoco_engine.py", "_advance")]]
 
 
 def test_the_phases_of_a_step_are_one_list_in_order() -> None:
@@ -43,6 +71,17 @@ def test_time_and_controls_are_always_kept() -> None:
     env.step(torch.full((2, 3), 0.5))
     assert torch.equal(env.time, torch.full((2,), env.timestep))
     assert torch.equal(env.field("ctrl"), env.action)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_fields_beside_the_task_do_not_change_its_numbers(engine: str) -> None:
+    plain, more = (lw.make("reach", nworld=3, engine=engine, fields=fields) for fields in ((), ("xpos", "cvel")))
+    for env in (plain, more):
+        env.rand_reset(1)
+        for _ in range(3):
+            env.step(torch.full_like(env.action, 0.3))
+    assert torch.equal(plain.obs, more.obs)
+    assert torch.equal(plain.reward, more.reward)
 
 
 @pytest.mark.parametrize("spoil", [pickle.dumps, copy.copy, copy.deepcopy])

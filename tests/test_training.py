@@ -1,6 +1,8 @@
 """Training with a run's folder: ended, continued and warm-started."""
 
+import contextlib
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -321,14 +323,14 @@ def test_a_run_notes_what_its_caller_gives_and_shows_its_way(env: lw.Env, tmp_pa
         def __init__(self) -> None:
             self.seen: list[object] = []
 
-        def begin(self, run: Run, learner: lw.Learner, iterations: int) -> None:
+        @contextlib.contextmanager
+        def training(self, run: Run, learner: lw.Learner, iterations: int) -> Iterator[None]:
             self.seen.append((run.folder, learner.iteration, iterations))
+            yield
+            self.seen.append("end")
 
         def __call__(self, iteration: lw.Iteration) -> None:
             self.seen.append(iteration.iteration)
-
-        def end(self) -> None:
-            self.seen.append("end")
 
     display, folder = Seen(), tmp_path / "run"
     lw.train(algorithm(env), folder, iterations=2, entries={"tag": "mine"}, display=display)

@@ -1,4 +1,4 @@
-"""The source of a Warp function: its syntax tree, its lines in the file, and what its names stand for."""
+"""Parse the source of a Warp function, and resolve its lines in the file and its names."""
 
 import ast
 import builtins
@@ -75,19 +75,24 @@ class FunctionSource:
         )
 
     def condition(self, node: ast.expr) -> bool | None:
-        """The value of a condition that Warp evaluates when it compiles; None for all others."""
-        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
-            inner = self.condition(node.operand)
-            return None if inner is None else not inner
-        if self.is_static(node):
-            found = self.value(node)
-            return None if found is None else bool(found)
-        return None
+        """The value of a condition ``wp.static(...)``, whose other branch Warp does not compile; None for any other."""
+        found = self.value(node) if self.is_static(node) else None
+        return None if found is None else bool(found)
 
 
 def has_source(function: wp.Function) -> bool:
     """Whether a function's source is Python: not that of a builtin, or of a ``wp.func_native``."""
     return function.func is not None and function.native_snippet is None
+
+
+def is_struct(kind: Any) -> bool:
+    """Whether a type is a ``wp.struct``."""
+    return hasattr(kind, "vars") and hasattr(kind, "cls")
+
+
+def is_row(kind: Any) -> bool:
+    """Whether a type is an array."""
+    return hasattr(kind, "ndim") and hasattr(kind, "dtype")
 
 
 def name_of(function: wp.Function) -> str:

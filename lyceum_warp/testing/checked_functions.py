@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from lyceum_warp.binding.sources import FunctionSource, has_source, name_of, overloads
+from lyceum_warp.binding.sources import FunctionSource, has_source, is_row, is_struct, name_of, overloads
 from lyceum_warp.kernels import bounds
 
 _SHAPES = ("shape", "strides")
@@ -70,25 +70,13 @@ class CheckedFunctions:
         functions: The functions by name.
         world: The task's World.
         batch: The struct of the task's fields for all worlds.
-        unrolled: Whether Warp writes short loops out, as it does for the task itself. Without it the copies compile in
-            a fraction of the time, but a loop cannot change a name that was assigned a constant.
 
     Raises:
         Unchecked: A function can't be copied.
     """
 
-    def __init__(
-        self,
-        module: str,
-        functions: Mapping[str, wp.Function],
-        world: Any,
-        batch: Any,
-        *,
-        unrolled: bool = False,
-    ) -> None:
-        self._module, self._world, self._batch, self.unrolled = module, world, batch, unrolled
-        if not unrolled:
-            wp.get_module(module).options["max_unroll"] = 0
+    def __init__(self, module: str, functions: Mapping[str, wp.Function], world: Any, batch: Any) -> None:
+        self._module, self._world, self._batch = module, world, batch
         self.places: list[Place] = []
         self._numbers: dict[wp.Function, int] = {}
         self._copies: dict[int, wp.Function] = {}
@@ -183,7 +171,7 @@ class CheckedFunctions:
                 lines += [f"s_{i}.{field} = batch_{i}.{field}[w % batch_{i}.{field}.shape[0]]" for field in kind.vars]
                 values.append(f"s_{i}")
             else:
-                scope[f"type_{i}"] = wp.array2d(dtype=kind.dtype) if _is_row(kind) else wp.array(dtype=kind)
+                scope[f"type_{i}"] = wp.array2d(dtype=kind.dtype) if is_row(kind) else wp.array(dtype=kind)
                 arguments.append(f"values_{i}: type_{i}")
                 values.append(f"values_{i}[w % values_{i}.shape[0]]")
         lines.append(f"copy({', '.join(values)})")
@@ -251,7 +239,7 @@ class _Rewriter(ast.NodeTransformer):
             self.callees.append(number)
             node.func = _name(f"bounds_{number}")
             node.args.insert(0, _name("bounds_report"))
-        elif any(_is_row(kind) or hasattr(kind, "vars") for kind in callee.input_types.values()):
+        elif any(is_row(kind) or is_struct(kind) for kind in callee.input_types.values()):
             raise Unchecked(
                 f"{self.source.name} calls the native function {name_of(callee)} ({self.source.place(node)}), which "
                 "has no source in Python: give it numbers instead of rows"
@@ -291,7 +279,7 @@ class _Rewriter(ast.NodeTransformer):
         """Whether Warp itself checks the index, which must be a constant."""
         value = self.source.value(node.value)
         not_ours = value is not None and not hasattr(value, "_wp_scalar_type_")  # a type, or Python's own tuple
-        return not_ours or _is_tuple(self.source, node.value)
+        return not_ours or (isinstance(node.value, ast.Attribute) and node.value.attr in _SHAPES)
 
     def _checked(self, node: ast.AST, text: str, verb: str, base: ast.expr, axis: int, index: ast.expr) -> ast.expr:
         """An index along one axis, with its check."""
@@ -314,35 +302,6 @@ class _Rewriter(ast.NodeTransformer):
         ).body
         node.body = [*count[1:], *node.body]
         return [count[0], node]
-
-
-def _is_tuple(source: FunctionSource, node: ast.expr, seen: frozenset[Any] = frozenset()) -> bool:
-    """Whether an expression is a tuple, or the shape of an array."""
-    if isinstance(node, ast.Attribute):
-        return node.attr in _SHAPES
-    if isinstance(node, ast.Tuple):
-        return True
-    if isinstance(node, ast.Name):
-        key: Any = (source.function, node.id)
-        values = [
-            inner.value
-            for inner in ast.walk(source.tree)
-            if isinstance(inner, ast.Assign)
-            and any(isinstance(target, ast.Name) and target.id == node.id for target in inner.targets)
-        ]
-    elif isinstance(node, ast.Call):
-        key = source.value(node.func)
-        if not isinstance(key, wp.Function) or not has_source(key):
-            return False
-        source = FunctionSource(key)
-        values = [inner.value for inner in ast.walk(source.tree) if isinstance(inner, ast.Return) and inner.value]
-    else:
-        return False
-    return key not in seen and any(_is_tuple(source, value, seen | {key}) for value in values)
-
-
-def _is_row(kind: Any) -> bool:
-    return hasattr(kind, "ndim") and hasattr(kind, "dtype")
 
 
 def _name(name: str) -> ast.Name:
@@ -381,22 +340,11 @@ def checked_functions(
         Unchecked: A function can't be checked.
     """
     key = (world, batch, *functions.items())
-    if key in _made:
-        _made[key].load(device)
-        return _made[key]
-    failure: Unchecked | None = None
-    for unrolled in (False, True):
-        module = re.sub(r"[^\w.]", "_", f"lyceum_warp.checked.{name}{'.unrolled' * unrolled}")
+    if key not in _made:
+        module = re.sub(r"[^\w.]", "_", f"lyceum_warp.checked.{name}")
         taken = sum(other == module or other.startswith(f"{module}_again") for other in _module_names)
         module = f"{module}_again{taken}" if taken else module
         _module_names.append(module)
-        checked = CheckedFunctions(module, functions, world, batch, unrolled=unrolled)
-        try:
-            checked.load(device)
-        except Unchecked as error:
-            failure = failure or error
-        else:
-            _made[key] = checked
-            return checked
-    assert failure is not None
-    raise failure
+        _made[key] = CheckedFunctions(module, functions, world, batch)
+    _made[key].load(device)
+    return _made[key]

@@ -41,7 +41,7 @@ CLASSES = {
     "R8 steps": ("check --steps -5 is a traceback", r"^lyceum-warp check .* at "),
     "N8": ("evaluate passes on torch's error about a policy of other sizes", r"^evaluate\(.*policy="),
 }
-"""What is known, and how the line of a failure of each class looks."""
+"""Known failures, and the pattern of their lines, by class."""
 
 
 def reason(name: str) -> str:

@@ -124,7 +124,7 @@ def test_a_graph_holds_the_launches_of_its_own_thread_alone() -> None:
         thread.start()
         thread.join()
 
-    # the lock keeps captures of the package apart, so this one must be Warp's own
+    # the lock keeps captures of the package apart, so that this one must be Warp's own
     mine.phase(1).run()
     with wp.ScopedCapture(device=cpu) as capture:
         mine.phase(1).run()

@@ -1,4 +1,4 @@
-"""Files with policies and states: those that are broken, foreign or missing."""
+"""Broken, foreign and missing files of policies and states."""
 
 from pathlib import Path
 
@@ -85,7 +85,7 @@ def test_a_policy_of_any_class_is_saved_without_a_value_function(tmp_path: Path)
 
 
 def test_a_module_of_the_package_is_made_again_by_its_class_and_its_shape(tmp_path: Path) -> None:
-    """A value function in the place of a policy stands for policies of later releases."""
+    """A value function in place of a policy represents policies of later releases."""
     run = Run.create(tmp_path / "run", {})
     run.save(policy_content(1, ValueFunction(3, (4,))), {})
     loaded = load(run)
