@@ -21,8 +21,8 @@ from lyceum_warp.support.docstrings import document_attributes
 class Engine(abc.ABC):
     """Many worlds of one model, stepped together.
 
-    An engine knows nothing of tasks. Its fields lie in Warp arrays with a leading ``nworld`` axis. Their addresses never
-    change, so graphs that read them are captured once.
+    An engine knows nothing of tasks. Its fields lie in Warp arrays with a leading ``nworld`` axis. The addresses of the
+    arrays never change, so graphs that read them are captured once.
 
     The order of calls in a step is: write ``ctrl`` and other inputs, ``step``, ``find_faults``, read fields and
     ``fault``; for worlds that restart, ``reset``, write state fields and model fields, ``commit``, ``apply_model``,
