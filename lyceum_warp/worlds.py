@@ -263,7 +263,11 @@ class Worlds(WorldArrays):
             fault, action_fault, self.outcome, self.metric_sums, self.obs, self.final_obs, self.restarting,
             self.fault_count,
         ], self.device)  # fmt: skip
-        if self.success_counts.size:  # the task asks for several steps in a row with its goal met
+        self._hold_success(mask, transition=transition)
+
+    def _hold_success(self, mask: wp.array, *, transition: bool) -> None:
+        """Let a success count after ``success_steps`` in a row."""
+        if self.success_counts.size:
             args = [mask, transition, self.task.task.success_steps, self.success_counts, self.outcome.success]
             launch_worlds(steps.hold_success, self.nworld, args, self.device)
 
@@ -315,13 +319,16 @@ class Worlds(WorldArrays):
             self.restarting, self.after, self.params, self.counters, self._continuing, self._physics_changed,
             self._changed, self._outdated,
         ], self.device)  # fmt: skip
-        for name, copy in before.items():  # a field is physics, or the task's memory
-            args = [self._continuing, flat(copy), flat(live[name]), name not in MEMORIES]
-            launch_lanes(rows.mark_changes, self.nworld, [
-                *args, self._physics_changed, self._changed, self._outdated,
-            ], self.device)  # fmt: skip
+        for name, copy in before.items():
+            self._mark_changes(copy, live[name], physics=name not in MEMORIES)
         state_fields = [name for name in before if name not in MEMORIES and name not in self._model_copies]
         self.engine.commit(self._physics_changed, state_fields)
+
+    def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
+        """Mark the worlds that continue and in which a field changed: it is physics, or the task's memory."""
+        found = [self._physics_changed, self._changed, self._outdated]
+        args = [self._continuing, flat(before), flat(after), physics, *found]
+        launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _observe(self, mask: wp.array) -> None:
         """Observe the masked worlds; the others were observed when they were judged."""
