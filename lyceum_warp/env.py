@@ -95,9 +95,9 @@ class Env:
     eval: torch.Tensor
     """The task's evaluation metric of the states that the last step led to, (nworld,), float32."""
     terminated: torch.Tensor
-    """Whether the task, or a fault, ended the episode, (nworld,), bool."""
+    """Whether the task ended the episode, (nworld,), bool."""
     truncated: torch.Tensor
-    """Whether the time limit was reached, (nworld,), bool."""
+    """Whether the time limit or a fault ended the episode, (nworld,), bool."""
     metrics: dict[str, torch.Tensor]
     """The task's metrics of the last step by their names, each (nworld,), float32."""
     episode_metrics: dict[str, torch.Tensor]
@@ -358,8 +358,8 @@ class Env:
         return _copied(self.eval if state is None else self._scratch_at(state).eval, out)
 
     def get_terminated(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
-        """Whether the last step, or given states, end the episode, (nworld,) bool."""
-        return _copied(self.terminated if state is None else self._scratch_at(state).terminated, out)
+        """Whether the last step terminated the episode, or ``terminated`` holds in given states, (nworld,) bool."""
+        return _copied(self.terminated if state is None else self._scratch_at(state).worlds.terminated_view, out)
 
     def get_reward(
         self,

@@ -1,7 +1,7 @@
 """The rules of an environment, as checks for any task on any engine; ``check_task`` runs them.
 
 Each check is one rule. It takes the environments under test, raises an AssertionError that names the task, the
-engine, the rule and the values, and leaves the environments usable for the next check.
+engine, the rule, the values, the seed and a world's state, and leaves the environments usable for the next check.
 """
 
 import dataclasses
@@ -139,6 +139,7 @@ def check_task(
     for check in checks:
         ctx.rule = check.__name__.removeprefix("check_")
         start = time.perf_counter()
+        ctx.restart()  # so that a verdict does not depend on the checks before it
         try:
             check(ctx)
         except AssertionError as error:
