@@ -1,8 +1,8 @@
 """Why an episode ended, as bits.
 
 Both engines report the same bits for the same fault. Only limits that one engine has differ: a C world that runs out
-of its arena memory may report ENGINE_WARNING beside an overflow, and MuJoCo Warp reports an overflow of its contact pool
-in every world that it touched.
+of its arena memory may report ENGINE_WARNING beside an overflow, and MuJoCo Warp reports an overflow of its contact
+pool in every world that it touched.
 """
 
 import enum

@@ -24,7 +24,7 @@ from lyceum_warp.options import OPTION_DOCS, EnvOptions, signature_of_options
 from lyceum_warp.spaces import Space
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.forks import leave_in_parent
+from lyceum_warp.support.forks import call_once_gone, leave_in_parent
 from lyceum_warp.support.validate import check_group, check_kind, check_tensor, described, whole_number
 from lyceum_warp.task import Task
 from lyceum_warp.world_arrays import own_bytes_per_world
@@ -167,6 +167,7 @@ class Env:
         self._scratch: Env | None = None
         try:
             self.worlds = worlds = Worlds(self.task, self.engine, options)
+            call_once_gone(self, worlds.drop_programs)
             for name, buffer in worlds.buffers.items():
                 setattr(self, name, buffer)
             self.obs_groups, self.final_obs_groups = worlds.obs_groups, worlds.final_obs_groups
@@ -370,7 +371,8 @@ class Env:
     ) -> torch.Tensor:
         """Rewards of the last step, or of given transitions, (nworld,).
 
-        Given transitions are judged in scratch worlds; the live ones stay untouched.
+        Given transitions are judged in scratch worlds; the live ones stay untouched. If an event follows the step,
+        ``after`` differs from the state that ``env.reward`` judged.
 
         Args:
             before: States before, (nworld, state_space.size).
