@@ -102,10 +102,9 @@ def test_metric_means_are_those_of_the_episodes_that_ended(rollout: lw.Rollout) 
     for processes in ([numbers(slice(None))], parts):
         assert summary(processes, 10, list(expected))["metrics"] == pytest.approx(expected, rel=1e-5)
     steps = {name: values.mean().item() for name, values in rollout.metrics.items()}
-    halves = [numbers(slice(0, 2)), numbers(slice(2, 4))]
-    assert rollout.env.nworld == 4 and summary(halves, 10, list(steps))["step_metrics"] == pytest.approx(
-        steps, rel=1e-5
-    )
+    for count in (rollout.env.nworld, 1):  # one process, and as many as worlds
+        shares = [numbers(slice(k, k + count)) for k in range(0, rollout.env.nworld, count)]
+        assert summary(shares, 10, list(steps))["step_metrics"] == pytest.approx(steps, rel=1e-5)
     none = [part._replace(episodes=EpisodeSums(*[0.0] * 9), metrics=(0.0,) * 4) for part in parts]
     assert all(math.isnan(mean) for mean in summary(none, 10, list(expected))["metrics"].values())
 
