@@ -113,7 +113,7 @@ def _ended(rollout: Rollout) -> torch.Tensor:
     return rollout.done & ~rollout.episode_return.isnan()
 
 
-def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, dict[str, float]]:
+def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Any]:
     """Compute ``metrics``, means over the episodes that ended (nan if none ended), and ``step_metrics``.
 
     Args:

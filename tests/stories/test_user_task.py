@@ -286,7 +286,7 @@ def test_named_elements_are_views_of_their_fields(module: ModuleType, engine: st
         assert view.data_ptr() == env.field(name)[where].data_ptr(), f"{name} is not a view"
     for element, place in (("tip", 0), ("lower", 3), ("target", 0), ("elbow", 1), ("velocity", 6)):
         assert env.task.params[element] == place
-    with pytest.raises(ValueError, match="no site 'hand' for the field 'site_xpos'; it has: tip"):
+    with pytest.raises(ValueError, match="no site 'hand'; it has: tip"):
         env.field("site_xpos", "hand")
 
 
