@@ -24,7 +24,7 @@ from lyceum_warp.options import OPTION_DOCS, EnvOptions, signature_of_options
 from lyceum_warp.spaces import Space
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.forks import leave_in_parent
+from lyceum_warp.support.forks import call_once_gone, leave_in_parent
 from lyceum_warp.support.validate import check_group, check_kind, check_tensor, whole_number
 from lyceum_warp.task import Task
 from lyceum_warp.world_arrays import own_bytes_per_world
@@ -95,9 +95,9 @@ class Env:
     eval: torch.Tensor
     """The task's evaluation metric after the last step, (nworld,), float32."""
     terminated: torch.Tensor
-    """Whether the task, or a fault, ended the episode, (nworld,), bool."""
+    """Whether the task ended the episode, (nworld,), bool."""
     truncated: torch.Tensor
-    """Whether the time limit was reached, (nworld,), bool."""
+    """Whether the time limit or a fault ended the episode, (nworld,), bool."""
     metrics: dict[str, torch.Tensor]
     """The task's metrics of the last step by name, each (nworld,), float32."""
     episode_metrics: dict[str, torch.Tensor]
@@ -166,6 +166,7 @@ class Env:
         self._scratch: Env | None = None
         try:
             self.worlds = worlds = Worlds(self.task, self.engine, options)
+            call_once_gone(self, worlds.drop_programs)
             for name, buffer in worlds.buffers.items():
                 setattr(self, name, buffer)
             self.obs_groups, self.final_obs_groups = worlds.obs_groups, worlds.final_obs_groups
@@ -354,8 +355,8 @@ class Env:
         return _copied(self.eval if state is None else self._scratch_at(state).eval, out)
 
     def get_terminated(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
-        """Whether the last step, or given states, end the episode, (nworld,) bool."""
-        return _copied(self.terminated if state is None else self._scratch_at(state).terminated, out)
+        """Whether the last step terminated the episode, or ``terminated`` holds in given states, (nworld,) bool."""
+        return _copied(self.terminated if state is None else self._scratch_at(state).worlds.terminated_view, out)
 
     def get_reward(
         self, before: torch.Tensor | None = None, action: torch.Tensor | None = None,

@@ -84,6 +84,11 @@ class Worlds(WorldArrays):
         self.programs = self._programs[key]
         self.step = self.programs.step
 
+    def drop_programs(self) -> None:
+        """Break the reference cycles through the programs, so that threads and memory go with the environment."""
+        self._programs.clear()
+        del self.programs, self.step
+
     def _make_workers(self) -> Workers | None:
         """Threads for the launches around the engine's calls; None for the caller's alone."""
         # Warp's kernels for debugging keep the address of a stack in a variable that all threads share
