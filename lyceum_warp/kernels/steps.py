@@ -387,7 +387,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         observations. It counts as truncated, so that learners bootstrap from those observations.
 
         Only a transition ends an episode: the ends of a state alone are those that it was saved with (``keep_reason``),
-        and ``found.terminated`` tells whether the task's ``terminated`` holds in it.
+        and ``found.terminated`` says whether the task's ``terminated`` holds in it.
         """
         k, lane = wp.tid()
         w = first + k
