@@ -20,6 +20,7 @@ from lyceum_warp.runs.checkpoints import (
     write_content,
 )
 from lyceum_warp.runs.metrics_table import read_metrics
+from lyceum_warp.runs.trust import remember
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import check_kind
@@ -105,7 +106,8 @@ class Run:
     ) -> "Run":
         """Make the folder of a run, with the versions, the copy of the task, and the configuration.
 
-        If this fails, nothing is left in the folder.
+        If this fails, nothing is left in the folder. The run may later run its task without being asked, because it is
+        recorded in the user's state directory (``lyceum_warp.runs.trust``).
 
         Args:
             folder: A new or empty folder.
@@ -131,6 +133,7 @@ class Run:
         except BaseException:  # a full disk, a folder that cannot be written, a signal
             shutil.rmtree(folder, ignore_errors=True)
             raise
+        remember(folder, run.config)
         return run
 
     @classmethod

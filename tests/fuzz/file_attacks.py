@@ -146,7 +146,7 @@ def _same_weights(network: torch.nn.Module, run: Path, name: str) -> None:
 
 
 def _resume(run: Path) -> None:
-    command("train", "--resume", run, "--iterations", "3", "--no-video", "--no-plot")
+    command("train", "--resume", run, "--trust", "--iterations", "3", "--no-video", "--no-plot")
 
 
 def _episodes(path: Path) -> None:
@@ -172,9 +172,9 @@ READERS: dict[str, Callable[[], object]] = {
     "load": lambda: _both(CASE / "run"),
     "load best": lambda: _both(CASE / "run", "best"),
     "load alone": lambda: _both(CASE / "run"),
-    "eval": lambda: command("eval", CASE / "run", "--episodes", 2),
-    "eval kept": lambda: command("eval", CASE / "kept", "--episodes", 2),
-    "view": lambda: command("view", CASE / "run", "--nworld", 1),
+    "eval": lambda: command("eval", CASE / "run", "--trust", "--episodes", 2),
+    "eval kept": lambda: command("eval", CASE / "kept", "--trust", "--episodes", 2),
+    "view": lambda: command("view", CASE / "run", "--trust", "--nworld", 1),
     "resume": lambda: _resume(CASE / "run"),
     "resume alone": lambda: _resume(CASE / "run"),
     "resume previous": lambda: _resume(CASE / "run"),
@@ -193,7 +193,7 @@ READERS: dict[str, Callable[[], object]] = {
 WITHOUT = {"load alone": "run/policy.pt", "resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}
 """Files to remove, so that a reader falls back to another file."""
 SLIDE_PY = str(BASE / "slide.py")
-_NEW = ("--out", "case/new", "--iterations", "1", "--no-video", "--no-plot")
+_NEW = ("--trust", "--out", "case/new", "--iterations", "1", "--no-video", "--no-plot")
 
 
 class RefusedError(Exception):
