@@ -127,6 +127,8 @@ class Train:
     """Iterations between two videos of the mean policy, videos/000100.mp4 and so on in the run's folder; 0 for none."""
     camera: CameraWords = ()
     trust: Trust = False
+    take_over: bool = False
+    """Continue a run that another process still locks, on this or another host. That process ends at its next write."""
     view: bool = False
     """Whether to show the newest policy while the run trains, as lyceum-warp view FOLDER --follow does in another
     shell."""
@@ -151,6 +153,8 @@ class Train:
         folder = self.resume or self.from_run
         if self.trust and folder is None:
             raise ValueError("--trust has no effect without --resume or --from: leave it out")
+        if self.take_over and self.resume is None:
+            raise ValueError("--take-over has no effect without --resume: leave it out")
         source = None if folder is None else Run.open(folder)
         saved = {} if source is None else source.config
         settings = {}
@@ -168,7 +172,7 @@ class Train:
                 with RunViewer(folder) if self.view and leads else contextlib.nullcontext():
                     run = train(
                         learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
-                        entries=entries, display=Display(console), **settings,
+                        take_over=self.take_over, entries=entries, display=Display(console), **settings,
                     )  # fmt: skip
             except Interrupted as signalled:
                 if leads and (path := folder / "policy.pt").exists():

@@ -6,6 +6,7 @@ import time
 from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.runs.checkpoints import policy_content, write_content
 from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.lock import RunLock
 from lyceum_warp.runs.metrics_table import append_row
 
 SAVE_SECONDS = 30.0
@@ -32,16 +33,24 @@ class Saver:
         keep_every: Iterations between two numbered policies; 0 for none.
         save_every: Iterations between two saves; 0 for the rule above.
         saved: Number of the iteration whose state is saved; -1 for none.
+        lock: The run's lock, which is checked before anything is written.
     """
 
     saved: int
     """Number of the iteration whose state is saved."""
 
     def __init__(
-        self, run: Run | None, learner: Learner, *, keep_every: int = 0, save_every: int = 0, saved: int = -1
+        self,
+        run: Run | None,
+        learner: Learner,
+        *,
+        keep_every: int = 0,
+        save_every: int = 0,
+        saved: int = -1,
+        lock: RunLock | None = None,
     ) -> None:
         self.run, self.learner, self.keep_every, self.save_every = run, learner, keep_every, save_every
-        self.saved = saved
+        self.saved, self._lock = saved, lock
         best = None if run is None else run.best_score()
         self._best = -math.inf if best is None else best[1]
         self._before = policy_content(learner.iteration, learner.policy, learner.value)
@@ -54,6 +63,7 @@ class Saver:
             The return that selects the best policy; None if the iteration has none.
         """
         assert self.run is not None
+        self._check_lock()
         append_row(self.run.metrics, iteration.row())
         learner, name = self.learner, self.learner.best_by
         score = getattr(iteration, name)
@@ -75,6 +85,10 @@ class Saver:
             write_content(path, self._before)
         return score
 
+    def _check_lock(self) -> None:
+        if self._lock is not None:
+            self._lock.check()
+
     def due(self) -> bool:
         """Whether it is time to save."""
         if self.save_every:
@@ -88,6 +102,7 @@ class Saver:
         state = learner.state_dict()  # gathers the worlds of all ranks
         with learner.team.together():
             if self.run is not None:
+                self._check_lock()
                 self.run.save(policy_content(learner.iteration, learner.policy, learner.value), state)
         self.saved, self._when = learner.iteration, time.perf_counter()
         self._seconds = self._when - start
