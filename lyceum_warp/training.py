@@ -147,7 +147,7 @@ def train(
                 run = _reopened(Path(folder), learner, settings, display.note if leads else log.debug)
         saver = Saver(
             run if leads else None, learner, keep_every=keep_every, save_every=save_every,
-            saved=learner.iteration if resume else -1, lock=lock,
+            saved=learner.iteration if resume else -1, lock=lock, note=display.note,
         )  # fmt: skip
         callbacks: list[Callback] = []
         if leads:

@@ -2,6 +2,7 @@
 
 import io
 import pydoc
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -163,10 +164,14 @@ def read_checkpoint(
     if not path.is_file():
         raise FileNotFoundError(f"there is no checkpoint {path}: train the run first")
     try:
-        content = torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:  # torch raises errors of many types
+        data = path.read_bytes()
+        _check_records(data)
+        content = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
+    except OSError:
+        raise
+    except Exception as error:  # zipfile and torch raise errors of many types
         raise ValueError(
-            f"the checkpoint {path} is cut off, or was not written by lyceum_warp ({_first_sentence(error)}): {_FIX}"
+            f"the checkpoint {path} is damaged, or was not written by lyceum_warp ({_first_sentence(error)}): {_FIX}"
         ) from error
     if not isinstance(content, dict) or "lyceum_warp" not in content:
         raise ValueError(f"the checkpoint {path} was not written by lyceum_warp: {_FIX}")
@@ -174,6 +179,19 @@ def read_checkpoint(
     if missing := set(parts) - content.keys():
         raise ValueError(f"the checkpoint {path} lacks {', '.join(sorted(missing))}: {_FIX}")
     return content
+
+
+def _check_records(data: bytes) -> None:
+    """Check the records of an archive of torch by their CRC-32, which torch writes and does not check.
+
+    Raises:
+        ValueError: A record is damaged.
+    """
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        # torch reads nothing of a record that is marked as a folder
+        folders = (record.filename for record in archive.infolist() if record.external_attr & 0x10)
+        if (name := archive.testzip() or next(folders, None)) is not None:
+            raise ValueError(f"its record {name} has other content than was written")
 
 
 def check_format(path: Path, number: Any) -> None:

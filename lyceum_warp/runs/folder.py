@@ -233,15 +233,21 @@ class Run:
         numbers = sorted(int(path.stem) for path in self.numbered(0).parent.glob("*.pt") if path.stem.isdigit())
         return ", ".join([*known, *map(str, numbers)]) or "none yet"
 
-    def best_score(self) -> tuple[int, float] | None:
-        """The iteration and the score of the best policy; None if there is none."""
+    def best_score(self, *, note: Callable[[str], None] = log.warning) -> tuple[int, float] | None:
+        """The iteration and the score of the best policy; None if there is none.
+
+        Args:
+            note: Called with a message if the file of the best policy is damaged.
+        """
         if not self.best.is_file():
             return None
         try:
             content = read_checkpoint(self.best, parts=("iteration", "policy", "score"))
-        except ValueError:
+            return int(content["iteration"]), float(content["score"]["value"])
+        except (ValueError, TypeError, KeyError) as error:
+            cause = str(error).rpartition(": ")[0] or f"{self.best} has no score"
+            note(f"{cause}: the next best policy replaces it, whatever its return")
             return None
-        return content["iteration"], content["score"]["value"]
 
     # the checkpoint
 

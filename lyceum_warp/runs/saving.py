@@ -1,13 +1,17 @@
 """Decide when a run is saved, and save it."""
 
+import logging
 import math
 import time
+from collections.abc import Callable
 
 from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.runs.checkpoints import policy_content, write_content
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.lock import RunLock
 from lyceum_warp.runs.metrics_table import append_row
+
+log = logging.getLogger(__name__)
 
 SAVE_SECONDS = 30.0
 """Seconds after which a run is saved."""
@@ -34,6 +38,7 @@ class Saver:
         save_every: Iterations between two saves; 0 for the rule above.
         saved: Number of the iteration whose state is saved; -1 for none.
         lock: The run's lock, which is checked before anything is written.
+        note: Called with a message if the file of the best policy is damaged.
     """
 
     saved: int
@@ -48,10 +53,11 @@ class Saver:
         save_every: int = 0,
         saved: int = -1,
         lock: RunLock | None = None,
+        note: Callable[[str], None] = log.warning,
     ) -> None:
         self.run, self.learner, self.keep_every, self.save_every = run, learner, keep_every, save_every
         self.saved, self._lock = saved, lock
-        best = None if run is None else run.best_score()
+        best = None if run is None else run.best_score(note=note)
         self._best = -math.inf if best is None else best[1]
         self._before = policy_content(learner.iteration, learner.policy, learner.value)
         self._seconds, self._when = 0.0, time.perf_counter()

@@ -7,7 +7,6 @@ import dataclasses
 import io
 import json
 import re
-import struct
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,7 +14,6 @@ import numpy as np
 import torch
 
 CLASSES = {
-    "R4": ("damaged weights are accepted", r"\.pt, .* other weights than those that were saved were accepted"),
     "R7 config": ("a bad value in config.json is a traceback", r"config\.json, [\w ]+: (?!SystemExit)\w+ at "),
     "R7 versions": ("a versions.json that is not a table is a traceback", r"^versions\.json, [\w ]+: \w+ at "),
     "R7 metrics": (
@@ -96,13 +94,6 @@ def _shape(**sizes: Any) -> Callable[[bytes], bytes]:
     return _saved(lambda content: content["policy"]["shape"].update(sizes))
 
 
-def _weight(data: bytes) -> bytes:
-    """Flip a bit of a weight within the file."""
-    weights = torch.load(io.BytesIO(data), weights_only=True)["policy"]["state"]["network.0.weight"].flatten()
-    found = data.index(struct.pack("<3f", *weights[:3].tolist()))
-    return data[: found + 2] + bytes([data[found + 2] ^ 0x40]) + data[found + 3 :]
-
-
 def _info(**changes: Any) -> Callable[[bytes], bytes]:
     """Change the description of a saved episode."""
 
@@ -138,7 +129,6 @@ FILES = {
         "metrics.csv", "resume", lambda data: data.replace(b"\n1,", b"\none,", 1), "R7 metrics"
     ),
     "metrics.csv that is not UTF-8": File("metrics.csv", "resume", lambda data: data + b"\xff", "R7 metrics"),
-    "policy.pt with a flipped bit of a weight": File("policy.pt", "load", _weight, "R4"),
     "policy.pt whose shape is a text": File(
         "policy.pt", "load", _saved(lambda c: c["policy"].update(shape="x")), "R7 policy"
     ),
