@@ -223,14 +223,14 @@ def _reopened(folder: Path, learner: Learner, settings: dict[str, Any], note: Ca
     note_changes(run, learner.env, note=note)
     try:
         learner.load_state_dict(content["state"])
-    except (KeyError, RuntimeError, ValueError) as error:
+    except Exception as error:  # the state may hold anything
         text = " ".join(str(error).split())
         raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {text}") from error
     if learner.team.leads:
+        cut_rows(run.metrics, done)  # a killed run may have rows of unsaved iterations
         if changed := run.changed(versions(run.config["device"])):
             text = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
             note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")
-        cut_rows(run.metrics, done)  # a killed run may have rows of unsaved iterations
         run.amend(**settings)
     return run
 

@@ -105,7 +105,8 @@ class Eval:
             table.add_row(name, *(f"{number.item():.6g}" for number in numbers))
         console = make_console()
         which = "the mean policy" if self.which == "last" else f"the mean policy {self.which!r}"
-        console.print(f"{env.task.name}: {self.episodes} episodes of {which} in {self.folder}", soft_wrap=True)
+        text = f"{env.task.name}: {self.episodes} episodes of {which} in {self.folder}"
+        console.print(text, soft_wrap=True, markup=False)
         console.print(table)
         if env.task.functions["success"] is not None:
             console.print(f"success: {episodes.success.mean().item():.0%}")
@@ -138,7 +139,8 @@ def run_worlds(run: Run, flags: Any, params: dict[str, Any], *, nworld: int, tas
     known = known.changed({"nworld": nworld} | given(flags))
     if flags.device is None:
         known = known.changed(options_for_few_worlds(known.engine, known.device))
-    env = run_env(run, known, own | params, note=note, task=task, trust=trust)
+    with run.settings():
+        env = run_env(run, known, own | params, note=note, task=task, trust=trust)
     if task is None:
         note_changes(run, env, note=note)
     return env

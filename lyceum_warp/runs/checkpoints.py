@@ -3,7 +3,7 @@
 import io
 import pydoc
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -93,14 +93,20 @@ def value_of(content: PolicyContent, path: Path) -> nn.Module:
 
 def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | None) -> nn.Module:
     """Load the weights of a file into a network."""
+    saved = content[name]
     try:
-        saved = content[name]
-        module = given if given is not None else _made(name, saved)
+        module = given
+        if module is None:
+            with torch.device("meta"):  # the shapes are compared before memory is allocated
+                module = _made(name, saved)
         if different := _difference(module, saved["state"]):
             fix = _FIX if given is None else "give one like that of the run"
-            raise ValueError(f"{path} holds a {name} of other parameters ({different}): {fix}")
+            raise ValueError(f"it holds a {name} of other parameters ({different}): {fix}")
+        module = _made(name, saved) if given is None else given
         module.load_state_dict(saved["state"])
-    except (KeyError, TypeError, RuntimeError) as error:
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    except (KeyError, TypeError, RuntimeError, NotImplementedError) as error:
         raise ValueError(f"{path} holds no {name} of lyceum_warp ({_first_sentence(error)}): {_FIX}") from error
     return module
 
@@ -108,13 +114,14 @@ def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | No
 def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
     """Make a network of the class and shape in a file, which must be a class of the package."""
     kind: Any = _CLASSES[name]
-    own = saved.get("class")
+    own, shape = saved.get("class"), saved["shape"]
     if own is not None:
-        kind = pydoc.locate(own) if own.startswith("lyceum_warp.") and saved["shape"] is not None else None
+        kind = pydoc.locate(own) if own.startswith("lyceum_warp.") and shape is not None else None
         if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
             fix = f": give one, as in lw.load(run, policy={own.rpartition('.')[2]}(...))" if name == "policy" else ""
             raise ValueError(f"the {name} is of a class of its own, {own}{fix}")
-    return kind.like(saved["shape"]) if hasattr(kind, "like") else kind(**saved["shape"])
+    module: nn.Module = kind.like(shape) if hasattr(kind, "like") else kind(**shape)
+    return module
 
 
 def check_sizes(policy: Any, env: Env, path: Path) -> None:
@@ -178,7 +185,31 @@ def read_checkpoint(
     check_format(path, content["lyceum_warp"])
     if missing := set(parts) - content.keys():
         raise ValueError(f"the checkpoint {path} lacks {', '.join(sorted(missing))}: {_FIX}")
+    if wrong := [name for name, value in content.items() if not _KINDS.get(name, lambda value: True)(value)]:
+        raise ValueError(f"the checkpoint {path} has other content than lyceum_warp writes as {wrong[0]}: {_FIX}")
+    if "state" in content and content["state"].get("iteration", content["iteration"]) != content["iteration"]:
+        raise ValueError(f"the checkpoint {path} has a policy and a state of different iterations: {_FIX}")
     return content
+
+
+def _is_network(saved: Any) -> bool:
+    """Whether a value of a file may be a saved network."""
+    return (
+        isinstance(saved, dict)
+        and isinstance(saved.get("shape", ""), dict | None)
+        and isinstance(saved.get("class", ""), str)
+        and isinstance(saved.get("state"), dict)
+        and all(isinstance(name, str) and type(part) is torch.Tensor for name, part in saved["state"].items())
+    )
+
+
+_KINDS: dict[str, Callable[[Any], bool]] = {
+    "iteration": lambda value: type(value) is int and value >= 0,
+    "policy": _is_network, "value": _is_network,
+    "state": lambda value: isinstance(value, dict) and type(value.get("iteration", 0)) is int,
+    "score": lambda value: isinstance(value, dict) and isinstance(value.get("value"), int | float),
+}  # fmt: skip
+"""Whether a value may be an entry of a file, by the entry's name."""
 
 
 def _check_records(data: bytes) -> None:

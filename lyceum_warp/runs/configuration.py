@@ -1,5 +1,6 @@
 """Convert a learner to the config.json of its run, and back."""
 
+import contextlib
 import dataclasses
 import logging
 import math
@@ -151,6 +152,13 @@ class Configuration:
             ValueError: A value is not valid, or ``run`` is not trusted.
             FileNotFoundError: The task or its model is missing.
         """
+        with contextlib.nullcontext() if run is None else run.settings():
+            return self._learner(team, run, networks, note, task, trust)
+
+    def _learner(
+        self, team: Team, run: Run | None, networks: tuple[Any, Any], note: Callable[[str], None], task: str | None,
+        trust: bool,
+    ) -> Learner:  # fmt: skip
         learner, _ = algorithm_of(self.algorithm)
         if self.threads < 1:
             raise ValueError(f"threads must be at least 1, not {self.threads}")

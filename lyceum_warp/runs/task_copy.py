@@ -2,7 +2,6 @@
 
 import hashlib
 import io
-import json
 import logging
 import os
 import warnings
@@ -144,7 +143,7 @@ def run_env(
     if chosen is None or kept.get("program"):
         where = "a notebook" if chosen is None else chosen.partition(":")[0]
         raise ValueError(
-            f"the task {kept['name']!r} of the run in {run.folder} was defined in {where}, which trained it: give a "
+            f"the task {run.task_name!r} of the run in {run.folder} was defined in {where}, which trained it: give a "
             "file that only defines it (eval --task my_task.py, train my_task.py --from), or go on there (resume=True)"
         )
     path, colon, attribute = chosen.partition(":")
@@ -162,7 +161,7 @@ def run_env(
     params, copy = run_params(run, params), run.task_folder / kept.get("model", "")
     if not copy.is_file():
         return Env(chosen, options, **params)
-    if kept["model_given"] and not isinstance(options.model, str):  # it was made in Python
+    if kept.get("model_given") and not isinstance(options.model, str):  # it was made in Python
         return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
     try:
         env = Env(chosen, options, **params)
@@ -171,7 +170,7 @@ def run_env(
         reason = "has changed since the run began"
     except FileNotFoundError:
         reason = "is no longer where it was"
-    note(f"the model of the task {kept['name']!r} {reason}: the run's own copy is used, {copy}")
+    note(f"the model of the task {run.task_name!r} {reason}: the run's own copy is used, {copy}")
     return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
 
 
@@ -223,12 +222,8 @@ def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
 
 def _model_changed(run: Run, env: Env) -> bool:
     """Whether the model has changed since the run began; False with another version of MuJoCo."""
-    try:
-        version = json.loads((run.folder / "versions.json").read_text())["mujoco"]
-    except (OSError, ValueError, KeyError):
-        return False
     known = run.config.get("kept", {}).get("model_hash")
-    return version == mujoco.__version__ and known not in (None, _model_hash(env))
+    return run.versions().get("mujoco") == mujoco.__version__ and known not in (None, _model_hash(env))
 
 
 def _digest(content: bytes) -> str:

@@ -109,8 +109,12 @@ def _table(data: bytes, random: Random) -> bytes:
 
 
 KINDS = {
-    "config.json": Kind("run/config.json", mutations.mutated_json, ("open", "eval", "resume", "from", "view")),
-    "kept config.json": Kind("kept/config.json", mutations.mutated_json, ("eval kept", "resume kept", "from kept")),
+    "config.json": Kind(
+        "run/config.json", mutations.mutated_json, ("open", "eval", "resume", "from", "view"), ("trained by",)
+    ),
+    "kept config.json": Kind(
+        "kept/config.json", mutations.mutated_json, ("eval kept", "resume kept", "from kept"), ("trained by",)
+    ),
     "versions.json": Kind("run/versions.json", mutations.mutated_json, ("eval", "resume")),
     "metrics.csv": Kind("run/metrics.csv", mutations.mutated_csv, ("open", "resume")),
     "policy.pt": Kind("run/policy.pt", _checkpoint, ("load", "load", "eval", "view", "from")),
