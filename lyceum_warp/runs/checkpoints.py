@@ -116,7 +116,8 @@ def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
     kind: Any = _CLASSES[name]
     own, shape = saved.get("class"), saved["shape"]
     if own is not None:
-        kind = pydoc.locate(own) if own.startswith("lyceum_warp.") and shape is not None else None
+        # other rooms have modules that run something when they are imported
+        kind = pydoc.locate(own) if own.startswith("lyceum_warp.algos.") and shape is not None else None
         if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
             fix = f": give one, as in lw.load(run, policy={own.rpartition('.')[2]}(...))" if name == "policy" else ""
             raise ValueError(f"the {name} is of a class of its own, {own}{fix}")

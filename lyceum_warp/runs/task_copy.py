@@ -148,13 +148,12 @@ def run_env(
         )
     path, colon, attribute = chosen.partition(":")
     copy = run.task_folder / kept.get("file", "")
-    changes = _source_changes(Path(path), kept) if copy.is_file() else []
     read += [run.task_folder / kept["model"]] if "model" in kept else []
-    if changes or path not in package_task_names():
-        check_trust(run.folder, run.config, copy if changes else path, runs=True, trust=trust)
+    if copy.is_file() or path not in package_task_names():
+        check_trust(run.folder, run.config, copy if copy.is_file() else path, runs=True, trust=trust)
     elif read:
         check_trust(run.folder, run.config, read[0], runs=False, trust=trust)
-    if changes:
+    if copy.is_file() and (changes := _source_changes(Path(path), kept)):
         new = f"; give {path} as the task to use the new version" if Path(path).is_file() else ""
         note(f"{changes[0]}: the run's own copy is used, {copy}{new}")
         chosen = f"{copy}{colon}{attribute}"

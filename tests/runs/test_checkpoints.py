@@ -126,7 +126,7 @@ def test_a_module_of_the_package_is_made_again_by_its_class_and_its_shape(tmp_pa
     assert isinstance(loaded, ValueFunction) and list(loaded.shape["hidden"]) == [4]
 
 
-@pytest.mark.parametrize("name", ["os.system", "lyceum_warp.cli.main", "lyceum_warp.runs.folder.Run"])
+@pytest.mark.parametrize("name", ["os.system", "lyceum_warp.cli.__main__.main", "lyceum_warp.algos.npg.NPG"])
 def test_a_file_makes_only_modules_of_the_package(name: str, run: Run) -> None:
     content = read_checkpoint(run.policy, parts=("iteration", "policy"))
     content["policy"]["class"] = name
