@@ -256,6 +256,17 @@ def test_training_ends_at_the_target_return(tmp_path: Path, capsys: pytest.Captu
     assert len(run.rows()) == 4
 
 
+def test_training_ends_after_its_minutes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "run"
+    run = lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=1000, minutes=1e-6)
+    assert len(run.rows()) == 1 and run.read()["iteration"] == 1
+    assert cli.main(["train", "--resume", str(folder), "--iterations", "1000", "--minutes", "1e-6", *QUIET]) == 0
+    assert "1e-06 minutes are over after 2 of 1000 iterations; continue with" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="minutes must be a positive number of minutes, not 0"):
+        lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "other", minutes=0)
+    assert not (tmp_path / "other").exists()
+
+
 # a run that was killed
 
 
