@@ -1,4 +1,4 @@
-"""Files of episodes, read for playback."""
+"""Load saved episodes for playback."""
 
 import dataclasses
 import json
@@ -32,15 +32,6 @@ def folder(episodes: list[lw.Trajectory], tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def without_source(path: Path) -> None:
-    """Make a file one of an earlier release."""
-    with np.load(path) as file:
-        arrays = dict(file)
-    info = json.loads(str(arrays["info"]))
-    del info["source"]
-    np.savez(path, **(arrays | {"info": np.array(json.dumps(info))}))
-
-
 def test_several_files_and_folders_are_loaded_in_order(folder: Path, episodes: list[lw.Trajectory]) -> None:
     first, second = sorted(folder.iterdir())
     for given, expected in ((folder, [first, second]), (str(second), [second]), ([second, first], [second, first])):
@@ -66,7 +57,11 @@ def test_an_environment_of_the_episodes_shows_and_continues_them(folder: Path) -
 
 def test_files_of_earlier_releases_are_read(folder: Path, tmp_path: Path) -> None:
     path = lw.control(lw.make("point_mass", autoreset=False, horizon=5), towards).save(tmp_path / "old.npz")
-    without_source(path)
+    with np.load(path) as file:
+        arrays = dict(file)
+    info = json.loads(str(arrays.pop("info")))
+    del info["source"]
+    np.savez(path, **arrays, info=np.array(json.dumps(info)))
     old = load_episodes(path)
     assert old[path].source == {}
     check_episode(episode_env(old), old[path])
