@@ -207,7 +207,7 @@ def _finite(value: Any) -> Any:
 _QUANTILES = {"p50": (0.5, 2), "p90": (0.9, 10), "p99": (0.99, 100), "p99_9": (0.999, 1000)}
 
 
-def _wilson(successes: int, trials: int) -> tuple[float, float]:
+def wilson(successes: int, trials: int) -> tuple[float, float]:
     """Wilson's 95 % confidence interval of a share (Wilson 1927)."""
     z = 1.959963984540054
     share = successes / trials
@@ -304,7 +304,7 @@ def _outcome_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
     returns = np.array([episode.episode_return for episode in episodes])
     wall, steps = sum(episode.wall_seconds for episode in episodes), sum(episode.steps for episode in episodes)
     successes = sum(episode.succeeded for episode in episodes)
-    low, high = _wilson(successes, len(episodes))
+    low, high = wilson(successes, len(episodes))
     return {
         "episodes": len(episodes),
         "steps": steps,
