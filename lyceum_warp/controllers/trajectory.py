@@ -125,13 +125,13 @@ class Trajectory:
 
     @property
     def terminated(self) -> bool:
-        """Whether the task or a fault ended the episode."""
-        return bool(self.done_reason & ~Done.TRUNCATED)
+        """Whether the task's ``terminated`` ended the episode."""
+        return bool(self.done_reason & Done.TERMINATED)
 
     @property
     def truncated(self) -> bool:
-        """Whether the episode reached its time limit."""
-        return bool(self.done_reason & Done.TRUNCATED)
+        """Whether the time limit or a fault ended the episode."""
+        return bool(self.done_reason & ~Done.TERMINATED)
 
     @property
     def succeeded(self) -> bool:

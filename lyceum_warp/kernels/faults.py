@@ -38,7 +38,7 @@ def faults_of_rows(
 
     The first ``nphysics`` columns of ``state`` are time, qpos, qvel and act. ``warning`` holds counters, (nworld, kind,
     2), which are cleared here. The kinds are mjtWarning's: 0 inertia, 1 contacts full, 2 constraints full, 3 to 5 bad
-    qpos, qvel, qacc, 6 bad control.
+    qpos, qvel, qacc, 6 bad control, which counts as a bad state, as on the Warp engine.
     """
     w = first + wp.tid()
     if not mask_in[w]:
@@ -54,7 +54,7 @@ def faults_of_rows(
                 fault = fault | CONTACT
             elif kind == 2:
                 fault = fault | CONSTRAINT
-            elif kind >= 3 and kind <= 5:
+            elif kind >= 3 and kind <= 6:
                 fault = fault | NAN
             else:
                 fault = fault | WARNING

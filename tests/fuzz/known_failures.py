@@ -170,14 +170,14 @@ FILES = {
 }  # fmt: skip
 
 KEYWORDS = {
-    "fields that are a tensor": Keywords("make", {"fields": torch.tensor(3)}, "R8 fields"),
-    "physics that is a number of NumPy": Keywords("make", {"physics": np.float32(2), "cone": "elliptic"}, "R8 physics"),
-    "iterations of 1e9": Keywords("MPPI", {"iterations": 1e9}, "R8 iterations"),
-    "a policy of other sizes": Keywords("evaluate", {"policy": torch.nn.Linear(3, 2)}, "N8"),
-    "a policy of 2^31 actions": Keywords("GaussianPolicy", {"nact": 2**31 - 1}, "F4"),
+    "fields that are a tensor": Keywords("make", {"fields": torch.tensor(3)}),
+    "physics that is a number of NumPy": Keywords("make", {"physics": np.float32(2), "cone": "elliptic"}),
+    "iterations of 1e9": Keywords("MPPI", {"iterations": 1e9}),
+    "a policy of other sizes": Keywords("evaluate", {"policy": torch.nn.Linear(3, 2)}),
+    "a policy of 2^31 actions": Keywords("GaussianPolicy", {"nact": 2**31 - 1}),
     "a policy that is not a function": Keywords("evaluate", {"policy": 3}),
     "an environment that is a text": Keywords("control_async", {"env": "hopper"}),
-    "a time feature of 10^9 powers": Keywords("ValueFunction", {"time_orders": 10**9}, "F4"),
+    "a time feature of 10^9 powers": Keywords("ValueFunction", {"time_orders": 10**9}),
     "10^9 plants": Keywords("CEM", {"plants": 10**9}),
     "10^9 episodes": Keywords("evaluate", {"episodes": 10**9}),
     "a horizon of 10^9 steps": Keywords("OpenLoop", {"horizon": 10**9}),
@@ -188,7 +188,7 @@ KEYWORDS = {
 }
 
 COMMANDS = {
-    "a negative number of steps": Command(("check", "point_mass", "--steps", "-5"), "R8 steps"),
+    "a negative number of steps": Command(("check", "point_mass", "--steps", "-5")),
     "a folder with markup": Command(
         ("train", "point_mass", "--out", "[/bold]x", "--iterations", "1", "--samples", "8", "--nworld", "2",
          "--horizon", "4", "--no-video", "--no-plot"),
