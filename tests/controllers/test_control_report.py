@@ -1,4 +1,4 @@
-"""Reports: their numbers, their JSON and their rows."""
+"""Reports: numbers, JSON and rows."""
 
 import dataclasses
 import json
@@ -117,9 +117,6 @@ def test_episodes_with_equal_nan_parameters_are_of_one_kind(env: lw.Env) -> None
     assert control_report([odd, dataclasses.replace(odd, params={**one.params, "odd": float("nan")})]).episodes == 2
 
 
-# samples
-
-
 def test_failed_samples_are_reported(env: lw.Env, tmp_path: Path) -> None:
     episode = control(env, SamplingPlanner(0, 8, 8, 2), steps=4, seed=1)
     assert episode.plan_failed.tolist() == [0, 8, 8, 2] and episode.plan_effective.tolist() == [2, 0, 0, 2]
@@ -151,9 +148,6 @@ def test_plans_of_mppi_without_a_good_sample_are_counted(run: Callable[..., Traj
     report = control_report(run(env, lw.MPPI("point_mass", **options), steps=4, seed=0))
     assert report.blind_plans == 0 and report.failed_share == 0
     assert report.effective_samples_mean is not None and 1 <= report.effective_samples_mean <= 3
-
-
-# JSON and rows
 
 
 def test_json_has_null_for_infinite_numbers(episode: Trajectory, tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def test_a_fast_planner_is_one_step_behind(env: lw.Env) -> None:
 
 def test_a_slow_planner_misses_its_deadlines(env: lw.Env) -> None:
     episode = simulated_run(env, seconds=2.5, steps=9)
-    # the plan from state 1 ends at 3.5; the next one, from the newest state at that time, takes from 3.5 to 6
+    # the plan from state 1 ends at 3.5; the next plan starts from the newest state and takes from 3.5 to 6
     assert episode.plan_of.tolist() == [0, 0, 0, 0, 1, 1, 2, 2, 2]
     assert episode.plan_steps[:3].tolist() == [0, 1, 3]
     assert episode.ages.tolist() == pytest.approx([0, 1, 2, 3, 3, 4, 3, 4, 5])
@@ -67,7 +67,7 @@ def test_a_slow_step_does_not_delay_the_schedule(env: lw.Env) -> None:
     assert report.tick_jitter_ms == pytest.approx(np.std([0, 0, 1250, 250, 0, 0], ddof=1))
 
 
-# the thread, with long periods and planners that are much slower
+# the thread, with long periods and even longer planning times
 
 
 def planner_threads() -> list[threading.Thread]:
@@ -81,7 +81,7 @@ def test_a_slow_planner_in_a_thread_plans_while_the_plant_steps(env: lw.Env) -> 
     assert planner.resets == [6, 6]
     assert planner.shifts[:3] == [0, 0, 0]
     assert planner.shifts[3:] == episode.plan_steps.diff().tolist()
-    # on a busy machine, too, each action is the one that its plan has for its step
+    # even on a busy machine, each action is the plan's action for its step
     assert hundredths(episode.actions[:, 0]) == episode.plan_steps[episode.plan_of].tolist()
     assert hundredths(episode.actions[:, 1]) == episode.age_steps.clamp(max=7).tolist()
     assert episode.plan_starts[0] < 0 and episode.ages[0] == 0 and (episode.plan_starts[1:] > 0).all()
