@@ -34,8 +34,8 @@ class CheckedController:
             )
         if (plants := getattr(controller, "plants", 1)) != 1:
             raise ValueError(
-                f"the controller plans for {plants} plants, and one is controlled here: make it with plants=1, or "
-                "control the worlds of an environment, as env.step(plan(env.get_state()))"
+                f"the controller plans for {plants} plants, and this loop controls one: make it with plants=1, or "
+                "control the worlds of an environment with env.step(plan(env.get_state()))"
             )
         self._controller: Any = controller
         self._names = env.action_space.columns

@@ -171,12 +171,10 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
     first = episodes[0]
     for name in ("task", "engine", "mode", "timestep", "period"):
         if len(values := {getattr(episode, name) for episode in episodes}) > 1:
-            raise ValueError(f"these trajectories differ in their {name} ({values}): make a report of each kind")
+            raise ValueError(f"these trajectories differ in their {name} ({values}): make separate reports")
     for name in ("params", "controller"):
         if names := _differing_names([getattr(episode, name) for episode in episodes]):
-            raise ValueError(
-                f"these trajectories differ in their {name} ({', '.join(names)}): make a report of each kind"
-            )
+            raise ValueError(f"these trajectories differ in their {name} ({', '.join(names)}): make separate reports")
     deadline = first.period if rate is None else 1 / positive_number("rate", rate, "plans per second")
     return ControlReport(
         task=first.task, engine=first.engine, mode=first.mode, params=first.params, controller=first.controller,

@@ -73,7 +73,7 @@ def begin_episode(
     """
     if env.nworld != 1 or env.autoreset:
         raise ValueError(
-            "a controller controls one world without automatic resets, not "
+            "a control loop needs one world without automatic resets, not "
             f"nworld={env.nworld}, autoreset={env.autoreset}: make(..., nworld=1, autoreset=False)"
         )
     if steps is None and env.horizon == 0:

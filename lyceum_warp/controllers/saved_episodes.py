@@ -100,7 +100,7 @@ def _files(paths: Iterable[str | Path]) -> list[Path]:
         if path.is_dir():
             inside = sorted(path.glob("*.npz"))
             if not inside:
-                raise FileNotFoundError(f"there is no episode in the folder {path}: its files would end in .npz")
+                raise FileNotFoundError(f"there is no episode in the folder {path}: it contains no .npz file")
             found += inside
         elif not path.exists():
             raise FileNotFoundError(f"there is no file {path}")
@@ -112,7 +112,7 @@ def _files(paths: Iterable[str | Path]) -> list[Path]:
 def _check_same(first: Path, one: Trajectory, path: Path, other: Trajectory) -> None:
     if other.task != one.task:
         raise ValueError(
-            f"{path} is an episode of the task {other.task!r}, and {first} of {one.task!r}: load them apart"
+            f"{path} is an episode of the task {other.task!r}, and {first} of {one.task!r}: load them separately"
         )
     if difference := _difference(one.state_parts, other.state_parts):
         raise ValueError(f"{path} is of another model than {first}: its states have {difference}")

@@ -122,7 +122,7 @@ def test_missing_broken_and_newer_files_are_reported_in_one_line(folder: Path, t
     empty.mkdir()
     for given, kind, message in (
         (tmp_path / "none.npz", FileNotFoundError, f"^there is no file {tmp_path / 'none.npz'}$"),
-        (empty, FileNotFoundError, f"there is no episode in the folder {empty}: its files would end in .npz"),
+        (empty, FileNotFoundError, f"there is no episode in the folder {empty}: it contains no .npz file"),
         (newer, ValueError, rf"{newer} was written by a newer lyceum_warp \(format 2, this one reads up to 1\)"),
         (broken, ValueError, f"{broken} is broken, or is not a trajectory"),
     ):
