@@ -111,13 +111,9 @@ class EpisodeCollector:
         self.controller = controller.description()
         self.states, self.obs = [env.get_state()[0]], [env.obs[0].clone()]
         self.times: list[float] = []
-        self._actions: list[torch.Tensor] = []
+        self._applied: list[tuple[torch.Tensor, TimedPlan, float, bool]] = []  # action, plan, age, late
         self._outcomes: list[tuple[float, float, bool]] = []
-        self._ages: list[float] = []
-        self._late: list[bool] = []
-        self._plan_of: list[int] = []
         self._plans: list[tuple[int, float, float, float, float]] = []
-        self._applied: TimedPlan | None = None
         self._now = now
         self.start = now()
 
@@ -142,12 +138,8 @@ class EpisodeCollector:
             age: Age of the action, seconds.
             late: Whether the step begins late.
         """
-        self._actions.append(self.env.action[0].clone())
+        self._applied.append((self.env.action[0].clone(), plan, age, late))
         self.times.append(now)
-        self._ages.append(age)
-        self._late.append(late)
-        self._plan_of.append(plan.index)
-        self._applied = plan
 
     def after_step(self, on_step: OnStep | None) -> None:
         """Add the state, the observation and the outcome of a step, and report progress."""
@@ -156,10 +148,9 @@ class EpisodeCollector:
         self.obs.append(env.final_obs[0].clone())
         self._outcomes.append((env.reward.item(), env.eval.item(), bool(env.success.item())))
         if on_step is not None:
-            assert self._applied is not None
-            plan_time, plans = self._applied.seconds, self._applied.index + 1
-            step, outcome, age = len(self._outcomes), self._outcomes[-1], self._ages[-1]
-            on_step(ControlProgress(step, self.elapsed(), *outcome, plan_time, age, plans))
+            _, plan, age, _ = self._applied[-1]
+            step, outcome = len(self._outcomes), self._outcomes[-1]
+            on_step(ControlProgress(step, self.elapsed(), *outcome, plan.seconds, age, plan.index + 1))
 
     def abort(self, on_abort: OnAbort | None, wall_seconds: float) -> None:
         """Call ``on_abort`` with the steps so far, if there are any."""
@@ -170,15 +161,16 @@ class EpisodeCollector:
         """Make the trajectory of all complete steps."""
         steps = len(self._outcomes)  # outcomes are added last, so an interrupted step has none
         rewards, evals, success = zip(*self._outcomes, strict=True)
+        actions, applied, ages, late = zip(*self._applied[:steps], strict=True)
         plan_steps, *plans = zip(*self._plans, strict=True)
         plan_starts, plan_times, failed, effective = (torch.tensor(column, dtype=torch.float64) for column in plans)
-        times, ages = (torch.tensor(column[:steps], dtype=torch.float64) for column in (self.times, self._ages))
         return Trajectory(
             states=torch.stack(self.states[: steps + 1]).cpu(), obs=torch.stack(self.obs[: steps + 1]).cpu(),
-            actions=torch.stack(self._actions[:steps]).cpu(), rewards=torch.tensor(rewards), evals=torch.tensor(evals),
-            success=torch.tensor(success), times=times, ages=ages, late=torch.tensor(self._late[:steps]),
-            plan_of=torch.tensor(self._plan_of[:steps]), plan_steps=torch.tensor(plan_steps), plan_starts=plan_starts,
-            plan_times=plan_times, plan_failed=failed, plan_effective=effective, timestep=self.env.timestep,
-            period=self.period, wall_seconds=wall_seconds, mode=self.mode, done_reason=done_reason, seed=self.seed,
-            controller=self.controller, **provenance(self.env),
+            actions=torch.stack(actions).cpu(), rewards=torch.tensor(rewards), evals=torch.tensor(evals),
+            success=torch.tensor(success), times=torch.tensor(self.times[:steps], dtype=torch.float64),
+            ages=torch.tensor(ages, dtype=torch.float64), late=torch.tensor(late),
+            plan_of=torch.tensor([plan.index for plan in applied]), plan_steps=torch.tensor(plan_steps),
+            plan_starts=plan_starts, plan_times=plan_times, plan_failed=failed, plan_effective=effective,
+            timestep=self.env.timestep, period=self.period, wall_seconds=wall_seconds, mode=self.mode,
+            done_reason=done_reason, seed=self.seed, controller=self.controller, **provenance(self.env),
         )  # fmt: skip
