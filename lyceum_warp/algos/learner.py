@@ -180,7 +180,7 @@ class Learner(abc.ABC):
         """Resume from a state of ``state_dict``; further iterations are equal to the bit.
 
         Raises:
-            ValueError: The state has another number of worlds.
+            ValueError: The state has another number of worlds, or its counters are no numbers.
         """
         nworld = self.env.nworld * self.team.size
         if len(state["env"]) != nworld:
@@ -191,4 +191,5 @@ class Learner(abc.ABC):
         if self.generator is not None:
             self.generator.set_state(state["generator"].cpu())
         self.env.set_state(state["env"][self._own].to(self.env.obs.device))
-        self.iteration, self.samples = state["iteration"], state["samples"]
+        self.iteration = whole_number("iteration", state["iteration"], low=0)
+        self.samples = whole_number("samples", state["samples"], low=0, high=2**63 - 1)

@@ -185,7 +185,9 @@ class Trajectory:
                 if info["format"] <= FORMAT:
                     content: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
                     _check(content)
-                    return cls(**content, **{name: kind(info[name]) for name, kind in _SCALARS.items()})
+                    scalars = {name: kind(info[name]) for name, kind in _SCALARS.items()}
+                    _check_scalars(scalars, content)
+                    return cls(**content, **scalars)
         except OSError:
             raise
         except Exception as error:  # numpy and zipfile raise many types
@@ -205,6 +207,21 @@ def _check(arrays: Mapping[str, torch.Tensor]) -> None:
             raise ValueError(f"{name} has type {array.dtype} and shape {tuple(array.shape)}")
     if not ((arrays["plan_of"] >= 0) & (arrays["plan_of"] < lengths["plans"])).all():
         raise ValueError(f"plan_of has indices outside the {lengths['plans']} plans")
+
+
+def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor]) -> None:
+    """Reject parts that are not columns of their array, and a source with wrong types."""
+    for name, array in (("state_parts", "states"), ("obs_parts", "obs")):
+        for part, place in scalars[name].items():
+            whole = isinstance(place, list) and len(place) == 2 and all(type(column) is int for column in place)
+            if not whole or not 0 <= place[0] <= place[1] <= arrays[array].shape[1]:
+                raise ValueError(f"{name} has {place!r} as the columns of {part!r}")
+    source = scalars["source"]
+    for name, kind in {"task": str | None, "params": list, "options": dict}.items():
+        if name in source and not isinstance(source[name], kind):
+            raise ValueError(f"source has {source[name]!r} as its {name}")
+    if missing := [name for name in source.get("params", ()) if name not in scalars["params"]]:
+        raise ValueError(f"source names the parameter {missing[0]!r}, which params lacks")
 
 
 def provenance(env: Env) -> dict[str, Any]:

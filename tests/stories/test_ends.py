@@ -69,7 +69,7 @@ ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
 
 @ENGINES
 @pytest.mark.parametrize("autoreset", [True, False])
-def test_a_fresh_state_is_no_end(autoreset: bool, engine: str) -> None:
+def test_a_fresh_state_does_not_end_an_episode(autoreset: bool, engine: str) -> None:
     env = lw.make(Leave, nworld=N, engine=engine, autoreset=autoreset)
     env.rand_reset(0)
     fresh = env.get_state()
@@ -82,7 +82,7 @@ def test_a_fresh_state_is_no_end(autoreset: bool, engine: str) -> None:
     assert not env.done.any()
 
 
-def test_a_next_step_reset_is_no_episode_of_length_0() -> None:
+def test_a_next_step_reset_does_not_count_as_an_episode() -> None:
     envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(
         GymnasiumVectorEnv(Leave, N, autoreset_mode=AutoresetMode.NEXT_STEP)
     )
