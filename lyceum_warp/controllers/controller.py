@@ -32,7 +32,7 @@ class Controller(Protocol):
 class PlanningController(Controller, Protocol):
     """A controller that makes a plan, a sequence of actions, at every call. ``lw.MPPI`` is one.
 
-    A controller implements the members that it needs, and does not have to derive from this class.
+    A controller implements the members that it needs, and need not derive from this class.
     """
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /, *, shift: int = 1) -> torch.Tensor:

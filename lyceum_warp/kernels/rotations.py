@@ -164,7 +164,7 @@ def quat_to_euler(q: wp.vec4) -> wp.vec3:
     m = quat_to_mat(q)
     cosine = wp.sqrt(m[1, 2] * m[1, 2] + m[2, 2] * m[2, 2])
     y = wp.atan2(m[0, 2], cosine)
-    if cosine < 1e-6:  # nothing but rounding error
+    if cosine < 1e-6:  # zero, up to rounding
         return wp.vec3(0.0, y, wp.atan2(m[1, 0], m[1, 1]))
     return wp.vec3(wp.atan2(-m[1, 2], m[2, 2]), y, wp.atan2(-m[0, 1], m[0, 0]))
 

@@ -44,7 +44,7 @@ class Counters:
     """Index of the episode."""
     rng: wp.array2d[wp.uint32]
     """Stream that a task's function draws from, (observation groups * nworld, 1), one row per thread that draws. Every
-    kernel starts it anew."""
+    kernel starts it again."""
 
 
 @wp.struct
@@ -366,7 +366,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         last good observations. It counts as truncated, so that learners bootstrap from those observations.
 
         Only a transition ends an episode. For a state without a transition, ``keep_reason`` keeps the saved reason, and
-        ``found.terminated`` tells whether the task's ``terminated`` holds.
+        ``found.terminated`` shows whether the task's ``terminated`` holds.
         """
         k, lane = wp.tid()
         w = first + k
