@@ -1,7 +1,7 @@
 """AdroitDoor: turn a latch with the hand and pull the door open (Gymnasium-Robotics' AdroitHandDoor-v1).
 
 The hand's model needs the extra "hand". The door's frame is a mocap body here, so its position is part of the state.
-The contact pair of ring and little fingertip, which the model lists twice, is listed once. As in the original, site
+The model lists the contact pair of ring and little fingertip twice; here it is listed once. As in the original, site
 positions lag by one substep, as ``mj_step`` leaves them. The reward grows with the palm's distance from the handle: a
 mistake of gymnasium-robotics 1.2.1 to 1.4.2, which is kept. ``palm_weight=-0.1`` corrects it, as in version 1.2.0.
 """

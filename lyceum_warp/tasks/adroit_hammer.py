@@ -1,10 +1,9 @@
 """AdroitHammer: pick up a hammer and drive a nail into a board (Gymnasium-Robotics' AdroitHandHammer-v1).
 
-The hand's model needs the extra "hand". The board is a mocap body here, so its height is part of the state. The contact
-pair of ring and little fingertip, which the model lists twice, is listed once. As in the original, positions and the
+The hand's model needs the extra "hand". The board is a mocap body here, so its height is part of the state. The model
+lists the contact pair of ring and little fingertip twice; here it is listed once. As in the original, positions and the
 force on the nail lag by one substep, as ``mj_step`` leaves them. The reward grows with the palm's distance from the
-hammer: a mistake of gymnasium-robotics 1.2.1 to 1.4.2, which is kept. ``palm_weight=-0.1`` corrects it, as in version
-1.2.0.
+hammer: a mistake of gymnasium-robotics 1.2.1 to 1.4.2, which is kept. ``palm_weight=-0.1`` corrects it (as in 1.2.0).
 """
 
 import mujoco

@@ -1,8 +1,8 @@
 """AdroitPen: turn a pen in the hand to a target orientation (Gymnasium-Robotics' AdroitHandPen-v1).
 
 The hand's model needs the extra "hand". The target is a mocap body here, so it is part of the state. The target does
-not collide; in the original, the pen can collide with it. The contact pair of ring and little fingertip, which the
-model lists twice, is listed once. As in the original, positions lag by one substep, as ``mj_step`` leaves them.
+not collide; in the original, the pen can collide with it. The model lists the contact pair of ring and little fingertip
+twice; here it is listed once. As in the original, positions lag by one substep, as ``mj_step`` leaves them.
 Success: the pen has been in the goal orientation for more than 20 steps of the episode.
 """
 

@@ -1,7 +1,7 @@
 """AdroitRelocate: pick up a ball and carry it to a target (Gymnasium-Robotics' AdroitHandRelocate-v1).
 
 The hand's model needs the extra "hand". The target is a mocap body here, and resets move the ball by its own joints, so
-both positions are part of the state. The contact pair of ring and little fingertip, which the model lists twice, is
+both positions are part of the state. The model lists the contact pair of ring and little fingertip twice; here it is
 listed once. As in the original, positions lag by one substep, as ``mj_step`` leaves them. The reward grows with the
 palm's distance from the ball: a mistake of gymnasium-robotics 1.2.1 to 1.4.2, which is kept. ``palm_weight=-0.1``
 corrects it, as in version 1.2.0.

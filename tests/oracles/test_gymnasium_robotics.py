@@ -324,7 +324,7 @@ def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, 
 
 
 def test_model_is_theirs_except_for_edits(shared_env: SharedEnv, task: str) -> None:
-    """Only bodies that a reset moves and duplicate pairs may differ, and the order of the sensors' sites."""
+    """The models may differ only in bodies that a reset moves, duplicate pairs, and the order of sensor sites."""
     ours, theirs = shared_env(task, autoreset=False, horizon=0, nthread=1).model, registered(task).model
     moved = mocap_bodies(ours)
     others = {(field, name) for field, name in differences(ours, theirs) if name not in moved}

@@ -1,4 +1,4 @@
-"""The herb_reach task: HERB's published numbers, its two equal arms, formulas, targets within reach, success."""
+"""The herb_reach task: HERB's published numbers, formulas, resets, targets within reach, success."""
 
 import mujoco
 import numpy as np
