@@ -350,7 +350,7 @@ class Planner:
         dim = (self._nsample, self._plan.shape[2])
         wp.launch(planning.draw_noise, dim, [self._seed, self._count, self._noise], device=device)
         wp.launch(planning.draw_keys, self.env.nworld, [self._seed, self._count, self._keys], device=device)
-        wp.launch(planning.count_up, self.plants, [self._count], device=device)
+        wp.launch(planning.add_to, self.plants, [1, self._count], device=device)
         bounds = [self._smoothing, bool(self.config.include_plan), self._low, self._high, self._samples]
         if self._deviation is not None and self._nominal_deviation is not None:
             self._shifted(first, self._deviation, self._first_deviation, False, self._nominal_deviation)
