@@ -6,7 +6,7 @@ import torch
 
 from lyceum_warp.adapters.adapted_env import environment_of
 from lyceum_warp.adapters.libraries import check_library
-from lyceum_warp.adapters.step_results import episode_ends, faulty
+from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import described
 from lyceum_warp.task import Task
@@ -124,12 +124,10 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         """
         env = self.env
         env.step(actions)
-        fault = faulty(env)
-        terminated, _ = episode_ends(env, fault)
         extras = {
-            "time_outs": env.done & ~terminated,
+            "time_outs": env.truncated & ~env.terminated,
             "final_obs": self._final_obs,
-            "log": self._log() | {"faults/worlds": fault.sum()},
+            "log": self._log() | {"faults/worlds": ((env.done_reason & FAULTS) != 0).sum()},
         }
         return self._obs.clone(), env.reward, env.done, extras
 

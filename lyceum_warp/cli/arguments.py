@@ -26,6 +26,15 @@ ParamWords = Annotated[
 ]
 """The flag --param; ``parameters`` parses it."""
 
+Trust = Annotated[
+    bool,
+    tyro.conf.arg(
+        help="Allow a run that you did not make on this machine to run its task and to read the files that it names, "
+        "now and later.",
+    ),
+]
+"""The flag --trust; see ``lyceum_warp.runs.trust``."""
+
 CameraWords = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     tyro.conf.arg(

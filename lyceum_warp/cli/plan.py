@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import torch
 import tyro
+from rich.markup import escape
 
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.mppi_config import MPPIConfig
@@ -224,7 +225,7 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
     console.print(
         f"[bold]{plant.task.name}[/]: {name}, {planner.samples} samples of {planner.horizon} steps "
         f"({planner.horizon * planner.timestep:.3g} s), {simulated.engine.name} engine on {simulated.device.alias}; "
-        f"{'real time' if options.real_time else 'the world waits'}; files in {run.folder}",
+        f"{'real time' if options.real_time else 'the world waits'}; files in {escape(str(run.folder))}",
         soft_wrap=True,
     )  # fmt: skip
     done: list[Trajectory] = []

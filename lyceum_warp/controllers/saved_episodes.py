@@ -65,7 +65,11 @@ def episode_env(
     chosen = _task(path, first, task)
     words = {"autoreset": False, "nthread": 1, **first.source.get("options", {})}
     words |= {name: first.params[name] for name in first.source.get("params", ())}
-    env = Env(chosen, **words | changes)
+    try:
+        env = Env(chosen, **words | changes)
+    except (ValueError, TypeError, FileNotFoundError) as error:
+        kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
+        raise kind(f"{path} cannot be shown: {error}") from error
     if env.task.name != first.task:
         raise ValueError(f"{path} is an episode of the task {first.task!r}, not of {env.task.name!r}")
     check_episode(env, first, path)
@@ -137,8 +141,6 @@ def _task(path: Path, episode: Trajectory, given: str | Path | type[Task] | None
         return find_task(given)
     spelled = episode.source.get("task", episode.task if "task" not in episode.source else None)
     advice = f"give the task that {path} was made with, as a file that defines it"
-    if spelled is not None and not isinstance(spelled, str):
-        raise ValueError(f"{path} is broken: it names the task {spelled!r}; {advice}")
     if spelled is None:
         raise ValueError(f"the task {episode.task!r} was defined in a notebook or a program: {advice}")
     file = spelled.partition(":")[0]

@@ -127,13 +127,13 @@ class Trajectory:
 
     @property
     def terminated(self) -> bool:
-        """Whether the task or a fault ended the episode."""
-        return bool(self.done_reason & ~Done.TRUNCATED)
+        """Whether the task's ``terminated`` ended the episode."""
+        return bool(self.done_reason & Done.TERMINATED)
 
     @property
     def truncated(self) -> bool:
-        """Whether the episode reached its time limit."""
-        return bool(self.done_reason & Done.TRUNCATED)
+        """Whether the time limit or a fault ended the episode."""
+        return bool(self.done_reason & ~Done.TERMINATED)
 
     @property
     def succeeded(self) -> bool:
@@ -197,6 +197,7 @@ class Trajectory:
                     _check(content)
                     scalars = {name: kind(info[name]) for name, kind in _SCALARS.items()}
                     scalars |= {name: kind(info[name]) for name, kind in _LATER.items() if name in info}
+                    _check_scalars(scalars, content)
                     return cls(**content, **scalars)
         except OSError:
             raise
@@ -217,6 +218,21 @@ def _check(arrays: Mapping[str, torch.Tensor]) -> None:
             raise ValueError(f"{name} has type {array.dtype} and shape {tuple(array.shape)}")
     if not ((arrays["plan_of"] >= 0) & (arrays["plan_of"] < lengths["plans"])).all():
         raise ValueError(f"plan_of has indices outside the {lengths['plans']} plans")
+
+
+def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor]) -> None:
+    """Refuse parts that are no columns of their array, and a source of other types."""
+    for name, array in (("state_parts", "states"), ("obs_parts", "obs")):
+        for part, place in scalars[name].items():
+            whole = isinstance(place, list) and len(place) == 2 and all(type(column) is int for column in place)
+            if not whole or not 0 <= place[0] <= place[1] <= arrays[array].shape[1]:
+                raise ValueError(f"{name} has {place!r} as the columns of {part!r}")
+    source = scalars.get("source", {})
+    for name, kind in {"task": str | None, "params": list, "options": dict}.items():
+        if name in source and not isinstance(source[name], kind):
+            raise ValueError(f"source has {source[name]!r} as its {name}")
+    if missing := [name for name in source.get("params", ()) if name not in scalars["params"]]:
+        raise ValueError(f"source names the parameter {missing[0]!r}, which params lacks")
 
 
 def provenance(env: Env) -> dict[str, Any]:

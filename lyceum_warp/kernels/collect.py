@@ -58,7 +58,7 @@ def store_outputs(
 ):
     """Store the results of a step and the episode's return so far, and count faults; launched over (nworld, nobs).
 
-    A fault does not count as a termination. With ``first_only`` the returns of a world's later episodes are nan.
+    With ``first_only`` the returns of a world's later episodes are nan.
     """
     w, i = wp.tid()
     t = index_in[0]
@@ -67,7 +67,7 @@ def store_outputs(
         out.reward[t, w] = reward_in[w]
         out.eval[t, w] = eval_in[w]
         fault = done_reason_in[w] & _FAULTS
-        out.terminated[t, w] = terminated_in[w] and fault == 0
+        out.terminated[t, w] = terminated_in[w]
         out.done[t, w] = done_in[w]
         out.success[t, w] = success_in[w]
         total = return_inout[w] + reward_in[w]

@@ -39,7 +39,7 @@ def faults_of_rows(
     Time, qpos, qvel and act lead the rows of ``state``; ``warning`` holds counters, (nworld, kind, 2).
 
     The kinds are mjtWarning's: 0 inertia, 1 contacts full, 2 constraints full, 3 to 5 bad qpos, qvel, qacc,
-    6 bad control. A counter is cleared when it is read.
+    6 bad control, which would become a bad state on the Warp engine. A counter is cleared when it is read.
     """
     w = first + wp.tid()
     if not mask_in[w]:
@@ -55,7 +55,7 @@ def faults_of_rows(
                 fault = fault | CONTACT
             elif kind == 2:
                 fault = fault | CONSTRAINT
-            elif kind >= 3 and kind <= 5:
+            elif kind >= 3 and kind <= 6:
                 fault = fault | NAN
             else:
                 fault = fault | WARNING

@@ -6,6 +6,8 @@ episode 0.
 
 import warp as wp
 
+from lyceum_warp.support.docstrings import document_overloads
+
 
 @wp.func
 def world_key(seed: int, world: int) -> wp.uint32:
@@ -79,3 +81,6 @@ def seed_worlds(
     if mask_in[w]:
         key_out[w] = world_key(seed_in[0], first + int(w))
         episode_out[w] = -1
+
+
+document_overloads(uniform)

@@ -199,23 +199,28 @@ def act_kernels(task: TaskCode) -> ActKernels:
     ):
         """Map actions to controls, clipped to their ranges; launched over (nworld,).
 
-        An action that is not finite counts as zero.
+        An action that is not finite counts as zero, and so does a control that is not-a-number, which clipping would
+        turn into a bound.
         """
         w = first + wp.tid()
         fault = int(0)
         for i in range(action_in.shape[1]):
             if not wp.isfinite(action_in[w, i]):
                 fault = ACTION
-        fault_out[w] = fault
         for i in range(action_in.shape[1]):
             safe_action_out[w, i] = wp.where(fault == 0, action_in[w, i], 0.0)
         if wp.static(has_control):
             control(view(batch, w), safe_action_out[w], params[w % params.shape[0]], ctrl_out[w])
+            for i in range(ctrl_out.shape[1]):
+                if wp.isnan(ctrl_out[w, i]):
+                    fault = fault | NAN
+                    ctrl_out[w, i] = 0.0
         else:
             for i in range(ctrl_out.shape[1]):
                 ctrl_out[w, i] = safe_action_out[w, i] * scale_in[i, 0] + scale_in[i, 1]
         for i in range(ctrl_out.shape[1]):
             ctrl_out[w, i] = wp.clamp(ctrl_out[w, i], range_in[i, 0], range_in[i, 1])
+        fault_out[w] = fault
         counters.step[w] = counters.step[w] + 1
 
     @task.kernel(task.checks_model)
@@ -379,7 +384,10 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         lanes of a world share its rows.
 
         A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and the last good
-        observations. It counts as terminated, so that no learner takes it for a time limit.
+        observations. It counts as truncated, so that learners bootstrap from those observations.
+
+        Only a transition ends an episode: the ends of a state alone are those that it was saved with (``keep_reason``),
+        and ``found.terminated`` says whether the task's ``terminated`` holds in it.
         """
         k, lane = wp.tid()
         w = first + k
@@ -415,17 +423,20 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
                     out.eval[w] = found.eval[w]
         else:
             out.eval[w] = gain
-        reason = fault
-        if fault == 0 and found.terminated[w]:
-            reason = TERMINATED
+        found.terminated[w] = fault == 0 and found.terminated[w]
         out.success[w] = fault == 0 and found.success[w]
-        if horizon > 0 and step_in[w] >= horizon:
-            reason = reason | TRUNCATED
+        reason = int(0)
+        if transition:
+            reason = fault
+            if found.terminated[w]:
+                reason = TERMINATED
+            if horizon > 0 and step_in[w] >= horizon:
+                reason = reason | TRUNCATED
         if keep_reason:
             reason = reason | out.done_reason[w]
         out.done_reason[w] = reason
-        out.terminated[w] = (reason & ~TRUNCATED) != 0
-        out.truncated[w] = (reason & TRUNCATED) != 0
+        out.terminated[w] = (reason & TERMINATED) != 0
+        out.truncated[w] = (reason & ~TERMINATED) != 0
         out.done[w] = reason != 0
         if transition:
             # without automatic resets a world steps on after its end, but not after a fault

@@ -6,6 +6,7 @@ from typing import Any
 import warp as wp
 
 from lyceum_warp.kernels.rotations import quat_from_axis_angle, quat_rotate_inverse
+from lyceum_warp.support.docstrings import document_overloads
 
 
 class Sigmoid(enum.IntEnum):
@@ -26,8 +27,8 @@ def put(row: wp.array[float], at: int, value: float) -> int:
     """Write a value into a row from the index ``at`` on; returns the index after it.
 
     The value is a number or a bool, a vector, a matrix (row by row), or a row of any of these; of a row, ``first`` and
-    ``last``     choose the elements with first <= i < last. An observation is written as a chain: ``k = lw.put(obs, 0,
-    s.qpos)``,     then ``k = lw.put(obs, k, s.qvel)``.
+    ``last`` choose the elements with first <= i < last. An observation is written as a chain: ``k = lw.put(obs, 0,
+    s.qpos)``, then ``k = lw.put(obs, k, s.qvel)``.
     """
     row[at] = value
     return at + 1
@@ -258,3 +259,7 @@ def grasp_terms(distance: float, finger: float, closed: float) -> tuple[float, f
     reach = tolerance(distance, wp.vec2(0.0, 0.005), 0.1, int(Sigmoid.RECIPROCAL), 0.2)
     shut = tolerance(finger, wp.vec2(0.0, closed), 0.02, int(Sigmoid.LINEAR))
     return near, reach, near * shut + 0.5 * (1.0 - near) * (1.0 - shut)
+
+
+document_overloads(put)
+document_overloads(sum_squares)

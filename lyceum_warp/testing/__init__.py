@@ -1,7 +1,7 @@
 """The rules of an environment, as checks for any task on any engine; ``check_task`` runs them.
 
 Each check is one rule. It takes the environments under test, raises an AssertionError that names the task, the
-engine, the rule and the values, and leaves the environments usable for the next check.
+engine, the rule, the values, the seed and a world's state, and leaves the environments usable for the next check.
 """
 
 import dataclasses
@@ -13,6 +13,7 @@ from typing import Any
 from lyceum_warp.engines.base import EngineFactory
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import whole_number
 from lyceum_warp.task import Task
 from lyceum_warp.testing import bounds_rules as bounds
 from lyceum_warp.testing import buffer_rules as buffers
@@ -118,13 +119,14 @@ def check_task(
 
     Raises:
         AssertionError: Rules are broken; the message lists them.
-        ValueError: There are fewer than 2 worlds, or an option does not fit.
+        ValueError: There are fewer than 2 worlds or no step, or an option does not fit.
 
     Example:
         >>> print(check_task("hopper", engine="mujoco"))
     """
     if nworld < 2:
         raise ValueError(f"the checks compare worlds with one another: nworld must be at least 2, not {nworld}")
+    steps = whole_number("steps", steps, low=1)
 
     if str(device or "").startswith("cuda"):
         options = {"deterministic": True} | options
@@ -139,6 +141,7 @@ def check_task(
     for check in checks:
         ctx.rule = check.__name__.removeprefix("check_")
         start = time.perf_counter()
+        ctx.restart()  # so that a verdict does not depend on the checks before it
         try:
             check(ctx)
         except AssertionError as error:

@@ -167,6 +167,7 @@ def test_a_task_file_that_others_can_write_is_not_run(
     assert ran.exists()
 
 
-def test_a_task_that_is_not_a_text_is_refused(episodes: list[lw.Trajectory]) -> None:
-    with pytest.raises(ValueError, match=r"the episode is broken: it names the task \['a'\]"):
-        episode_env(dataclasses.replace(episodes[0], source={"task": ["a"]}))
+def test_a_task_that_is_not_a_text_is_refused(episodes: list[lw.Trajectory], tmp_path: Path) -> None:
+    path = dataclasses.replace(episodes[0], source={"task": ["a"]}).save(tmp_path / "episode.npz")
+    with pytest.raises(ValueError, match=r"episode.npz is broken.*source has \['a'\] as its task"):
+        load_episodes(path)
