@@ -78,7 +78,7 @@ class Plan:
     """Control a task with a planner that replans at every step, and report rewards, success and planning times.
 
     The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling. Its settings come from
-    the task unless they are given. Options of the physics (--integrator, --solver, ...) apply to the planner alone.
+    the task unless they are given. Options of the physics (--integrator, --solver, ...) apply only to the planner.
 
     The folder then holds config.json, versions.json, report.json, plan.png, video.mp4 of the first episode, and a file
     for each episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy). After Ctrl-C the
