@@ -55,15 +55,17 @@ EVERY = 16
 """Steps between two in which states are changed; as many times more worlds then get such a fault."""
 SAMPLES = 5
 """Samples of the memory in a chunk."""
-CHUNKS = 10
 TASKS = {
-    "point_mass": (1024, 10**7, 4.0), "hopper": (512, 10**6, 60.0), "soft_ball": (256, 10**6, 100.0),
-    "panda_lift": (256, 10**6, 250.0), "adroit_relocate": (256, 10**6, 250.0), "humanoid": (256, 10**6, 300.0),
-    "go1_velocity": (256, 10**6, 300.0),
+    "point_mass": (1024, 10**7, 10, 4.0), "hopper": (512, 10**6, 10, 100.0), "soft_ball": (256, 10**6, 10, 100.0),
+    "panda_lift": (256, 10**6, 10, 250.0), "adroit_relocate": (256, 10**6, 10, 250.0),
+    "humanoid": (256, 10**6, 10, 300.0), "go1_velocity": (256, 10**6, 10, 300.0),
 }  # fmt: skip
-"""Worlds, steps of a chunk, and seconds for a million steps on two cores."""
-GPU_TASKS = {"half_cheetah": (16_384, 10**8, 0.5)}
-SAME_BITS = {"half_cheetah": (4096, 10**6, 20.0)}
+"""Worlds, steps of a chunk, chunks, and seconds for a million steps on two cores."""
+OTHERS = (256, 10**6, 1, 300.0)
+"""The same for all other tasks."""
+SHORT = (64, 20_000, 2, 0.0)
+GPU_TASKS = {"half_cheetah": (16_384, 10**8, 10, 0.5)}
+SAME_BITS = {"half_cheetah": (4096, 10**6, 10, 20.0)}
 """The same in the deterministic mode, without which a GPU's numbers differ in the last bits from run to run."""
 TRAININGS = {
     "hopper": "--iterations 400 --nthread 2",
@@ -183,11 +185,11 @@ class Kills:
 
 def cases(options: Options) -> list[Any]:
     parts, short, cuda = experiment.choose(options.parts, PARTS, what="part"), options.short, options.device != "cpu"
-    known = {"point_mass": (64, 64 * 300, 0.0)} if short else GPU_TASKS if cuda else TASKS
-    usual = (64, 64 * 300, 0.0) if short else (256, 10**6, 0.0)
-    runs = [(task, known.get(task, usual), not cuda)
+    everything = TASKS | {task: OTHERS for task in lw.task_names() if task not in TASKS}
+    known = {"point_mass": SHORT} if short else GPU_TASKS if cuda else everything
+    runs = [(task, known.get(task, SHORT if short else OTHERS), not cuda)
             for task in experiment.choose(options.tasks, lw.task_names(), tuple(known), what="task")]  # fmt: skip
-    if cuda and not options.tasks:
+    if cuda and not short and not options.tasks:
         runs += [(task, sizes, True) for task, sizes in SAME_BITS.items()]
     found: list[Any] = []
     for seed in options.seeds or (0,):
@@ -195,7 +197,7 @@ def cases(options: Options) -> list[Any]:
             nworld = whole_number("--nworld", options.nworld or sizes[0], low=8)
             steps = whole_number("--steps", options.steps or sizes[1], low=nworld * SAMPLES)
             chunks = [Faults(task, chunk, steps, nworld, options.engine, options.device, compared,
-                             1e-2 if short else 1e-3, seed) for chunk in range(2 if short else CHUNKS)]  # fmt: skip
+                             1e-2 if short else 1e-3, seed) for chunk in range(sizes[2])]  # fmt: skip
             # a machine that gets another one's folder goes on from there
             done = max((i for i in range(1, len(chunks) + 1) if chunks[0].state(options.work, i).exists()), default=1)
             found += chunks[done - 1 :]
@@ -211,7 +213,7 @@ def cases(options: Options) -> list[Any]:
 def estimate(case: Any) -> float:
     if isinstance(case, Faults):
         table = SAME_BITS if case.compared and case.device != "cpu" else TASKS | GPU_TASKS
-        return 5.0 + table.get(case.task, (0, 0, 100.0))[2] * case.steps / 1e6
+        return 5.0 + table.get(case.task, OTHERS)[3] * case.steps / 1e6
     return 20.0 if isinstance(case, Memory) else 20.0 + 2.0 * case.kills * case.kill_every
 
 
@@ -318,7 +320,10 @@ def inject(case: Faults, options: Options) -> dict[str, Any]:
     before = case.state(options.work, case.chunk)
     if case.chunk and not before.exists():
         raise Skipped(f"there is no {before}: give the folder in which chunk {case.chunk - 1} ran as --work")
-    file, low, high = variant(case.task, options.work)
+    try:
+        file, low, high = variant(case.task, options.work)
+    except (FileNotFoundError, ImportError) as error:
+        raise Skipped(f"{case.task}: {error}") from error
     make = functools.partial(
         lw.make, file, engine=case.engine, device=case.device, seed=case.seed, nthread=options.threads,
         deterministic=case.compared and case.device != "cpu",
@@ -344,7 +349,7 @@ def inject(case: Faults, options: Options) -> dict[str, Any]:
     tallied = [row, kind, env.done_reason, env.done, env.obs, env.reward, twin.done_reason, twin.obs, twin.reward,
                pending, clean, injected, reasons, outcome]  # fmt: skip
     drawn, tallied = (list(map(wp.from_torch, tensors)) for tensors in (drawn, tallied))
-    steps, samples, began = case.steps // case.nworld, [], time.perf_counter()
+    steps, samples, began = -(-case.steps // case.nworld), [], time.perf_counter()
     for t in range(case.chunk * steps, case.chunk * steps + steps):
         wp.launch(draw, case.nworld, [case.seed, t, case.rate, *drawn], device=env.device)
         if t % EVERY == 0 and (mask := (kind == 1) | (kind == 2)).any():
@@ -500,7 +505,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         for column, what in ((1, "resident"), (2, "GPU")):
             levels = [sample[column] / 2**20 for result in results for sample in result["memory"]]
             if any(levels):
-                slopes = [1e6 * slope(result["memory"], column) for result in results]
+                slopes = [round(1e6 * slope(result["memory"], column)) for result in results]
                 grown.append([name, what, f"{levels[0]:,.0f}", f"{max(levels):,.0f}", f"{levels[-1]:,.0f}",
                               experiment.median_and_range(slopes, ",.0f")])  # fmt: skip
     return [
