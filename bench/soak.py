@@ -437,11 +437,11 @@ def kill(case: Kills, options: Options) -> dict[str, Any]:
     start = [*program, case.task, *case.words.split(), *quiet, "--seed", str(case.seed), "--out"]
     subprocess.run([*start, str(straight)], check=True, stdout=subprocess.DEVNULL)
     resume = [*program, "--resume", str(killed), "--iterations", str(len(table(straight))), *quiet]
-    draws, kills, begun_again, code = random.Random(case.seed), 0, 0, -1
+    draws, kills, restarts, code = random.Random(case.seed), 0, 0, -1
     while code < 0:
         saved = (killed / "checkpoint.pt").exists()
         if killed.exists() and not saved:
-            begun_again += 1
+            restarts += 1
             shutil.rmtree(killed)
         rows = len(table(killed))
         process = subprocess.Popen(resume if saved else [*start, str(killed)], stdout=subprocess.DEVNULL)
@@ -456,7 +456,7 @@ def kill(case: Kills, options: Options) -> dict[str, Any]:
         code = process.wait()
     policies = [lw.load(folder).state_dict() for folder in (straight, killed)]
     return {
-        "kills": kills, "begun_again": begun_again, "exit_code": code, "iterations": len(table(straight)),
+        "kills": kills, "restarts": restarts, "exit_code": code, "iterations": len(table(straight)),
         "equal_rows": table(straight) == table(killed),
         "equal_policy": all(torch.equal(value, policies[1][name]) for name, value in policies[0].items()),
     }  # fmt: skip
@@ -484,7 +484,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
                          f"{result['bytes_per_env']:,.0f}", f"{result['gpu_bytes_per_env']:,.0f}"])  # fmt: skip
         elif case["part"] == "kills":
             kills.append([f"{case['task']} {case['words']}", *(f"{result[name]}" for name in (
-                "kills", "begun_again", "iterations", "equal_rows", "equal_policy"))])  # fmt: skip
+                "kills", "iterations", "equal_rows", "equal_policy"))])  # fmt: skip
     for run in runs.values():
         case, results = run[0].case, [row.result for row in run]
         if case["part"] != "faults":
@@ -522,7 +522,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         Table("Bytes that stay for each environment that is made and deleted.",
               ["task", "device", "worlds", "made", "resident", "GPU"], made),
         Table("Trainings that were killed and resumed, beside one that was not interrupted.",
-              ["training", "kills", "begun again", "iterations", "equal metrics", "equal policy"], kills),
+              ["training", "kills", "iterations", "equal metrics", "equal policy"], kills),
     ]  # fmt: skip
 
 
