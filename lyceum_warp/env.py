@@ -11,6 +11,7 @@ import torch
 import warp as wp
 
 from lyceum_warp.binding.bound_task import BoundTask, check_field_name
+from lyceum_warp.binding.compile_errors import explained
 from lyceum_warp.binding.read_only_model import read_only
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.done import FAULTS
@@ -193,9 +194,9 @@ class Env:
             if not _replica:
                 self.engine.check_room()
         except Exception as error:
-            if (explained := self.task.explained(error)) is error:
+            if (clear := explained(error, self.task.name)) is error:
                 raise
-            raise explained from None
+            raise clear from None
         leave_in_parent(self, "worlds", "engine")
 
     def __setattr__(self, name: str, value: Any) -> None:

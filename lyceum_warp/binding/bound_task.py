@@ -3,7 +3,6 @@
 import difflib
 import keyword
 import math
-import re
 from collections.abc import Collection, Mapping
 from types import SimpleNamespace
 from typing import Any
@@ -194,11 +193,6 @@ class BoundTask:
         """Whether an observation draws random numbers."""
         return any(len(function.input_types) > len(FUNCTIONS["observe"].kinds) for function in self.observers.values())
 
-    @property
-    def obs_layout(self) -> dict[str, int]:
-        """The parts of the policy's observation and their sizes."""
-        return self.obs_layouts["policy"]
-
     def _checked_writes(self) -> dict[str, frozenset[str]]:
         written = {name: function for name, function in self.functions.items() if function is not None}
         check_writes(self.name, written, {name: self._rights(function) for name, function in FUNCTIONS.items()})
@@ -340,33 +334,6 @@ class BoundTask:
     def _layouts(self) -> dict[str, dict[str, int]]:
         """The parts of each group of observations and their sizes, for the parameters as they are."""
         return obs_layouts(self.task, self.params)
-
-    def explained(self, error: Exception) -> Exception:
-        """An error in one line, where Warp could not compile the task's functions; other errors as they are."""
-        text = str(error)
-        if "while parsing function" not in text and not type(error).__module__.startswith("warp"):
-            return error
-        # which kernel is compiled first, and so which of its lines is in the message, differs from run to run
-        flat = " ".join(text.split())
-        # the last function that is named holds the line that fails: where a kernel does not call it, the mistake lies
-        # within a function
-        innermost = flat.rpartition("while parsing function")[2]
-        call = re.search(r"\b(reward|evaluate|terminated|success)\((?:s0|s1|view)\b", innermost)
-        kind = re.search(r"value argument type \((.+?)\) must be|with different type \(<class '[\w.]*?(\w+)'>\)", flat)
-        if call and kind:
-            signature, returned = FUNCTIONS[call.group(1)].signature, kind.group(1) or kind.group(2)
-            return ValueError(
-                f"{call.group(1)} of the task {self.name!r} returns {returned}: it must be written as {signature}"
-            )
-        lines = [line.strip(" ;") for line in text.splitlines() if line.strip(" ;")]
-        hint = ": a function returns one number, not a tuple" if "tuple_t" in text else ""
-        if re.search(r"overload for '(quat\w*|mul)' .*\bvec4f\b", flat):
-            hint = (
-                ": quaternions are w, x, y, z here: use lw.quat_rotate, lw.quat_mul, ... in place of Warp's functions"
-            )
-        if "overload for 'extract'" in flat and re.search(r"\]\s*(\*|/|//|%|\*\*)=", flat):
-            hint = ": Warp has no such assignment to an element of a row: write a[i] = a[i] * x in place of a[i] *= x"
-        return ValueError(f"Warp can't compile the functions of the task {self.name!r}: {' '.join(lines[-3:])}{hint}")
 
     def check_field(self, name: str, array: wp.array) -> None:
         """Compare the declaration of a field in World with the array that it will be bound to, (nworld, ...).

@@ -58,25 +58,7 @@ class TaskSource:
                 group = name.removeprefix(GROUP_PREFIX)
                 if group not in groups:
                     raise ValueError(f"obs of the task {self.name!r} has no group {group!r}, which {name} writes")
-        self._check_module_groups(groups)
         return found
-
-    def _check_module_groups(self, groups: Collection[str]) -> None:
-        """Refuse a function of the module that looks like that of a group, where nothing in the module uses it."""
-        module = vars(sys.modules[self.task.__module__])
-        functions = {name: value for name, value in module.items() if isinstance(value, wp.Function)}
-        tasks = [kind for kind in (self.task, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
-        attributes = [value for task in tasks for value in vars(task).values()]
-        codes = [getattr(function.func, "__code__", None) for function in functions.values()]  # Warp's own have none
-        called = {name for code in codes if code is not None for name in code.co_names}
-        for name, function in functions.items():
-            group = name.removeprefix(GROUP_PREFIX)
-            if group == name or group in groups or name in called or any(function is value for value in attributes):
-                continue
-            kinds = tuple(map(self._kind, function.input_types.values()))
-            own = kinds in (FUNCTIONS["observe"].kinds, FUNCTIONS["observe"].all_kinds)  # not another task's
-            if own and not any(_may_list(task, group) for task in tasks):
-                raise ValueError(f"obs of the task {self.name!r} has no group {group!r}, which {name} writes")
 
     def _written(self, name: str) -> Any:
         """The value of a name in the class, in its module, or in those of the classes that it extends."""
@@ -114,9 +96,10 @@ class TaskSource:
                 "'from __future__ import annotations', and quotes around types"
             )
         returned = annotations.get("return")
-        if wanted.result is not None and not _returns(function):
+        values = _return_values(function)
+        if wanted.result is not None and not values:
             raise ValueError(f"{name} of the task {self.name!r} has no return: it is written as {wanted.signature}")
-        if wanted.result is not None and _returns_tuple(function):
+        if wanted.result is not None and any(isinstance(value, ast.Tuple) for value in values):
             raise ValueError(
                 f"{name} of the task {self.name!r} returns a tuple, and must return a single {wanted.result.__name__}"
             )
@@ -163,30 +146,13 @@ class TaskSource:
                     raise ValueError(f"the task {self.name!r} has a function {name!r}: did you mean {close[0]}?")
 
 
-def _may_list(task: type[Task], group: str) -> bool:
-    """Whether a class lists a group of observations, or may do so, where ``obs`` is a method."""
-    obs = getattr(task, "obs", None)
-    return callable(obs) or (isinstance(obs, Mapping) and isinstance(obs.get(group), Mapping))
-
-
 def _origin(struct: Any) -> str:
     """The file that a struct comes from; its module where there is no file."""
     module = struct.cls.__module__
     return str(getattr(sys.modules.get(module), "__file__", None) or module)
 
 
-def _return_values(function: wp.Function) -> list[ast.expr] | None:
-    """The expressions that a function returns; None for a function without a source in Python."""
-    if not has_source(function):
-        return None
+def _return_values(function: wp.Function) -> list[ast.expr]:
+    """The expressions that a function returns."""
     nodes = ast.walk(FunctionSource(function).tree)
     return [node.value for node in nodes if isinstance(node, ast.Return) and node.value is not None]
-
-
-def _returns(function: wp.Function) -> bool:
-    values = _return_values(function)
-    return values is None or bool(values)
-
-
-def _returns_tuple(function: wp.Function) -> bool:
-    return any(isinstance(value, ast.Tuple) for value in _return_values(function) or [])

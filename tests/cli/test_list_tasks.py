@@ -63,7 +63,7 @@ def test_listed_sizes_are_those_of_an_environment(name: str, capsys: pytest.Capt
     except FileNotFoundError as error:
         pytest.skip(str(error))
     actions = sum(task.task.actions.values()) if task.task.actions else task.model.nu
-    sizes = [sum(task.obs_layout.values()), actions, task.frame_skip, f"{task.timestep:g}"]
+    sizes = [sum(task.obs_layouts["policy"].values()), actions, task.frame_skip, f"{task.timestep:g}"]
     assert row[:4] == list(map(str, sizes))
 
 
