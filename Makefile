@@ -9,7 +9,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-all lint clean
+.PHONY: demo test test-all test-room lint clean
 
 demo: $(VENV)/installed-viz
 	$(BIN)/lyceum-warp train hopper --iterations 80 --out runs/demo-$$(date +%Y%m%d-%H%M%S) --require-return 1000
@@ -22,6 +22,10 @@ test: $(VENV)/installed-dev
 
 test-all: $(VENV)/installed-dev
 	$(PYTEST) -m "long or not long"
+
+# make test-room ROOM=algos: one room of the package, by the tests that mirror it
+test-room: $(VENV)/installed-dev
+	$(PYTEST) $(wildcard tests/$(ROOM) tests/test_$(ROOM).py)
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .

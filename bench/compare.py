@@ -1,4 +1,4 @@
-"""Every difference, to the bit, between the numbers of two checkouts: how to show that a redesign changed nothing.
+"""Report every difference, to the bit, between the numbers of two checkouts.
 
     lyceum-warp bench compare main
     lyceum-warp bench compare v0.1.0 HEAD --parts env plans --tasks hopper reach --out differences.json
@@ -8,7 +8,7 @@ OLD and NEW are revisions of git, or folders with a checkout; NEW is this workin
 units of work side by side, each in a process of its own, with the same Python and the same packages. A unit is a part
 on a task and an engine.
 
-The numbers hold for one processor alone, so that no file of them can take the place of OLD. The program uses the public
+The numbers depend on the processor: a file of them cannot replace OLD. The program uses the public
 names of the package only (probes/checkout.py). Exit code: 0 without a difference, 1 with differences, 2 for bad input.
 """
 
@@ -70,7 +70,7 @@ class Options:
     engines: tuple[Literal["mujoco", "warp"], ...] = ENGINES
     """Engines."""
     device: str = "cpu"
-    """Device of the Warp engine, for example cuda, where its deterministic mode is compared."""
+    """Device of the Warp engine, for example cuda, with its deterministic mode."""
     parts: tuple[Part, ...] = PARTS
     """What is compared. env: the compiled model, resets, steps with actions beyond their bounds and short episodes,
     observations, rewards and evaluations of given states, resets of some worlds, a fault, a rollout of given actions.
@@ -340,7 +340,7 @@ class Report:
     units: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     found: list[Difference] = dataclasses.field(default_factory=list)
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Units that an extra is missing for, and what is missing."""
+    """Skipped units, and the missing extra of each."""
     arrays: int = 0
     """Arrays that were compared."""
     ignored: int = 0
@@ -396,7 +396,7 @@ def compare_unit(unit: Unit, sides: Sequence[Side], device: str, report: Report)
     )
     axes = {**answers["new"].get("axes", {}), **answers["old"].get("axes", {})}
     found = [each for each in failures(unit.name, answers) if report.kept(each.name)]
-    if found:  # what a failure left out is not a further difference
+    if found:  # arrays that a failure left out are not further differences
         old, new = ({name: array for name, array in side.items() if name in old and name in new} for side in (old, new))
     found += differences(unit.name, old, new, axes)
     for side, arrays in (("old", old), ("new", new)):
@@ -443,15 +443,12 @@ def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
 
 def written(report: Report, options: Options, checkouts: Mapping[str, str], seconds: float) -> dict[str, Any]:
     """The content of the file."""
-    packages = {name: importlib.metadata.version(name) for name in PACKAGES}
     return {
         "checkouts": checkouts,
         "options": dataclasses.asdict(options) | {"out": str(options.out)},
         "machine": {"processor": platform.processor() or platform.machine(), "system": platform.platform()},
-        "versions": {
-            "python": platform.python_version(),
-            **{name: importlib.metadata.version(name) for name in packages},
-        },
+        "versions": {name: importlib.metadata.version(name) for name in PACKAGES}
+        | {"python": platform.python_version()},
         "seconds": round(seconds, 1),
         "differences": len(report.found),
         "skipped": report.skipped,

@@ -1,4 +1,4 @@
-"""Statistics of learning curves: means with intervals, and whether two sets of curves differ at given points."""
+"""Compute statistics of learning curves: means with intervals, and whether two sets of curves differ."""
 
 import itertools
 import math
@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 MOST_SPLITS = 20_000
-"""Splits of the seeds that the permutation test looks at; where there are more, it draws so many."""
+"""Most splits of the seeds in the permutation test; from more, it draws so many."""
 
 
 def student_quantile(probability: float, freedom: float) -> float:
-    """Quantile of Student's t distribution, by bisection on the integral of its density.
+    """Return a quantile of Student's t distribution, by bisection on the integral of its density.
 
     Args:
         probability: At least 0.5.
@@ -34,7 +34,7 @@ def student_quantile(probability: float, freedom: float) -> float:
 
 
 def mean_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[float, float]:
-    """Mean, and half the width of its confidence interval (Student's t); nan for the width of a single value."""
+    """Return the mean, and half the width of its confidence interval (Student's t); nan for a single value."""
     array = np.asarray(values, float)
     if len(array) < 2:
         return float(array.mean()), math.nan
@@ -42,20 +42,8 @@ def mean_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[fl
     return float(array.mean()), quantile * float(array.std(ddof=1)) / math.sqrt(len(array))
 
 
-def difference_interval(a: Sequence[float], b: Sequence[float], confidence: float = 0.95) -> tuple[float, float]:
-    """Difference of the means of a and b, and half the width of its confidence interval (Welch 1947)."""
-    difference = float(np.mean(a) - np.mean(b))
-    if min(len(a), len(b)) < 2:
-        return difference, math.nan
-    parts = [float(np.var(values, ddof=1)) / len(values) for values in (a, b)]
-    if sum(parts) == 0.0:
-        return difference, 0.0
-    freedom = sum(parts) ** 2 / sum(part**2 / (len(v) - 1) for part, v in zip(parts, (a, b), strict=True))
-    return difference, student_quantile(0.5 + confidence / 2, freedom) * math.sqrt(sum(parts))
-
-
 def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Two-sided p values at every point that the curves a and b have the same distribution, adjusted for all points.
+    """Test at every point whether the curves a and b have the same distribution, adjusted for all points.
 
     The test permutes whole curves, and compares each point's Welch statistic with the largest one of all points
     (Westfall and Young 1993, single step), so that the probability of an error at any point is at most the level, with
@@ -66,7 +54,7 @@ def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         b: Curves, (curves, points).
 
     Returns:
-        Adjusted p values, (points,); nan with fewer than two curves in a or b.
+        Adjusted two-sided p values, (points,); nan with fewer than two curves in a or b.
     """
     both, n = np.concatenate([a, b]), len(a)
     if min(n, len(b)) < 2:
@@ -87,6 +75,6 @@ def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _welch(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Absolute Welch statistics of all points, (points,)."""
+    """Return the absolute Welch statistics of all points, (points,)."""
     spread = a.var(axis=0, ddof=1) / len(a) + b.var(axis=0, ddof=1) / len(b)
     return np.abs(a.mean(axis=0) - b.mean(axis=0)) / np.sqrt(np.maximum(spread, 1e-300))

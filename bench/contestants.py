@@ -1,40 +1,38 @@
-"""What samples in the experiments throughput and scaling: this package, MuJoCo's own rollout, and other libraries.
+"""Step the worlds of lyceum_warp, of ``mujoco.rollout`` and of other libraries for the experiment throughput.
 
-A sample is one environment step, with its observation and its reward in the hands of the caller. All use the same
-model, substeps, bounds of uniformly random actions, and resets: after a number of steps from random initial states the
-worlds are at random places of their episodes, and those that end restart. Each contestant gets as many worlds for each
-thread as suit it.
+A sample is one environment step whose observation and reward the caller has received. All contestants use the same
+model, substeps and bounds of uniformly random actions. Worlds start from random initial states, take some steps before
+the clock starts, and restart at the end of an episode. Each contestant gets the number of worlds for each thread that
+suits it.
 """
 
-import contextlib
 import importlib.util
 import sys
-from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import experiment
 import mujoco
 import numpy as np
-import peers
 import torch
+import venvs
 import warp as wp
 from mujoco.rollout import Rollout
 
 import lyceum_warp as lw
 
-WORKER = "environments/sampling.py"
-sys.path.append(str((peers.FOLDER / WORKER).parent))
-import sampling  # noqa: E402  # a worker of the peers, whose clock and actions we share
+WORKER = venvs.FOLDER / "environments" / "sampling.py"
+sys.path.append(str(WORKER.parent))
+import sampling  # noqa: E402  # a worker of the peers; its clock and its actions serve here, too
 
 LABELS = {
-    "c": "ours, C engine",
-    "warp": "ours, Warp engine",
+    "c": "lyceum_warp, C engine",
+    "warp": "lyceum_warp, Warp engine",
     "native": "native C",
     "envpool": "EnvPool",
     "gym-async": "Gymnasium, AsyncVectorEnv",
     "gym-sync": "Gymnasium, SyncVectorEnv",
     "gymnasium": "Gymnasium",
-    "gymnasium-newton": "Gymnasium, Newton's solver",
     "dm_control": "dm_control",
 }
 
@@ -45,70 +43,56 @@ GPU_WORLDS = 16_384
 
 
 def worlds(contestant: str, threads: int, device: str) -> int:
-    """How many worlds a contestant steps at a time."""
+    """Return the default number of worlds of a contestant."""
     if contestant == "warp" and device.startswith("cuda"):
         return GPU_WORLDS
     return WORLDS[contestant] * (1 if contestant == "gym-sync" else threads)
 
 
 def takes_part(contestant: str, task: str) -> bool:
-    """Whether a contestant has a task; Newton's solver is another one than the model's own for humanoid alone."""
-    if contestant == "gymnasium-newton":
-        return task == "humanoid"
+    """Return whether a contestant has a task."""
     return contestant != "envpool" or task in sampling.ENVPOOL
 
 
 def measure(
     contestant: str, task: str, *, worlds: int, threads: int, device: str, seed: int, seconds: float, warm: int
 ) -> dict[str, Any]:
-    """Environment steps per second.
+    """Measure environment steps per second.
 
     Args:
         contestant: A name of ``LABELS``.
         task: A task of this package.
         worlds: Number of worlds.
-        threads: Number of threads, and of cores that they may use.
+        threads: Number of threads and cores.
         device: Device of the Warp engine.
         seed: Seed of actions and initial states.
-        seconds: How long to step.
-        warm: Steps before that.
+        seconds: Duration of the measurement.
+        warm: Steps before it.
 
     Raises:
         experiment.Skipped: The contestant is not installed, or there are too few cores.
     """
-    with experiment.cores(threads), torch_threads(1):
+    torch.set_num_threads(1)
+    with experiment.cores(threads):
         if contestant in ("c", "warp"):
-            made: Ours | Native = Ours(contestant, task, worlds, threads, device, seed)
+            made: LyceumWarp | Native = LyceumWarp(contestant, task, worlds, threads, device, seed)
         elif contestant == "native":
             made = Native(task, worlds, threads, seed, warm)
         else:
             settings = {"contestant": contestant, "task": task, "envs": worlds, "threads": threads}
-            return worker(contestant).run(**settings, seed=seed, seconds=seconds, warm=warm)
+            return venvs.run(python_of(contestant), WORKER, **settings, seed=seed, seconds=seconds, warm=warm)
         steps, passed = sampling.timed(made.step, len(made.actions), warm, seconds, made.wait)
     return {"env_steps_per_second": steps * worlds / passed, "steps": steps}
 
 
-def worker(contestant: str) -> peers.Peer:
-    """The program that measures another library."""
-    if contestant in ("gymnasium", "gymnasium-newton", "gym-sync", "gym-async"):
-        return peers.peer_here("gymnasium", WORKER)
-    if contestant == "envpool" and importlib.util.find_spec("envpool"):
-        return peers.peer_here("envpool", WORKER)
-    return peers.peer(contestant, WORKER)
+def python_of(contestant: str) -> Path:
+    """Return the Python that runs another library."""
+    if contestant.startswith("gym") or (contestant == "envpool" and importlib.util.find_spec("envpool")):
+        return Path(sys.executable)
+    return venvs.python_of(contestant)
 
 
-@contextlib.contextmanager
-def torch_threads(number: int) -> Iterator[None]:
-    """Keep torch's own threads from the cores."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(number)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-class Ours:
+class LyceumWarp:
     """An environment of this package."""
 
     def __init__(self, contestant: str, task: str, nworld: int, threads: int, device: str, seed: int) -> None:
@@ -126,21 +110,21 @@ class Ours:
 
 
 def actions(env: lw.Env, seed: int) -> list[torch.Tensor]:
-    """Actions of some steps, (nworld, nact) each; a list, because taking a tensor's rows would be timed, too."""
+    """Return actions of several steps, (nworld, nact) each; a list, because indexing a tensor would be timed, too."""
     low, high = (np.nan_to_num(x, posinf=1.0, neginf=-1.0) for x in (env.action_space.low, env.action_space.high))
     drawn = sampling.draw(np.asarray(low), np.asarray(high), env.nworld, seed)
     return list(torch.as_tensor(drawn, dtype=torch.float32, device=env.obs.device))
 
 
 class Native:
-    """``mujoco.rollout`` without a task: one call for every environment step, as the next actions are not known yet.
+    """``mujoco.rollout`` without a task, one call for each environment step.
 
-    It steps the states that our environment starts its steps from, after its warm-up, with the same controls. So it
-    makes the same substeps and restarts, without observations and rewards.
+    It steps the states from which lyceum_warp's environment steps, with the same controls: the same substeps and
+    restarts, without observations and rewards.
     """
 
     def __init__(self, task: str, nworld: int, threads: int, seed: int, warm: int) -> None:
-        ours = Ours("c", task, nworld, threads, "cpu", seed)
+        ours = LyceumWarp("c", task, nworld, threads, "cpu", seed)
         env, engine = ours.env, ours.env.engine
         self.model, nstep = engine.native_model, env.task.frame_skip
         for t in range(warm):
@@ -157,7 +141,7 @@ class Native:
         self.rollout = Rollout(nthread=threads)
 
     def _split(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The states that a rollout takes, and the accelerations that warm-start its solver."""
+        """Return the states of a rollout, and the accelerations that warm-start its solver."""
         data = mujoco.MjData(self.model)
         whole, full = mujoco.mjtState.mjSTATE_INTEGRATION.value, mujoco.mjtState.mjSTATE_FULLPHYSICS.value
         physics = np.zeros((len(states), mujoco.mj_stateSize(self.model, full)))
@@ -176,4 +160,4 @@ class Native:
         )
 
     def wait(self) -> None:
-        """Each step has ended when its call returns."""
+        """Do nothing: a step ends before its call returns."""

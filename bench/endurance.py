@@ -1,8 +1,7 @@
-"""Long runs of every task under random actions: how episodes end, and which faults there are.
+"""Run every task for long under random actions, and count ends of episodes and faults.
 
-python bench/endurance.py
-python bench/endurance.py --engine warp --nworld 64 --steps 200
-python bench/endurance.py ant humanoid --steps 10000 --out endurance.json
+lyceum-warp bench endurance
+lyceum-warp bench endurance --engine warp --nworld 64 --steps 200
 """
 
 import dataclasses
@@ -26,7 +25,7 @@ class Options:
     """Long runs under random actions."""
 
     tasks: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Tasks; without any, all of them."""
+    """Tasks; by default all."""
     engine: str = "mujoco"
     """Engine."""
     device: str = "cpu"
@@ -43,14 +42,14 @@ class Options:
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What happened to the worlds of a task."""
+    """Counts of a task."""
 
     task: str
     world_steps: int
     terminated: int
     truncated: int
     faults: dict[str, int]
-    """Number of each kind of fault, those that occurred."""
+    """Number of each kind of fault that occurred."""
     largest_speed: float
     """The largest magnitude in ``qvel`` after a step, in worlds whose episode went on."""
     seconds: float
@@ -62,7 +61,6 @@ def run(options: Options, task: str) -> Row:
         task, engine=options.engine, device=options.device, nworld=options.nworld, seed=options.seed, fields=["qvel"]
     )
     low, high = env.action_space.low, env.action_space.high
-    # an action without bounds takes any number
     low, high = (np.full(env.action.shape[1], np.inf) if bound is None else bound for bound in (low, high))
     bounded = np.isfinite(low) & np.isfinite(high)
     low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
@@ -98,7 +96,7 @@ def show(rows: list[Row], console: Console) -> None:
 
 
 def main() -> int:
-    """Run all tasks, print and store the counts; the exit code is 1 after a fault, or where a model is missing."""
+    """Run all tasks, print and store the counts; return 1 after a fault or if a model is missing."""
     options = tyro.cli(Options, description=__doc__)
     console, rows, missing = Console(), [], False
     for task in options.tasks or lw.task_names():

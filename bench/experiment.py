@@ -1,9 +1,9 @@
-"""What the experiments of this folder share: command line, cases, results as JSON lines, tables and figures.
+"""Run experiments: cases, stored results, tables and figures.
 
-An experiment is one file with an ``EXPERIMENT``: a list of cases, a function that measures one of them, and functions
-that make tables and a figure from results alone. ``main`` prints the time that the cases take, leaves out those that
-the file of results has from the same hardware and versions, and writes each result when it is there, so that a
-program that is killed loses one case at most. The same command then continues.
+An experiment is a file with an ``EXPERIMENT``: a list of cases, a function that measures one case, and functions that
+make tables and a figure from stored results. ``main`` prints the time that the cases take and skips cases whose results
+from the same hardware and software are stored. Each result is written as soon as it is measured: an interrupted run
+loses at most one case per job, and the same command continues.
 """
 
 import concurrent.futures
@@ -24,7 +24,6 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -34,41 +33,47 @@ import tyro
 
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
-NAMES = ("throughput", "scaling", "npg", "mppi", "fidelity", "latency")
-"""The experiments, in the order of the lists."""
+NAMES = ("throughput", "npg", "learning", "mppi", "fidelity")
+"""The experiments."""
 
-SOFTWARE = ("python", "lyceum_warp", "mujoco", "mujoco_warp", "warp_lang", "torch", "numpy", "gymnasium")
-"""Entries that, with the hardware's, must be equal for a result to stand for a case that is to be measured."""
+SOFTWARE = ("python", "mujoco", "mujoco_warp", "warp_lang", "torch", "numpy", "gymnasium")
+"""Versions that must be equal for results to be compared, together with the hardware."""
+
+STYLES = (
+    ("#D55E00", "o", "-"), ("#0072B2", "s", "--"), ("#009E73", "^", "-."), ("#CC79A7", "D", ":"),
+    ("#E69F00", "v", (0, (5, 1))), ("#56B4E9", "P", (0, (3, 1, 1, 1))), ("#000000", "X", "-"),
+)  # fmt: skip
+"""Colour (Okabe and Ito's palette for colour-blind readers), marker and line style of the n-th curve."""
 
 
 class Skipped(Exception):  # noqa: N818
-    """A case cannot be measured here, as its peer is not installed; the text is one line that says why."""
+    """A case cannot be measured on this machine; the message is one line with the reason."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Options of all experiments. An experiment may derive a class with more of them."""
+    """Options of every experiment. An experiment may derive a class with more options."""
 
     short: bool = False
-    """Measure so little that two cores finish in two minutes; the results go into results/short/."""
+    """Measure little, in two minutes on two cores; the results go to results/short/."""
     out: Path | None = None
-    """File of the results (JSON lines); by default results/NAME.jsonl beside this program."""
+    """File of the results (JSON lines); by default results/NAME.jsonl."""
     tasks: tuple[str, ...] = ()
-    """Tasks; by default all of the experiment's."""
+    """Tasks; by default the experiment's."""
     contestants: tuple[str, ...] = ()
-    """What is compared; by default all of the experiment's."""
+    """Contestants; by default the experiment's."""
     device: str = "cpu"
     """Device of the Warp engine, for example cuda."""
     threads: int | None = None
-    """Threads of everything that runs on the CPU; by default all cores."""
+    """Threads of each contestant on the CPU; by default all cores."""
     repeats: int | None = None
-    """How often every comparison is repeated."""
+    """Number of repeats of each comparison."""
     seeds: tuple[int, ...] = ()
-    """Seeds, where the experiment has some."""
+    """Seeds, if the experiment has any."""
     jobs: int = 1
-    """Cases at the same time, each on as many cores of its own as there are threads, where the experiment allows it."""
+    """Number of cases that run at the same time, each on cores of its own, if the experiment allows it."""
     dry_run: bool = False
-    """Print the cases and their time, and measure nothing."""
+    """Print the cases and their durations, and measure nothing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +86,7 @@ class Row:
     provenance: dict[str, Any]
     """Machine, versions, commit and date."""
     seconds: float
-    """Wall-clock time of the measurement, with its preparation."""
+    """Wall-clock time of the measurement, including its preparation."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,16 +99,15 @@ class Table:
 
     def markdown(self) -> str:
         lines = [self.header, ["---"] * len(self.header), *self.rows]
-        return "\n".join([*([self.title, ""] if self.title else []), *(f"| {' | '.join(line)} |" for line in lines)])
+        return "\n".join([self.title, "", *(f"| {' | '.join(line)} |" for line in lines)])
 
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """An experiment, as its file defines it.
+    """An experiment.
 
-    A case is a frozen dataclass of the experiment's own, with everything that the result depends on except for machine
-    and versions: sizes, number of the repeat, seed, whether it is the short mode's. Where contestants are compared,
-    they must take turns: list the cases with the repeats outside and the contestants inside.
+    A case is a frozen dataclass with everything that the result depends on, except for the machine and the versions.
+    Contestants that are compared take turns: list the cases with the repeats outside and the contestants inside.
     """
 
     name: str
@@ -111,39 +115,32 @@ class Experiment:
     summary: str
     """One line."""
     cases: Callable[[Any], Sequence[Any]]
-    """Cases for the options, in the order of the measurements."""
+    """Return the cases for the options, in the order of the measurements."""
     estimate: Callable[[Any], float]
-    """Seconds that a case takes on two cores."""
+    """Return the seconds that a case takes on two cores."""
     measure: Callable[[Any, Any], dict[str, Any]]
-    """Measures a case with the options; raises Skipped where that is impossible here."""
+    """Measure a case with the options; raise Skipped if that is impossible on this machine."""
     tables: Callable[[Sequence[Row]], Sequence[Table]]
-    """Tables from the results of one machine alone."""
-    figure: Callable[[Sequence[Row]], Any] | None
-    """Figure of matplotlib, which may be missing where cases are measured, from the results of one machine alone.
-
-    None where they hold nothing to draw.
-    """
+    """Make tables from the stored results of one machine."""
+    figure: Callable[[Sequence[Row]], Any] | None = None
+    """Draw the stored results of one machine with matplotlib; return None if there is nothing to draw."""
     options: type[Options] = Options
     packages: tuple[str, ...] = ()
     """Peers whose versions belong to the provenance."""
     apart: bool = False
-    """Whether each case is a process of its own, on cores of its own, so that several can run at the same time."""
+    """Whether each case runs in a process of its own."""
     parallel: bool = False
-    """Whether the same holds where several run at the same time, and only then."""
+    """Whether cases run in processes of their own if there are several jobs."""
 
 
 def load(name: str) -> Experiment:
-    """An experiment by its name.
-
-    Raises:
-        ValueError: There is none of that name.
-    """
+    """Import an experiment by its name; raise ValueError if there is none of that name."""
     choose((name,), NAMES, what="experiment")
     return importlib.import_module(name).EXPERIMENT
 
 
 def choose(given: Sequence[str], known: Iterable[str], default: Sequence[str] = (), *, what: str) -> tuple[str, ...]:
-    """The names that were given, or the default ones where there are none; all, where there is no default.
+    """Return the given names; without any, the default ones, and all without a default.
 
     Raises:
         ValueError: A name is unknown.
@@ -158,7 +155,7 @@ def choose(given: Sequence[str], known: Iterable[str], default: Sequence[str] = 
 
 
 def installed(module: str, requirement: str) -> Any:
-    """Import a peer that shares our environment.
+    """Import a package of a peer.
 
     Raises:
         Skipped: It is not installed.
@@ -174,8 +171,26 @@ def installed(module: str, requirement: str) -> Any:
 # files of results
 
 
+def stored(names: Sequence[str], results: Path) -> dict[str, Path]:
+    """Return the files of results in a folder by experiment: of the given experiments, or of all with results.
+
+    Raises:
+        ValueError: A name is unknown.
+        FileNotFoundError: There are no results.
+    """
+    found = {name: results / f"{name}.jsonl" for name in choose(names, NAMES, what="experiment")}
+    if not names:
+        found = {name: path for name, path in found.items() if path.exists()}
+    for name, path in found.items():
+        if not path.exists():
+            raise FileNotFoundError(f"there is no {path}: run the experiment {name} first")
+    if not found:
+        raise FileNotFoundError(f"there are no results in {results}: run an experiment first")
+    return found
+
+
 def read(path: Path) -> list[Row]:
-    """Rows of a file of results; a last line that was torn off is left out, with a warning.
+    """Read a file of results; an incomplete last line is dropped with a warning.
 
     Raises:
         ValueError: A line is not a result.
@@ -185,12 +200,12 @@ def read(path: Path) -> list[Row]:
 
 
 def _read(path: Path) -> tuple[list[Row], int]:
-    """Rows, and the number of bytes up to the end of the last one."""
+    """Return the rows, and the offset at which the last one ends."""
     rows, size = [], 0
     for number, line in enumerate(path.read_bytes().splitlines(keepends=True), start=1):
         try:
             if not line.endswith(b"\n"):
-                print(f"{path}: line {number} was torn off by a stop, and is left out", file=sys.stderr)
+                print(f"{path}: line {number} is incomplete and is dropped", file=sys.stderr)
                 break
             rows.append(Row(**json.loads(line)))
         except (ValueError, TypeError) as error:
@@ -200,7 +215,7 @@ def _read(path: Path) -> tuple[list[Row], int]:
 
 
 def append(path: Path, row: Row) -> None:
-    """Add a row to a file of results; it has reached the disk when this returns."""
+    """Append a row to a file of results, and flush it to the disk."""
     with path.open("ab") as file:
         file.write(json.dumps(dataclasses.asdict(row)).encode() + b"\n")
         file.flush()
@@ -208,93 +223,78 @@ def append(path: Path, row: Row) -> None:
 
 
 def machine(row: Row) -> tuple[Any, ...]:
-    """What must be equal for numbers to be compared."""
+    """Return the hardware that must be equal for numbers to be compared."""
     return tuple(row.provenance.get(name) for name in measurements.HARDWARE)
 
 
-Software = tuple[tuple[Any, ...], frozenset[tuple[str, str]]]
-"""Versions of SOFTWARE, and those of the peers that are installed."""
-
-
-def _software(row: Row) -> Software:
-    peers = row.provenance.get("peers") or {}
-    return tuple(row.provenance.get(name) for name in SOFTWARE), frozenset(peers.items())
-
-
-def _agree(one: Software, other: Software) -> bool:
-    """Whether the versions are the same; a peer that is missing on one side took no part there."""
-    mine, theirs = dict(one[1]), dict(other[1])
-    return one[0] == other[0] and all(mine[name] == theirs[name] for name in mine.keys() & theirs.keys())
+def software(row: Row) -> tuple[Any, ...]:
+    """Return the versions that must be equal for numbers to be compared."""
+    return tuple(row.provenance.get(name) for name in SOFTWARE)
 
 
 def by_machine(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Rows of each machine under a short name of it, such as "64-cores-h200".
-
-    Of each case it takes the last row. It leaves out rows whose versions differ from those of a later row that stays.
-    """
-    machines: dict[tuple[Any, ...], list[Row]] = {}
+    """Group rows by hardware and software, under names such as "64-cores-h200"; keep the last row of each case."""
+    groups: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:
-        machines.setdefault(machine(row), []).append(row)
+        groups.setdefault((machine(row), software(row)), {})[key(row.case)] = row
     named: dict[str, list[Row]] = {}
-    for same in machines.values():
-        accepted: dict[Software, bool] = {}
-        for software in map(_software, reversed(same)):
-            if software not in accepted:
-                accepted[software] = all(_agree(software, later) for later, kept in accepted.items() if kept)
-        latest = {key(row.case): row for row in same if accepted[_software(row)]}
-        name = slug(same[-1])
+    for same in groups.values():
+        name = slug(next(iter(same.values())))
         while name in named:
             name += "-other"
-        named[name] = list(latest.values())
+        named[name] = list(same.values())
     return named
 
 
 def slug(row: Row) -> str:
-    """Short name of a machine."""
+    """Return a short name of a machine."""
     cores, gpu = row.provenance["cores"], row.provenance.get("gpu")
     model = [] if gpu is None else [word.lower() for word in gpu.split() if any(map(str.isdigit, word))][:1] or ["gpu"]
     return "-".join([f"{cores}-cores", *model])
 
 
-def described(row: Row) -> str:
-    """The machine and the versions, in one line."""
-    found = row.provenance
+def described(rows: Sequence[Row]) -> str:
+    """Describe machine, versions and commits of rows from one machine in one line."""
+    found = rows[-1].provenance
     parts = [f"{found['cores']} cores ({found['cpu']})"]
     if found.get("gpu"):
         parts.append(f"{found['gpu']} (driver {found.get('driver')})")
     names = {"mujoco": "mujoco", "mujoco_warp": "mujoco_warp", "warp_lang": "Warp", "torch": "torch"}
     parts.append(", ".join(f"{label} {found.get(name)}" for name, label in names.items()))
-    commit = [f"commit {found['commit'][:10]}"] if found.get("commit") else []
-    parts.append(", ".join([*commit, found["date"][:10]]))
+    by_date = sorted(rows, key=lambda row: row.provenance.get("date", ""))
+    commits = dict.fromkeys(commit[:7] for row in by_date if (commit := row.provenance.get("commit")))
+    dates = sorted({date[:10] for row in rows if (date := row.provenance.get("date"))})
+    parts.append(f"commit {', '.join(commits)}" if commits else "commit unknown")
+    if dates:
+        parts.append(dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}")
     return "; ".join(parts)
 
 
 def key(case: Mapping[str, Any]) -> str:
-    """A case as text that is equal for equal cases."""
+    """Return text that is equal for equal cases."""
     return json.dumps(case, sort_keys=True)
 
 
-# statistics that several experiments use
+# helpers of several experiments
 
 
-def paired(rows: Sequence[Row], quantity: str, unit: str, by: str = "contestant") -> dict[str, list[float]]:
-    """Ratios of a quantity to the unit's, for each contestant, from the same repeats.
+def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[float]]:
+    """Return ratios of a quantity to the unit's in the same repeat, by contestant.
 
     Args:
         rows: Rows of otherwise equal cases, which have a ``repeat``.
         quantity: Entry of the results.
         unit: The contestant that counts as 1.
-        by: Entry of the cases that names the contestant.
     """
     values: dict[str, dict[int, float]] = {}
     for row in rows:
-        values.setdefault(row.case[by], {})[row.case["repeat"]] = row.result[quantity]
+        values.setdefault(row.case["contestant"], {})[row.case["repeat"]] = row.result[quantity]
     ones = values.get(unit, {})
     return {name: [mine[i] / ones[i] for i in sorted(mine) if i in ones] for name, mine in values.items()}
 
 
 def median_and_range(values: Sequence[float], form: str = ".2f") -> str:
-    """Median, and the smallest and largest value in parentheses; empty text without values."""
+    """Format the median, and the smallest and largest value in parentheses; empty text without values."""
     if not values:
         return ""
     middle = format(statistics.median(values), form)
@@ -303,7 +303,7 @@ def median_and_range(values: Sequence[float], form: str = ".2f") -> str:
 
 @contextlib.contextmanager
 def cores(number: int | None) -> Iterator[None]:
-    """Let this thread, and the threads and processes that it starts, use only the first of its cores.
+    """Limit this thread, and the threads and processes that it starts, to the first cores.
 
     Raises:
         Skipped: There are fewer.
@@ -338,7 +338,7 @@ def provenance(experiment: Experiment, device: str) -> dict[str, Any]:
 
 
 def run(experiment: Experiment, options: Options) -> int:
-    """Measure the cases that the file of results does not have; returns the exit code.
+    """Measure the cases without a stored result; return the exit code.
 
     Raises:
         ValueError: An option is wrong.
@@ -353,12 +353,12 @@ def run(experiment: Experiment, options: Options) -> int:
     path = options.out or folder / f"{experiment.name}.jsonl"
     rows, size = _read(path) if path.exists() else ([], 0)
     now = Row({}, {}, provenance(experiment, options.device), 0.0)
-    known = {key(row.case) for row in rows if machine(row) == machine(now) and _agree(_software(row), _software(now))}
+    known = {key(row.case) for row in rows if machine(row) == machine(now) and software(row) == software(now)}
     left = {name: case for name, case in cases.items() if name not in known}
     took = duration(sum(map(experiment.estimate, left.values())) / max(1, options.jobs))
-    print(f"{experiment.name}: {len(cases) - len(left)} of {len(cases)} cases are there; the rest takes about {took}")
+    print(f"{experiment.name}: {len(cases) - len(left)} of {len(cases)} cases are stored; the rest takes about {took}")
     if options.jobs != 1 and not (experiment.apart or experiment.parallel):
-        raise ValueError(f"the cases of {experiment.name} compete for the cores, so that jobs must be 1")
+        raise ValueError(f"the cases of {experiment.name} compete for the cores: jobs must be 1")
     if options.dry_run:
         for case in left.values():
             print(f"  {_text(case)}: {duration(experiment.estimate(case))}")
@@ -382,12 +382,10 @@ def run(experiment: Experiment, options: Options) -> int:
         row = Row(dataclasses.asdict(case), result, provenance(experiment, options.device), seconds)
         append(path, row)
         print(f"[{number}/{len(left)}] {_text(case)}: {_values(result)}", flush=True)
-    here = (
-        [same for same in by_machine(read(path)).values() if machine(same[0]) == machine(now)] if path.exists() else []
-    )
-    for table in experiment.tables(here[0]) if here else []:
-        print("\n" + table.markdown())
-    if here:
+    mine = [row for row in (read(path) if path.exists() else []) if machine(row) == machine(now)]
+    for here in list(by_machine(mine).values())[-1:]:
+        for table in experiment.tables(here):
+            print("\n" + table.markdown())
         print(f"\nresults: {path}; lyceum-warp bench plot {experiment.name} draws them")
     return 1 if failed else 0
 
@@ -395,7 +393,7 @@ def run(experiment: Experiment, options: Options) -> int:
 def outcomes(
     experiment: Experiment, cases: Sequence[Any], options: Options
 ) -> Iterator[tuple[Any, dict[str, Any] | Exception, float]]:
-    """Cases with their results, or the exceptions that they ended with, and the seconds that they took."""
+    """Yield each case with its result, or with the exception that it raised, and its seconds."""
     if not experiment.apart and options.jobs == 1:
         for case in cases:
             began = time.perf_counter()
@@ -408,25 +406,16 @@ def outcomes(
     places = queue.SimpleQueue[set[int]]()
     for place in core_sets(options.jobs, options.threads):
         places.put(place)
-
-    running: set[Any] = set()
+    context = multiprocessing.get_context("spawn")
 
     def alone(case: Any) -> tuple[Any, dict[str, Any] | Exception, float]:
         began, place = time.perf_counter(), places.get()
-        os.sched_setaffinity(0, place)  # of this thread, from which the process inherits it
-        context = multiprocessing.get_context("spawn")
-        pipe, other = context.Pipe()
-        process = context.Process(target=_measure_apart, args=(other, experiment.measure, case, options))
-        process.start()
-        running.add(process)
-        other.close()
+        os.sched_setaffinity(0, place)  # of this thread; the process inherits it
         try:
-            result = pipe.recv()
-        except EOFError:
-            process.join()
-            result = RuntimeError(f"the process of the case ended with exit code {process.exitcode}")
-        process.join()
-        running.discard(process)
+            with concurrent.futures.ProcessPoolExecutor(1, context) as process:
+                result = process.submit(_measure_apart, experiment.measure, case, options).result()
+        except Exception as error:  # the case's own, or that its process died
+            result = error
         places.put(place)
         return case, result, time.perf_counter() - began
 
@@ -436,31 +425,19 @@ def outcomes(
             yield future.result()
     finally:
         threads.shutdown(wait=False, cancel_futures=True)
-        for process in list(running):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process.pid, signal.SIGTERM)
+        for process in multiprocessing.active_children():
+            process.terminate()
         threads.shutdown()
 
 
-def _measure_apart(pipe: Connection, measure: Callable[[Any, Any], Any], case: Any, options: Options) -> None:
-    """A case's process: sends its result, or the exception that it ended with; it ends with the program."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, which the shell can make a program ignore
+def _measure_apart(measure: Callable[[Any, Any], Any], case: Any, options: Options) -> Any:
+    """Measure a case in this process, which ends with its parent and on SIGTERM."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that it ends its own processes, too
     threading.Thread(target=_interrupt_after_parent, daemon=True).start()
-    try:
-        result = measure(case, options)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except Exception as error:
-        error.add_note("".join(traceback.format_tb(error.__traceback__)))
-        result = error
-    try:
-        pipe.send(result)
-    except Exception as error:  # of a result that cannot be pickled
-        pipe.send(RuntimeError(f"the result cannot be sent: {error!r}; it is {result!r}"))
+    return measure(case, options)
 
 
 def _interrupt_after_parent() -> None:
-    """Interrupt this process when the program that started it has ended, so that it ends its own processes, too."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -468,26 +445,16 @@ def _interrupt_after_parent() -> None:
 
 
 def core_sets(jobs: int, threads: int | None) -> list[set[int]]:
-    """Disjoint sets of cores, one for each job; cores that share their hardware come last.
+    """Return disjoint sets of cores, one for each job.
 
     Raises:
         ValueError: There are too few cores.
     """
-    usable = sorted(os.sched_getaffinity(0), key=lambda core: (_siblings(core).index(core), core))
+    usable = sorted(os.sched_getaffinity(0))
     each = threads or len(usable) // max(1, jobs)
     if jobs < 1 or each < 1 or jobs * each > len(usable):
-        raise ValueError(f"{jobs} jobs with {each} threads need as many cores, and {len(usable)} are here")
+        raise ValueError(f"{jobs} jobs with {each} threads need {jobs * each} cores, and there are {len(usable)}")
     return [set(usable[job * each : (job + 1) * each]) for job in range(jobs)]
-
-
-def _siblings(core: int) -> list[int]:
-    """The logical cores that share a core's hardware, itself included."""
-    try:
-        text = Path(f"/sys/devices/system/cpu/cpu{core}/topology/thread_siblings_list").read_text()
-        found = [range(int(part.split("-")[0]), int(part.split("-")[-1]) + 1) for part in text.strip().split(",")]
-        return [sibling for part in found for sibling in part]
-    except (OSError, ValueError):
-        return [core]
 
 
 def _text(case: Any) -> str:
@@ -501,13 +468,13 @@ def _values(result: Mapping[str, Any]) -> str:
 
 
 def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
-    """The program of an experiment; returns the exit code: 0, 1 if a case failed, 2 for bad input, 130 after Ctrl-C."""
+    """Run an experiment; return the exit code: 0, 1 if a case failed, 2 for bad input, 130 after Ctrl-C."""
     options = tyro.cli(experiment.options, prog=f"lyceum-warp bench {experiment.name}", args=argv)
     return guarded(lambda: run(experiment, options), experiment.name)
 
 
 def guarded(program: Callable[[], int], name: str) -> int:
-    """Run a program, with one line for bad input and for Ctrl-C; returns the exit code."""
+    """Run a program with a one-line message for bad input and for Ctrl-C; return the exit code."""
     try:
         return program()
     except (ValueError, FileNotFoundError) as error:

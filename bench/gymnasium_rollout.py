@@ -1,4 +1,4 @@
-"""NPG's samples from Gymnasium's vector environments, in place of ours."""
+"""Fill NPG's buffer of samples from Gymnasium's vector environments."""
 
 import contextlib
 import functools
@@ -19,10 +19,10 @@ TASKS = {"swimmer": "Swimmer-v5", "hopper": "Hopper-v5", "walker2d": "Walker2d-v
 
 
 class GymnasiumRollout(Rollout):
-    """Fills NPG's buffer from a vector environment of Gymnasium, as ``Rollout`` does from ours.
+    """Fill NPG's buffer from a vector environment of Gymnasium, as ``Rollout`` does from ours.
 
-    A world that ends begins its next episode within the same step, and the first episodes are as much shortened as
-    those of our environment were.
+    A world that ends begins its next episode within the same step. The first episodes begin at our environment's
+    episode steps.
     """
 
     def __init__(self, env: lw.Env, steps: int, envs: VectorEnv, seed: int, *, segments: bool) -> None:
@@ -32,7 +32,7 @@ class GymnasiumRollout(Rollout):
         self.elapsed = torch.zeros(env.nworld)
         if segments:
             self.elapsed.copy_(env.episode_step)
-            # the time limit is the outermost wrapper, in processes of their own, too
+            # the time limit is the outermost wrapper, in AsyncVectorEnv, too
             envs.set_attr("_elapsed_steps", env.episode_step.tolist())
             self.running_return.masked_fill_(self.elapsed > 0, torch.nan)
 
@@ -42,7 +42,7 @@ class GymnasiumRollout(Rollout):
         self.running_return.zero_()
 
     def stagger(self, generator: torch.Generator, team: Team | None = None) -> None:
-        raise NotImplementedError("the clocks of Gymnasium's environments are set once, to those of our environment")
+        raise NotImplementedError("the clocks of Gymnasium's environments are set only once")
 
     def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
         raise NotImplementedError("worlds of Gymnasium's environments restart at the end of their episodes alone")
@@ -70,16 +70,16 @@ class GymnasiumRollout(Rollout):
 
 
 def vector(task: str, nworld: int, mode: str) -> VectorEnv:
-    """Gymnasium's vector environment, without the checks that are for writers of environments."""
+    """Make Gymnasium's vector environment, without the checks for writers of environments."""
     made = [functools.partial(gymnasium.make, TASKS[task], disable_env_checker=True)] * nworld
     if mode == "sync":
         return SyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP)
-    # Gymnasium's own way on Linux; new interpreters would import all of this program, once for each world
+    # Gymnasium's default on Linux; a new interpreter for each world would import all of this program
     return AsyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP, context="fork")
 
 
 def rates(task: str, nworld: int, steps: int) -> dict[str, float]:
-    """Environment steps per second of both vector modes on these cores, with random actions."""
+    """Measure environment steps per second of both vector modes on these cores, with random actions."""
     found = {}
     for mode in ("sync", "async"):
         with contextlib.closing(vector(task, nworld, mode)) as envs:

@@ -1,23 +1,14 @@
-"""What a step costs beside the bare engine on the same states.
+"""Measure the cost of an environment's step beside the bare engine on the same states.
 
-Environment and bare engine take turns of ten steps: each state that the environment starts a step from is copied to
-the bare engine, outside the clock, so that both step the same states, resets included, under the same load of the
-machine. The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the same model,
-controls and number of substeps. ``kept`` is bare time by environment time; ``added`` is the difference. ``refresh`` is
-the time for fields that ``mj_step`` leaves behind, as a share of the step. On the Warp engine it counts those of the
-new state where the task reads positions, and a forward pass of the restarted worlds where it reads forces; what the
-next step takes over is counted, too. On the C engine it counts those of the new state.
-
-Beside the package's tasks there is ``quadruped``, dm_control's, which reads sensors; dm_control must be installed.
-The experiment throughput prints these numbers.
+Environment and bare engine alternate every ten steps. The states from which the environment steps are copied to the
+bare engine, outside the clock, so that both step the same states, resets included, under the same load of the machine.
+The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the same model, controls and
+substeps. ``kept`` is bare time divided by environment time; ``added`` is the difference.
 """
 
-import dataclasses
 import statistics
 import time
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import contestants
@@ -33,32 +24,12 @@ from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.support.arrays import launch_worlds
 
-FILES = {"quadruped": Path(__file__).with_name("quadruped.py")}
-"""Tasks of this folder."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Setting:
-    """What is measured."""
-
-    task: str
-    nworld: int
-    engine: str = "mujoco"
-    device: str = "cpu"
-    nthread: int = 0
-    """Threads of the C engine; 0 for all cores."""
-    blocks: int = 50
-    """Blocks of ten steps; the results are medians over them."""
-    apart: bool = False
-    """Whether the worlds are at different steps of their episodes, so that some restart in every step."""
-    npg: bool = False
-    """Whether NPG samples: the policy's forward passes, the noise and the rollout buffer are part of the step."""
-    policy: Path | None = None
-    """A run, or the file of a policy, whose mean policy chose the actions; random actions by default."""
+BLOCK = 10
+"""Steps after which environment and bare engine change places."""
 
 
 def next_controls(env: lw.Env) -> torch.Tensor:
-    """The controls of the environment's next step, (nworld, nu)."""
+    """Return the controls of the environment's next step, (nworld, nu)."""
     if (control := env.task.kernels.control_worlds) is None:
         low, high = (torch.as_tensor(x, device=env.obs.device) for x in (env.action_space.low, env.action_space.high))
         return env.action.clamp(low, high)
@@ -78,7 +49,7 @@ class BareC:
         self.batch = Batch(engine.batch.model, env.nworld, engine.nthread)
 
     def snapshot(self) -> tuple[np.ndarray, np.ndarray]:
-        """States and controls of the environment's next step."""
+        """Return states and controls of the environment's next step."""
         return self.rows.copy(), next_controls(self.env).numpy()
 
     def load(self, snapshot: tuple[np.ndarray, np.ndarray]) -> None:
@@ -105,7 +76,7 @@ class BareWarp:
         self.graph = capture.graph
 
     def snapshot(self) -> tuple[wp.array, torch.Tensor]:
-        """States and controls of the environment's next step."""
+        """Return states and controls of the environment's next step."""
         with wp.ScopedDevice(self.env.device):
             state = wp.zeros((self.env.nworld, self.engine.integration_size), dtype=float)
             mjw.get_state(self.engine.m, self.engine.d, state, self.spec)
@@ -137,44 +108,33 @@ def seconds(env: lw.Env, function: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-BLOCK = 10
-"""Steps after which environment and bare engine change places."""
-
-FOLLOWED = 250
-"""Steps of a policy before anything is measured under its actions."""
-
-
-def compare(
-    env: lw.Env,
-    blocks: int,
-    act: Callable[[int], None],
-    block: Callable[[], None],
-    first: float,
-    prepare: Callable[[], None] | None = None,
-) -> dict[str, Any]:
-    """Time an environment and the bare engine on the same states; seconds are medians over the blocks.
+def measure(task: str, nworld: int, blocks: int, **place: Any) -> dict[str, Any]:
+    """Time an environment under random actions and its bare engine on the same states; return medians over the blocks.
 
     Args:
-        env: The environment.
-        blocks: How often.
-        act: Sets the actions of step t of a block.
-        block: Makes the steps of a block, with those actions.
-        first: Seconds until the environment's first step was done.
-        prepare: Chooses the actions of the next block, in steps that are taken back; off the clock.
+        task: Name of a task.
+        nworld: Number of worlds.
+        blocks: Number of blocks.
+        **place: Engine, device and threads, as in lw.make.
     """
+    env = lw.make(task, nworld=nworld, **place)
+    actions = contestants.actions(env, seed=0)
     bare = bare_engine(env)
+
+    def block() -> None:
+        for t in range(BLOCK):
+            env.action.copy_(actions[t])
+            env.step()
+
     whole, alone = [], []
-    warm = max(2, env.horizon // 500)  # graphs are captured, and states are no longer the first ones
+    warm = max(2, env.horizon // 500)  # captures graphs and leaves the initial states
     for repetition in range(warm + blocks):
         start = env.get_state()
-        if prepare is not None:
-            prepare()
-            env.set_state(start)
         time_env = seconds(env, block)
         env.set_state(start)
         snapshots = []
         for t in range(BLOCK):
-            act(t)
+            env.action.copy_(actions[t])
             snapshots.append(bare.snapshot())
             env.step()
         time_bare = 0.0
@@ -184,78 +144,10 @@ def compare(
         if repetition >= warm:
             whole.append(time_env / BLOCK)
             alone.append(time_bare / BLOCK)
-    kept = statistics.median(b / a for a, b in zip(whole, alone, strict=True))
-    step, step_alone = statistics.median(whole), statistics.median(alone)
-    added = statistics.median(a - b for a, b in zip(whole, alone, strict=True)) * 1e6
-    rate = env.nworld / step
     return {
-        "env_steps_per_second": rate,
-        "bare_steps_per_second": env.nworld / step_alone,
-        "kept": kept,
-        "added_microseconds": added,
-        "refresh": refresh_seconds(env) / step,
+        "env_steps_per_second": env.nworld / statistics.median(whole),
+        "bare_steps_per_second": env.nworld / statistics.median(alone),
+        "kept": statistics.median(b / a for a, b in zip(whole, alone, strict=True)),
+        "added_microseconds": 1e6 * statistics.median(a - b for a, b in zip(whole, alone, strict=True)),
         "bytes_per_world": env.bytes_per_world,
-        "first_step_seconds": first,  # with a cold cache, mostly compilation
     }
-
-
-def refresh_seconds(env: lw.Env) -> float:
-    """Seconds of a step's refreshes alone; on the Warp engine for the worlds that restarted in the last step, too."""
-    engine = env.engine
-    if isinstance(engine, MujocoEngine):
-        refresh: Callable[[], object] = engine.compute_stage
-        stages = (engine.stage,)
-    else:
-        assert isinstance(engine, WarpEngine)
-        stages = (engine.stage, engine.reset_stage)
-        with wp.ScopedDevice(env.device), wp.ScopedCapture() as capture:
-            engine.refresh_current(env.worlds.everyone)
-            engine.refresh(env.worlds.restarting)
-        refresh = partial(wp.capture_launch, capture.graph)
-    if not any(stages):
-        return 0.0
-    return statistics.median(seconds(env, refresh) for _ in range(30))
-
-
-def first_step(setting: Setting) -> tuple[lw.Env, float]:
-    """The environment, and the seconds until its first step was done."""
-    began = time.perf_counter()
-    place = {"nthread": setting.nthread} if setting.engine == "mujoco" else {"device": setting.device}
-    env = lw.make(FILES.get(setting.task, setting.task), nworld=setting.nworld, engine=setting.engine, **place)
-    first = time.perf_counter() - began + seconds(env, env.step)
-    if setting.apart:
-        state = env.get_state()
-        step = env.state_space.split(state)["step"]
-        step.copy_(torch.randint(0, env.horizon, step.shape, device=state.device))
-        env.set_state(state)
-    return env, first
-
-
-def measure(setting: Setting) -> dict[str, Any]:
-    """What of the bare engine's rate is kept."""
-    env, first = first_step(setting)
-    if setting.npg:
-        npg = lw.NPG(env, config=lw.NPGConfig(samples=BLOCK * setting.nworld, mean_every=0))
-        return compare(
-            env, setting.blocks, lambda t: npg.policy.sample(env.obs, npg.noise[t], out=env.action), npg.sample, first
-        )
-    actions = contestants.actions(env, seed=0)
-    policy = None if setting.policy is None else lw.load(setting.policy).to(env.obs.device)
-
-    def block() -> None:
-        for t in range(BLOCK):
-            env.action.copy_(actions[t])
-            env.step()
-
-    @torch.no_grad()
-    def follow() -> None:
-        """Steps of the policy, whose actions become those of the block."""
-        for t in range(BLOCK):
-            actions[t].copy_(policy(env.obs))
-            env.step(actions[t])
-
-    if policy is not None:
-        for _ in range(FOLLOWED // BLOCK):  # into states of the policy's own
-            follow()
-    prepare = None if policy is None else follow
-    return compare(env, setting.blocks, lambda t: env.action.copy_(actions[t]), block, first, prepare)

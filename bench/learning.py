@@ -1,117 +1,145 @@
-"""Learning curves of NPG over several seeds, each in a process of its own.
+"""Measure the seconds of learning until NPG or PPO reaches a return.
 
-python bench/learning.py hopper --seeds 0 1 2 --iterations 100 --out hopper.csv
-python bench/curves.py hopper=hopper.csv --out hopper.png
+    lyceum-warp bench learning --device cuda
+    lyceum-warp bench learning --tasks go1_velocity --algorithm npg --device cuda
+
+The clock includes captures of graphs, sampling and updates; it excludes the compilation of kernels and evaluations. The
+mean return covers the last 100 episodes, without each world's first episode, which begins at a random step. If
+iterations have too few steps for whole episodes, it covers 16 separate episodes of the stochastic policy every few
+iterations. On go1_velocity a robot that stands still also reaches high returns: the mean policy therefore walks for
+10 s in new worlds, with noise and pushes, and its tracking errors and falls are measured.
 """
 
-import concurrent.futures
+import collections
 import csv
 import dataclasses
-import json
 import math
-import multiprocessing
 import statistics
+import sys
 import time
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal
 
-import measurements
+import experiment
 import torch
-import tyro
-from rich.console import Console
-from rich.table import Table
+from experiment import STYLES, Experiment, Row, Table, choose
 
 import lyceum_warp as lw
 from lyceum_warp.algos.networks import moved
-from lyceum_warp.cli.arguments import parameter
+from lyceum_warp.viz.style import finish_axes, new_figure
+
+TARGETS: dict[str, tuple[str, float, int, int | None, int]] = {
+    "go1_velocity": ("ppo", 80.0, 4096, None, 0),
+    "hopper": ("npg", 1500.0, 4096, 65_536, 5),
+    "half_cheetah": ("npg", 5000.0, 4096, 65_536, 5),
+    "humanoid": ("npg", 4500.0, 8192, 131_072, 5),
+}
+"""Algorithm, target, worlds, samples of an iteration, and iterations between evaluations (0: the last 100 episodes)."""
+
+SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "desired_kl 0.01": {"desired_kl": 0.01}}
+"""Hyperparameters that differ from the algorithm's defaults."""
+
+JUDGED, RECENT, WALKED = 16, 100, (256, 500)
+"""Episodes of an evaluation, episodes in the mean return of a training run, and worlds and steps of the walk."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
-    """Learning curves of NPG."""
+class Options(experiment.Options):
+    """Seconds until NPG or PPO reaches a return."""
 
-    task: tyro.conf.Positional[str]
-    """Task."""
-    config: lw.NPGConfig = dataclasses.field(default_factory=lw.NPGConfig)
-    """Hyperparameters."""
-    seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds."""
-    iterations: int = 100
-    """Iterations of each run."""
-    nworld: int = 32
-    """Worlds."""
-    device: str = "cpu"
-    """Device."""
-    engine: str = "auto"
-    """Engine."""
-    integrator: str | None = None
-    """Another integrator than the model's: euler, rk4, implicit or implicitfast."""
-    param: tuple[str, ...] = ()
-    """Parameters of the task, each as NAME=VALUE."""
-    target: float | None = None
-    """A mean return at which a run ends: that of the policy with its noise over 16 episodes of its own, off the clock.
-    An iteration's episodes would not do: with short segments, the long ones among them end late."""
-    judge_every: int = 5
-    """Iterations from one such judgement to the next."""
-    reward_scale: float = 1.0
-    """Factor of all rewards that NPG gets. The returns in the table are the task's own."""
-    outlier: float | None = None
-    """A reward that one sample of iteration 3 gets in place of its own."""
-    processes: int = 1
-    """Runs at the same time; each then has one thread."""
-    out: Path | None = None
-    """Table (CSV) of the iterations."""
+    algorithm: Literal["npg", "ppo"] | None = None
+    """Algorithm; by default the task's."""
+    settings: tuple[str, ...] = ("default",)
+    """Settings: default, desired_kl 0.01 (PPO)."""
+    seconds: float = 300.0
+    """Longest duration of a run."""
 
 
-def run(options: Options, seed: int) -> list[dict[str, Any]]:
-    """One run; returns its iterations and adds the seconds since its start."""
-    nthread = None
-    if options.processes > 1:
-        torch.set_num_threads(1)
-        nthread = 1 if options.device == "cpu" else None
-    env = lw.make(
-        options.task, nworld=options.nworld, seed=seed, device=options.device, engine=options.engine,
-        integrator=options.integrator, nthread=nthread, **dict(map(parameter, options.param)),
-    )  # fmt: skip
-    npg = lw.NPG(env, config=options.config, seed=seed)
-    if options.reward_scale != 1.0 or options.outlier is not None:
-        distort(npg, options)
-    judge = None if options.target is None else Judge(env)
-    seconds, rows = 0.0, []
-    for number in range(1, options.iterations + 1):
-        start = time.perf_counter()
-        iteration = next(npg)
-        seconds += time.perf_counter() - start
-        row = iteration.row() | {"seed": seed, "seconds": seconds, "judged": None}
-        rows.append(row)
-        if judge is not None and options.target is not None and number % options.judge_every == 0:
-            row["judged"] = judge(npg.policy)
-            if row["judged"] >= options.target:
-                break
-    return rows
+@dataclasses.dataclass(frozen=True)
+class Case:
+    task: str
+    algorithm: str
+    setting: str
+    seed: int
+    nworld: int
+    target: float
+    """Mean return at which the run ends."""
+    seconds: float
+    """Seconds after which the run ends."""
+    device: str
 
 
-def distort(npg: lw.NPG, options: Options) -> None:
-    """Scale the rewards of the rollouts, and put an outlier into the middle of the third."""
-    collect, reward = npg.rollout.collect, npg.rollout.reward
+def cases(options: Options) -> list[Case]:
+    tasks = choose(options.tasks, TARGETS, ("hopper",) if options.short else (), what="task")
+    settings = choose(options.settings, SETTINGS, what="setting")
+    return [
+        Case(task, options.algorithm or TARGETS[task][0], setting, seed, 8 if options.short else TARGETS[task][2],
+             TARGETS[task][1], 1.0 if options.short else options.seconds, options.device)
+        for task in tasks for setting in settings for seed in options.seeds or range(1 if options.short else 3)
+    ]  # fmt: skip
 
-    def distorted(policy: lw.GaussianPolicy, noise: torch.Tensor) -> None:
-        collect(policy, noise)
-        reward.mul_(options.reward_scale)
-        if options.outlier is not None and npg.iteration == 2:
-            reward[len(reward) // 2, 0] = options.outlier
 
-    npg.rollout.collect = distorted  # type: ignore[method-assign]
+def learner(case: Case, nworld: int, **changes: Any) -> Any:
+    """Make the case's learner."""
+    env = lw.make(case.task, nworld=nworld, seed=case.seed, device=case.device)
+    words = {**changes, **SETTINGS[case.setting]}
+    if case.algorithm == "ppo":
+        return lw.PPO(env, config=lw.PPOConfig(**words), seed=case.seed)
+    return lw.NPG(env, config=lw.NPGConfig(**words), seed=case.seed)
+
+
+def measure(case: Case, options: Options) -> dict[str, Any]:
+    torch.set_num_threads(1)
+    _, _, _, per_iteration, judge_every = TARGETS[case.task]
+    short = case.nworld < 64
+    changes: dict[str, Any] = {"mean_every": 0}
+    if case.algorithm == "npg":
+        changes["samples"] = 64 if short else per_iteration
+    next(learner(case, 4, **(changes | ({"samples": 64} if case.algorithm == "npg" else {}))))  # compiles kernels
+    made = learner(case, case.nworld, **changes)
+    judge = Judge(made.env) if judge_every else None
+    recent: collections.deque[float] = collections.deque(maxlen=RECENT)
+    seconds, curve, mean = 0.0, [], -math.inf
+    while seconds < case.seconds and mean < case.target:
+        began = time.perf_counter()
+        it = next(made)  # it ends with a copy to the host: the device has finished its work
+        seconds += time.perf_counter() - began
+        if judge is None:
+            returns = made.rollout.episode_return[made.rollout.done]
+            recent.extend(returns[~returns.isnan()][-RECENT:].tolist())
+            mean = statistics.fmean(recent) if recent else -math.inf
+        elif it.iteration % judge_every == 0:
+            mean = judge(made.policy)
+        else:
+            continue
+        if math.isfinite(mean):
+            curve.append([it.samples, round(seconds, 4), round(mean, 3)])
+    walked = walk(case, made.policy) if case.task == "go1_velocity" else {}
+    return {"reached": mean >= case.target, "seconds": seconds, "samples": made.samples, "curve": curve, **walked}
+
+
+@torch.no_grad()
+def walk(case: Case, policy: lw.GaussianPolicy) -> dict[str, float]:
+    """Return mean tracking errors and falls of a mean policy in new worlds; a fall is an early end of an episode."""
+    nworld, steps = WALKED
+    env = lw.make(case.task, nworld=min(nworld, case.nworld), seed=1000, device=case.device)
+    sums = torch.zeros(3, dtype=torch.float64, device=env.obs.device)
+    for _ in range(steps):
+        env.step(policy(env.obs))
+        errors = (env.metrics["velocity_error"], env.metrics["yaw_rate_error"], env.terminated)
+        sums += torch.stack([error.double().mean() for error in errors])
+    velocity, yaw_rate, falls = (sums / steps).tolist()
+    return {"velocity_error": velocity, "yaw_rate_error": yaw_rate, "falls_per_world_second": falls / env.timestep}
 
 
 class Judge:
-    """Evaluates a policy with its noise, in worlds of its own."""
+    """Evaluate a stochastic policy in 16 worlds, with the same initial states and the same noise each time."""
 
     def __init__(self, env: lw.Env) -> None:
-        self.env = env.replicate_few(16)
+        self.env = env.replicate_few(JUDGED)
 
     def __call__(self, policy: lw.GaussianPolicy) -> float:
-        """Mean return; the same initial states and the same noise each time."""
+        """Return the mean return."""
         policy, out = moved(policy, self.env), torch.empty_like(self.env.action)
         generator = torch.Generator(out.device).manual_seed(0)
 
@@ -121,60 +149,61 @@ class Judge:
         return lw.evaluate(self.env, noisy, self.env.nworld, seed=0).returns.mean().item()
 
 
-def main(options: Options) -> None:
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(options.processes, mp_context=context) as pool:
-        runs = list(pool.map(run, [options] * len(options.seeds), options.seeds))
-    table = Table("iteration", "samples", "return", "min .. max over seeds", "mean policy", "min .. max over seeds")
-    for i in range(options.iterations):
-        if (i + 1) % max(1, options.iterations // 10) and i > 0:
-            continue
-        rows = [rows[i] for rows in runs if i < len(rows)]
-        if not rows:
-            break
-        table.add_row(str(i + 1), f"{rows[0]['samples']:,}", *spread(rows, "return_mean"), *spread(rows, "mean_return"))
-    console = Console(width=130)
-    console.print(table)
-    sample = statistics.median(row["time_sample"] for rows in runs for row in rows)
-    learn = statistics.median(
-        row["time_gradient"] + row["time_solve"] + row["time_value"] for rows in runs for row in rows
-    )
-    terminal = [statistics.mean(row["terminal_reward"] for row in rows[-10:]) for rows in runs]
-    console.print(f"median seconds of an iteration: sampling {sample:.2f}, learning {learn:.2f}")
-    console.print(f"mean terminal reward of the last ten iterations, each seed: {[round(x, 3) for x in terminal]}")
-    if options.target is not None:
-        for seed, rows in zip(options.seeds, runs, strict=True):
-            last, reached = rows[-1], (rows[-1]["judged"] or -math.inf) >= options.target
-            spent = f"{last['seconds']:.1f} s and {last['samples']:,} samples"
-            console.print(f"a mean return of {options.target:g}, seed {seed}: {'' if reached else 'not '}after {spent}")
-    if options.out is not None:
-        write(options, [row for rows in runs for row in rows])
+# tables and figure
 
 
-KEPT = ("seed", "iteration", "samples", "seconds", "return_mean", "length_mean", "mean_return", "judged",
-        "terminal_reward", "time_mean")  # fmt: skip
-"""Columns of the table; "seconds" counts those of the mean policy's evaluations, "time_mean", but not the judge's."""
+WALK = {"velocity_error": "velocity error, m/s", "yaw_rate_error": "yaw rate error, rad/s",
+        "falls_per_world_second": "falls a world-second"}  # fmt: skip
 
 
-def write(options: Options, rows: list[dict[str, Any]]) -> None:
-    """The table, and beside it the settings and what they ran on, as JSON."""
-    assert options.out is not None
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    with options.out.open("w", newline="") as file:
-        writer = csv.DictWriter(file, KEPT, extrasaction="ignore")
-        writer.writeheader()
-        writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
-    settings = {name: value for name, value in dataclasses.asdict(options).items() if name != "out"}
-    content = {"options": settings, "versions": measurements.context(options.device)}
-    options.out.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n")
+def tables(rows: Sequence[Row]) -> list[Table]:
+    lines, tasks, settings = [], list(TARGETS), list(SETTINGS)
+    walk = {name: title for name, title in WALK.items() if any(name in row.result for row in rows)}
+    for row in sorted(rows, key=lambda row: (tasks.index(row.case["task"]), settings.index(row.case["setting"]))):
+        case, result = row.case, row.result
+        reached = f"{result['seconds']:.1f}" if result["reached"] else f"not in {result['seconds']:.0f}"
+        lines.append([
+            case["task"], case["algorithm"].upper(), case["setting"], f"{case['nworld']:,}", f"{case['target']:,g}",
+            str(case["seed"]), reached, f"{result['samples'] / 1e6:.1f}",
+            *(f"{result[name]:.3g}" if name in result else "" for name in walk),
+        ])  # fmt: skip
+    header = ["task", "algorithm", "setting", "worlds", "target", "seed", "seconds", "million samples", *walk.values()]
+    return [Table("Seconds of sampling and learning until the mean return reaches a target.", header, lines)]
 
 
-def spread(rows: list[dict[str, Any]], key: str) -> tuple[str, str]:
-    values = [row[key] for row in rows if row[key] is not None and not math.isnan(row[key])]
-    if not values:
-        return "", ""
-    return f"{statistics.mean(values):.0f}", f"{min(values):.0f} .. {max(values):.0f}"
+def figure(rows: Sequence[Row]) -> Any:
+    """Draw the returns of go1_velocity by seconds, beside mjlab's."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        if (row.case["task"], row.case["algorithm"]) == ("go1_velocity", "ppo"):
+            groups.setdefault(row.case["setting"], []).append(row)
+    if not groups:
+        return None
+    made = new_figure("learning", 6.5, 3.9)
+    axes = made.subplots()
+    for (setting, same), (color, marker, line) in zip(groups.items(), STYLES, strict=False):
+        for k, row in enumerate(same):
+            _, seconds, returns = zip(*row.result["curve"], strict=True)
+            axes.plot(seconds, returns, color=color, linestyle=line, marker=marker, markevery=0.15, markersize=4,
+                      linewidth=1.3, label=f"lyceum_warp, {setting}" if k == 0 else None)  # fmt: skip
+    with (experiment.RESULTS / "ppo-go1_velocity-mjlab.csv").open(newline="") as file:
+        points = [(float(row["seconds"]), float(row["return_recent"])) for row in csv.DictReader(file)]
+    color, marker, line = STYLES[len(groups)]
+    axes.plot(*zip(*points, strict=True), color=color, linestyle=line, marker=marker, label="mjlab 1.6.0 with rsl_rl")
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("seconds of sampling and learning")
+    axes.set_ylabel("mean return of the last 100 episodes")
+    axes.set_title("go1_velocity, 4,096 worlds", loc="left", fontsize="medium")
+    axes.legend(frameon=False, loc="lower right")
+    finish_axes([axes])
+    return made
 
+
+EXPERIMENT = Experiment(
+    name="learning", summary="Seconds of learning until NPG or PPO reaches a return.",
+    cases=cases, estimate=lambda case: 0.3 * case.seconds, measure=measure, tables=tables, figure=figure,
+    options=Options,
+)  # fmt: skip
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    sys.exit(experiment.main(EXPERIMENT))

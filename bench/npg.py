@@ -1,31 +1,25 @@
-"""NPG's learning curves on our environments, and of the same NPG fed by Gymnasium's vector environments (figure 2).
+"""Measure NPG's learning on lyceum_warp's and Gymnasium's environments, beside PPO and TRPO (the paper's figure 2).
 
     lyceum-warp bench npg --threads 2 --jobs 16
 
-Both sides run the same class with the same settings, the same number of worlds and the same seeds; only the buffer of
-samples is filled by other environments. Gymnasium's have the faster one of its two vector modes on these cores,
-measured before the clock starts. Beside them learn PPO of stable-baselines3 and TRPO of sb3-contrib with the settings
-that RL Baselines3 Zoo tuned for these tasks, for twelve minutes each, and, with --device cuda, our NPG and PPO on the
-same worlds of a GPU.
+Both NPGs are the same class with the same settings, number of worlds and seeds; only the buffer of samples is filled by
+other environments, in the faster of Gymnasium's two vector modes. Beside them learn PPO of stable-baselines3 and TRPO
+of sb3-contrib with the settings that RL Baselines3 Zoo tuned for these tasks, for twelve minutes each, and, with
+--device cuda, lw.NPG and lw.PPO on the same worlds of a GPU.
 
-The policies of all contestants are judged by the same judge: the mean action, in single environments of Gymnasium,
-from the same initial states. The clock stands still meanwhile, and starts once kernels are compiled and environments
-exist. Every case is a process of its own on cores of its own; those of stable-baselines3 use one core, as a second
-makes them slower. Runs on a GPU have it one after the other, and their policies are judged once they have left it.
+All policies are evaluated alike: the mean action, in single environments of Gymnasium, from the same initial states.
+The clock stops meanwhile, and starts once kernels are compiled and environments exist. Every case is a process of its
+own on cores of its own; runs on a GPU need --jobs 1.
 """
 
 import contextlib
 import copy
 import dataclasses
-import fcntl
 import math
-import os
 import statistics
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import comparison
@@ -33,47 +27,44 @@ import experiment
 import gymnasium
 import numpy as np
 import torch
-from experiment import Row, Table, choose, installed, median_and_range
+from experiment import STYLES, Row, Table, choose, installed, median_and_range
 from gymnasium_rollout import TASKS, GymnasiumRollout, rates, vector
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullFormatter
 
 import lyceum_warp as lw
-from lyceum_warp.viz.style import finish_axes
+from lyceum_warp.viz.style import finish_axes, new_figure
 
 CONFIGS = {
     "swimmer": lw.NPGConfig(gamma=0.999, mean_every=0),
     "hopper": lw.NPGConfig(mean_every=0),
     "walker2d": lw.NPGConfig(mean_every=0),
 }
-"""Settings of NPG: the default ones, except for Swimmer's discount, which an earlier table chose."""
+"""Settings of NPG: the default ones, except for Swimmer's discount."""
 
 SHORT: dict[str, Any] = {"samples": 500, "value_epochs": 1}
 """Other settings of NPG in the short mode."""
 
 CONTESTANTS = {
-    "npg": "NPG, our environments",
+    "npg": "NPG, lyceum_warp",
     "npg_gymnasium": "NPG, Gymnasium's environments",
     "ppo_sb3": "PPO, stable-baselines3",
     "trpo_sb3": "TRPO, sb3-contrib",
-    "npg_gpu": "NPG, our environments on a GPU",
-    "ppo_rsl_rl": "PPO, our environments on a GPU",  # the stored runs are of rsl_rl's PPO, which ours equals
+    "npg_gpu": "NPG, lyceum_warp on a GPU",
+    "ppo_gpu": "PPO, lyceum_warp on a GPU",
+    "ppo_rsl_rl": "rsl_rl's PPO, lyceum_warp on a GPU",  # stored results of an earlier commit
 }
-ON_CPU, ON_GPU, YARDSTICKS = tuple(CONTESTANTS)[:4], tuple(CONTESTANTS)[4:], ("ppo_sb3", "trpo_sb3")
+ON_CPU, ON_GPU, YARDSTICKS = tuple(CONTESTANTS)[:4], tuple(CONTESTANTS)[4:6], ("ppo_sb3", "trpo_sb3")
 
-COLORS = dict(zip(CONTESTANTS, ("#c8502d", "#3d6fa5", "#5a8f4e", "#8a6bb1", "#d99a2b", "#58a6a6"), strict=True))
-
-GPU_WORLDS = {"npg_gpu": 2048, "ppo_rsl_rl": 4096}
-
-SECONDS = {"npg": 90.0, "npg_gymnasium": 200.0, "ppo_sb3": 1700.0, "trpo_sb3": 350.0}
-"""Rough time of a case of a million samples on its cores, the judge included."""
+GPU_WORLDS = {"npg_gpu": 2048, "ppo_gpu": 4096}
 
 EVERY_100K = tuple(range(100_000, 1_000_001, 100_000))
 """Samples at which the curves are compared."""
 
-ZOO = "https://github.com/DLR-RM/rl-baselines3-zoo"
-"""Where the settings below come from (hyperparams/ppo.yml and hyperparams/trpo.yml)."""
+LIMITS = dict.fromkeys(YARDSTICKS, 720.0) | dict.fromkeys(ON_GPU, 30.0)
+"""Seconds of learning after which a run ends, if it has not ended before."""
+
+EVALUATIONS, EPISODES = 20, 16
+"""Evaluations of a run after the first, and episodes of an evaluation."""
 
 _TUNED_NETWORK = {"log_std_init": -2.0, "ortho_init": False, "activation_fn": torch.nn.ReLU,
                   "net_arch": {"pi": [256, 256], "vf": [256, 256]}}  # fmt: skip
@@ -90,7 +81,8 @@ PPO: dict[str, dict[str, Any]] = {
         "clip_range": 0.1, "n_epochs": 20, "gae_lambda": 0.95, "max_grad_norm": 1.0, "vf_coef": 0.871923,
     },
 }  # fmt: skip
-"""Settings of stable-baselines3's PPO, with one environment and normalised observations and rewards."""
+"""Settings of stable-baselines3's PPO, with one environment and normalised observations and rewards, from
+https://github.com/DLR-RM/rl-baselines3-zoo (hyperparams/ppo.yml; TRPO's from hyperparams/trpo.yml)."""
 
 _TRPO = {"batch_size": 128, "n_steps": 1024, "gamma": 0.99, "gae_lambda": 0.95, "sub_sampling_factor": 1,
          "cg_max_steps": 25, "cg_damping": 0.1, "n_critic_updates": 20, "learning_rate": 1e-3}  # fmt: skip
@@ -108,15 +100,7 @@ class Options(experiment.Options):
     samples: int = 1_000_000
     """Samples of a run on the CPU."""
     nworld: int = 64
-    """Worlds of NPG on the CPU, ours and Gymnasium's."""
-    yardstick_seconds: float = 720.0
-    """Seconds of learning after which PPO and TRPO on the CPU end, if they have not had all samples before."""
-    gpu_seconds: float = 30.0
-    """Seconds of learning on a GPU."""
-    judgements: int = 20
-    """How often a run's policy is judged after the start."""
-    episodes: int = 16
-    """Episodes of a judgement."""
+    """Worlds of both NPGs on the CPU."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,33 +112,31 @@ class Case:
     seed: int
     threads: int
     nworld: int | None
-    """Worlds, where they do not follow from the contestant's settings."""
+    """Worlds, if they do not follow from the contestant's settings."""
     samples: int | None
     """Samples after which it ends."""
-    limit: float | None
-    """Seconds of learning after which it ends, if it has not ended before."""
-    judgements: int
-    episodes: int
     short: bool
+
+    @property
+    def limit(self) -> float:
+        """Seconds of learning after which it ends."""
+        return LIMITS.get(self.contestant, math.inf) / (10.0 if self.short else 1.0)
 
 
 def cases(options: Options) -> list[Case]:
-    """The runs; those that are compared have the same seeds and follow one another, those on a GPU come last."""
+    """List the runs: contestants that are compared follow one another, and runs on a GPU come last."""
     short, cuda = options.short, options.device.startswith("cuda")
-    contestants = choose(options.contestants, CONTESTANTS, ON_CPU + (ON_GPU if cuda else ()), what="contestant")
+    contestants = choose(options.contestants, ON_CPU + ON_GPU, ON_CPU + (ON_GPU if cuda else ()), what="contestant")
     for name in contestants:
         if name in ON_GPU and not cuda:
             raise ValueError(f"{name} needs a GPU: give --device cuda")
-    limits = dict.fromkeys(YARDSTICKS, options.yardstick_seconds)
-    limits |= dict.fromkeys(ON_GPU, 3.0 if short else options.gpu_seconds)
-    if options.judgements < 2:
-        raise ValueError(f"judgements must be at least 2, not {options.judgements}")
+        if name in ON_GPU and options.jobs > 1:
+            raise ValueError(f"{name} is timed alone on the GPU: give --jobs 1")
     return [
         Case(
             task, name, seed, 1 if name in (*YARDSTICKS, *ON_GPU) else options.threads or 1,
             GPU_WORLDS[name] if name in ON_GPU else None if name in YARDSTICKS else 8 if short else options.nworld,
-            None if name in ON_GPU else 1000 if short else options.samples,
-            limits.get(name), 2 if short else options.judgements, 2 if short else options.episodes, short,
+            None if name in ON_GPU else 1000 if short else options.samples, short,
         )
         for group in (ON_CPU, ON_GPU)
         for seed in options.seeds or (range(2) if short else range(5))
@@ -164,26 +146,23 @@ def cases(options: Options) -> list[Case]:
 
 
 def estimate(case: Case) -> float:
-    judge, limit = 0.1 * case.judgements * case.episodes + 10.0, case.limit or math.inf
-    if case.samples is None:
-        return limit + judge + 10.0
-    return min(SECONDS[case.contestant] * case.samples / 1e6 + 10.0, limit + judge)
+    return 50.0 + min(case.limit, 200.0 * (case.samples or math.inf) / 1e6)
 
 
-# the judge, and the points of a curve
+# evaluations
 
 Act = Callable[[np.ndarray], np.ndarray]
-"""From observations (n, nobs) to actions (n, nact)."""
+"""Maps observations (n, nobs) to actions (n, nact)."""
 
 
 class Judge:
-    """Evaluates policies in single environments of Gymnasium, from the same initial states each time."""
+    """Evaluate policies in single environments of Gymnasium, from the same initial states each time."""
 
     def __init__(self, task: str, episodes: int) -> None:
         self.envs = [gymnasium.make(TASKS[task], disable_env_checker=True) for _ in range(episodes)]
 
     def __call__(self, act: Act) -> float:
-        """Mean return over the episodes."""
+        """Return the mean return over the episodes."""
         current = [env.reset(seed=2**31 - 1 - i)[0] for i, env in enumerate(self.envs)]
         returns, running = np.zeros(len(self.envs)), list(range(len(self.envs)))
         while running:
@@ -198,68 +177,50 @@ class Judge:
 
 
 class Curve:
-    """The points of a run's curve, and its clock, which stands still while a policy is judged."""
+    """Keep a run's curve, on a clock that stops while a policy is evaluated."""
 
     def __init__(self, case: Case) -> None:
-        self.case, self.judge = case, Judge(case.task, case.episodes)
-        self._points: list[tuple[int, float, float | Act, float | None]] = []
-        self.returns: list[float] = []
-        """Returns of the episodes that ended since the last point, of the policy with its noise."""
-        self._began, self._waited = 0.0, 0.0
-        self._next = 0
+        self.case, self.judge = case, Judge(case.task, 2 if case.short else EPISODES)
+        self.points: list[tuple[int, float, float]] = []
+        """Samples, seconds of learning, and return of the mean policy."""
+        self._stopped, self._next = 0.0, 0
 
     def start(self, act: Act) -> None:
-        """Judge the first policy and start the clock."""
-        self._began, self._waited = time.perf_counter(), 0.0
+        """Evaluate the first policy and start the clock."""
+        self._stopped = time.perf_counter()
         self.add(0, act)
 
     def seconds(self) -> float:
-        return time.perf_counter() - self._began - self._waited
+        return time.perf_counter() - self._stopped
 
     def ended(self, samples: int) -> bool:
-        """Whether the run has reached its end."""
-        case = self.case
-        return samples >= (case.samples or math.inf) or self.seconds() >= (case.limit or math.inf)
+        """Return whether the run has reached its end."""
+        return samples >= (self.case.samples or math.inf) or self.seconds() >= self.case.limit
 
     def due(self, samples: int) -> bool:
-        """Whether the policy is to be judged now: at even distances, and at the end."""
-        return self.ended(samples) or self._distances(samples) >= self._next
+        """Return whether an evaluation is due: at even distances, and at the end."""
+        return self.ended(samples) or self._evaluations(samples) >= self._next
 
-    def _distances(self, samples: int) -> float:
-        """How much of the run is over, in distances between judgements."""
-        case = self.case
-        over = (samples, case.samples), (self.seconds(), case.limit)
-        return max(case.judgements * spent / (whole or math.inf) for spent, whole in over)
+    def _evaluations(self, samples: int) -> float:
+        """Return the progress of the run, in distances between evaluations."""
+        progress = max(samples / (self.case.samples or math.inf), self.seconds() / self.case.limit)
+        return (2 if self.case.short else EVALUATIONS) * progress
 
     def add(self, samples: int, act: Act) -> None:
-        """Judge a policy, or keep it until the run has left the GPU; then it must not change with further learning."""
-        seconds = self.seconds()
-        self._next = int(self._distances(samples)) + 1
+        """Evaluate a policy, unless its number of samples is that of the last point."""
+        if self.points and self.points[-1][0] == samples:
+            return
+        seconds, self._next = self.seconds(), int(self._evaluations(samples)) + 1
         before = time.perf_counter()
-        noisy = statistics.fmean(self.returns) if self.returns else None
-        judged = act if self.case.contestant in ON_GPU else self.judge(act)
-        self._points.append((samples, round(seconds, 4), judged, noisy))
-        self.returns = []
-        self._waited += time.perf_counter() - before
-
-    def finish(self, samples: int, act: Act) -> None:
-        """Judge the last policy, if that has not been done: the time may have passed after it."""
-        if self._points[-1][0] < samples:
-            self.add(samples, act)
-
-    def points(self) -> list[tuple[int, float, float, float | None]]:
-        """Samples; seconds of learning; return of the mean policy; mean return of the training episodes that ended."""
-        return [
-            (samples, seconds, round(self.judge(found) if callable(found) else found, 3), noisy)
-            for samples, seconds, found, noisy in self._points
-        ]
+        self.points.append((samples, round(seconds, 4), round(self.judge(act), 3)))
+        self._stopped += time.perf_counter() - before
 
 
-# NPG, on our environments and on Gymnasium's
+# NPG on lyceum_warp's and on Gymnasium's environments
 
 
 def mean_action(policy: torch.nn.Module) -> Act:
-    """A policy as it is now, and as the judge calls it."""
+    """Copy a policy for the evaluation."""
     now = copy.deepcopy(policy).cpu()
 
     @torch.no_grad()
@@ -272,7 +233,7 @@ def mean_action(policy: torch.nn.Module) -> Act:
 def config_of(case: Case) -> lw.NPGConfig:
     changes = dict(SHORT) if case.short else {}
     if case.contestant not in ON_GPU:
-        changes["min_restarts"] = 0.0  # on both sides: Gymnasium's buffer cannot restart some of its worlds
+        changes["min_restarts"] = 0.0  # Gymnasium's vector environments cannot restart some of their worlds
     return dataclasses.replace(CONFIGS[case.task], **changes)
 
 
@@ -283,14 +244,14 @@ def environment(case: Case, options: Options, nworld: int) -> lw.Env:
 
 
 def npg(case: Case, options: Options, curve: Curve) -> dict[str, Any]:
-    """Our NPG; Gymnasium's environments are made first, because their processes are forks."""
+    """Run NPG. Gymnasium's environments are made first, because their processes are forks."""
     assert case.nworld is not None
     more: dict[str, Any] = {}
     with contextlib.ExitStack() as stack:
         envs = None
         if case.contestant == "npg_gymnasium":
-            more["rates"] = rates(case.task, case.nworld, 20 if case.short else 100)
-            more["mode"] = max(more["rates"], key=more["rates"].get)
+            found = rates(case.task, case.nworld, 20 if case.short else 100)
+            more["mode"] = max(found, key=found.get)
             envs = stack.enter_context(contextlib.closing(vector(case.task, case.nworld, more["mode"])))
         config = config_of(case)
         # compiles kernels
@@ -299,43 +260,38 @@ def npg(case: Case, options: Options, curve: Curve) -> dict[str, Any]:
         learner = lw.NPG(env, config=config, seed=case.seed)
         if envs is not None:
             learner.rollout = GymnasiumRollout(env, learner.rollout.steps, envs, case.seed, segments=learner.segments)
-        return more | iterate(learner, curve, lambda it: it.time_gradient + it.time_solve + it.time_value)
+        return more | iterate(learner, curve)
 
 
 def ppo(case: Case, options: Options, curve: Curve) -> dict[str, Any]:
-    """PPO with its default settings."""
+    """Run PPO with its default settings."""
     assert case.nworld is not None
     config = lw.PPOConfig(mean_every=0)
     next(lw.PPO(environment(case, options, config.minibatches), config=config, seed=case.seed))  # compiles kernels
     learner = lw.PPO(environment(case, options, case.nworld), config=config, seed=case.seed)
-    return iterate(learner, curve, lambda it: it.time_update)
+    return iterate(learner, curve)
 
 
-def iterate(learner: Any, curve: Curve, update: Callable[[Any], float]) -> dict[str, Any]:
+def iterate(learner: Any, curve: Curve) -> dict[str, Any]:
     """Run a learner of this package until its curve is complete."""
-    sampling = updates = 0.0
+    sampling = 0.0
     curve.start(mean_action(learner.policy))
     while not curve.ended(learner.samples):
-        it = next(learner)  # it ends with a copy to the host, so that a GPU has done its work
-        sampling, updates = sampling + it.time_sample, updates + update(it)
-        rollout = learner.rollout
-        ended = rollout.done & ~rollout.episode_return.isnan()
-        curve.returns += rollout.episode_return[ended].tolist()
+        sampling += next(learner).time_sample  # it ends with a copy to the host: a GPU has finished its work
         if curve.due(learner.samples):
             curve.add(learner.samples, mean_action(learner.policy))
-    curve.finish(learner.samples, mean_action(learner.policy))
-    return {"sampling_seconds": sampling, "update_seconds": updates}
+    curve.add(learner.samples, mean_action(learner.policy))
+    return {"sampling_seconds": sampling}
 
 
 # stable-baselines3 and sb3-contrib
 
 
 def stable_baselines3(case: Case, options: Options, curve: Curve) -> dict[str, Any]:
-    """PPO or TRPO with the settings that are published for the task, on environments of Gymnasium."""
+    """Run PPO or TRPO with the published settings of the task, on environments of Gymnasium."""
     installed("stable_baselines3", "stable-baselines3")
     import stable_baselines3 as sb3
     from stable_baselines3.common.callbacks import BaseCallback
-    from stable_baselines3.common.monitor import Monitor
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
     if case.contestant == "trpo_sb3":
@@ -344,17 +300,16 @@ def stable_baselines3(case: Case, options: Options, curve: Curve) -> dict[str, A
         algorithm, settings, count = sb3.PPO, PPO[case.task], 1
 
     def agent(**changes: int) -> tuple[Any, VecNormalize]:
-        made = [lambda: Monitor(gymnasium.make(TASKS[case.task], disable_env_checker=True))] * count
+        made = [lambda: gymnasium.make(TASKS[case.task], disable_env_checker=True)] * count
         envs = VecNormalize(DummyVecEnv(made), gamma=settings["gamma"])
         words = copy.deepcopy(settings) | changes
         return algorithm("MlpPolicy", envs, seed=case.seed, device="cpu", **words), envs
 
     class Watch(BaseCallback):
-        """Judges the policy between two updates."""
+        """Evaluates the policy between two updates."""
 
         def _on_step(self) -> bool:
-            curve.returns += [info["episode"]["r"] for info in self.locals["infos"] if "episode" in info]
-            return curve.seconds() < (case.limit or math.inf)
+            return curve.seconds() < case.limit
 
         def _on_rollout_start(self) -> None:
             if self.num_timesteps and curve.due(self.num_timesteps) and not curve.ended(self.num_timesteps):
@@ -368,40 +323,28 @@ def stable_baselines3(case: Case, options: Options, curve: Curve) -> dict[str, A
     assert case.samples is not None
     curve.start(act)
     model.learn(case.samples, callback=Watch())
-    curve.finish(model.num_timesteps, act)
+    curve.add(model.num_timesteps, act)
     return {}
 
 
-RUN = {"npg": npg, "npg_gymnasium": npg, "npg_gpu": npg, "ppo_rsl_rl": ppo, "ppo_sb3": stable_baselines3,
+RUN = {"npg": npg, "npg_gymnasium": npg, "npg_gpu": npg, "ppo_gpu": ppo, "ppo_sb3": stable_baselines3,
        "trpo_sb3": stable_baselines3}  # fmt: skip
-
-
-@contextlib.contextmanager
-def alone(name: str) -> Iterator[None]:
-    """Wait until no other process of this machine is in here: jobs would share the GPU."""
-    path = Path(tempfile.gettempdir()) / f"lyceum_warp-{os.getuid()}-{name}.lock"
-    with path.open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def measure(case: Case, options: Options) -> dict[str, Any]:
     torch.set_num_threads(case.threads)
     curve = Curve(case)
-    on_gpu = case.contestant in ON_GPU
-    with experiment.cores(case.threads), alone("gpu") if on_gpu else contextlib.nullcontext():
+    with experiment.cores(case.threads):
         more = RUN[case.contestant](case, options, curve)
-    points = curve.points()
-    samples, seconds, mean, noisy = points[-1]
-    return {"samples": samples, "seconds": seconds, "mean_return": mean, "noisy_return": noisy, **more,
-            "curve": points}  # fmt: skip
+    samples, seconds, mean = curve.points[-1]
+    return {"samples": samples, "seconds": seconds, "mean_return": mean, **more, "curve": curve.points}
 
 
 # tables and figure
 
 
 def runs(rows: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
-    """Runs by task and contestant."""
+    """Group runs by task and contestant."""
     found: dict[str, dict[str, list[Row]]] = {task: {} for task in TASKS}
     for row in rows:
         found[row.case["task"]].setdefault(row.case["contestant"], []).append(row)
@@ -411,17 +354,14 @@ def runs(rows: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
     }  # fmt: skip
 
 
-def values_at(row: Row, samples: Sequence[float], column: int = 2) -> np.ndarray:
-    """A column of a curve at numbers of samples, by linear interpolation; nan beyond the curve's end."""
-    points = [point for point in row.result["curve"] if point[column] is not None]
-    if not points:
-        return np.full(len(samples), np.nan)
-    x, y = [point[0] for point in points], [point[column] for point in points]
+def values_at(row: Row, samples: Sequence[float]) -> np.ndarray:
+    """Interpolate the returns of a curve at numbers of samples; nan beyond the curve's end."""
+    x, _, y = zip(*row.result["curve"], strict=True)
     return np.interp(samples, x, y, left=np.nan, right=np.nan)
 
 
 def seconds_to(row: Row, target: float) -> float | None:
-    """Seconds of learning until the mean policy first returned so much."""
+    """Return the seconds of learning until the mean policy first reached a return."""
     return next((point[1] for point in row.result["curve"] if point[2] >= target), None)
 
 
@@ -435,14 +375,13 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def ends(found: dict[str, dict[str, list[Row]]]) -> Table:
-    """How the runs ended, and when they reached nine tenths of what the Gymnasium-fed NPG returns in the end."""
+    """Tabulate the ends of the runs, and when they reached 90 % of the final return of NPG on Gymnasium."""
     lines = []
     for task, same in found.items():
         ours = {row.case["seed"]: row for row in same.get("npg", ())}
         fed = same.get("npg_gymnasium", ())
         target = 0.9 * statistics.fmean(row.result["mean_return"] for row in fed) if fed else None
         for name, group in same.items():
-            noisy = [row.result["noisy_return"] for row in group if row.result["noisy_return"] is not None]
             reached = [] if target is None else [seconds_to(row, target) for row in group]
             arrived = [seconds for seconds in reached if seconds is not None]
             share = f" ({len(arrived)} of {len(reached)})" if len(arrived) < len(reached) else ""
@@ -454,7 +393,6 @@ def ends(found: dict[str, dict[str, list[Row]]]) -> Table:
                 task, CONTESTANTS[name] + (f" ({', '.join(modes)})" if modes else ""), str(len(group)),
                 f"{statistics.median(row.result['samples'] for row in group):,.0f}",
                 interval(comparison.mean_interval([row.result["mean_return"] for row in group])),
-                interval(comparison.mean_interval(noisy)) if noisy else "",
                 median_and_range([row.result["seconds"] for row in group], ".1f"),
                 f"{statistics.median(phases):.1f}" if phases else "",
                 median_and_range(ratios),
@@ -462,16 +400,16 @@ def ends(found: dict[str, dict[str, list[Row]]]) -> Table:
             ])  # fmt: skip
     title = (
         "At the end of learning: mean over the seeds ± half of its 95 % interval (Student's t); seconds and ratios are "
-        "medians over the seeds (smallest to largest). The last column has the seconds until the mean policy first "
-        "returned 90 % of what NPG on Gymnasium's environments returns in the end."
+        "medians over the seeds (smallest to largest). The last column is the time until the mean policy first "
+        "reached 90 % of the final return of NPG on Gymnasium's environments."
     )
-    header = ["task", "contestant", "seeds", "samples", "mean policy", "with noise", "seconds", "of them sampling",
-              "time of a sample by ours", "to 90 %, s"]  # fmt: skip
+    header = ["task", "contestant", "seeds", "samples", "return", "seconds", "of them sampling",
+              "time of a sample, relative to lyceum_warp's", "to 90 %, s"]  # fmt: skip
     return Table(title, header, lines)
 
 
 def pace(row: Row) -> float:
-    """Seconds of learning for each sample."""
+    """Return the seconds of learning per sample."""
     return row.result["seconds"] / row.result["samples"]
 
 
@@ -481,39 +419,29 @@ def interval(found: tuple[float, float], form: str = ",.0f") -> str:
 
 
 def agreement(task: str, same: dict[str, list[Row]]) -> Table | None:
-    """The mean policy's return of both NPGs at every hundred thousand samples, and whether they differ.
-
-    None with a single seed, or with runs that end before.
-    """
+    """Compare the returns of both NPGs every 100,000 samples; return None with one seed or with shorter runs."""
     ours, fed = (np.array([values_at(row, EVERY_100K) for row in same[name]]) for name in ("npg", "npg_gymnasium"))
     there = ~np.isnan(np.concatenate([ours, fed])).any(axis=0)
     if not there.any() or min(len(ours), len(fed)) < 2:
         return None
     ours, fed, places = ours[:, there], fed[:, there], np.array(EVERY_100K)[there]
     p = comparison.permutation_test(ours, fed)
-    gaps = [comparison.difference_interval(a, b) for a, b in zip(ours.T, fed.T, strict=True)]
     lines = [
-        [f"{place:,}", interval(comparison.mean_interval(a)), interval(comparison.mean_interval(b)), interval(gap),
-         "yes" if abs(gap[0]) <= gap[1] else "no", f"{value:.3f}"]
-        for place, a, b, gap, value in zip(places, ours.T, fed.T, gaps, p, strict=True)
-    ]  # fmt: skip
-    differing = int((p < 0.05).sum())
-    verdict = f"differ at {differing} of them" if differing else "differ at none of them"
-    inside = sum(line[4] == "yes" for line in lines)
+        [f"{place:,}", interval(comparison.mean_interval(a)), interval(comparison.mean_interval(b)), f"{value:.3f}"]
+        for place, a, b, value in zip(places, ours.T, fed.T, p, strict=True)
+    ]
     title = (
-        f"{task}: at {len(lines)} points, the curves of our and of Gymnasium's environments {verdict} (permutation of "
-        f"whole curves, adjusted for all points, level 5 %; smallest p {p.min():.3f}); the 95 % interval of the "
-        f"difference (Welch) contains 0 at {inside} points."
+        f"{task}: the curves on lyceum_warp's and on Gymnasium's environments differ at {int((p < 0.05).sum())} of "
+        f"{len(lines)} points (permutation of whole curves, adjusted for all points, level 5 %; least p {p.min():.3f})."
     )
-    header = ["samples", "our environments", "Gymnasium's", "difference", "0 inside", "adjusted p"]
+    header = ["samples", "lyceum_warp", "Gymnasium", "adjusted p"]
     return Table(title, header, lines)
 
 
-def figure(rows: Sequence[Row]) -> Figure:
-    """Returns against samples and against seconds: mean over the seeds with its 95 % interval."""
+def figure(rows: Sequence[Row]) -> Any:
+    """Draw returns against samples and against seconds: mean over the seeds with its 95 % interval."""
     found = runs(rows)
-    drawn = Figure(figsize=(max(4.0 * len(found), 7.0), 6.6), layout="constrained")
-    FigureCanvasAgg(drawn)
+    drawn = new_figure("npg", max(4.0 * len(found), 7.0), 6.6)
     axes = drawn.subplots(2, len(found), squeeze=False)
     for column, (task, same) in enumerate(found.items()):
         for name, group in same.items():
@@ -522,13 +450,13 @@ def figure(rows: Sequence[Row]) -> Figure:
             draw(axes[1, column], group, name, 1)
         axes[0, column].set_title(task, loc="left")
         axes[0, column].set_xlabel("samples")
-        axes[1, column].set_xlabel("seconds of learning")
+        axes[1, column].set_xlabel("seconds of learning (log scale)")
         axes[1, column].set_xscale("log")
         axes[1, column].xaxis.set_major_formatter(EngFormatter(sep=""))
         axes[1, column].xaxis.set_minor_formatter(NullFormatter())
         axes[0, column].xaxis.set_major_formatter(EngFormatter(sep=""))
     for row in axes:
-        row[0].set_ylabel("return of the mean policy\n(dotted: of the policy with its noise)")
+        row[0].set_ylabel("return of the mean policy")
     handles = {label: handle for panel in axes.flat for handle, label in zip(*panel.get_legend_handles_labels(),
                                                                              strict=True)}  # fmt: skip
     drawn.legend(
@@ -539,29 +467,26 @@ def figure(rows: Sequence[Row]) -> Figure:
 
 
 def draw(axes: Any, group: Sequence[Row], name: str, x: int) -> None:
-    """The curves of a contestant against samples (x = 0) or seconds (x = 1)."""
+    """Draw the curves of a contestant against samples (x = 0) or seconds (x = 1)."""
+    color, marker, line = STYLES[list(CONTESTANTS).index(name)]
     last = min(row.result["curve"][-1][x] for row in group)
     # the first policy is at 0 seconds, which a logarithmic axis does not have
     first = min(max(row.result["curve"][x][x] for row in group), last)
     grid = np.linspace(first, last, 101) if x == 0 else np.geomspace(first, last, 101)
-    for column, style in ((2, "-"), (3, ":")):
-        curves = []
-        for row in group:
-            points = [point for point in row.result["curve"] if point[column] is not None]
-            if points:
-                curves.append(np.interp(grid, [p[x] for p in points], [p[column] for p in points], left=np.nan))
-        if not curves:
-            continue
-        each = [comparison.mean_interval(values) for values in np.array(curves).T]
-        mean, half = np.array(each).T
-        axes.plot(grid, mean, style, color=COLORS[name], linewidth=1.6 if column == 2 else 1.0,
-                  label=CONTESTANTS[name] if column == 2 else None)  # fmt: skip
-        if column == 2 and len(group) > 1:
-            axes.fill_between(grid, mean - half, mean + half, color=COLORS[name], alpha=0.18, linewidth=0)
+    curves = [
+        np.interp(grid, [p[x] for p in row.result["curve"]], [p[2] for p in row.result["curve"]]) for row in group
+    ]
+    mean, half = np.array([comparison.mean_interval(values) for values in np.array(curves).T]).T
+    # markers of contestants whose curves coincide must not cover each other
+    every = (3 * list(CONTESTANTS).index(name), 16)
+    axes.plot(grid, mean, color=color, linestyle=line, marker=marker, markevery=every, markersize=5, linewidth=1.5,
+              label=CONTESTANTS[name])  # fmt: skip
+    if len(group) > 1:
+        axes.fill_between(grid, mean - half, mean + half, color=color, alpha=0.13, linewidth=0)
 
 
 EXPERIMENT = experiment.Experiment(
-    name="npg", summary="NPG's learning curves on our environments and on Gymnasium's, beside PPO and TRPO",
+    name="npg", summary="NPG's learning curves on lyceum_warp's and on Gymnasium's environments, beside PPO and TRPO.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, figure=figure, options=Options,
     packages=("stable-baselines3", "sb3-contrib"), apart=True,
 )  # fmt: skip

@@ -1,46 +1,30 @@
-"""Figures of the experiments, from their results alone, as PNG and SVG.
-
-python bench/plot.py throughput scaling
-"""
+"""Draw the figures of experiments from stored results, as PNG files."""
 
 import dataclasses
 import sys
 from pathlib import Path
 
 import experiment
-import matplotlib
 import tyro
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Draw an experiment's figure for each machine that it has results from."""
+    """Draw the figure of each experiment and machine with stored results."""
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Experiments; by default all that have results."""
+    """Experiments; by default all with results."""
     results: Path = experiment.RESULTS
-    """Folder with the results; the figures go there, too."""
+    """Folder of the results and of the figures."""
 
 
 def main(options: Options) -> int:
-    names = experiment.choose(options.names, experiment.NAMES, what="experiment")
-    if not options.names:
-        names = tuple(name for name in names if (options.results / f"{name}.jsonl").exists())
-    if not names:
-        raise FileNotFoundError(f"there are no results in {options.results}: run an experiment first")
-    for name in names:
-        path = options.results / f"{name}.jsonl"
-        if not path.exists():
-            raise FileNotFoundError(f"there is no {path}: run the experiment {name} first")
+    for name, path in experiment.stored(options.names, options.results).items():
         draw = experiment.load(name).figure
         for machine, rows in experiment.by_machine(experiment.read(path)).items() if draw else ():
-            if (figure := draw(rows)) is None:
-                continue
-            for ending in ("png", "svg"):
-                out = options.results / f"{name}-{machine}.{ending}"
-                # names of elements that do not change with each drawing, and no date: equal figures are equal files
-                with matplotlib.rc_context({"svg.hashsalt": name}):
-                    figure.savefig(out, dpi=130, metadata={"Date": None} if ending == "svg" else None)
+            if (figure := draw(rows)) is not None:
+                out = options.results / f"{name}-{machine}.png"
+                figure.savefig(out, dpi=130)
                 print(out)
     return 0
 

@@ -1,9 +1,7 @@
-"""MPPI in Python over single environments with Gymnasium's step, in processes: what the mppi experiment compares with.
+"""Plan with MPPI in Python, over single environments with Gymnasium's step in processes.
 
-``PythonMPPI`` is a careful planner without this package: an environment in each of the processes, which are kept
-alive; one message for each plan and process; noise and weights in NumPy. ``StepwiseMPPI`` is the simple one: as
-Gymnasium's asynchronous vector environment does, it sends a message for each step of each sample. Both have the
-settings of an ``lw.MPPI`` and control the same plant.
+``PythonMPPI`` does not use this package's worlds: each process keeps an environment and gets one message a plan; noise
+and weights are NumPy's. It takes the settings of an ``lw.MPPI`` and controls the same plant.
 """
 
 import multiprocessing
@@ -22,7 +20,7 @@ STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
 class ReachEnv:
-    """Reach as one writes it for Gymnasium: MuJoCo's own objects, NumPy, and as little else as can be."""
+    """Reach, written for Gymnasium with MuJoCo's objects and NumPy."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model, self.data = model, mujoco.MjData(model)
@@ -43,12 +41,12 @@ class ReachEnv:
 
 
 class GymnasiumEnv:
-    """An environment of Gymnasium or Gymnasium-Robotics, put into a state of our task.
+    """Set an environment of Gymnasium or Gymnasium-Robotics to a state of our task.
 
     Args:
         name: Gymnasium's name.
         model: Our model, which describes the states.
-        target: A body that is a part of the model there and a mocap body of ours: its orientation is in our state.
+        target: A body whose orientation is a constant of Gymnasium's model, and a mocap body of ours.
     """
 
     def __init__(self, name: str, model: mujoco.MjModel, target: str | None = None) -> None:
@@ -84,104 +82,64 @@ ENVS: dict[str, Callable[[mujoco.MjModel], Any]] = {
 """Environments by the names of our tasks; their actions are bounded by -1 and 1."""
 
 
-class Processes:
-    """Processes with an environment each, that wait until a function has made it.
-
-    Args:
-        count: Number of processes.
-        target: What a process runs; it gets its end of a pipe first, and a last message that is None.
-        arguments: Further arguments of each.
-    """
-
-    def __init__(self, count: int, target: Callable[..., None], arguments: list[tuple[Any, ...]]) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.pipes, self.processes = [], []
-        for i in range(count):
-            pipe, other = context.Pipe()
-            process = context.Process(target=target, args=(other, *arguments[i]), daemon=True)
-            process.start()
-            other.close()  # so that the end of the process ends our waiting for it
-            self.pipes.append(pipe)
-            self.processes.append(process)
-        for pipe in self.pipes:
-            pipe.recv()
-
-    def close(self) -> None:
-        for pipe in self.pipes:
-            pipe.send(None)
-        for process in self.processes:
-            process.join()
-
-
 def smoothed(noise: np.ndarray, smoothing: tuple[float, float, float]) -> np.ndarray:
-    """Noise smoothed over time from the third step on, in place; (samples, horizon, nact)."""
+    """Smooth noise, (samples, horizon, nact), over time from the third step on, in place."""
     for t in range(2, noise.shape[1]):
         noise[:, t] = smoothing[0] * noise[:, t] + smoothing[1] * noise[:, t - 1] + smoothing[2] * noise[:, t - 2]
     return noise
 
 
-class _Controller:
-    """What both planners have in common: settings, plan and update."""
+class PythonMPPI:
+    """MPPI over single environments in processes, with one message for each plan and process.
 
-    def __init__(self, plan: lw.MPPI, count: int) -> None:
-        config, self.shape = plan.config, tuple(plan.actions.shape)
-        self.samples, self.horizon, self.temperature = config.samples, config.horizon, config.temperature
-        self.noise, self.smoothing = config.noise, config.smoothing
-        self.count = min(count, config.samples)
-        self.shares = np.diff(np.linspace(0, config.samples, self.count + 1).astype(int))
-        self.plan = np.zeros(self.shape)
-        self.processes: Processes
+    Args:
+        task: A name of ``ENVS``.
+        plan: Planner whose settings it takes.
+        count: Number of processes.
+    """
+
+    def __init__(self, task: str, plan: lw.MPPI, count: int) -> None:
+        config = plan.config
+        self.temperature, self.plan = config.temperature, np.zeros(tuple(plan.actions.shape))
+        context = multiprocessing.get_context("spawn")
+        self.pipes = []
+        count = min(count, config.samples)
+        for i, share in enumerate(np.diff(np.linspace(0, config.samples, count + 1).astype(int))):
+            pipe, other = context.Pipe()
+            settings = (task, int(share), config.horizon, config.noise, config.smoothing, i)
+            context.Process(target=_roll_out, args=(other, *settings), daemon=True).start()
+            other.close()  # so that recv raises EOFError if the process has ended
+            self.pipes.append(pipe)
+        for pipe in self.pipes:
+            pipe.recv()
 
     def reset(self, seed: int | None) -> None:
-        """Forget the plan."""
+        """Forget the plan, and seed the noise."""
         self.plan[:] = 0.0
+        for pipe in self.pipes:
+            pipe.send(seed)
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor | None = None) -> torch.Tensor:
-        """Improve the plan from a state; returns its first action, and moves the plan forward by a step."""
-        returns, actions = self.rollout(state.numpy())
+        """Improve the plan from a state; return its first action, and move the plan forward by a step."""
+        for pipe in self.pipes:
+            pipe.send((state.numpy(), self.plan))
+        answers = [pipe.recv() for pipe in self.pipes]
+        returns, actions = (np.concatenate(parts) for parts in zip(*answers, strict=True))
         weights = np.exp((returns - returns.max()) / self.temperature)
         plan = np.tensordot(weights / weights.sum(), actions, axes=1)
         self.plan = np.concatenate([plan[1:], np.zeros((1, plan.shape[1]))])
         return torch.from_numpy(plan[0].astype(np.float32))
 
-    def rollout(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns, (samples,), and actions, (samples, horizon, nact), of noisy samples of the plan."""
-        raise NotImplementedError
-
-    def close(self) -> None:
-        self.processes.close()
-
-
-class PythonMPPI(_Controller):
-    """MPPI over single environments in processes, one message for each plan and process."""
-
-    def __init__(self, task: str, plan: lw.MPPI, count: int) -> None:
-        super().__init__(plan, count)
-        settings = [(task, int(share), self.horizon, self.noise, self.smoothing, i)
-                    for i, share in enumerate(self.shares)]  # fmt: skip
-        self.processes = Processes(self.count, _roll_out, settings)
-
-    def reset(self, seed: int | None) -> None:
-        super().reset(seed)
-        for pipe in self.processes.pipes:
-            pipe.send(seed)
-
-    def rollout(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        for pipe in self.processes.pipes:
-            pipe.send((state, self.plan))
-        answers = [pipe.recv() for pipe in self.processes.pipes]
-        returns, actions = (np.concatenate(parts) for parts in zip(*answers, strict=True))
-        return returns, actions
-
 
 def _roll_out(
     pipe: Connection, task: str, samples: int, horizon: int, scale: Any, smoothing: tuple[float, float, float], own: int
 ) -> None:
-    """A process of ``PythonMPPI``: rolls out its share of the samples for every plan that it is sent."""
+    """Roll out a process's share of the samples for each plan that it receives."""
     env = ENVS[task](lw.make(task, nthread=1).model)
     random = np.random.default_rng((own, 0))
     pipe.send("ready")
-    while (message := pipe.recv()) is not None:
+    while True:
+        message = pipe.recv()
         if isinstance(message, int):
             random = np.random.default_rng((own, message))
             continue
@@ -196,45 +154,3 @@ def _roll_out(
             for t in range(horizon):
                 returns[k] += env.step(actions[k, t])[1]
         pipe.send((returns, actions))
-
-
-class StepwiseMPPI(_Controller):
-    """MPPI over single environments in processes, one message for each step of each sample."""
-
-    def __init__(self, task: str, plan: lw.MPPI, count: int) -> None:
-        super().__init__(plan, count)
-        self.processes = Processes(self.count, _step, [(task,)] * self.count)
-        self.random = np.random.default_rng(0)
-
-    def reset(self, seed: int | None) -> None:
-        super().reset(seed)
-        self.random = np.random.default_rng(seed)
-
-    def rollout(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        noise = smoothed(self.noise * self.random.standard_normal((self.samples, *self.shape)), self.smoothing)
-        noise[0] = 0.0  # the plan itself is a sample
-        actions = np.clip(self.plan + noise, -1.0, 1.0)
-        returns = np.zeros(self.samples)
-        for first in range(0, self.samples, self.count):
-            wave = list(enumerate(self.processes.pipes, start=first))[: self.samples - first]
-            for _, pipe in wave:
-                pipe.send(("state", state))
-            for t in range(self.horizon):
-                for k, pipe in wave:
-                    pipe.send(("step", actions[k, t]))
-                for k, pipe in wave:
-                    _obs, reward, _terminated, _truncated, _info = pipe.recv()
-                    returns[k] += reward
-        return returns, actions
-
-
-def _step(pipe: Connection, task: str) -> None:
-    """A process of ``StepwiseMPPI``: sets its environment's state, or steps it, as each message says."""
-    env = ENVS[task](lw.make(task, nthread=1).model)
-    pipe.send("ready")
-    while (message := pipe.recv()) is not None:
-        kind, value = message
-        if kind == "state":
-            env.set_state(value)
-        else:
-            pipe.send(env.step(value))

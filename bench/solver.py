@@ -1,11 +1,11 @@
-"""Speed and accuracy of options of the physics, on states that the model's own options lead to.
+"""Measure speed and accuracy of options of the physics, on states that the model's own options lead to.
 
-    python bench/solver.py --tasks hopper half_cheetah humanoid --nworld 4096 --engine warp --device cuda
+    lyceum-warp bench solver --tasks hopper half_cheetah humanoid --nworld 4096 --engine warp --device cuda
 
-Every setting makes the same steps: from each saved state, episodes that have just begun included, one step with the
-saved action. A step's error is the largest of a world's velocities, relative to the larger of 1 and the largest
-velocity; its scale is the difference between two passes with the model's own options ("own, again": on a GPU sums are
-taken in any order). Settings take turns, so that all run under the same load.
+Every setting makes the same steps: one step with the saved action from each saved state, including states at the start
+of episodes. The error of a step is a world's largest difference of velocities, relative to the larger of 1 and the
+largest velocity; its scale is the difference between two passes with the model's own options ("own, again": a GPU adds
+in any order). Settings take turns, under the same load.
 """
 
 import dataclasses
@@ -45,7 +45,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 """Options of ``lw.make``."""
 
 ON_A_GPU = ("unroll", "deterministic")
-"""Options that make a difference on a GPU alone."""
+"""Options with an effect on a GPU only."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,12 +82,12 @@ class Row:
     error_99: float
     error_max: float
     faults: int
-    """Worlds whose step ended in a fault; they don't count among the errors."""
+    """Worlds whose step ended in a fault; the errors exclude them."""
     bytes_per_world: float
 
 
 def saved_steps(task: str, nworld: int, options: Options) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """States with the actions that are taken there, under uniformly random ones."""
+    """Return states and their actions, under uniformly random actions."""
     env = lw.make(task, nworld=nworld, engine=options.engine, device=options.device)
     generator = torch.Generator(env.obs.device).manual_seed(0)
     low, high = (torch.as_tensor(x, device=env.obs.device) for x in (env.action_space.low, env.action_space.high))

@@ -48,7 +48,7 @@ class Params:
     gait: wp.array2d[float] = GAIT  # joint angles to imitate, a row for each phase
     period: float = 0.4  # of the gait, s
     weights: wp.vec4 = wp.vec4(1.0, 0.3, -0.02, -0.5)  # of the reward's terms
-    feet: int = lw.sensor("bfoot")  # followed by that of the other foot
+    feet: int = lw.sensor("bfoot")  # the other foot's sensor follows
     floor: int = lw.geom("floor")
 
 

@@ -28,7 +28,7 @@ def main(
         seed: Seed of the first episode; the next ones count up.
     """
     plant = lw.make(task, autoreset=False)  # the controlled world
-    # the planner simulates in worlds of its own, one for each sample
+    # the planner has its own worlds, one for each sample
     plan = lw.MPPI(task) if samples is None else lw.MPPI(task, samples=samples)
 
     trajectories = []

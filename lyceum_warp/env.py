@@ -26,7 +26,7 @@ from lyceum_warp.spaces import Space
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.forks import leave_in_parent
-from lyceum_warp.support.validate import check_kind, check_tensor, described, whole_number
+from lyceum_warp.support.validate import check_group, check_kind, check_tensor, described, whole_number
 from lyceum_warp.task import Task
 from lyceum_warp.world_arrays import own_bytes_per_world
 from lyceum_warp.worlds import Worlds
@@ -351,10 +351,7 @@ class Env:
         Raises:
             ValueError: There is no such group, or an argument has another shape or type.
         """
-        if group not in self.obs_groups:
-            raise ValueError(
-                f"the task {self.task.name!r} has no group {group!r} of observations: it has {list(self.obs_groups)}"
-            )
+        check_group(group, self.obs_groups, self.task.name)
         return _copied((self if state is None else self._scratch_at(state)).obs_groups[group], out)
 
     def get_eval(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:

@@ -1,14 +1,13 @@
-"""Gymnasium's ids of all tasks: ``gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=64)``.
+"""Register all tasks with Gymnasium: ``gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=64)``.
 
-Importing this module registers every task of the package, and every task that was registered by then, in the namespace
-``lyceum``, under the name of its class: ``lyceum/HalfCheetah-v0``. No task's file is read before an environment is
-made. ``register`` adds a task of your own.
+Importing this module gives each registered task an id in the namespace ``lyceum``, by the name of its class:
+``lyceum/HalfCheetah-v0``. A task's file is read when an environment is made. ``register`` adds a task of your own.
 """
 
 from pathlib import Path
 
-from lyceum_warp.adapters.gymnasium_library import gymnasium
 from lyceum_warp.adapters.gymnasium_single import GymnasiumEnv
+from lyceum_warp.adapters.gymnasium_spaces import gymnasium
 from lyceum_warp.adapters.gymnasium_vector import GymnasiumVectorEnv
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.task import Task
@@ -17,12 +16,12 @@ __all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "register"]
 
 
 def register(task: str | Path | type[Task]) -> str:
-    """Give a task an id of Gymnasium, and return it, as "lyceum/MyHopper-v0".
+    """Give a task a Gymnasium id, and return the id, such as "lyceum/MyHopper-v0".
 
-    A task with the same id is replaced.
+    It replaces a task with the same id.
 
     Args:
-        task: Name of a task, a file with one, or its class.
+        task: Name of a task, path of its file, or its class.
 
     Raises:
         ValueError: There is no such task.

@@ -93,7 +93,7 @@ class OpenLoop:
         self._keys, self._nominal_model, self._models = keys, nominal_model, dict(models or {})
         rows = self.horizon * n
         stepwise = task.functions["control"] is not None or task.functions["substep"] is not None
-        check_fit(self._bytes_per_world(env, self.horizon), n, env.device)
+        check_fit(self._bytes_per_world(env, self.horizon), n, env.device, model=f"horizon {self.horizon}")
         with wp.ScopedDevice(env.device):
             self._state = wp.zeros((states, env.state_space.size), dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nact), dtype=float)

@@ -1,10 +1,10 @@
-"""Train a learner, and write its run: the loop that the command line and ``lw.train`` share."""
+"""Train a learner and write its run, for the command line and for ``lw.train``."""
 
 import contextlib
 import json
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,27 +27,26 @@ from lyceum_warp.viz.video import check_video
 log = logging.getLogger(__name__)
 
 Callback = Callable[[Any], Any]
-"""Called with the statistics of each iteration, which are of the algorithm's own class."""
+"""Called with the statistics of each iteration, of the algorithm's class."""
 
 
 class Display:
-    """What a training shows on its way: nothing but log messages. The command line shows more."""
+    """Show the progress of a training. This class only logs messages; subclasses show more."""
 
-    def begin(self, run: Run, learner: Learner, iterations: int) -> None:
-        """Training begins, or goes on, up to so many iterations."""
+    @contextlib.contextmanager
+    def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
+        """Show a training up to a number of iterations, within the context."""
+        yield
 
     def __call__(self, iteration: Iteration) -> None:
         """An iteration is complete."""
 
     def work(self, text: str, unit: str, done: int, total: int) -> None:
-        """Other work between two iterations has made progress."""
+        """Work between two iterations has made progress, such as a video."""
 
     def note(self, line: str) -> None:
-        """Something is worth a line."""
+        """Show a message."""
         log.warning(line)
-
-    def end(self) -> None:
-        """Training ends, with or without an error."""
 
 
 def train(
@@ -68,44 +67,43 @@ def train(
 ) -> Run:
     """Train, and write the same folder as ``lyceum-warp train``: metrics, policies and checkpoints.
 
-    ``lw.load(folder)`` returns the last policy, ``lw.load(folder, which="best")`` the one with the best return:
-    that of ``mean_return``, the evaluations without noise, if the learner makes some; otherwise that of
-    ``return_mean``, the episodes of an iteration, which were sampled with the policy before it.
+    ``lw.load(folder)`` returns the last policy, and ``lw.load(folder, which="best")`` the policy with the best return.
+    The return is ``mean_return`` if the learner evaluates the mean policy. Otherwise it is ``return_mean``, of the
+    episodes of an iteration, which are sampled by the policy before the iteration.
 
-    The policy and the complete state, from which a run continues exactly, are saved at the start, at the end, and every
-    30 s, or more often while that takes at most 1 % of the time; see ``lyceum_warp.runs.saving``. A run that is killed
-    continues from the last save, to the same numbers. Ctrl-C, SIGTERM and SIGHUP end it after the iteration, with a
-    save; a second one ends it at once.
+    The policy and the complete state are saved at the start, at the end, and every 30 s, or more often while saving
+    takes at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run continues from the last save with the
+    same numbers. Ctrl-C, SIGTERM and SIGHUP end the run after the iteration, with a save; a second signal ends it at
+    once.
 
     Args:
         learner: The algorithm: ``NPG(env)``, or another ``lyceum_warp.algos.learner.Learner``.
         folder: The run's folder, new or empty.
         iterations: Iterations in all, including those before ``resume``.
-        callback: Called with each iteration after its row was written. Training ends if it returns True, and if it
-            raises an error, which is passed on after a save.
-        target_return: Training ends once the return by which the best policy is selected is at least this.
-        keep_every: Iterations between two policies that are kept under their numbers; 0 for none.
-        save_every: Iterations between two saves; 0 for a number that follows from their time.
-        tensorboard: Whether to write the metrics for TensorBoard, too.
-        video_every: Iterations between two videos of the policy, ``videos/000100.mp4`` and so on in the folder, which
-            TensorBoard shows, too; 0 for none. If one fails, a warning says so, and training goes on.
-        camera: Camera of the videos: one of the model's by name or index, a ``viz.cameras.FreeCamera``, or "free" for
-            MuJoCo's default free camera.
-        resume: Whether the folder holds a run that is continued; ``learner`` must be made with the same arguments.
-        entries: Further entries of config.json, of values that JSON can hold.
-        display: Shows the training; by default notes are logged.
+        callback: Called with each iteration after its row was written. Training ends if it returns True. If it raises
+            an error, the run is saved, and the error is raised again.
+        target_return: Training ends once the return that selects the best policy reaches this number.
+        keep_every: Iterations between two numbered policies; 0 for none.
+        save_every: Iterations between two saves; 0 to save by time.
+        tensorboard: Whether to also write the metrics for TensorBoard.
+        video_every: Iterations between two videos of the policy, ``videos/000100.mp4`` and so on in the folder; 0 for
+            none. If a video fails, a warning is logged, and training continues without videos.
+        camera: Camera of the videos: a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or "free"
+            for MuJoCo's default free camera.
+        resume: Whether to continue the run in the folder. ``learner`` must be made with the same arguments.
+        entries: Further entries of config.json, of JSON values.
+        display: Shows the progress; by default messages are logged.
 
     Returns:
         The run. ``run.rows()`` returns the metrics.
 
     Raises:
-        ValueError: The folder holds something else, an argument is out of range, or the run does not fit
-            ``learner``.
+        ValueError: The folder is not empty, an argument is out of range, or the run does not fit ``learner``.
         ImportError: The extra ``tensorboard`` is not installed.
-        NoVideoError: The extra ``viz`` is not installed, and there should be videos.
-        OSError: The folder could no longer be written. The last save stands, and ``resume=True`` continues from it.
-        FloatingPointError: The learner's updates are no longer finite; see there.
-        Interrupted: One of several processes received a signal.
+        NoVideoError: ``video_every`` is given, and the extra ``viz`` is not installed.
+        OSError: The folder cannot be written. ``resume=True`` continues from the last save.
+        FloatingPointError: The learner's updates are no longer finite.
+        Interrupted: One of several ranks received a signal.
     """
     check_kind("learner", learner, Learner, "as lw.NPG(env)")
     check_kind("folder", folder, str | Path, "as 'runs/mine'")
@@ -150,8 +148,7 @@ def train(
                 learner, run.folder / "videos", video_every, seed, board, camera=camera, note=display.note,
                 progress=display.work,
             )  # fmt: skip
-            shown.callback(display.end)
-            display.begin(run, learner, iterations)
+            shown.enter_context(display.training(run, learner, iterations))
             callbacks = [function for function in (board, display, videos, callback) if function is not None]
         try:
             _learn(learner, saver, iterations, callbacks, target_return)
@@ -165,7 +162,7 @@ def train(
 def _learn(
     learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None
 ) -> None:
-    """Iterate, and decide with all processes when the run is saved and when it ends."""
+    """Iterate. All ranks agree on when the run is saved and when it ends."""
     team, run = learner.team, saver.run
     ended = False
     with ending(), postponed(insist=team.size == 1) as noted:
@@ -199,7 +196,7 @@ def _learn(
 
 
 def _reopened(folder: Path, learner: Learner, settings: dict[str, Any], note: Callable[[str], None]) -> Run:
-    """Open a run that is continued, and put the learner into the state of its checkpoint."""
+    """Open a run, and load its checkpoint into the learner."""
     run = Run.open(folder)
     content = run.read(learner.env.obs.device, note=note)
     reached, target, done = run.config.get("reached"), settings["target_return"], content["iteration"]
@@ -224,18 +221,18 @@ def _reopened(folder: Path, learner: Learner, settings: dict[str, Any], note: Ca
         if changed := run.changed(versions(run.config["device"])):
             text = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
             note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")
-        cut_rows(run.metrics, done)  # an interrupted run may have written rows that were not saved
+        cut_rows(run.metrics, done)  # a killed run may have rows of unsaved iterations
         run.amend(**settings)
     return run
 
 
 def _check_equal(run: Run, learner: Learner) -> None:
-    """Refuse a learner with other settings than the run's."""
+    """Check that a learner has the run's settings."""
     then, now, env = Configuration.of(run), describe(learner), learner.env
     old, new, algorithm = then.options, env.options, run.config["algorithm"]
     now["engine"] = engine_name(now["engine"], now["device"])
     own = {"engine": engine_name(old.engine, old.device), "algorithm": algorithm, "nworld": old.nworld}
-    # nthread and graphs do not change the numbers, and the model is compared by its content
+    # nthread and graphs do not change the numbers; note_changes compares the model
     options = {"horizon": old.horizon, "fields": old.fields, "dynamics": old.dynamics}
     params = dict.fromkeys(now["params"]) | run_params(run, then.params)
     # a run of an earlier release lacks the newest hyperparameters

@@ -1,4 +1,4 @@
-"""Studio's viewer without a browser or a window: the panel runs in it, and what it draws is thrown away."""
+"""Run the panel in studio's viewer without a browser or a window."""
 
 from typing import Any
 
@@ -7,8 +7,9 @@ import numpy as np
 from mujoco.studio import launch_thread, messages, ux, viewer_protocol
 
 from lyceum_warp.viewer.protocol import Frame, Opened, Pose, Reply, Scene, Status
+from lyceum_warp.viewer.session.frames import model_bytes
 from lyceum_warp.viewer.window.panel import Panel
-from lyceum_warp.viewer.window.studio import Screen, imgui, implot
+from lyceum_warp.viewer.window.studio import imgui, implot
 
 ROBOT = """
 <mujoco>
@@ -32,10 +33,8 @@ def robot() -> mujoco.MjModel:
 
 
 def scene_of(model: mujoco.MjModel, **changes: Any) -> Scene:
-    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, content)
     values: dict[str, Any] = dict(
-        title="ball", model=content.tobytes(), nworld=8, timestep=0.01, modes=("passive", "controller", "playback"),
+        title="ball", model=model_bytes(model), nworld=8, modes=("passive", "controller", "playback"),
         controllers=("policy", "mppi"), episodes=("first", "second"), curves=("reward", "eval"),
     )  # fmt: skip
     return Scene(**values | changes)
@@ -79,7 +78,7 @@ class HeadlessViewer(viewer_protocol.Viewer):
 
 
 class Bench:
-    """A panel in a viewer of its own, with the session's end at hand."""
+    """A panel in a viewer of its own, which keeps what the panel sends."""
 
     def __init__(self, model: mujoco.MjModel, scene: Scene, **options: Any) -> None:
         self.model, self.data = model, mujoco.MjData(model)
@@ -95,14 +94,16 @@ class Bench:
         self.sent: list[Reply] = []
         self.given: Frame | None = None
         self.models: list[mujoco.MjModel] = []
-        self.panel = Panel(scene, model, self, ShownModels(self.models), Opened("http://here"), **options)
+        self.panel = Panel(
+            scene, model, self.sent.append, self.take, self, Opened("http://here"), **options
+        )  # fmt: skip
         here, _ = launch_thread.make_thread_endpoints()
         config = viewer_protocol.ViewerConfig()
         self.viewer = HeadlessViewer(config, here, model=model, plugins=[self.panel])
         self.viewer.dispatch(viewer_protocol.ViewerInitEvent(viewer=self.viewer))
 
-    def send(self, reply: Reply) -> None:
-        self.sent.append(reply)
+    def show_model(self, model: mujoco.MjModel) -> None:
+        self.models.append(model)
 
     def take(self) -> Frame | None:
         given, self.given = self.given, None
@@ -121,13 +122,3 @@ class Bench:
         self.viewer.dispatch(messages.BuildGuiEvent())
         imgui.Render()
         return self.sent[before:]
-
-
-class ShownModels(Screen):
-    """Takes the models that the panel shows."""
-
-    def __init__(self, shown: list[mujoco.MjModel]) -> None:
-        self.shown = shown
-
-    def show_model(self, model: mujoco.MjModel) -> None:
-        self.shown.append(model)

@@ -14,25 +14,24 @@ class MemoryWindow:
     """Shows nothing.
 
     Args:
-        script: Called after each frame; returns commands. The window closes where it returns None.
-        seconds: The test fails after this time.
+        script: Called after each frame with the frame and its number; returns commands, or None to close the window.
+        seconds: Time limit of the test.
     """
+
+    wants_frame = True
+    error: str | None = None
 
     def __init__(self, script: Callable[[Frame, int], Iterable[Command] | None], seconds: float = 60.0) -> None:
         self.script, self.end = script, time.monotonic() + seconds
         self.frames: list[Frame] = []
         self.pending: deque[Command] = deque()
-        self.open = True
-        self.closed = 0
-        self.error: str | None = None
+        self.open, self.closed = True, 0
 
     def show(self, frame: Frame) -> None:
         self.frames.append(frame)
         commands = self.script(frame, len(self.frames) - 1)
-        if commands is None:
-            self.open = False
-        else:
-            self.pending.extend(commands)
+        self.open = commands is not None
+        self.pending.extend(commands or ())
 
     def commands(self) -> list[Command]:
         assert time.monotonic() < self.end, "the session did not end"
@@ -50,29 +49,21 @@ class MemoryWindow:
         return [message for frame in self.frames for message in frame.messages]
 
 
-def run(session: Session, *script: Iterable[Command] | Callable[[Frame], Iterable[Command] | None]) -> MemoryWindow:
-    """Run a session: after each frame the next entry of the script. A function is called until it returns None."""
+def run(session: Session, *script: Iterable[Command] | Callable[[Frame], bool]) -> MemoryWindow:
+    """Run a session: after each frame the next commands of the script. A condition is awaited first."""
     entries = list(script)
 
     def after(frame: Frame, number: int) -> Iterable[Command] | None:
-        while entries:
-            entry = entries[0]
-            if not callable(entry):
-                entries.pop(0)
-                return entry
-            if (commands := entry(frame)) is not None:
-                return commands
+        while entries and callable(condition := entries[0]):
+            if not condition(frame):
+                return []
             entries.pop(0)
-        return None
+        return entries.pop(0) if entries else None  # type: ignore[return-value]
 
     window = MemoryWindow(after)
-    session.run(window)
+    session.run(window)  # type: ignore[arg-type]
     assert window.closed == 1
     return window
-
-
-def until(wanted: Callable[[Frame], bool]) -> Callable[[Frame], list[Command] | None]:
-    return lambda frame: None if wanted(frame) else []
 
 
 def pushing(obs: torch.Tensor) -> torch.Tensor:

@@ -178,6 +178,12 @@ def test_files_that_a_document_names_exist(document: Path) -> None:
     assert not sorted(name for name in named if not any((place / name).exists() for place in places))
 
 
+def test_the_map_of_the_rooms_is_current() -> None:
+    """``python docs/rooms.py`` writes it from the docstrings."""
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    assert runpy.run_path(str(ROOT / "docs" / "rooms.py"))["written"](page) == page
+
+
 def test_the_workflow_runs_the_checks_on_every_supported_python() -> None:
     yaml = pytest.importorskip("yaml")
     workflow = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())

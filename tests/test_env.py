@@ -9,7 +9,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-import mujoco_warp
 import pytest
 import torch
 
@@ -43,19 +42,6 @@ def test_a_step_reaches_the_c_engine_through_two_functions() -> None:
     env.engine.batch = spy = Spy(env.engine.batch)  # type: ignore[attr-defined]
     env.step()
     assert spy.stacks == [[("env.py", "step"), ("engines/c/mujoco_engine.py", "_advance")]]
-
-
-def test_an_uncaptured_step_reaches_mujoco_warp_through_two_functions(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = lw.make("hopper", nworld=2, engine="warp", graphs=False)
-    stacks, step = [], mujoco_warp.step
-
-    def spy(*args: Any) -> None:
-        stacks.append(own_frames())
-        step(*args)
-
-    monkeypatch.setattr(mujoco_warp, "step", spy)
-    env.step()
-    assert stacks == [[("env.py", "step"), ("engines/warp/warp_engine.py", "step")]] * env.task.frame_skip
 
 
 def test_the_phases_of_a_step_are_one_list_in_order() -> None:

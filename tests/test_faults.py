@@ -227,7 +227,7 @@ def test_a_bad_action_is_applied_as_zero(engine: str) -> None:
         ({"device": "tpu"}, "no device 'tpu' on this machine; it has 'cpu'"),
         ({"device": "cuda:77"}, "no device 'cuda:77' on this machine; it has 'cpu'.*nvidia-smi"),
         ({"engine": "bullet"}, "no engine 'bullet': use one of 'auto', 'mujoco', 'warp'"),
-        ({"engine": None}, "no engine None"),
+        ({"engine": None}, "engine must be .* not NoneType None"),
         ({"engine": "mujoco", "njmax": 64}, "the mujoco engine takes no njmax; it takes nthread"),
         ({"engine": "warp", "nthread": 2}, "the warp engine takes no nthread; it takes nconmax, njmax, unroll"),
         ({"engine": "warp", "njmax": -3}, "njmax must be a whole number from 1 to .*, not -3"),

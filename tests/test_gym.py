@@ -46,11 +46,6 @@ def test_a_file_gets_an_id(task_file: TaskFile) -> None:
     assert gymnasium.make_vec(id, num_envs=3).single_observation_space.shape == (1,)
 
 
-def test_options_of_an_environment_are_passed_on() -> None:
-    envs = gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=2, engine="mujoco", horizon=7, nthread=1)
-    assert isinstance(envs, GymnasiumVectorEnv) and envs.env.horizon == 7 and envs.env.options.nthread == 1
-
-
 def test_an_unknown_task_gets_no_id(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="there is no task 'hoper': did you mean hopper"):
         register("hoper")

@@ -1,6 +1,8 @@
 """Training with a run's folder: ended, continued and warm-started."""
 
+import contextlib
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.runs.folder import Run
+from lyceum_warp.training import Display
 
 
 @pytest.fixture
@@ -300,3 +303,35 @@ def test_evaluations_and_training_with_one_seed_draw_other_states(env: lw.Env) -
 
     lw.evaluate(env, policy, 2, seed=1)  # type: ignore[arg-type]
     assert not torch.isclose(seen[0], trained_on).all(1).any()
+
+
+def test_ppo_trains_by_the_same_loop_from_the_shell(six: Path, tmp_path: Path) -> None:
+    """It begins with the networks of an NPG run, and resumes to the same numbers."""
+    options = ["--num-steps", "16", "--minibatches", "2", "--epochs", "2", "--nworld", "4", *QUIET]
+    begin = ["train", "--from", str(six), "--algorithm", "ppo", *options, "--out"]
+    assert cli.main([*begin, str(tmp_path / "whole"), "--iterations", "4"]) == 0
+    assert cli.main([*begin, str(tmp_path / "parts"), "--iterations", "2"]) == 0
+    assert cli.main(["train", "--resume", str(tmp_path / "parts"), "--iterations", "4", *QUIET]) == 0
+    assert metrics(tmp_path / "parts") == metrics(tmp_path / "whole")
+    config = Run.open(tmp_path / "parts").config
+    assert config["algorithm"] == "ppo" and config["ppo"]["hidden"] == [8] and "npg" not in config
+    assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # the settings of NPG are not those of PPO
+
+
+def test_a_run_notes_what_its_caller_gives_and_shows_its_way(env: lw.Env, tmp_path: Path) -> None:
+    class Seen(Display):
+        def __init__(self) -> None:
+            self.seen: list[object] = []
+
+        @contextlib.contextmanager
+        def training(self, run: Run, learner: lw.Learner, iterations: int) -> Iterator[None]:
+            self.seen.append((run.folder, learner.iteration, iterations))
+            yield
+            self.seen.append("end")
+
+        def __call__(self, iteration: lw.Iteration) -> None:
+            self.seen.append(iteration.iteration)
+
+    display, folder = Seen(), tmp_path / "run"
+    lw.train(algorithm(env), folder, iterations=2, entries={"tag": "mine"}, display=display)
+    assert display.seen == [(folder, 0, 2), 1, 2, "end"] and Run.open(folder).config["tag"] == "mine"

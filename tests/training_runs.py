@@ -63,5 +63,5 @@ def six_iterations(folder: Path) -> Path:
 
 
 def mean_action(policy: lw.GaussianPolicy) -> torch.Tensor:
-    """What a policy does for one observation."""
+    """The action of a policy for one observation."""
     return policy(torch.linspace(-1.0, 1.0, policy.nobs))

@@ -1,11 +1,11 @@
 """Compute numbers with the lyceum_warp of a checkout, one unit of work after another, for bench/compare.py.
 
-compare.py runs this program once for each checkout, with the checkout first on the path. Its first answer names what
-the checkout has. Each line on stdin then is a unit, the keyword arguments of one of PARTS as JSON, and each line on
-stdout an answer. The arrays of a unit go into the file that is the program's argument, in the order in which they were
-computed.
+compare.py runs this program once for each checkout, with the checkout first on the path. Its first answer lists the
+tasks and the learners of the checkout. Each further line on stdin is a unit, the keyword arguments of one of PARTS as
+JSON, and each line on stdout an answer. The arrays of a unit are written to the file of the program's argument, in the
+order of their computation.
 
-It uses the package's public names alone, because the two checkouts may differ in everything else.
+Only public names of the package are used: the two checkouts may differ in everything else.
 """
 
 import contextlib
@@ -51,7 +51,7 @@ class Numbers:
         """Add an array, a number, a text, or every leaf of a mapping, a dataclass or a list.
 
         Args:
-            name: Name; those of leaves are appended.
+            name: Name; names of leaves are appended.
             value: The value. None is left out.
             axes: Names of the leading axes.
             along: Name of a further first axis, along which the values of several calls are stacked.
@@ -77,7 +77,7 @@ class Numbers:
         return {name: np.stack(value) if isinstance(value, list) else value for name, value in self._arrays.items()}
 
 
-# what the parts share
+# helpers of the parts
 
 
 def make(task: str, engine: str, device: str, **options: Any) -> Any:
@@ -348,7 +348,7 @@ def compute(unit: dict[str, Any], file: Path) -> dict[str, Any]:
 
 def main() -> None:
     faulthandler.enable()
-    # what the package prints goes to stderr
+    # the package's prints go to stderr
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
 

@@ -1,4 +1,4 @@
-"""What the adapters have in common: the environment behind them, its seeds, and its values for each world."""
+"""Make and check the environment behind an adapter: its arguments, seeds and pictures."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -8,24 +8,26 @@ import torch
 from lyceum_warp.env import Env, make
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.task import Task
+from lyceum_warp.viz.cameras import CameraChoice
+from lyceum_warp.viz.pictures import WorldPictures
 
 _SEEDS = 2**31
-"""Seeds of an environment lie below this number."""
+"""Seeds of an environment are below this number."""
 
 _OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode, where there is one,"}
-"""Options of an environment that an adapter sets, and what decides instead."""
+"""Options of an environment that an adapter sets, and the argument that decides instead."""
 
 
 def environment_of(
     task: str | type[Task] | Env, num_envs: int | None, words: Mapping[str, Any], *, autoreset: bool
 ) -> Env:
-    """The environment that an adapter's arguments stand for.
+    """Make the environment behind an adapter, or check one that was given.
 
     Args:
         task: A task as ``lw.make`` takes it, or an environment.
-        num_envs: Number of worlds; None for one, or for those of the environment.
+        num_envs: Number of worlds; by default one, or the number in the given environment.
         words: Options and parameters, for ``lw.make``.
-        autoreset: Whether the environment restarts worlds within a step.
+        autoreset: Whether the environment resets worlds within a step.
 
     Raises:
         ValueError: An argument does not fit; the message names it.
@@ -44,41 +46,45 @@ def environment_of(
     return task
 
 
-def small_seed(seed: Any) -> int:
-    """A seed of any size as one of an environment, which is below 2**31; smaller ones stay the same.
+def pictures_of(
+    env: Env, render_mode: str | None, camera: CameraChoice, size: tuple[int, int]
+) -> tuple[WorldPictures, dict[str, Any]]:
+    """The pictures of an environment's worlds, and the entries of a library's ``metadata`` that describe them.
 
     Raises:
-        ValueError: It is not a whole number of at least 0.
+        ValueError: There is no such render mode or camera, or the size is odd.
     """
-    return whole_number("seed", seed, low=0, high=2**128) % _SEEDS
+    if render_mode not in (None, "rgb_array"):
+        raise ValueError(f"there is no render_mode {render_mode!r}: use 'rgb_array', or None for no pictures")
+    metadata = {"render_modes": ["rgb_array"], "render_fps": max(1, round(1 / env.timestep))}
+    return WorldPictures(env, camera=camera, size=size), metadata
 
 
 class ResetSeeds:
-    """The seeds of resets, where a library expects that the first reset without one draws it.
+    """Choose the seed of each reset. The first reset without a seed draws one, as libraries expect.
 
     Args:
-        seeded: Whether the environment's streams were seeded by the user.
+        seeded: Whether the user has seeded the environment.
     """
 
     def __init__(self, *, seeded: bool) -> None:
         self._seeded = seeded
 
     def __call__(self, given: Any, drawn: Callable[[], Any]) -> int | None:
-        """The seed of this reset; None where the random streams go on.
+        """The seed of this reset; None continues the random streams.
 
         Args:
-            given: The seed that the reset was given, or None.
-            drawn: Called for a random seed, where the worlds never had one.
+            given: The seed of any size that the reset was given, or None.
+            drawn: Returns a random seed, for worlds that never had one.
         """
         if given is None and self._seeded:
             return None
-        seed = small_seed(drawn() if given is None else given)
         self._seeded = True
-        return seed
+        return whole_number("seed", drawn() if given is None else given, low=0, high=2**128) % _SEEDS
 
 
 def per_world(value: Any, nworld: int) -> list[Any]:
-    """A value once for each world: rows of a tensor that has one for each world, otherwise the same value."""
+    """A value for each world: the rows of a tensor with one row for each world, otherwise the same value."""
     if isinstance(value, torch.Tensor) and value.ndim and len(value) == nworld:
         return list(value)
     return [value] * nworld

@@ -1,32 +1,28 @@
-"""One world as an environment of Gymnasium."""
+"""Adapt one world to Gymnasium's Env."""
 
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
-from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of
-from lyceum_warp.adapters.gymnasium_library import gymnasium
-from lyceum_warp.adapters.gymnasium_spaces import action_space, observation_space
-from lyceum_warp.adapters.host_arrays import HostArrays
-from lyceum_warp.adapters.rendering import RENDER_MODES, check_render_mode, frame_rate
-from lyceum_warp.adapters.step_results import Observations, StepResults
+from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, pictures_of
+from lyceum_warp.adapters.gymnasium_spaces import box, gymnasium, observation_space
+from lyceum_warp.adapters.step_results import HostArrays, Observations, StepResults
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 from lyceum_warp.viz.cameras import CameraChoice
-from lyceum_warp.viz.pictures import WorldPictures
 
 
 class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
-    """One task in one world, as ``gymnasium.Env``: for evaluation, debugging and tools that take no vector environment.
+    """One world as a ``gymnasium.Env``, for evaluation, debugging and tools without support for vector environments.
 
-    ``info`` holds ``eval``, ``done_reason``, and where the task has them ``success``, ``metrics`` and
-    ``episode_metrics``. Many worlds are much faster in ``GymnasiumVectorEnv``.
+    ``info`` holds ``eval`` and ``done_reason``, and if the task has them ``success``, ``metrics`` and
+    ``episode_metrics``. ``GymnasiumVectorEnv`` steps many worlds much faster.
 
     Args:
         task: A task as ``lw.make`` takes it, or an environment of one world, made with ``autoreset=False``.
-        dict_obs: Whether an observation is a dict of the task's groups. By default it is where there are several;
-            False gives the group ``policy`` alone.
+        dict_obs: Whether an observation is a dict of the task's groups, by default if it has several; otherwise it is
+            the group ``policy``.
         render_mode: "rgb_array" for pictures, or None.
         camera: The camera of pictures, as in ``lyceum_warp.viz.video.write_video``.
         render_size: Their width and height in pixels, even numbers.
@@ -34,10 +30,10 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
 
     Raises:
         ValueError: An argument is unknown or does not fit.
-        FileNotFoundError: A package that brings the task's model is not installed.
+        FileNotFoundError: The package with the task's model is not installed.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES, "render_fps": 50}  # type: ignore[misc]
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"]}  # type: ignore[misc]
 
     def __init__(
         self,
@@ -49,24 +45,22 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         render_size: tuple[int, int] = (480, 480),
         **words: Any,
     ) -> None:
-        check_render_mode(render_mode)
         self.env = environment_of(task, 1, words, autoreset=False)
         self.render_mode = render_mode
-        self.metadata = {**self.metadata, "render_fps": frame_rate(self.env)}  # type: ignore[misc]
+        self._pictures, self.metadata = pictures_of(self.env, render_mode, camera, render_size)  # type: ignore[misc]
         self._observations = Observations(self.env, dict_obs=dict_obs)
         self.observation_space = observation_space(self.env, dict_obs=self._observations.dict_obs)
-        self.action_space = action_space(self.env)
+        self.action_space = box(self.env.action_space)
         self._host = HostArrays(self.env, one_world=True)
         self._results = StepResults(self.env, self._observations, self._rows)
         self._seeds = ResetSeeds(seeded=isinstance(task, Env) or "seed" in words)
         self._reset_once = False
-        self._pictures = WorldPictures(self.env, camera=camera, size=render_size)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin a new, random episode.
 
         Args:
-            seed: Restarts the random stream; without one it goes on.
+            seed: Seed of the random stream; None continues it.
             options: None or empty.
 
         Raises:
@@ -116,5 +110,5 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
 
 
 def _numbers(info: dict[str, Any]) -> dict[str, Any]:
-    """Infos of one world as Python's own numbers."""
+    """Convert infos of one world to Python numbers."""
     return {name: _numbers(value) if isinstance(value, dict) else value.item() for name, value in info.items()}

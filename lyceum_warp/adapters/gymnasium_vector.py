@@ -1,63 +1,61 @@
-"""Many worlds as a vector environment of Gymnasium."""
+"""Adapt many worlds to Gymnasium's VectorEnv."""
 
 from typing import Any
 
 import numpy as np
 import torch
 
-from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, per_world
-from lyceum_warp.adapters.gymnasium_library import gymnasium
-from lyceum_warp.adapters.gymnasium_spaces import action_space, observation_space
-from lyceum_warp.adapters.host_arrays import HostArrays
-from lyceum_warp.adapters.rendering import RENDER_MODES, check_render_mode, frame_rate
-from lyceum_warp.adapters.step_results import Observations, StepResults
+from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, per_world, pictures_of
+from lyceum_warp.adapters.gymnasium_spaces import box, gymnasium, observation_space
+from lyceum_warp.adapters.step_results import HostArrays, Observations, StepResults
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_tensor, described
 from lyceum_warp.task import Task
 from lyceum_warp.viz.cameras import CameraChoice
-from lyceum_warp.viz.pictures import WorldPictures
 
 AutoresetMode = gymnasium.vector.AutoresetMode
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
-    """One task in many worlds, as ``gymnasium.vector.VectorEnv``.
+    """Many worlds as a ``gymnasium.vector.VectorEnv``.
 
-    ``infos`` holds ``eval``, ``done_reason``, and where the task has them ``success``, ``metrics`` and
-    ``episode_metrics``, arrays with a value for each world. In the mode SAME_STEP a world whose episode ends shows the
-    first observation of the next one; ``infos["final_obs"]`` then holds the last observations, ``infos["final_info"]``
-    what else the last step said, and the masks ``_final_obs`` and ``_final_info`` the worlds that this concerns. Under
-    NumPy these four are there if an episode ended, and ``final_obs`` is an object array with None for the other worlds,
-    as Gymnasium's wrappers expect. With ``torch=True`` they are always there, as tensors of all worlds, because
-    whether an episode ended is not known without waiting for the device.
+    ``infos`` holds ``eval`` and ``done_reason``, and if the task has them ``success``, ``metrics`` and
+    ``episode_metrics``: arrays with a value for each world.
 
-    In the mode DISABLED an ended world goes on with its end set until it is reset by
-    ``reset(options={"reset_mask": mask})``; one with a fault restarts at once, but shows its last good observation.
-    NEXT_STEP resets it in the next step, whose action it ignores, at the cost of a second reset phase in every step; a
-    few wrappers, such as ``NormalizeObservation``, demand it.
+    ``autoreset_mode`` says when an ended world is reset:
 
-    The first reset without a seed draws one, as Gymnasium's environments do, unless ``seed=`` is given here. Worlds
-    under one seed differ, and are the same in every run.
+    - SAME_STEP: within the step. The world returns the first observation of its next episode;
+      ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last observations and infos of ended episodes, and
+      the masks ``_final_obs`` and ``_final_info`` select their worlds. With NumPy these entries exist if an episode
+      ended, and ``final_obs`` is an object array with None for the other worlds, as Gymnasium's wrappers expect. With
+      ``torch=True`` they always exist, as tensors of all worlds, because the step does not wait for the device.
+    - DISABLED: by ``reset(options={"reset_mask": mask})``. Until then the world keeps stepping and its end stays set. A
+      world with a fault is reset at once, but returns its last good observation.
+    - NEXT_STEP: in the next step, which ignores the world's action. Every step then runs a second reset phase. Some
+      wrappers, such as ``NormalizeObservation``, require this mode.
+
+    As in Gymnasium's own environments, the first reset without a seed draws one, unless ``seed=`` is given here. Worlds
+    with one seed differ from each other, and are the same in every run.
 
     Args:
         task: A task as ``lw.make`` takes it, or an environment.
         num_envs: Number of worlds.
         autoreset_mode: SAME_STEP, DISABLED or NEXT_STEP of ``gymnasium.vector.AutoresetMode``, or its value; by default
             SAME_STEP, or DISABLED for an environment with ``autoreset=False``.
-        torch: Whether to take and give tensors on the environment's device. A step then never waits for the device.
-        copy: Whether to give copies. Without, most tensors and most arrays of the CPU are live buffers, which change
-            with the next step.
-        dict_obs: Whether an observation is a dict of the task's groups. By default it is where there are several;
-            False gives the group ``policy`` alone.
+        torch: Whether actions and results are tensors on the environment's device. A step then never waits for it.
+        copy: Whether results are copies. Otherwise most tensors, and most arrays on the CPU, are live buffers that the
+            next step overwrites.
+        dict_obs: Whether an observation is a dict of the task's groups, by default if it has several; otherwise it is
+            the group ``policy``.
         render_mode: "rgb_array" for pictures, or None.
         camera: The camera of pictures, as in ``lyceum_warp.viz.video.write_video``.
         render_size: Their width and height in pixels, even numbers.
         max_episode_steps: Steps after which an episode is truncated; by default the task's horizon.
-        **words: Options and parameters for ``lw.make``, as ``device="cuda"`` or ``ctrl_cost_weight=1e-2``.
+        **words: Options and parameters for ``lw.make``, such as ``device="cuda"`` or ``ctrl_cost_weight=1e-2``.
 
     Raises:
         ValueError: An argument is unknown or does not fit.
-        FileNotFoundError: A package that brings the task's model is not installed.
+        FileNotFoundError: The package with the task's model is not installed.
     """
 
     def __init__(
@@ -78,21 +76,22 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if autoreset_mode is None:
             made_without = isinstance(task, Env) and not task.autoreset
             autoreset_mode = AutoresetMode.DISABLED if made_without else AutoresetMode.SAME_STEP
-        self.autoreset_mode = _autoreset_mode(autoreset_mode)
-        check_render_mode(render_mode)
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            known = ", ".join(mode.value for mode in AutoresetMode)
+            raise ValueError(f"there is no autoreset_mode {autoreset_mode!r}: use one of {known}") from None
         if max_episode_steps is not None:
             words["horizon"] = max_episode_steps
         same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
         self.env = environment_of(task, num_envs, words, autoreset=same_step)
         self.num_envs = self.env.nworld
         self.render_mode = render_mode
-        self.metadata = {
-            "render_modes": list(RENDER_MODES), "render_fps": frame_rate(self.env),
-            "autoreset_mode": self.autoreset_mode,
-        }  # fmt: skip
+        self._pictures, metadata = pictures_of(self.env, render_mode, camera, render_size)
+        self.metadata = metadata | {"autoreset_mode": self.autoreset_mode}
         self._observations = Observations(self.env, dict_obs=dict_obs)
         self.single_observation_space = observation_space(self.env, dict_obs=self._observations.dict_obs)
-        self.single_action_space = action_space(self.env)
+        self.single_action_space = box(self.env.action_space)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
         self._host = None if torch else HostArrays(self.env, copy=copy)
@@ -101,7 +100,6 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self._seeds = ResetSeeds(seeded=isinstance(task, Env) or "seed" in words)
         self._ended = self.env.done.clone()
         self._reset_once = False
-        self._pictures = WorldPictures(self.env, camera=camera, size=render_size)
 
     @property
     def device(self) -> torch.device:
@@ -112,14 +110,14 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Begin new, random episodes.
 
         Args:
-            seed: Restarts the worlds' random streams; without one they go on.
-            options: ``{"reset_mask": mask}`` concerns the worlds of the mask alone, (num_envs,) bool.
+            seed: Seed of the worlds' random streams; None continues them.
+            options: ``{"reset_mask": mask}`` resets the worlds in the mask alone, (num_envs,) bool.
 
         Returns:
             The observations and infos of all worlds.
 
         Raises:
-            ResetNeeded: There was no reset of all worlds before that of some.
+            ResetNeeded: A reset of some worlds came before a reset of all.
             ValueError: The seed is not a whole number, or an option is unknown or has another shape or type.
         """
         mask = self._mask(options)
@@ -152,7 +150,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         else:
             self._host.set_action(actions)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            env.action.masked_fill_(self._ended[:, None], 0.0)  # they are ignored, so that they must be no fault
+            env.action.masked_fill_(self._ended[:, None], 0.0)  # an ignored action must not be a fault
         env.step()
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             env.rand_reset(mask=self._ended)
@@ -171,9 +169,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return None if self.render_mode is None else tuple(self._pictures())
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """A method's result or an attribute's value for each world, of this environment or of the one behind it.
+        """Call a method, or read an attribute, of this adapter or of its ``Env``, and return a value for each world.
 
-        A tensor with a row for each world gives the rows, anything else the same value for each.
+        A tensor with a row for each world returns its rows; any other value is repeated.
         """
         value = getattr(self if hasattr(self, name) else self.env, name)
         value = value(*args, **kwargs) if callable(value) else value
@@ -187,11 +185,11 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the process that draws pictures."""
-        if hasattr(self, "_pictures"):  # Gymnasium closes an environment that could not be made, too
+        if hasattr(self, "_pictures"):  # Gymnasium also closes an environment whose constructor failed
             self._pictures.close()
 
     def _given(self, *buffers: torch.Tensor) -> list[Any]:
-        """Buffers as the caller gets them."""
+        """Copy or convert buffers for the caller."""
         if self._host is not None:
             return list(self._host.of(*buffers))
         return [buffer.clone() for buffer in buffers] if self._copy else list(buffers)
@@ -230,14 +228,6 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if not self._reset_once:
             raise gymnasium.error.ResetNeeded("no reset came before this reset_mask: call reset() without it first")
         return mask
-
-
-def _autoreset_mode(given: gymnasium.vector.AutoresetMode | str) -> gymnasium.vector.AutoresetMode:
-    try:
-        return AutoresetMode(given)
-    except ValueError:
-        known = ", ".join(mode.value for mode in AutoresetMode)
-        raise ValueError(f"there is no autoreset_mode {given!r}: use one of {known}") from None
 
 
 def _tensor(actions: Any, like: torch.Tensor) -> torch.Tensor:

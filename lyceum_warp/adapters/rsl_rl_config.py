@@ -1,4 +1,4 @@
-"""Convert a configuration of PPO into the dictionary that rsl_rl's runner takes."""
+"""Convert a configuration of PPO into the dict that rsl_rl's runner takes."""
 
 import math
 from typing import Any
@@ -8,7 +8,7 @@ from lyceum_warp.algos.value import value_group
 from lyceum_warp.env import Env
 
 _ACTIVATIONS = {"leaky_relu": "lrelu", "silu": "swish"}
-"""Activations that rsl_rl calls by another name."""
+"""Names of activations here and in rsl_rl, if they differ."""
 
 _PPO = {
     "epochs": "num_learning_epochs", "minibatches": "num_mini_batches", "clip": "clip_param", "gamma": "gamma",
@@ -16,7 +16,7 @@ _PPO = {
     "max_grad_norm": "max_grad_norm", "clip_value_loss": "use_clipped_value_loss", "schedule": "schedule",
     "desired_kl": "desired_kl", "whiten_minibatches": "normalize_advantage_per_mini_batch",
 }  # fmt: skip
-"""Hyperparameters of PPO, and what rsl_rl calls them."""
+"""Names of hyperparameters here and in rsl_rl."""
 
 
 def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
@@ -25,17 +25,17 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     Example:
         >>> runner = OnPolicyRunner(RslRlVecEnv(env), runner_config(env))
 
-    rsl_rl's PPO ignores ``final_entropy_coef``, ``stagger``, ``tf32`` and the evaluations of the mean policy.
+    rsl_rl's PPO has no counterpart of ``final_entropy_coef``, ``stagger``, ``tf32`` and evaluations of the mean policy.
 
     Args:
-        env: The environment, whose groups of observations the networks get.
-        config: Hyperparameters; those of ``lw.PPO`` by default.
+        env: The environment; its observation groups are the inputs of the networks.
+        config: Hyperparameters; by default ``PPOConfig()``.
 
     Returns:
-        A new dictionary, which rsl_rl changes.
+        A new dict, which rsl_rl modifies.
 
     Raises:
-        ValueError: The task lacks the value function's group.
+        ValueError: The task has no observation group for the value function.
     """
     config = config or PPOConfig()
     network = {"class_name": "rsl_rl.models.MLPModel", "obs_normalization": config.normalize}
@@ -46,7 +46,7 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     return {
         "num_steps_per_env": config.num_steps,
         "save_interval": 50,
-        "check_for_nan": False,  # it would wait for the device; numbers that are not finite are faults
+        "check_for_nan": False,  # it waits for the device, and the environment reports non-finite values as faults
         "obs_groups": {"actor": ["policy"], "critic": [value_group(env, config.value_group)]},
         "actor": network | _layers(config.hidden, config.activation) | {"distribution_cfg": distribution},
         "critic": network | _layers(config.value_hidden, config.value_activation),

@@ -1,19 +1,19 @@
-"""An environment as rsl_rl's VecEnv."""
+"""Adapt an environment to rsl_rl's VecEnv."""
 
 from typing import Any
 
 import torch
 
 from lyceum_warp.adapters.adapted_env import environment_of
-from lyceum_warp.adapters.rsl_rl_release import check_rsl_rl
+from lyceum_warp.adapters.libraries import check_library
 from lyceum_warp.adapters.step_results import episode_ends, faulty
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import described
 from lyceum_warp.task import Task
 
-check_rsl_rl()  # its error says more than that of the imports below
+check_library("rsl-rl-lib", low="5.4.2", below="6", install="lyceum-warp[rsl-rl]")
 
-from rsl_rl.env import VecEnv  # noqa: E402
+from rsl_rl.env import VecEnv  # noqa: E402 (after the check)
 from tensordict import TensorDict  # noqa: E402
 
 RECENT = 100
@@ -21,20 +21,19 @@ RECENT = 100
 
 
 class RslRlVecEnv(VecEnv):  # type: ignore[misc]
-    """What rsl_rl's runners step: ``OnPolicyRunner(RslRlVecEnv("hopper", 4096, device="cuda"), config, ...)``.
+    """An environment for rsl_rl's runners: ``OnPolicyRunner(RslRlVecEnv("hopper", 4096, device="cuda"), config)``.
 
-    Nothing in ``step`` waits for the device. Its observations are copies, because rsl_rl stores those of a step only
-    after the next step. Everything else that it returns are buffers, or made from them, that the next step overwrites:
-    rsl_rl copies them before.
+    ``step`` never waits for the device. It returns copies of the observations, because rsl_rl stores observations only
+    after the next step. The other results are buffers that the next step overwrites; rsl_rl copies them first.
 
     Args:
-        task: A task as ``lw.make`` takes it, or an environment, which resets automatically. rsl_rl never resets it.
-        num_envs: Number of worlds; by default one, or those of the environment.
+        task: A task as ``lw.make`` takes it, or an environment with automatic resets.
+        num_envs: Number of worlds; by default one, or the number in the given environment.
         words: Options and parameters, as for ``lw.make``.
 
     Raises:
         ValueError: An argument does not fit; the message names it.
-        ImportError: rsl_rl is not installed, or is of another release (when this module is imported).
+        ImportError: When this module is imported: rsl_rl is missing, or its release is not supported.
     """
 
     num_envs: int
@@ -42,7 +41,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     num_actions: int
     """Numbers in an action."""
     max_episode_length: int
-    """Steps after which an episode is truncated; 2147483647 in a task without a horizon."""
+    """Steps after which an episode is truncated; 2147483647 without a horizon."""
     device: torch.device
     """Device of all tensors."""
     cfg: dict[str, Any]
@@ -62,7 +61,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             for groups in (env.obs_groups, env.final_obs_groups)
         )
         self._metrics = torch.zeros(len(env.metrics), device=self.device)
-        self._episodes = torch.zeros((), device=self.device)  # in the means, at most RECENT or those of the last step
+        self._episodes = torch.zeros((), device=self.device)  # in the means
 
     @property
     def unwrapped(self) -> Env:
@@ -71,9 +70,9 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Steps since the reset, (nworld,) int32, a live view for reading. Assigned, the worlds continue from there.
+        """Steps since the reset, (nworld,) int32, a live view. Assign it to move the worlds to other steps.
 
-        Time limits follow: a world at step ``max_episode_length - 1`` is truncated by the next step.
+        Time limits follow: the next step truncates a world at step ``max_episode_length - 1``.
         """
         return self.env.episode_step
 
@@ -98,7 +97,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         env.set_state(state)
 
     def get_observations(self) -> TensorDict:
-        """The current observations by their groups, each (nworld, size of the group)."""
+        """The current observations, a dict of groups, each (nworld, size of the group)."""
         return self._obs.clone()
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
@@ -108,13 +107,13 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             actions: (nworld, nact), float32.
 
         Returns:
-            Observations, those of a new episode where one began; rewards, (nworld,); whether an episode ended,
-            (nworld,) bool; and a dictionary:
+            Observations, after a reset the first of the new episode; rewards, (nworld,); dones, (nworld,) bool; and a
+            dict:
 
             ============= =========================================================================================
-            ``time_outs`` whether the time limit or a fault cut the episode off, (nworld,) bool: the reward of a
-                          transition with a fault is 0, and its final observation the last good one
-            ``final_obs`` the observations that the step led to, before any reset, by their groups
+            ``time_outs`` whether the time limit or a fault truncated the episode, (nworld,) bool. A transition with
+                          a fault has reward 0 and the last good observation as its final one
+            ``final_obs`` a dict of observation groups after the step, before any reset
             ``log``       means of the task's metrics over about the last 100 episodes that ended (all of this step's),
                           ``metrics/NAME``, which are 0 before the first end; and ``faults/worlds``, worlds with a
                           fault
@@ -135,10 +134,10 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         return self._obs.clone(), env.reward, env.done, extras
 
     def _log(self) -> dict[str, torch.Tensor]:
-        """Means of the metrics over recent episodes, without waiting for the number of those that ended.
+        """Means of the metrics over recent episodes, computed on the device.
 
-        rsl_rl averages them over the steps of an iteration: means of the last step's ends alone would count a step in
-        which one episode ended as much as one in which a thousand did.
+        rsl_rl averages the log over the steps of an iteration. Means over the last step alone would give a step with
+        one ended episode the weight of a step with a thousand.
         """
         env = self.env
         if not env.metrics:

@@ -1,4 +1,4 @@
-"""Many worlds as a vector environment of Stable-Baselines3. It needs the extra ``stable-baselines3``."""
+"""Adapt many worlds to Stable-Baselines3's VecEnv, with the extra ``stable-baselines3``."""
 
 import time
 from collections.abc import Sequence
@@ -7,16 +7,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, per_world
-from lyceum_warp.adapters.gymnasium_spaces import action_space, observation_space
-from lyceum_warp.adapters.host_arrays import HostArrays
+from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, per_world, pictures_of
+from lyceum_warp.adapters.gymnasium_spaces import box, observation_space
 from lyceum_warp.adapters.libraries import check_library
-from lyceum_warp.adapters.rendering import check_render_mode, frame_rate
-from lyceum_warp.adapters.step_results import Infos, Observations, episode_ends
+from lyceum_warp.adapters.step_results import HostArrays, Infos, Observations, episode_ends
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 from lyceum_warp.viz.cameras import CameraChoice
-from lyceum_warp.viz.pictures import WorldPictures
 
 check_library("stable-baselines3", low="2.9", below="3", install="lyceum-warp[stable-baselines3]")
 
@@ -25,20 +22,19 @@ from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
 
 
 class StableBaselines3VecEnv(VecEnv):
-    """One task in many worlds, as ``stable_baselines3.common.vec_env.VecEnv``.
+    """Many worlds as a ``stable_baselines3.common.vec_env.VecEnv``.
 
-    A world whose episode ends has an info dict with ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (as
-    Stable-Baselines3's Monitor gives it: return ``r``, length ``l``, seconds since the start ``t``), ``eval``,
-    ``done_reason``, where the task has a goal ``is_success``, and where it has metrics ``episode_metrics``. Those of
-    the other worlds are empty, and are the same objects in every step.
+    The info dict of a world whose episode ends has ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (as
+    from Stable-Baselines3's Monitor: return ``r``, length ``l``, seconds since the start ``t``), ``eval``,
+    ``done_reason``, ``is_success`` if the task has a goal, and ``episode_metrics`` if it has metrics. The info dicts of
+    the other worlds are empty, and the same objects in every step.
 
-    Only the group ``policy`` of several groups of observations is given, because Stable-Baselines3 would show the
-    others to the policy, too.
+    By default observations are the group ``policy``, because Stable-Baselines3 feeds all groups to the policy.
 
     Args:
         task: A task as ``lw.make`` takes it, or an environment.
         num_envs: Number of worlds.
-        dict_obs: Whether an observation is a dict of all groups instead.
+        dict_obs: Whether an observation is a dict of all groups.
         render_mode: "rgb_array" for pictures, or None.
         camera: The camera of pictures, as in ``lyceum_warp.viz.video.write_video``.
         render_size: Their width and height in pixels, even numbers.
@@ -46,7 +42,7 @@ class StableBaselines3VecEnv(VecEnv):
 
     Raises:
         ValueError: An argument is unknown or does not fit.
-        FileNotFoundError: A package that brings the task's model is not installed.
+        FileNotFoundError: The package with the task's model is not installed.
     """
 
     def __init__(
@@ -60,19 +56,18 @@ class StableBaselines3VecEnv(VecEnv):
         render_size: tuple[int, int] = (480, 480),
         **words: Any,
     ) -> None:
-        check_render_mode(render_mode)
-        self.render_mode = render_mode  # which the base class asks for
+        self.render_mode = render_mode  # the base class reads it
         self.env = env = environment_of(task, num_envs, words, autoreset=True)
+        self._pictures, metadata = pictures_of(env, render_mode, camera, render_size)
         self._observations = Observations(env, dict_obs=dict_obs)
         self._host, self._infos = HostArrays(env), Infos(env)
-        super().__init__(env.nworld, observation_space(env, dict_obs=dict_obs), action_space(env))
-        self.metadata: dict[str, Any] = {**self.metadata, "render_fps": frame_rate(env)}
+        super().__init__(env.nworld, observation_space(env, dict_obs=dict_obs), box(env.action_space))
+        self.metadata: dict[str, Any] = {**self.metadata, **metadata}
         self._own_seeds = ResetSeeds(seeded=isinstance(task, Env) or "seed" in words)
         self._returns, self._lengths = np.zeros(env.nworld), np.zeros(env.nworld, dtype=int)
         self._no_infos: list[dict[str, Any]] = [{} for _ in range(env.nworld)]
         self._start = time.time()
         self._reset_once = False
-        self._pictures = WorldPictures(env, camera=camera, size=render_size)
 
     def reset(self) -> Any:
         """Begin new, random episodes in all worlds, and return their first observations.
@@ -129,10 +124,9 @@ class StableBaselines3VecEnv(VecEnv):
         return [None] * self.num_envs if self.render_mode is None else self._pictures()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of the environment behind this one, or of this one, for each world.
+        """Read an attribute of the ``Env`` or of this adapter, or a parameter of the task, for each world.
 
-        A tensor with a row for each world gives the rows, anything else the same value for each. A parameter of the
-        task gives its value.
+        A tensor with a row for each world returns its rows; any other value is repeated.
         """
         parameters = self.env.task.parameters
         if attr_name in parameters.values:
@@ -142,24 +136,24 @@ class StableBaselines3VecEnv(VecEnv):
         return self._chosen(getattr(self.env if hasattr(self.env, attr_name) else self, attr_name), indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set a parameter of the task in all worlds, or an attribute of this environment.
+        """Set a parameter of the task in all worlds, or an attribute of this adapter.
 
         Raises:
-            ValueError: There is neither, or ``indices`` leaves worlds out.
+            ValueError: There is no such parameter or attribute, or ``indices`` leaves worlds out.
         """
         if len(set(self._get_indices(indices))) != self.num_envs:
             raise ValueError(f"{attr_name!r} belongs to all worlds together: leave indices out")
         if attr_name not in self.env.task.parameters.values and hasattr(self, attr_name):
             setattr(self, attr_name, value)
-        else:  # whose error has the closest names
+        else:  # its error suggests the closest names
             self.env.set_params(**{attr_name: value})
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method of the environment behind this one once; its result for each world, as in ``get_attr``."""
+        """Call a method of the ``Env`` once, and return its result for each world, as ``get_attr`` does."""
         return self._chosen(getattr(self.env, method_name)(*method_args, **method_kwargs), indices)
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Whether a wrapper's work is done here, for each world: that of Monitor is."""
+        """Whether each world is wrapped. True for Monitor, whose statistics this adapter provides."""
         return self._chosen(wrapper_class is Monitor, indices)
 
     def _chosen(self, value: Any, indices: Any) -> list[Any]:
@@ -167,7 +161,7 @@ class StableBaselines3VecEnv(VecEnv):
         return [rows[i] for i in self._get_indices(indices)]
 
     def _add_ends(self, infos: list[dict[str, Any]], worlds: np.ndarray) -> None:
-        """Put the infos of ended episodes in their places, and begin to sum up the next ones."""
+        """Fill in the infos of ended episodes, and reset the sums of their worlds."""
         env, count = self.env, self._observations.count
         index = torch.from_numpy(worlds).to(env.obs.device)
         terminated, _ = episode_ends(env)
@@ -188,7 +182,7 @@ class StableBaselines3VecEnv(VecEnv):
 
 
 def _of_world(infos: dict[str, Any], i: int) -> dict[str, Any]:
-    """The infos of one world, under Stable-Baselines3's names."""
+    """The infos of one world, with Stable-Baselines3's names."""
     return {
         "is_success" if name == "success" else name: _of_world(value, i) if isinstance(value, dict) else value[i].item()
         for name, value in infos.items()

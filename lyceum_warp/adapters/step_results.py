@@ -1,4 +1,4 @@
-"""What a step led to, in the forms that libraries expect."""
+"""Convert actions, observations and infos of a step to the formats of other libraries."""
 
 from collections.abc import Callable
 from itertools import islice
@@ -10,14 +10,15 @@ import torch
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.support.arrays import torch_view
+from lyceum_warp.support.validate import described
 
 
 class Observations:
-    """The observations that an adapter gives: those of the group ``policy``, or of every group by its name.
+    """The observations that an adapter returns: the group ``policy``, or a dict of all groups.
 
     Args:
         env: The environment.
-        dict_obs: Whether to give every group; None where there are several.
+        dict_obs: Whether to return all groups; by default if there are several.
     """
 
     def __init__(self, env: Env, *, dict_obs: bool | None) -> None:
@@ -27,17 +28,17 @@ class Observations:
 
     @property
     def current(self) -> list[torch.Tensor]:
-        """The observations of each group, (nworld, size); without automatic resets the last ones of ended episodes."""
+        """The observations of each group, (nworld, size); without automatic resets the last ones of ended worlds."""
         env = self._env
         if env.autoreset:
             return [env.obs_groups[group] for group in self._groups]
-        # a world with a fault has restarted even then, and its observation is that of its next episode
+        # a world with a fault is reset in any case, so that its buffer holds the next episode's observation
         done = env.done[:, None]
         return [torch.where(done, env.final_obs_groups[group], env.obs_groups[group]) for group in self._groups]
 
     @property
     def final(self) -> list[torch.Tensor]:
-        """The same of the states that the last step led to, before any reset."""
+        """The observations of each group after the last step, before any reset."""
         return [self._env.final_obs_groups[group] for group in self._groups]
 
     @property
@@ -46,20 +47,60 @@ class Observations:
         return len(self._groups)
 
     def formed(self, values: list[Any]) -> Any:
-        """Values of the groups as the library takes them: one array, or a dict of arrays."""
+        """Form one array, or a dict of arrays, from the values of the groups."""
         return dict(zip(self._groups, values, strict=True)) if self.dict_obs else values[0]
 
     def rows(self, values: list[np.ndarray]) -> list[Any]:
-        """Arrays of the groups, (worlds, size of the group), as one observation for each world."""
+        """Split arrays of the groups, (worlds, size of the group), into one observation for each world."""
         return [self.formed(list(row)) for row in zip(*values, strict=True)]
 
 
-class Infos:
-    """What an environment says about a step beside its results, by name.
+class HostArrays:
+    """Transfers actions and results between NumPy arrays and an environment's buffers.
 
-    ``eval`` is the evaluation metric of the state that the step led to, ``done_reason`` has the bits of ``lw.Done``,
-    ``success`` is there where the task has a goal; ``metrics`` and ``episode_metrics`` (their sums over the episode of
-    the step) where it has metrics.
+    Args:
+        env: The environment.
+        copy: Whether results are copies. Otherwise results of an environment on the CPU are its live buffers, which the
+            next step overwrites.
+        one_world: Whether actions lack the axis of worlds, because there is one world.
+    """
+
+    def __init__(self, env: Env, *, copy: bool = True, one_world: bool = False) -> None:
+        self._env, self._copy = env, copy
+        # on the CPU the array shares the buffer's memory; copies to a GPU start from pinned memory
+        pinned = torch.empty(env.action.shape, pin_memory=True) if env.action.is_cuda else None
+        self._pinned = pinned
+        actions = (env.action if pinned is None else pinned).numpy()
+        self._action = actions[0] if one_world else actions
+
+    def set_action(self, action: Any) -> None:
+        """Copy actions into the environment, (nworld, nact) or (nact,), float32 or float64.
+
+        Raises:
+            ValueError: They are not a NumPy array, or have another shape or type.
+        """
+        if not isinstance(action, np.ndarray) or action.shape != self._action.shape or action.dtype.kind != "f":
+            numpy = isinstance(action, np.ndarray)
+            given = f"a {action.dtype} array of shape {action.shape}" if numpy else described(action)
+            raise ValueError(f"actions must be a float32 array of shape {self._action.shape}, not {given}")
+        np.copyto(self._action, action, casting="same_kind")
+        if self._pinned is not None:
+            self._env.action.copy_(self._pinned, non_blocking=True)
+
+    def of(self, *tensors: torch.Tensor) -> list[np.ndarray]:
+        """Copy tensors to NumPy arrays, with at most one wait for the device."""
+        if self._pinned is None:
+            return [tensor.numpy().copy() if self._copy else tensor.numpy() for tensor in tensors]
+        copies = [tensor.to("cpu", non_blocking=True) for tensor in tensors]
+        torch.cuda.current_stream(self._env.action.device).synchronize()
+        return [copy.numpy() for copy in copies]
+
+
+class Infos:
+    """The infos of a step, by name.
+
+    ``eval`` is the evaluation metric after the step, and ``done_reason`` has the bits of ``lw.Done``. A task with a
+    goal adds ``success``; a task with metrics adds ``metrics`` and ``episode_metrics``, their sums over the episode.
 
     Args:
         env: The environment.
@@ -76,11 +117,11 @@ class Infos:
 
     @property
     def tensors(self) -> list[torch.Tensor]:
-        """The buffers that hold it all."""
+        """The buffers of all infos."""
         return [*self._plain.values(), *self._metrics.values()]
 
     def named(self, values: list[Any]) -> dict[str, Any]:
-        """Values of the buffers in their order, tensors or arrays, by name."""
+        """Name the values of the buffers, which are tensors or arrays in the same order."""
         infos = dict(zip(self._plain, values, strict=False))
         for name, table in zip(self._metrics, values[len(self._plain) :], strict=True):
             infos[name] = dict(zip(self._names, table.T, strict=True))
@@ -93,13 +134,13 @@ def faulty(env: Env) -> torch.Tensor:
 
 
 def episode_ends(env: Env, fault: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-    """Whether the last step terminated episodes, and whether it truncated them, each (nworld,) bool.
+    """Whether the last step terminated or truncated each episode, two masks (nworld,) bool.
 
-    A fault truncates: the task did not end the episode, so that learners bootstrap with the last good observation.
+    A fault truncates, so that learners bootstrap from the last good observation.
 
     Args:
         env: The environment.
-        fault: What ``faulty`` returned, where the caller has it already.
+        fault: The result of ``faulty``, if the caller has it.
     """
     fault = faulty(env) if fault is None else fault
     return env.terminated & ~fault, env.truncated | fault
@@ -111,7 +152,7 @@ class StepResults:
     Args:
         env: The environment.
         observations: Its observations.
-        given: Turns buffers into what the caller gets, all of them in one call.
+        given: Converts buffers for the caller, all of them in one call.
     """
 
     def __init__(self, env: Env, observations: Observations, given: Callable[..., list[Any]]) -> None:

@@ -1,15 +1,14 @@
-"""The cross-entropy method (CEM): planning by a normal distribution that is fitted to the best samples.
+"""Update plans by the cross-entropy method (CEM): fit a normal distribution to the best samples.
 
-The planner is that of ``planner.py`` with another update. Its noise has a standard deviation s_t for each number of the
-plan. From the n best samples (the elites) u_t^1, ..., u_t^n
+The noise of the planner (``planner.py``) then has a standard deviation s_t for each number of the plan. The n best
+samples (the elites) u_t^1, ..., u_t^n give the next plan and its noise:
 
     u_t = 1/n sum_k u_t^k,    s_t = max(sqrt(1/n sum_k (u_t^k - u_t)^2), min_noise)
 
-are the next plan and its noise. This is the method of Rubinstein (1999, "The cross-entropy method for combinatorial and
-continuous optimization") for a normal distribution with a diagonal covariance, as in hydrax, judo and MuJoCo MPC. The
-noise moves forward in time with the plan, and its end is filled with the initial noise. Where noise is smoothed
-over time, s_t is that of the noise before smoothing: the spread of the elites is divided by what smoothing leaves of
-a standard deviation of 1.
+This is the method of Rubinstein (1999, "The cross-entropy method for combinatorial and continuous optimization") with a
+diagonal covariance, as in hydrax, judo and MuJoCo MPC. The standard deviations are shifted in time with the plan, and
+the end is filled with the initial ones. If noise is smoothed over time, s_t refers to the noise before smoothing: the
+spread of the elites is divided by the standard deviation of smoothed standard normal noise.
 """
 
 from collections.abc import Sequence
@@ -23,10 +22,10 @@ from lyceum_warp.kernels import planning
 
 
 class EliteWeights(PlanUpdate):
-    """Equal weights of the best samples, and none of the others.
+    """Equal weights for the best samples, zero for the others.
 
     Args:
-        elites: Number of the best samples.
+        elites: Number of samples with a weight.
     """
 
     capturable = True
@@ -51,9 +50,9 @@ class CrossEntropy(EliteWeights):
     """The update of CEM.
 
     Args:
-        elites: Number of the best samples.
-        min_noise: The smallest standard deviation, as one number or one for each action.
-        smoothing: The weights that smooth the noise over time.
+        elites: Number of samples to fit to.
+        min_noise: The smallest standard deviation, one number or one for each action.
+        smoothing: Weights (b0, b1, b2) that smooth the noise over time.
     """
 
     adapts_noise = True
@@ -63,10 +62,10 @@ class CrossEntropy(EliteWeights):
         self.min_noise, self.smoothing = min_noise, smoothing
 
     def prepare(self, samples: PlanSamples) -> None:
-        """Allocate the ranks, the smallest deviations and what smoothing leaves of a deviation.
+        """Allocate the ranks, the smallest deviations and the deviations of smoothed noise.
 
         Raises:
-            ValueError: ``min_noise`` is not for the task's actions.
+            ValueError: ``min_noise`` has another number of values than the task has actions.
         """
         super().prepare(samples)
         count, _, nact = samples.plan.shape
@@ -88,9 +87,9 @@ class CrossEntropy(EliteWeights):
 
 
 def spread(smoothing: tuple[float, float, float], count: int) -> np.ndarray:
-    """The standard deviation that smoothing gives standard normal noise, (count,) from the first step on.
+    """Standard deviations of smoothed standard normal noise, (count,).
 
-    For e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) the variances v_t and the covariances c_t of e_t and e_(t-1) follow
+    With e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) the variances v_t and the covariances c_t of e_t and e_(t-1) follow
     v_t = b0^2 + b1^2 v_(t-1) + b2^2 v_(t-2) + 2 b1 b2 c_(t-1) and c_t = b1 v_(t-1) + b2 c_(t-1).
     """
     b0, b1, b2 = smoothing
@@ -99,5 +98,5 @@ def spread(smoothing: tuple[float, float, float], count: int) -> np.ndarray:
         new = b0 * b0 + b1 * b1 * variance[-1] + b2 * b2 * variance[-2] + 2 * b1 * b2 * covariance
         covariance = b1 * variance[-1] + b2 * covariance
         variance.append(new)
-    # a spread of 0 would divide by it
+    # the result is a divisor
     return np.sqrt(np.maximum(variance[:count], np.finfo(np.float32).tiny))

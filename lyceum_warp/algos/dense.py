@@ -1,7 +1,7 @@
-"""Fully connected networks on the CPU, with derivatives that are written out.
+"""Compute small fully connected networks and their derivatives on the CPU without autograd.
 
-With some hundred units in a layer, modules and autograd cost more than the arithmetic. Here a pass is one product of
-matrices a layer, into buffers that are allocated once. Other networks, and other devices, take the way of torch.
+With a hundred units in a layer, the overhead of modules and autograd exceeds the arithmetic. Here a pass is one matrix
+product for each layer, into preallocated buffers. Other networks and devices use torch's modules and autograd.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -26,27 +26,28 @@ _tanh_slope, _relu_slope, _elu_slope = (
     getattr(torch.ops.aten, f"{name}_backward").grad_input for name in ("tanh", "threshold", "elu")
 )
 
-# numpy's tanh is several times as fast as torch's on some processors
+# NumPy's tanh is several times as fast as torch's on some processors
 _ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[[torch.Tensor, torch.Tensor], Any]]] = {
     nn.Tanh: (lambda x: np.tanh(x, out=x), lambda d, y: _tanh_slope(d, y, grad_input=d)),
     nn.ReLU: (lambda x: np.maximum(x, 0.0, out=x), lambda d, y: _relu_slope(d, y, 0.0, grad_input=d)),
     nn.ELU: (_elu_, lambda d, y: _elu_slope(d, 1.0, 1.0, 1.0, True, y, grad_input=d)),
 }
-"""Activations in place, and products in place with their slopes, which follow from their results, of those modules of
-``mlp`` that have such. A product is one pass over memory."""
-
+"""For each supported activation: the activation in place, and the in-place product with its slope, which is computed
+from the activation's result."""
 
 _FEW = 2**18
-"""Rows times the weights of the largest layer, up to which numpy computes results. Between two steps of the worlds,
-when caches hold other things, it begins a call several times as fast; it divides larger products among threads."""
+"""Number of rows times weights of the largest layer up to which NumPy computes the results. With cold caches, as
+between two steps of the worlds, a call of NumPy has less overhead; larger products run faster in torch."""
 
 
 class DensePasses:
-    """Outputs y of a network, and products with J = d y / d parameters. A result is valid until the next call.
+    """Forward passes y = f(x), and products with the Jacobian J = dy / dparameters.
+
+    Results are buffers, which the next call overwrites.
 
     Args:
         parameters: Weight and bias of each layer, in the order of the layers.
-        activation: What follows each layer but the last one; a key of ``_ACTIVATIONS``.
+        activation: The activation after each layer except the last; a key of ``_ACTIVATIONS``.
     """
 
     def __init__(self, parameters: Iterable[torch.Tensor], activation: type[nn.Module]) -> None:
@@ -60,13 +61,8 @@ class DensePasses:
         self._allocate(0)
 
     @staticmethod
-    def of(network: nn.Module, last: "DensePasses | None" = None) -> "DensePasses | None":
-        """Passes through a network; None if it is not one of ``mlp`` on the CPU, or its activation is not known here.
-
-        Args:
-            network: The network.
-            last: What an earlier call returned; it is returned once more where it still has the network's parameters.
-        """
+    def of(network: nn.Module) -> "DensePasses | None":
+        """Wrap a network of ``mlp`` on the CPU; None for any other network."""
         if type(network) is not nn.Sequential or len(network) % 2 == 0:
             return None
         layers: list[Any] = list(network)[::2]
@@ -74,7 +70,7 @@ class DensePasses:
         kind = type(activations[0]) if activations else nn.Tanh
         linear = all(type(layer) is nn.Linear and layer.bias is not None for layer in layers)
         parameters = [p for layer in layers for p in (layer.weight, layer.bias)] if linear else []
-        # a layer may occur twice, or its weight may be computed from another parameter
+        # refuse shared layers, and weights that are computed from other parameters
         if [id(p) for p in network.parameters()] != [id(p) for p in parameters] or kind not in _ACTIVATIONS:
             return None
         if (
@@ -83,17 +79,15 @@ class DensePasses:
             or any(map(_hooked, network.modules()))
         ):
             return None
-        if last is not None and last.activation is kind and _places(last.parameters) == _places(parameters):
-            return last
         return DensePasses(parameters, kind)
 
     def _allocate(self, rows: int) -> None:
-        """Buffers of a number of rows: results and derivatives of each layer."""
+        """Allocate the results and derivatives of each layer for a number of rows."""
         widths = [len(bias) for bias in self.biases]
         self._buffers = [[torch.empty(rows, n) for n in widths] for _ in range(2)]
 
     def _resize(self, rows: int) -> None:
-        """Use the first rows of the buffers."""
+        """Use the first rows of the buffers; allocate larger ones if necessary."""
         if rows > len(self._buffers[0][0]):
             self._allocate(rows)
         self._rows, self._few = rows, rows * max(weight.numel() for weight in self.weights) <= _FEW
@@ -101,7 +95,7 @@ class DensePasses:
         self._arrays = [result.numpy() for result in self.results]
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
-        """Outputs, (rows, outputs), from inputs, (rows, inputs), which must stay as they are for later products."""
+        """Compute outputs, (rows, outputs), from inputs, (rows, inputs); later products read the inputs again."""
         if len(x) != self._rows:
             self._resize(len(x))
         self._inputs = [x, *self.results[:-1]]
@@ -119,11 +113,7 @@ class DensePasses:
         return self.results[-1]
 
     def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
-        """J v, (rows, outputs), at the last inputs.
-
-        Args:
-            parts: v, in tensors of the parameters' shapes.
-        """
+        """Compute J v, (rows, outputs), at the last inputs, from v in tensors of the parameters' shapes."""
         last = len(self.weights) - 1
         for i, derivative in enumerate(self.derivatives):
             torch.addmm(parts[2 * i + 1], self._inputs[i], parts[2 * i].t(), out=derivative)
@@ -134,15 +124,10 @@ class DensePasses:
         return self.derivatives[-1]
 
     def pull(self, u: torch.Tensor, out: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
-        """J^T u at the last inputs.
-
-        Args:
-            u: Derivatives by the outputs, (rows, outputs).
-            out: Where to write it: tensors of the parameters' shapes.
-        """
+        """Compute J^T u at the last inputs, from u, (rows, outputs), into tensors of the parameters' shapes."""
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
-            if x.shape[1] < u.shape[1]:  # the product with the longer rows is the faster one
+            if x.shape[1] < u.shape[1]:  # the product with the longer rows is faster
                 out[2 * i].copy_((x.t() @ u).t())
             else:
                 torch.mm(u.t(), x, out=out[2 * i])
@@ -154,113 +139,76 @@ class DensePasses:
 
 
 class DensePolicy:
-    """A ``GaussianPolicy`` with a network of ``mlp``, on the CPU.
-
-    Args:
-        policy: The policy.
-        passes: Passes through its network.
-    """
+    """A ``GaussianPolicy`` whose network is a ``DensePasses``; both share their parameters."""
 
     def __init__(self, policy: GaussianPolicy, passes: DensePasses) -> None:
         self.policy, self.passes = policy, passes
-        self.others = _others(policy)
-        self._log_std, *self._statistics = [tensor.numpy() for tensor in self.others]
         self._x = torch.empty(0, policy.nobs)
         self._pulled = [torch.empty_like(parameter) for parameter in passes.parameters]
 
     @staticmethod
-    def of(policy: GaussianPolicy, last: "DensePolicy | None" = None) -> "DensePolicy | None":
-        """The same policy; None if a part of it is of another kind, or some of its network is not learned.
-
-        Args:
-            policy: The policy.
-            last: What an earlier call returned; it is returned once more where it still has the policy's parameters.
-        """
+    def of(policy: GaussianPolicy) -> "DensePolicy | None":
+        """Wrap a policy; None if its network is not supported, is partly frozen, or if the policy is a subclass."""
         plain = type(policy) is GaussianPolicy and type(policy.normalizer) in (Normalizer, nn.Identity)
         if not plain or _hooked(policy) or _hooked(policy.normalizer):
             return None
         if not all(parameter.requires_grad for parameter in policy.network.parameters()):
             return None
-        passes = DensePasses.of(policy.network, last.passes if last else None)
-        if passes is None:
-            return None
-        kept = last is not None and last.policy is policy and last.passes is passes
-        kept = kept and last is not None and _places(last.others) == _places(_others(policy))
-        return last if kept else DensePolicy(policy, passes)
+        passes = DensePasses.of(policy.network)
+        return None if passes is None else DensePolicy(policy, passes)
 
     def __call__(self, obs: torch.Tensor) -> torch.Tensor:
-        """Mean actions, (rows, nact), from observations, (rows, nobs)."""
+        """Compute mean actions, (rows, nact), from observations, (rows, nobs)."""
         normalizer = self.policy.normalizer
         if not isinstance(normalizer, Normalizer):
             return self.passes(obs)
         if len(obs) > len(self._x):
             self._x = torch.empty_like(obs)
         x = self._x[: len(obs)]
-        array, (shift, scale) = x.numpy(), self._statistics
-        np.subtract(obs.numpy(), shift, out=array)
-        np.multiply(array, scale, out=array)
+        array = x.numpy()
+        np.subtract(obs.numpy(), normalizer.shift.numpy(), out=array)
+        np.multiply(array, normalizer.scale.numpy(), out=array)
         np.clip(array, -normalizer.limit, normalizer.limit, out=array)
         return self.passes(x)
 
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
-        """Draw actions, as ``GaussianPolicy.sample``."""
+        """Draw actions; see ``GaussianPolicy.sample``."""
         action = out.numpy()
-        np.multiply(noise.numpy(), np.exp(self._log_std), out=action)
+        np.multiply(noise.numpy(), np.exp(self.policy.log_std.detach().numpy()), out=action)
         np.add(action, self(obs).numpy(), out=action)
         return out
 
     def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
-        """J v for the network's parameters, at the last observations (``DensePasses.push``)."""
+        """Compute J v for the network's parameters at the last observations; see ``DensePasses.push``."""
         return self.passes.push(parts)
 
     def pull(self, u: torch.Tensor) -> list[torch.Tensor]:
-        """J^T u for the network's parameters, at the last observations, in tensors of their shapes."""
+        """Compute J^T u for the network's parameters at the last observations; see ``DensePasses.pull``."""
         self.passes.pull(u, self._pulled)
         return list(self._pulled)
 
 
 class DenseValue:
-    """Predictions of a ``ValueFunction`` with a network of ``mlp``, on the CPU.
-
-    Args:
-        value: The value function.
-        passes: Passes through its network.
-    """
+    """A ``ValueFunction`` whose network is a ``DensePasses``; both share their parameters."""
 
     def __init__(self, value: ValueFunction, passes: DensePasses) -> None:
         self.value, self.passes = value, passes
 
     @staticmethod
-    def of(value: ValueFunction, last: "DenseValue | None" = None) -> "DenseValue | None":
-        """The same value function; None if a part of it is of another kind. ``last`` as for a ``DensePolicy``."""
+    def of(value: ValueFunction) -> "DenseValue | None":
+        """Wrap a value function; None if its network is not supported, or if it is of a subclass."""
         if type(value) is not ValueFunction or _hooked(value):
             return None
-        passes = DensePasses.of(value.network, last.passes if last else None)
-        if passes is None:
-            return None
-        kept = last is not None and last.value is value and last.passes is passes
-        return last if kept else DenseValue(value, passes)
+        passes = DensePasses.of(value.network)
+        return None if passes is None else DenseValue(value, passes)
 
     def __call__(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Predicted returns, (...,), from observations, (..., nobs), and steps since the reset, (...,)."""
+        """Predict returns, (...,), from observations, (..., nobs), and steps since the reset, (...,)."""
         features = self.value.features(obs, step)
         output = self.passes(features.reshape(-1, features.shape[-1])).view(features.shape[:-1])
         return output * self.value.scale.float() + self.value.shift.float()
 
 
 def _hooked(module: nn.Module) -> bool:
-    """Whether more than ``forward`` runs when a module is called."""
+    """Whether a module has forward hooks."""
     return any(getattr(module, f"_forward{kind}_hooks") for kind in ("", "_pre"))
-
-
-def _others(policy: GaussianPolicy) -> list[torch.Tensor]:
-    """The tensors of a policy that are not its network's."""
-    normalizer = policy.normalizer
-    return [
-        policy.log_std.detach(),
-        *([normalizer.shift, normalizer.scale] if isinstance(normalizer, Normalizer) else []),
-    ]
-
-
-def _places(tensors: Iterable[torch.Tensor]) -> list[int]:
-    return [tensor.data_ptr() for tensor in tensors]

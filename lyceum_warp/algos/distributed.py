@@ -1,28 +1,30 @@
-"""Learning in several processes: each steps its share of the worlds, and all make the same update.
+"""Distribute learning over processes: each steps its share of the worlds, and all make the same update.
 
-A sum over all worlds is a sum over each process's own worlds, then over the processes. Every process draws the random
-numbers of all worlds from the same stream and takes those of its own worlds. The number of processes therefore changes
-only the rounding of sums.
+Sums over worlds are computed in each process and then reduced over the processes. Every process draws the random
+numbers of all worlds from the same stream and uses its own part. The number of processes therefore changes only the
+rounding of sums.
 """
 
 import contextlib
 import os
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import torch
 from torch import distributed
 
+from lyceum_warp.graphs.capture import capturing
+
 
 class Team:
-    """The processes that learn together, and their communication. A team of one process does not communicate.
+    """The processes that learn together, and their communication; a team of one process does not communicate.
 
-    All processes must call every method but ``share`` and ``locate``, in the same order.
+    Except for ``share`` and ``locate``, all processes must call the methods in the same order.
 
     Args:
-        rank: Number of this process.
+        rank: Rank of this process.
         size: Number of processes.
-        device: Where this process computes: "cpu", or a CUDA device of its own.
+        device: Device of this process: "cpu", or a CUDA device that no other process uses.
         neighbours: Number of processes on this machine.
     """
 
@@ -32,25 +34,34 @@ class Team:
 
     @property
     def leads(self) -> bool:
-        """Whether this process writes the files and messages."""
+        """Whether this process is rank 0, which writes files and messages."""
         return self.rank == 0
 
     @property
     def captures(self) -> bool:
-        """Whether a CUDA graph can hold the communication of the processes."""
+        """Whether the communication can be captured in a CUDA graph."""
         return self.size == 1 or distributed.get_backend() == "nccl"
 
+    def capture(self, function: Callable[[], object]) -> torch.cuda.CUDAGraph:
+        """Capture torch operations and communication in a CUDA graph, which is registered for ``release``."""
+        graph = torch.cuda.CUDAGraph()
+        # other threads, such as NCCL's, call CUDA during the capture
+        with capturing(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            function()
+        self.keep(graph)
+        return graph
+
     def keep(self, graph: torch.cuda.CUDAGraph) -> None:
-        """Register a graph that holds communication, for ``release``."""
+        """Register a graph for ``release``."""
         self._graphs.add(graph)
 
     def release(self) -> None:
-        """Reset all graphs that ``keep`` registered. As long as one exists, NCCL does not shut down."""
+        """Reset all registered graphs: NCCL does not shut down while one exists."""
         for graph in list(self._graphs):
             graph.reset()
 
     def share(self, nworld: int) -> int:
-        """Number of worlds of each process, of ``nworld`` in all.
+        """Divide ``nworld`` worlds among the processes; returns the number for each process.
 
         Raises:
             ValueError: ``nworld`` is not a multiple of the number of processes.
@@ -62,15 +73,15 @@ class Team:
         return nworld // self.size
 
     def locate(self, index: torch.Tensor, nworld: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Find samples of all worlds among those of this process's worlds.
+        """Convert indices of samples of all worlds to indices of this process's samples.
 
         Args:
-            index: Places in the flattened (steps, all worlds).
+            index: Indices into the flattened (steps, worlds of all processes).
             nworld: Number of this process's worlds.
 
         Returns:
-            Places in the flattened (steps, nworld), 0 for samples of other processes; and whether each sample is one
-            of this process.
+            Indices into the flattened (steps, nworld), 0 for samples of other processes; and a mask of this process's
+            samples.
         """
         step, world = index // (nworld * self.size), index % (nworld * self.size) - self.rank * nworld
         own = (world >= 0) & (world < nworld)
@@ -83,7 +94,7 @@ class Team:
         return tensor
 
     def largest(self, *numbers: int) -> tuple[int, ...]:
-        """The largest of the processes' numbers, for each place. Several processes wait for the device."""
+        """Elementwise maximum over the processes; with several processes, this waits for the device."""
         if self.size == 1:
             return numbers
         whole = torch.tensor(numbers, device=self.device)
@@ -91,7 +102,7 @@ class Team:
         return tuple(whole.tolist())
 
     def gather(self, part: torch.Tensor) -> torch.Tensor:
-        """Concatenate the parts of all processes, (size * n, ...) from (n, ...), in every process."""
+        """All-gather: concatenate the parts of all processes, (size * n, ...) from (n, ...)."""
         if self.size == 1:
             return part
         whole = part.new_empty(self.size * part.shape[0], *part.shape[1:])
@@ -100,10 +111,10 @@ class Team:
 
     @torch.no_grad()
     def copy_leader(self, tensors: Iterable[torch.Tensor]) -> None:
-        """Overwrite tensors with those of the leading process.
+        """Broadcast tensors from rank 0, in place.
 
-        On equal hardware, parameters that each process updates are equal already.
-        On different hardware this prevents rounding errors from adding up.
+        Parameters updated in each process are already equal on equal hardware. On different hardware, this prevents
+        rounding errors from accumulating.
         """
         if self.size > 1:
             tensors = list(tensors)
@@ -114,9 +125,9 @@ class Team:
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
-        """A block that ends in all processes if it fails in one; only the one that failed reports the error.
+        """End all processes if the block fails in one; only that process reports the error.
 
-        The block itself must not communicate: a process that has failed would not take part.
+        The block must not communicate, because a failed process would not take part.
 
         Raises:
             SystemExit: The block failed in another process.
@@ -135,11 +146,21 @@ class Team:
 
 
 @contextlib.contextmanager
+def side_stream() -> Iterator[None]:
+    """Run a block on another CUDA stream than the default one, as torch requires before a capture."""
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        yield
+    torch.cuda.current_stream().wait_stream(stream)
+
+
+@contextlib.contextmanager
 def join(device: str = "cpu") -> Iterator[Team]:
-    """The team of the processes that ``torchrun`` started, or a team of this process alone.
+    """Join the processes that ``torchrun`` started; without torchrun, yield a team of one process.
 
     Args:
-        device: "cpu", or a CUDA device. Each of several processes takes the GPU of its number on its machine.
+        device: "cpu", or a CUDA device. With several processes, each uses the GPU of its local rank.
 
     Raises:
         ValueError: There are fewer GPUs than processes on this machine.
@@ -148,8 +169,8 @@ def join(device: str = "cpu") -> Iterator[Team]:
     if size == 1 or "MASTER_ADDR" not in os.environ:
         yield Team(device=device)
         return
-    # The first optimizer loads torch's compiler. Loaded within a process group, the compiler would keep the group
-    # alive: its threads would still run while Python ends, which now and then aborts the process.
+    # The first optimizer imports torch's compiler. If that happens while a process group exists, the compiler keeps the
+    # group and its threads alive until Python exits, which sometimes aborts the process.
     torch.optim.SGD([torch.zeros(1)])
     place, neighbours = int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     if device.startswith("cuda"):
@@ -169,7 +190,7 @@ def join(device: str = "cpu") -> Iterator[Team]:
         clean = True
     finally:
         team.release()
-        # After an error NCCL may wait for processes that have ended already, so the group is left to the end of the
-        # process. Gloo does not wait, but its threads must end before Python does.
+        # After an error NCCL might wait for processes that have already exited, so its group is not destroyed. Gloo
+        # does not wait, and its threads must end before Python exits.
         if clean or distributed.get_backend() == "gloo":
             distributed.destroy_process_group()

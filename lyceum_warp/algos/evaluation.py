@@ -1,4 +1,4 @@
-"""Evaluation of policies: whole episodes under the mean action."""
+"""Evaluate policies in whole episodes under the mean action."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -9,26 +9,24 @@ import torch
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import Policy, acting
+from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_function, check_kind, described, whole_number
 
 MEAN_SEED = 2**31 - 1
-"""Seed of the initial states from which NPG evaluates the mean policy."""
+"""Seed of the initial states for evaluations of the mean policy during training."""
 
 
 def evaluation_seed(seed: int) -> int:
-    """The seed of an environment's random streams for an evaluation with a seed.
-
-    Training with the same seed draws other initial states. Different seeds of evaluations stay different.
-    """
+    """Derive an evaluation's seed, one-to-one, so that training with the same seed draws other initial states."""
     return whole_number("seed", seed, low=0) ^ 0x5A17C3E9
 
 
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class Episodes:
-    """Finished episodes, one number each. All tensors have shape (episodes,) and lie on the CPU."""
+    """Results of finished episodes. All tensors are (episodes,), on the CPU."""
 
     returns: torch.Tensor
     """Sums of rewards."""
@@ -37,14 +35,14 @@ class Episodes:
     rewards: torch.Tensor
     """Rewards of the last step."""
     evals: torch.Tensor
-    """The evaluation metric at the end."""
+    """The evaluation metric at the end of each episode."""
     success: torch.Tensor
-    """Whether the goal was met at the end, 1 or 0."""
+    """Whether the goal was met at the end of each episode, 1 or 0."""
     metrics: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
-    """Sums of the task's metrics, by the metrics' names."""
+    """Sums of the task's metrics, by name."""
 
     def first(self, count: int) -> "Episodes":
-        """The first of the episodes."""
+        """Select the first ``count`` episodes."""
         names = [field.name for field in dataclasses.fields(self) if field.name != "metrics"]
         metrics = {name: sums[:count] for name, sums in self.metrics.items()}
         return dataclasses.replace(self, metrics=metrics, **{name: getattr(self, name)[:count] for name in names})
@@ -59,19 +57,19 @@ def evaluate(
     seed: int | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Episodes:
-    """Run a policy's mean action for whole episodes from random initial states.
+    """Run a policy without noise for whole episodes from random initial states.
 
-    Every world contributes the same number of episodes, its first ones. Otherwise worlds with short episodes would
-    contribute more of them, and the statistics would favour short episodes.
+    Every world contributes the same number of episodes. Counting all episodes that end would bias the statistics
+    towards short ones.
 
     Args:
         env: The environment; its worlds are reset.
-        policy: Its ``act``, or else the policy itself, is called with observations (nworld, nobs) and returns actions
+        policy: A module with a method ``act``, or a function; maps observations (nworld, nobs) to actions
             (nworld, nact).
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
-        seed: Seed of the initial states, which differ from those of an environment made with the same seed; by default
-            the worlds continue their random streams.
-        progress: Called every 50 steps with the number of steps so far and the largest possible number.
+        seed: Seed of the initial states; they differ from the initial states of an environment made with this seed. By
+            default the worlds continue their random streams.
+        progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:
         ValueError: The task has no horizon, or the environment was made with ``autoreset=False``.
@@ -86,6 +84,7 @@ def evaluate(
     if not env.autoreset:
         raise ValueError("evaluate needs an environment that resets automatically: make it with autoreset=True")
     act, each = acting(policy), -(-episodes // env.nworld)
+    check_fit(8 * (5 + len(env.episode_metrics)) * each, env.nworld, env.device, model=f"{each} episodes")
     env.rand_reset(None if seed is None else evaluation_seed(seed))
     metrics = list(env.episode_metrics.values())
     results = torch.zeros(5 + len(metrics), each, env.nworld, device=env.obs.device)
@@ -113,26 +112,26 @@ def evaluate(
 
 
 ENDLESS_STEPS = 1000
-"""Steps of an episode in evaluations of a task without a horizon, whose episodes may never end."""
+"""Steps of an episode in evaluations of a task without a horizon."""
 
 
 def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
-    """A few worlds of the same task for whole episodes; without a horizon they are cut off after 1,000 steps.
+    """Make a few worlds of the same task for whole episodes; without a horizon, episodes are truncated at 1,000 steps.
 
     Args:
         env: The environment.
         nworld: Number of worlds.
-        changes: Other options, as for ``replicate``.
+        changes: Options that differ; see ``Env.replicate``.
     """
     endless = {} if env.horizon else {"horizon": ENDLESS_STEPS}
     return env.replicate_few(nworld, **(endless | changes))
 
 
 class MeanPolicyEvaluation:
-    """Evaluates the mean policy during training, in a few worlds of its own.
+    """Evaluates the mean policy during training in a separate environment with few worlds.
 
     The initial states are the same each time and are not trained on, so that only the policy differs between two
-    evaluations. The leading process evaluates; all processes get its numbers.
+    evaluations. Rank 0 evaluates; all processes get its numbers.
 
     Args:
         env: The environment of the training; each evaluation uses its current parameters.
@@ -145,7 +144,7 @@ class MeanPolicyEvaluation:
         self._few: Env | None = None
 
     def __call__(self, policy: torch.nn.Module) -> dict[str, float]:
-        """Means over the episodes, by their names in ``Iteration``."""
+        """Run the evaluation; returns means over the episodes, by their names in ``Iteration``."""
         means = torch.zeros(len(MEAN_STATISTICS), dtype=torch.float64, device=self.env.obs.device)
         if self.team.leads:
             if self._few is None:
@@ -159,4 +158,4 @@ class MeanPolicyEvaluation:
 
 
 MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")
-"""The attributes of ``Iteration`` that an evaluation of the mean policy sets."""
+"""The attributes of ``Iteration`` that are set by an evaluation of the mean policy."""

@@ -1,10 +1,10 @@
-"""Define what training needs of a learning algorithm, so that one loop and one kind of run folder serve every one."""
+"""Define the interface of a learning algorithm, which training, run folders and export share."""
 
 import abc
 import copy
 import dataclasses
 from collections.abc import Iterator, Mapping
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 
@@ -14,15 +14,15 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
 
 METRIC_COLUMN = "metrics/"
-"""What the columns of a task's own metrics begin with."""
+"""Prefix of the columns of a task's own metrics."""
 
 
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Iteration:
-    """Statistics of one iteration of a learner. Numbers that it does not report are None.
+    """Statistics of one iteration of a learner. Numbers that a learner does not report are None.
 
-    An algorithm with further numbers puts them into ``numbers``, or extends this class by fields.
+    An algorithm reports additional numbers in ``numbers``, or in fields of a subclass.
     """
 
     iteration: int
@@ -32,7 +32,7 @@ class Iteration:
     reward_mean: float | None = None
     """Mean reward of a step, over all samples."""
     return_mean: float | None = None
-    """Mean return (sum of an episode's rewards) of the episodes that ended while sampling; nan if none ended."""
+    """Mean return (sum of rewards) of the episodes that ended during sampling; nan if none ended."""
     return_std: float | None = None
     """Standard deviation of these returns."""
     return_min: float | None = None
@@ -46,27 +46,24 @@ class Iteration:
     eval_mean: float | None = None
     """Mean evaluation metric at the end of an episode."""
     success: float | None = None
-    """Share of the episodes that ended with the goal met; nan for a task without a success."""
+    """Share of the episodes that ended with the goal met; nan for tasks without ``success``."""
     mean_return: float | None = None
-    """Mean return of the policy without noise, after the iteration; None in iterations that do not evaluate it."""
+    """Mean return of the policy without noise, evaluated after the iteration; None in iterations without evaluation."""
     mean_length: float | None = None
-    """Mean number of steps in an episode of this evaluation, or None."""
+    """Mean length of the evaluated episodes, steps."""
     mean_terminal_reward: float | None = None
-    """Mean reward of the last step of an episode of this evaluation, or None."""
+    """Mean reward of the last step of the evaluated episodes."""
     mean_eval: float | None = None
-    """Mean evaluation metric at the end of an episode of this evaluation, or None."""
+    """Mean evaluation metric at the end of the evaluated episodes."""
     mean_success: float | None = None
-    """Share of these episodes that ended with the goal met, or None; None for a task without a success."""
+    """Share of the evaluated episodes that ended with the goal met; None for tasks without ``success``."""
     metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Means of the task's metrics, each summed over an episode, by the metrics' names."""
+    """Means over episodes of the task's metrics, each summed over an episode, by name."""
     numbers: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Further numbers of the algorithm, by the names of their columns."""
+    """Additional numbers of the algorithm, by the names of their columns."""
 
     def row(self) -> dict[str, Any]:
-        """The numbers by the names of their columns in metrics.csv, without those that are None.
-
-        The metric ``forward`` is ``metrics/forward``.
-        """
+        """Convert to a row of metrics.csv: numbers by column, without None; the metric ``x`` is ``metrics/x``."""
         names = [field.name for field in dataclasses.fields(self) if field.name not in ("metrics", "numbers")]
         own = {name: number for name in names if (number := getattr(self, name)) is not None}
         return own | dict(self.numbers) | {METRIC_COLUMN + name: mean for name, mean in self.metrics.items()}
@@ -74,32 +71,31 @@ class Iteration:
 
 @document_attributes
 class Learner(abc.ABC):
-    """A learning algorithm, which ``lw.train`` trains: an endless iterator that yields an ``Iteration`` each time.
+    """Base class of learning algorithms: an infinite iterator of ``Iteration``, which ``lw.train`` runs.
 
-    A learner of your own extends this class. It sets ``algorithm``, ``policy`` and ``config``, and defines
-    ``__next__``, which counts ``iteration`` and ``samples``. What else the next iteration depends on is added to
-    ``state_dict`` and ``load_state_dict``. docs/learners.md has an example.
+    A subclass sets ``algorithm``, ``policy`` and ``config``, and implements ``__next__``, which counts ``iteration``
+    and ``samples``. It extends ``state_dict`` and ``load_state_dict`` by any other state of the algorithm.
+    docs/learners.md has an example.
 
     Args:
         env: The environment; do not step it between iterations.
         seed: Seed of new networks and of the noise.
-        team: The processes that learn together, each with an environment of its share of the worlds; by default this
-            process alone.
+        team: The processes that learn together, each with its share of the worlds; by default this process alone.
 
     Raises:
-        ValueError: The environment does not reset automatically, or has other worlds than its share; or the seed is
-            not a whole number.
+        ValueError: The environment does not reset automatically, its worlds are not this process's share, or the seed
+            is not a whole number.
     """
 
     algorithm: str
-    """The name of the algorithm in a run's config.json, where its hyperparameters have this name, too."""
+    """The name of the algorithm, under which a run's config.json holds the hyperparameters."""
     env: Env
-    """The environment in which it learns; its policy is evaluated in others of the same task."""
+    """The environment that provides the samples."""
     policy: torch.nn.Module
     """The policy after the last iteration. Its method ``act`` maps observations, (..., nobs), to actions without noise,
-    (..., nact); a normaliser of observations is part of it. Its attributes ``nobs`` and ``nact`` are these sizes."""
+    (..., nact), and includes the normaliser of observations. It has the attributes ``nobs`` and ``nact``."""
     value: torch.nn.Module | None = None
-    """The value function after the last iteration, for algorithms that have one."""
+    """The value function after the last iteration; None for algorithms without one."""
     config: Any
     """The hyperparameters, a dataclass."""
     seed: int
@@ -107,7 +103,7 @@ class Learner(abc.ABC):
     team: Team
     """The processes that learn together."""
     generator: torch.Generator | None = None
-    """The source of its random numbers, if it has one."""
+    """The random generator, if the algorithm has one."""
     iteration: int
     """Number of complete iterations."""
     samples: int
@@ -134,30 +130,30 @@ class Learner(abc.ABC):
 
     @abc.abstractmethod
     def __next__(self) -> Iteration:
-        """Make an iteration: sample, update the policy, and evaluate it if it is time for that.
+        """Run one iteration: sample, update the policy, and evaluate it if due.
 
         Raises:
-            FloatingPointError: An update is not finite, so that learning cannot go on.
+            FloatingPointError: An update is not finite, so that learning cannot continue.
         """
 
     @property
     def best_by(self) -> str:
-        """The return by which a run selects its best policy and ends: "mean_return" or "return_mean".
+        """The return that selects a run's best policy and ends the run: "mean_return" or "return_mean".
 
-        The first is the return of the policy after the iteration, the second that of the policy before it. By default
-        it is the first, unless the configuration has a ``mean_every`` of 0.
+        "mean_return" belongs to the policy after the iteration, "return_mean" to the policy before it. The default is
+        "mean_return", or "return_mean" if the configuration has ``mean_every=0``.
         """
         return "return_mean" if getattr(self.config, "mean_every", None) == 0 else "mean_return"
 
     def settings(self) -> dict[str, Any]:
-        """The hyperparameters as a run's config.json holds them."""
+        """The hyperparameters for a run's config.json."""
         return dataclasses.asdict(self.config)
 
     def state_dict(self) -> dict[str, Any]:
-        """A copy of the state on which the next iteration depends, with the worlds of all processes.
+        """Copy the complete state, including the worlds of all processes, to resume from.
 
-        It consists of tensors, numbers, strings and containers of them. All processes must call it. Any number of
-        processes can continue from it.
+        The state consists of tensors, numbers, strings, dicts and lists. All processes must call this method. Any
+        number of processes can resume from the state.
         """
         state = {
             "policy": self.policy.state_dict(),
@@ -172,10 +168,10 @@ class Learner(abc.ABC):
         return copy.deepcopy(state)  # a module's own state_dict shares memory with its parameters
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken.
+        """Resume from a state of ``state_dict``; further iterations are equal to the bit.
 
         Raises:
-            ValueError: The state has another number of worlds, or does not fit for another reason.
+            ValueError: The state has another number of worlds.
         """
         nworld = self.env.nworld * self.team.size
         if len(state["env"]) != nworld:
@@ -187,25 +183,3 @@ class Learner(abc.ABC):
             self.generator.set_state(state["generator"].cpu())
         self.env.set_state(state["env"][self._own].to(self.env.obs.device))
         self.iteration, self.samples = state["iteration"], state["samples"]
-
-
-Config = TypeVar("Config")
-
-
-def fitted_config(config: Config, policy_shape: Mapping[str, Any], value_shape: Mapping[str, Any]) -> Config:
-    """Hyperparameters with the sizes and the group of given networks, from which networks like these can be made.
-
-    Args:
-        config: The hyperparameters, a dataclass.
-        policy_shape: The ``shape`` of the policy.
-        value_shape: That of the value function.
-    """
-    assert dataclasses.is_dataclass(config) and not isinstance(config, type)
-    entries = {"hidden": policy_shape.get("hidden"), "activation": policy_shape.get("activation")}
-    entries |= {f"value_{name}": value_shape.get(name) for name in ("hidden", "activation")}
-    entries |= {"normalize": policy_shape.get("normalize"), "time_orders": value_shape.get("time_orders")}
-    if getattr(config, "value_group", None) is not None and value_shape:
-        entries["value_group"] = value_shape.get("group", "policy")
-    known = {field.name for field in dataclasses.fields(config)}
-    changes = {name: entry for name, entry in entries.items() if entry is not None and name in known}
-    return dataclasses.replace(config, **changes)

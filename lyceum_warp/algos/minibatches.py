@@ -1,4 +1,4 @@
-"""Run epochs of mini-batches; on a GPU an epoch is one CUDA graph, and nothing waits for the device."""
+"""Run epochs of mini-batches; on a GPU an epoch is one CUDA graph, without host synchronisation."""
 
 import contextlib
 import math
@@ -6,29 +6,28 @@ from collections.abc import Callable, Iterator, Mapping
 
 import torch
 
-from lyceum_warp.algos.distributed import Team
-from lyceum_warp.graphs.capture import capturing
+from lyceum_warp.algos.distributed import Team, side_stream
 
 Samples = Mapping[str, torch.Tensor]
-"""Samples by the names of their parts, each (samples, ...)."""
+"""Tensors by name, each with a row for each sample."""
 
 _SURE = 6.0
-"""Standard deviations between the mean number of a process's samples in a mini-batch and the room for them."""
+"""Room for a process's samples in a mini-batch, in standard deviations above their mean number."""
 
 
 class Minibatches:
     """Shuffles the samples of a rollout once, and learns from the same mini-batches in every epoch.
 
-    The mini-batches are the same for any number of processes: each takes the samples of its own worlds, in a tensor of
-    fixed size whose other rows have the weight 0. A mini-batch in which a process has more samples than this size, six
-    standard deviations above its mean share, loses the excess.
+    The mini-batches do not depend on the number of processes: each process uses the samples of its own worlds, in a
+    tensor of fixed size that is padded with rows of weight 0. The size is six standard deviations above the mean number
+    of samples; excess samples are dropped.
 
-    On a GPU the first epoch runs directly, which allocates Adam's moments. The second one is captured, and replayed
-    from then on. A graph holds addresses: ``learn`` must change its tensors in place.
+    On a GPU the first epoch runs directly, which allocates Adam's moments. The second epoch is captured and then
+    replayed. Graphs hold addresses, so ``learn`` must update tensors in place.
 
     Args:
-        learn: Learns from the process's samples of a mini-batch, and from their weights, (samples,), whose sum over all
-            processes is 1.
+        learn: Called with the process's samples of a mini-batch and their weights, (samples,), which sum to 1 over all
+            processes.
         steps: Steps of every world.
         nworld: Worlds of this process.
         count: Number of mini-batches.
@@ -52,24 +51,24 @@ class Minibatches:
         self.forget()
 
     def forget(self) -> None:
-        """Drop the graph, after tensors behind it were replaced."""
+        """Drop the graph, because its tensors were replaced."""
         self._warm = False
         self._graph: torch.cuda.CUDAGraph | None = None
 
     @torch.no_grad()
     def shuffle(self, samples: Samples, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Copy samples into mini-batches, at the same addresses each time.
+        """Copy samples into mini-batches at fixed addresses.
 
         Args:
             samples: Samples of this process's worlds, each (steps, nworld, ...).
-            generator: Draws the order of the samples of all processes.
+            generator: Draws the permutation of the samples of all processes.
 
         Returns:
             The mini-batches, each (mini-batches, samples, ...).
         """
         order = torch.randperm(self.samples, generator=generator, device=self.weight.device)
         places, own = self.team.locate(order[: self.count * self.batch].view(self.count, self.batch), self.nworld)
-        if self.room < self.batch:  # the own samples first
+        if self.room < self.batch:  # move own samples to the front
             first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self.room]
             places, own = places.gather(1, first), own.gather(1, first)
         self.order.copy_(places.flatten())
@@ -82,7 +81,7 @@ class Minibatches:
         return self._parts
 
     def run(self, epochs: int) -> None:
-        """Learn from the shuffled samples in a number of epochs."""
+        """Learn from the shuffled samples for a number of epochs."""
         for _ in range(epochs):
             if self.captures:
                 with torch.cuda.device(self.weight.device):
@@ -96,27 +95,18 @@ class Minibatches:
 
     def _run_captured(self) -> None:
         if not self._warm:
-            stream = torch.cuda.Stream()  # a capture needs another one than the default stream
-            stream.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(stream):
+            with side_stream():
                 self._epoch()
-            torch.cuda.current_stream().wait_stream(stream)
             self._warm = True
             return
         if self._graph is None:
-            graph = torch.cuda.CUDAGraph()
-            # other threads, such as NCCL's, call CUDA during the capture
-            with capturing(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
-                self._epoch()
-            if self.team.size > 1:
-                self.team.keep(graph)
-            self._graph = graph
+            self._graph = self.team.capture(self._epoch)
         self._graph.replay()
 
 
 @contextlib.contextmanager
 def precision(*, tf32: bool) -> Iterator[None]:
-    """A block in which matrix products on a GPU may use TensorFloat-32."""
+    """Run a block in which matrix products on a GPU may use TensorFloat-32."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if tf32 else before)
     try:

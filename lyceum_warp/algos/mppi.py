@@ -1,11 +1,11 @@
-"""Model predictive path integral control (MPPI): samples weighed by the exponential of their returns.
+"""Update plans by model predictive path integral control (MPPI): weigh samples by the exponential of their returns.
 
-The update of ``planner.py`` that gives sample k with the return R_k the weight
+Sample k of the planner (``planner.py``), with the return R_k, has the weight
 
     w_k = exp((R_k - max R) / temperature) / sum_j exp((R_j - max R) / temperature),
 
-as Williams et al. (2017, "Information theoretic MPC for model-based reinforcement learning") without a cost on the
-controls. A sample that failed has no weight.
+as in Williams et al. (2017, "Information theoretic MPC for model-based reinforcement learning"), without a cost on the
+controls. A failed sample has the weight 0.
 """
 
 import warp as wp

@@ -1,8 +1,7 @@
-"""The arguments of a call of MPPI: sorted, and completed from the task's planning."""
+"""Sort the arguments of a planner into settings, options and parameters, and complete them from the task's planning."""
 
 import contextlib
 import dataclasses
-import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,12 +19,12 @@ from lyceum_warp.binding.registry import task_name
 from lyceum_warp.engines.memory import NotEnoughMemoryError
 from lyceum_warp.engines.placement import place_samples
 from lyceum_warp.options import OPTIONS, EnvOptions, suggestion
-from lyceum_warp.support.validate import described, whole_number
+from lyceum_warp.support.validate import check_kind, described, whole_number
 from lyceum_warp.task import Planning, Task
 
 
 def task_config(task: type[Task], value: object = None) -> MPPIConfig:
-    """The settings that a task gives in its ``planning``.
+    """Make the settings from a task's ``planning``.
 
     Args:
         task: The task.
@@ -50,49 +49,43 @@ def planner_arguments(
     value: object,
     plants: int = 1,
 ) -> tuple[MPPIConfig, EnvOptions, dict[str, Any]]:
-    """Sort the arguments of a call of MPPI, and complete them from the task's ``planning``.
+    """Sort the arguments of a planner, and complete them from the task's ``planning``.
 
     Args:
         task: The task.
-        config: Settings in place of the task's.
+        config: Settings that replace the task's.
         words: The flat keyword arguments: single settings, options of the worlds, parameters of the task. A setting
-            of None is not given.
+            of None is ignored.
         params: Parameters of the task.
-        value: The value function. With one the parameters in ``planning`` do not apply.
+        value: The value function. With a value function, the parameters in ``planning`` are ignored.
         plants: Number of plants to plan for.
 
     Returns:
-        The settings, the options of the planner's worlds with the engine and the device that suit the number of
-        samples, and the parameters of the planner's worlds.
+        The settings; the options of the planner's worlds, with an engine and a device for this number of samples; and
+        the parameters of the planner's worlds.
 
     Raises:
         ValueError: A word is unknown or ambiguous, or a value is not valid.
     """
-    if config is not None and not isinstance(config, MPPIConfig):
-        raise ValueError(f"config must be a lw.MPPIConfig, as lw.MPPIConfig(horizon=16), not {described(config)}")
-    if params is not None and not isinstance(params, Mapping):
-        raise ValueError(f"params must be a dict of parameters of the task, not {described(params)}")
+    check_kind("config", config, MPPIConfig | None, "as lw.MPPIConfig(horizon=16)")
+    check_kind("params", params, Mapping | None, "a dict of parameters of the task")
     name, planning, known = task_name(task), _planning(task), _parameter_names(task)
-    for word in words:
-        if word in SETTINGS and word in known:
-            raise ValueError(
-                f"{word!r} is a setting of MPPI and a parameter of the task {name!r}: give the setting as "
-                f"config=lw.MPPIConfig({word}=...), or the parameter as params={{{word!r}: ...}}"
-            )
-    config = (task_config(task, value) if config is None else config).changed(
-        {word: words[word] for word in words if word in SETTINGS and words[word] is not None}
-    )
+    if both := [word for word in words if word in SETTINGS and word in known]:
+        raise ValueError(
+            f"{both[0]!r} is a setting of MPPI and a parameter of the task {name!r}: give the setting as "
+            f"config=lw.MPPIConfig({both[0]}=...), or the parameter as params={{{both[0]!r}: ...}}"
+        )
+    config = config or task_config(task, value)
+    config = config.changed({word: words[word] for word in words if word in SETTINGS and words[word] is not None})
     config = config.completed(value)
 
     given = {word: words[word] for word in words if word in OPTIONS and word not in SETTINGS}
     _check_options(given)
     options = EnvOptions().changed(planning.options).changed(given)
 
-    rest = {word: words[word] for word in words if word not in SETTINGS and word not in OPTIONS}
-    rest |= params or {}
-    for word in rest:
-        if word not in known:
-            raise ValueError(f"the task {name!r} has no parameter {word!r}: {_hint(word, known)}")
+    rest = {word: words[word] for word in words if word not in SETTINGS and word not in OPTIONS} | dict(params or {})
+    if unknown := [word for word in rest if word not in known]:
+        raise ValueError(f"the task {name!r} has no parameter {unknown[0]!r}: {_hint(unknown[0], known)}")
     place = place_samples(
         options.engine, options.device, nthread=options.nthread, samples=config.samples * config.models * plants,
         spec=partial(task_spec, task, options.model), solver=options.physics.solver,
@@ -100,8 +93,8 @@ def planner_arguments(
     return config, options.changed(place), dict(planning.params if value is None else {}) | rest
 
 
-def plant_seeds(seed: int | Sequence[int], plants: int) -> list[int]:
-    """A seed for each plant, from that of the first one or from a list.
+def plant_seeds(seed: int | Sequence[int], plants: int) -> Sequence[int]:
+    """Make a seed for each plant from the first plant's seed, or check a list of seeds.
 
     Raises:
         ValueError: A seed is not a whole number from 0, or there are too few or too many.
@@ -114,15 +107,15 @@ def plant_seeds(seed: int | Sequence[int], plants: int) -> list[int]:
             raise ValueError(f"seed must be a number, or a list with one for each of {plants} plants, not {given!r}")
         return [whole_number("seed", one, low=0) for one in given]
     first = whole_number("seed", given, low=0, high=2**31 - plants)
-    return list(range(first, first + plants))
+    return range(first, first + plants)
 
 
 @contextlib.contextmanager
 def explained_worlds(config: MPPIConfig, plants: int) -> Iterator[None]:
-    """Make worlds of a planner; where they do not fit into memory, the error says which settings their number is from.
+    """Name the settings that determine the number of worlds, if the worlds made in this block do not fit into memory.
 
     Raises:
-        NotEnoughMemoryError: They do not fit into memory.
+        NotEnoughMemoryError: They do not fit.
     """
     try:
         yield
@@ -131,25 +124,8 @@ def explained_worlds(config: MPPIConfig, plants: int) -> Iterator[None]:
         raise NotEnoughMemoryError(f"{error}, where nworld is plants * samples * models, {product}") from error
 
 
-def words_of_update(update: str | None, words: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments of a call of CEM or predictive sampling as those of a call of MPPI.
-
-    Args:
-        update: The update that the planner has; None for MPPI, which has any.
-        words: The flat keyword arguments.
-
-    Raises:
-        ValueError: They ask for another update.
-    """
-    if update is None:
-        return dict(words)
-    if words.get("update", update) != update:
-        raise ValueError(f"update={words['update']!r} is another planner than {update!r}: call lw.MPPI with it")
-    return {**words, "update": update}
-
-
 def plain(value: Any) -> Any:
-    """A setting, an option or a parameter as JSON can hold it."""
+    """Convert a setting, an option or a parameter to what JSON can hold."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, Mapping):
@@ -182,8 +158,8 @@ def _check_options(options: Mapping[str, Any]) -> None:
 
 
 def _hint(word: str, known: Sequence[str]) -> str:
-    """What may have been meant by a parameter that the task does not have."""
-    if word in SETTINGS or word in OPTIONS:  # only in params, because among the words it is that
+    """Suggest what an unknown parameter may stand for."""
+    if word in SETTINGS or word in OPTIONS:  # given in params
         return f"it is {'a setting of MPPI' if word in SETTINGS else 'an option of its worlds'}: give it outside params"
     others = [setting for setting in SETTINGS if setting not in OPTIONS]
     return suggestion(word, [*others, *known]) or f"it has {', '.join(known) or 'none'}"
@@ -194,7 +170,7 @@ def _parameter_names(task: type[Task]) -> list[str]:
 
 
 def _planning(task: type[Task]) -> Planning:
-    """A task's ``planning``, all of whose names are known."""
+    """A task's ``planning``, checked: every name in it is known."""
     planning, name = task.planning, task_name(task)
     if not isinstance(planning, Planning):
         raise ValueError(
@@ -203,14 +179,11 @@ def _planning(task: type[Task]) -> Planning:
         )
     known = {"settings": SETTINGS, "options": OPTIONS, "params": _parameter_names(task)}
     for part, names in known.items():
-        for word in getattr(planning, part):
-            if word in names:
-                continue
-            other = next((other for other in known if word in known[other]), None)
-            close = difflib.get_close_matches(word, names, 3)
-            hint = f"it belongs to {other}" if other else f"did you mean {' or '.join(close)}?" if close else ""
-            hint = hint or f"there are {', '.join(names) or 'none'}"
-            raise ValueError(f"{word!r} in planning.{part} of the task {name!r} is unknown: {hint}")
+        if unknown := [word for word in getattr(planning, part) if word not in names]:
+            hints = [f"it belongs to {other}" for other in known if unknown[0] in known[other]]
+            hints += [suggestion(unknown[0], set(names) - set(OPTIONS)), f"there are {', '.join(names) or 'none'}"]
+            hint = next(filter(None, hints))
+            raise ValueError(f"{unknown[0]!r} in planning.{part} of the task {name!r} is unknown: {hint}")
     try:
         _check_options(planning.options)
         EnvOptions().changed(planning.options)

@@ -1,4 +1,4 @@
-"""The settings of MPPI, CEM and predictive sampling, and their checks."""
+"""Define and check the settings of MPPI, CEM and predictive sampling."""
 
 import dataclasses
 import math
@@ -12,91 +12,93 @@ from lyceum_warp.algos.plan_update import PlanUpdate
 from lyceum_warp.kernels.knots import ORDERS
 from lyceum_warp.spaces import Space
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import whole_number
+from lyceum_warp.support.validate import check_flag, check_word, finite_number, whole_number
 
 Numbers: TypeAlias = float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray | torch.Tensor
 
 _SMALLEST = float(np.finfo(np.float32).tiny)
-"""The smallest temperature that float32, the type of the kernels, holds at full precision."""
+"""The smallest normal float32, the type of the kernels."""
 
 
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MPPIConfig:
-    """Settings of MPPI, CEM and predictive sampling. Arrays and tensors are stored as tuples of floats.
+    """Settings of MPPI, CEM and predictive sampling. Arrays and tensors are converted to tuples of floats.
 
     Raises:
         ValueError: A value is of the wrong type or out of range.
     """
 
     horizon: int = 32
-    """Steps of a plan."""
+    """Number of steps in a plan."""
     samples: int = 64
-    """Samples for each improvement of the plan; each is rolled out in a world of its own for each model."""
+    """Number of samples for each improvement of the plan; each is rolled out in one world for each model."""
     update: Literal["mppi", "cem", "predictive_sampling"] | PlanUpdate = "mppi"
-    """How samples become the new plan: their mean with weights exp(return / temperature) ("mppi"), the mean of the best
-    ones ("cem", the cross-entropy method), the best one ("predictive_sampling"), or an object of your own."""
+    """How samples become the new plan: by their mean with weights exp(return / temperature) ("mppi"), the mean of the
+    best samples ("cem", the cross-entropy method), the best sample ("predictive_sampling"), or a ``PlanUpdate``."""
     temperature: float = 0.1
-    """Temperature of MPPI's weights, in units of reward: a low one follows the best sample, a high one averages all."""
+    """Temperature of MPPI's weights, in units of reward. Low temperatures follow the best sample, high temperatures
+    average all samples."""
     elites: int | None = None
-    """Number of the best samples, for CEM. None is a tenth of the samples, and at least two."""
+    """Number of samples that CEM fits to. None means a tenth of the samples, but at least two."""
     noise: Numbers = 0.5
-    """Noise around the plan, in units of the action: its standard deviation, as one number or one for each action, or
-    its covariance, (nact, nact). CEM starts with these standard deviations and adapts them."""
+    """Noise that is added to the plan, in units of the action: a standard deviation, one for each action, or a
+    covariance, (nact, nact). CEM starts with these standard deviations and adapts them."""
     min_noise: float | Sequence[float] | None = None
-    """The smallest standard deviation to which CEM adapts its noise, as one number or one for each action. None is a
-    tenth of ``noise``."""
+    """Lower limit of CEM's adapted standard deviations, one number or one for each action. None means a tenth of
+    ``noise``."""
     include_plan: bool | None = None
-    """Whether the first sample is the plan itself, without noise. None is True where there are several samples, except
-    for CEM and other updates that adapt the noise."""
+    """Whether the first sample is the plan itself, without noise. None means True if there are several samples and the
+    update does not adapt the noise, as CEM does."""
     smoothing: tuple[float, float, float] = (0.25, 0.8, 0.0)
     """Weights (b0, b1, b2) that smooth the noise n over time: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) from the third
     step on. (1, 0, 0) is white noise. Noise of knots is not smoothed."""
     knots: int | None = None
-    """Knots of a plan that is a spline: noise is added to this many numbers over the horizon for each action, and the
-    actions of all steps are interpolated. None is a plan with a number of its own for each step."""
+    """Number of knots over the horizon if the plan is a spline: noise is added to the knots, and the actions of all
+    steps are interpolated. None means that the plan has separate actions for each step."""
     spline: Literal["zero", "linear", "cubic"] = "cubic"
-    """Interpolation between knots: each holds until the next ("zero"), straight lines ("linear"), or a cubic Hermite
-    spline ("cubic")."""
+    """Interpolation between knots: piecewise constant ("zero"), piecewise linear ("linear"), or a cubic Hermite spline
+    ("cubic")."""
     discount: float | None = None
-    """Discount of rewards and of the terminal value for each step. None is that of the value function, or else 1."""
+    """Discount factor of rewards and of the terminal value. None means the value function's discount, or else 1."""
     iterations: int = 1
-    """Improvements of the plan in each call."""
+    """Number of improvements of the plan in each call."""
     fill: str | Numbers = "zero"
-    """What fills the end of a plan that moves forward: "zero" (the action nearest to zero), "repeat" (the last action),
-    or an action, as one number or one for each."""
+    """Actions at the end of a plan that is shifted: "zero" (the action nearest to zero), "repeat" (the last action), or
+    an action, given as one number or one for each element."""
     termination: Literal["stop", "ignore"] = "stop"
-    """Whether a sample whose episode ends earns nothing afterwards ("stop"), or goes on ("ignore", as Lyceum and
-    trajopt do)."""
+    """Whether a sample's return ends with its episode ("stop"), or continues to the horizon ("ignore", as in Lyceum and
+    trajopt)."""
     nominal_model: bool = False
-    """Whether samples have the nominal values of model fields that differ between worlds, or those of the state to
-    plan from (default)."""
+    """Whether samples use the nominal values of per-world model fields; by default they use the values in the state to
+    plan from."""
     models: int = 1
-    """Models in which each sample is rolled out. More than one take model fields that the planner draws with the task's
-    ``startup``, ``initialize`` and ``randomize``, instead of those of the state to plan from."""
+    """Number of models in which each sample is rolled out. With several models, the planner draws their model fields
+    with the task's ``startup``, ``initialize`` and ``randomize``, and ignores the values in the state."""
     risk: Literal["mean", "worst"] = "mean"
-    """The return of a sample in several models: their mean, or the smallest one."""
+    """The return of a sample in several models: the mean or the smallest of its returns."""
 
     def __post_init__(self) -> None:
-        """Check everything that does not depend on the task."""
+        """Check what does not depend on the task."""
         checked: dict[str, Any] = {
             name: whole_number(name, getattr(self, name), low=1)
             for name in ("horizon", "samples", "iterations", "models")
         }
-        checked["temperature"] = _number("temperature", self.temperature, _SMALLEST)
+        checked["temperature"] = finite_number("temperature", self.temperature, low=_SMALLEST)
         checked["noise"] = _noise(self.noise)
         checked["smoothing"] = _smoothing(self.smoothing)
         if self.discount is not None:
-            checked["discount"] = _number("discount", self.discount, 0.0, 1.0)
+            checked["discount"] = finite_number("discount", self.discount, low=0.0, high=1.0)
         checked["fill"] = _fill(self.fill)
-        for name, words in _WORDS.items():
-            _one_of(name, getattr(self, name), words)
+        check_word("termination", self.termination, ("stop", "ignore"))
+        check_word("spline", self.spline, tuple(ORDERS))
+        check_word("risk", self.risk, ("mean", "worst"))
         if not isinstance(self.update, PlanUpdate):
-            _one_of("update", self.update, _UPDATES, ", or an object of a subclass of lw.PlanUpdate")
-        if not isinstance(self.nominal_model, bool):
-            raise ValueError(f"nominal_model must be True or False, not {self.nominal_model!r}")
-        if self.include_plan is not None and not isinstance(self.include_plan, bool):
-            raise ValueError(f"include_plan must be True, False or None, not {self.include_plan!r}")
+            updates = ("mppi", "cem", "predictive_sampling")
+            check_word("update", self.update, updates, ", or an object of a subclass of lw.PlanUpdate")
+        check_flag("nominal_model", self.nominal_model)
+        if self.include_plan is not None:
+            check_flag("include_plan", self.include_plan)
         if self.min_noise is not None:
             checked["min_noise"] = _deviations("min_noise", self.min_noise)
         for name, most in (("elites", "samples"), ("knots", "horizon")):
@@ -116,7 +118,7 @@ class MPPIConfig:
             object.__setattr__(self, name, value)
 
     def changed(self, settings: Mapping[str, Any]) -> "MPPIConfig":
-        """The same settings with some changed. With another update, settings of the old one have their defaults.
+        """Copy with changed settings. A change of the update resets the settings of the old update to their defaults.
 
         Raises:
             ValueError: A value is of the wrong type or out of range.
@@ -126,7 +128,7 @@ class MPPIConfig:
         return dataclasses.replace(self, **words)
 
     def completed(self, value: object = None) -> "MPPIConfig":
-        """The same settings with those that are None chosen, except ``knots`` and what the update does not use.
+        """Copy with defaults for the settings that are None, except ``knots`` and settings that the update ignores.
 
         Args:
             value: The planner's value function; its ``discount``, if it has one, is the default.
@@ -156,10 +158,10 @@ class MPPIConfig:
         )
 
     def noise_factor(self, nact: int) -> np.ndarray:
-        """The lower Cholesky factor of the noise's covariance, (nact, nact).
+        """Lower Cholesky factor of the noise's covariance, (nact, nact).
 
         Raises:
-            ValueError: ``noise`` is not for ``nact`` actions.
+            ValueError: ``noise`` has another number of actions.
         """
         noise = np.asarray(self.noise)
         if noise.shape in ((), (nact,)):
@@ -173,29 +175,20 @@ class MPPIConfig:
 
     @property
     def noise_smoothing(self) -> tuple[float, float, float]:
-        """The weights that smooth the noise: ``smoothing``, or none for knots."""
+        """The effective ``smoothing``: white noise for knots."""
         return self.smoothing if self.knots is None else (1.0, 0.0, 0.0)
 
     def fill_action(self, space: Space) -> np.ndarray:
-        """The action that fills the end of a plan and the whole first plan, within bounds, (nu,).
+        """The action that fills the end of a plan and the whole initial plan, clipped to the bounds, (nact,).
 
         Raises:
-            ValueError: ``fill`` is not for the actions of this space.
+            ValueError: ``fill`` has another number of actions.
         """
         fill = np.asarray(0.0 if isinstance(self.fill, str) else self.fill)
         if fill.shape not in ((), (space.size,)):
             raise ValueError(f"fill must be 'zero', 'repeat', a number or {space.size} of them, not {self.fill!r}")
         return np.clip(np.broadcast_to(fill, space.size), space.low, space.high)
 
-
-_UPDATES = ("mppi", "cem", "predictive_sampling")
-"""The names of the updates."""
-
-_WORDS = {
-    "termination": ("stop", "ignore"), "spline": tuple(ORDERS),
-    "risk": ("mean", "worst"),
-}  # fmt: skip
-"""The values of the settings that are words."""
 
 _OF_CEM = ("elites", "min_noise")
 """Settings of CEM alone."""
@@ -204,19 +197,8 @@ SETTINGS = tuple(field.name for field in dataclasses.fields(MPPIConfig))
 """Names of the settings."""
 
 
-def _number(name: str, value: Any, low: float, high: float = math.inf) -> float:
-    try:
-        number = math.nan if isinstance(value, (bool, str, bytes)) else float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not (low <= number <= high and math.isfinite(number)):
-        bounds = f"number from {low:g} to {high:g}" if math.isfinite(high) else "finite number above 0"
-        raise ValueError(f"{name} must be a {bounds}, not {value!r}")
-    return number
-
-
 def _array(value: Any) -> np.ndarray | None:
-    """Finite numbers as float64; None where they are not."""
+    """Convert finite numbers to float64; None for anything else."""
     try:
         array = np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value)
         array = array.astype(np.float64) if array.dtype.kind in "iuf" else np.array(math.nan)
@@ -226,14 +208,8 @@ def _array(value: Any) -> np.ndarray | None:
 
 
 def _tuples(array: np.ndarray) -> Any:
-    """Numbers of any shape as a float or as tuples, which a frozen dataclass can compare and hash."""
+    """Convert an array to a float or to tuples, which a frozen dataclass can compare and hash."""
     return array.item() if array.ndim == 0 else tuple(map(_tuples, array))
-
-
-def _one_of(name: str, value: Any, words: Sequence[str], others: str = "") -> None:
-    if not isinstance(value, str) or value not in words:
-        *first, last = map(repr, words)
-        raise ValueError(f"{name} must be {', '.join(first)} or {last}{others}, not {value!r}")
 
 
 def _deviations(name: str, value: Any) -> Any:
@@ -264,7 +240,7 @@ def _smoothing(smoothing: Any) -> Any:
     if array is None or array.shape != (3,):
         raise ValueError(f"smoothing must be 3 finite numbers, not {smoothing!r}")
     b0, b1, b2 = array.tolist()
-    # the poles are the roots of z^2 - b1 z - b2 (the stability triangle of a filter of second order)
+    # stability triangle of a second-order filter, whose poles are the roots of z^2 - b1 z - b2
     if not (abs(b2) < 1 and abs(b1) < 1 - b2):
         raise ValueError(
             f"smoothing {(b0, b1, b2)} is unstable: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) must have its poles inside "

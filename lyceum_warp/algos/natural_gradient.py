@@ -1,4 +1,4 @@
-"""The vanilla gradient, and the natural gradient's linear system: the Fisher information, and conjugate gradient."""
+"""Compute the vanilla gradient, products with the Fisher information, and conjugate gradient."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -17,14 +17,14 @@ def score_gradient(
     *,
     dense: DensePolicy | None = None,
 ) -> torch.Tensor:
-    """Gradient of sum(weight * log pi(action | obs)) by the policy's parameters that are learned, (parameters,).
+    """Gradient of sum(weight * log pi(action | obs)) with respect to the policy's trainable parameters, (parameters,).
 
     Args:
         policy: The policy.
         obs: Observations, (samples, nobs).
         action: Actions, (samples, nact).
         weight: Weights, (samples,).
-        dense: The same policy with derivatives that are written out, where it has such.
+        dense: The same policy without autograd, if it is available.
     """
     parameters = [p for p in policy.parameters() if p.requires_grad]
     if dense is None:
@@ -40,17 +40,17 @@ def score_gradient(
 class FisherProduct:
     """Products with the Fisher information of a Gaussian policy, averaged over observations.
 
-    For N(mean(s; theta), diag(sigma^2)) it is E[J^T diag(1 / sigma^2) J] for the parameters of the mean, with
-    J = d mean / d theta, and 2 for each log sigma.
+    For N(mean(s; theta), diag(sigma^2)) the Fisher information is E[J^T diag(1 / sigma^2) J] for the parameters of the
+    mean, with J = d mean / d theta, and 2 for each log sigma.
 
     Args:
         policy: The policy.
         obs: Observations, (samples, nobs).
         damping: Added to the diagonal.
-        count: Number of observations of all processes; by default those in ``obs``.
-        weight: Weights of the observations, (samples,): 1, or 0 for one that another process brings.
+        count: Number of observations of all processes; ``len(obs)`` by default.
+        weight: Weights of the observations, (samples,): 0 for observations of other processes, otherwise 1.
         team: The processes.
-        dense: The same policy with derivatives that are written out, where it has such.
+        dense: The same policy without autograd, if it is available.
     """
 
     def __init__(
@@ -88,14 +88,14 @@ class FisherProduct:
 
 
 class AutogradJacobian:
-    """Products with J = d mean / d parameters, of any network.
+    """Products with the Jacobian J = d mean / d parameters of any network, by autograd.
 
     J v is the derivative of the linear map u -> J^T u, so both products are backward passes through graphs that are
     built once.
 
     Args:
-        mean: The network's results, (samples, nact).
-        parameters: Its parameters that are learned.
+        mean: The network's outputs, (samples, nact).
+        parameters: The network's trainable parameters.
     """
 
     def __init__(self, mean: torch.Tensor, parameters: Sequence[torch.Tensor]) -> None:
@@ -117,8 +117,8 @@ def conjugate_gradient(
 ) -> torch.Tensor:
     """Solve product(x) = target for a symmetric positive definite product, from x = 0.
 
-    The number of iterations is fixed and no decision depends on a number, so nothing waits for the device. Once the
-    residual vanishes the steps are zero.
+    The number of iterations is fixed and nothing branches on values, so nothing waits for the device. Steps are zero
+    once the residual vanishes.
     """
     x = torch.zeros_like(target)
     residual = target.clone()
@@ -136,7 +136,7 @@ def conjugate_gradient(
 
 
 def flatten(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
-    """The numbers of several tensors as one vector."""
+    """Concatenate tensors into one vector."""
     return torch.cat([tensor.reshape(-1) for tensor in tensors])
 
 

@@ -1,17 +1,17 @@
-"""Networks that policies and value functions are made of."""
+"""Build the networks and observation normalisers of policies and value functions."""
 
 import copy
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, TypeAlias, TypeVar, get_args
+from typing import Literal, TypeAlias, TypeVar, get_args
 
 import torch
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.env import Env
-from lyceum_warp.support.validate import check_flag, check_kind, described
+from lyceum_warp.support.validate import check_flag, check_kind, check_word, described
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -24,30 +24,6 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {
 }  # fmt: skip
 
 
-def check_activation(activation: object, name: str = "activation") -> Activation:
-    """Check the name of an activation, and return it.
-
-    Raises:
-        ValueError: It is not one of the known names.
-    """
-    for known in get_args(Activation):
-        if activation == known:
-            return known
-    raise ValueError(f"{name} must be one of {', '.join(map(repr, get_args(Activation)))}, not {activation!r}")
-
-
-def check_network(normalize: Any, limit: Any, generator: Any) -> None:
-    """Check the arguments that policies and value functions share.
-
-    Raises:
-        ValueError: One is of another type or out of range.
-    """
-    check_flag("normalize", normalize)
-    if not isinstance(limit, (int, float)) or not limit > 0:
-        raise ValueError(f"limit must be a positive number, or inf for none, not {described(limit)}")
-    check_kind("generator", generator, torch.Generator | None, "as torch.Generator()")
-
-
 def mlp(
     sizes: Sequence[int],
     *,
@@ -55,18 +31,20 @@ def mlp(
     last_scale: float = 1.0,
     generator: torch.Generator | None = None,
 ) -> nn.Sequential:
-    """A network of fully connected layers with Glorot-uniform weights and zero biases.
+    """Make a fully connected network with Glorot-uniform weights and zero biases.
 
     Args:
-        sizes: Widths of all layers, the input and the output included.
-        activation: What follows each layer but the last one.
+        sizes: Widths of all layers, including input and output.
+        activation: Activation after each layer except the last.
         last_scale: Factor of the last layer's initial weights.
         generator: Draws the initial weights.
 
     Raises:
         ValueError: The activation is not one of the known names.
     """
-    kind = _ACTIVATIONS[check_activation(activation)]
+    check_word("activation", activation, get_args(Activation))
+    check_kind("generator", generator, torch.Generator | None, "as torch.Generator()")
+    kind = _ACTIVATIONS[activation]
     layers: list[nn.Module] = []
     for i, (n, m) in enumerate(itertools.pairwise(sizes)):
         linear = nn.Linear(n, m)
@@ -91,13 +69,13 @@ def initialize_as_torch(network: nn.Module, generator: torch.Generator) -> None:
 
 
 LIMIT = 10.0
-"""The largest normalised observation, unless another limit is given."""
+"""Default limit of normalised observations."""
 
 _Applied: TypeAlias = tuple[torch.Tensor, torch.Tensor]
 
 
 class Normalizer(nn.Module):
-    """Normalises observations by their running mean and variance; the identity until the first update.
+    """Normalises observations by their running mean and variance; the identity before the first update.
 
     Args:
         size: Numbers in an observation.
@@ -121,12 +99,12 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def update(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
-        """Take observations into the mean and variance (Chan et al. 1983, parallel mean and variance).
+        """Update mean and variance with a batch of observations (Chan et al. 1983, parallel mean and variance).
 
         Args:
             obs: Observations, (..., size).
             team: The processes; each brings the same number of observations.
-            eps: Added to the standard deviations that observations are divided by.
+            eps: Added to the standard deviations.
         """
         team = team or Team()
         obs = obs.reshape(-1, obs.shape[-1]).double()
@@ -142,24 +120,48 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def interpolate(self, before: _Applied, after: _Applied, part: torch.Tensor) -> None:
-        """Apply only a part of an update: the running mean and variance stay, and later updates make the rest.
+        """Apply a fraction of an update to ``shift`` and ``scale``; mean and variance keep the whole update.
 
         Args:
             before: ``shift`` and ``scale`` before the update.
             after: ``shift`` and ``scale`` after it.
-            part: The part of the change that is applied, from 0 to 1.
+            part: The fraction, from 0 to 1.
         """
         self.shift.copy_(torch.lerp(before[0], after[0], part))
         self.scale.copy_(torch.lerp(before[1].log(), after[1].log(), part).exp())
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        """Normalised observations, (..., size)."""
+        """Normalise observations, (..., size)."""
         normalized = (obs - self.shift) * self.scale
         return normalized if self.limit == math.inf else normalized.clamp(-self.limit, self.limit)
 
 
+class Normalized(nn.Module):
+    """Base class of modules with an optional normaliser of observations; see ``Normalizer``."""
+
+    normalizer: nn.Module
+
+    def __init__(self, nobs: int, normalize: bool, limit: float) -> None:
+        super().__init__()
+        check_flag("normalize", normalize)
+        if not isinstance(limit, (int, float)) or not limit > 0:
+            raise ValueError(f"limit must be a positive number, or inf for none, not {described(limit)}")
+        self.normalizer = Normalizer(nobs, limit) if normalize else nn.Identity()
+
+    def observe(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
+        """Update the normaliser, if there is one; this changes the outputs.
+
+        Args:
+            obs: Observations, (..., nobs).
+            team: The processes; each brings the same number of observations.
+            eps: Added to the standard deviations.
+        """
+        if isinstance(self.normalizer, Normalizer):
+            self.normalizer.update(obs, team, eps=eps)
+
+
 def moved(module: Module, env: Env) -> Module:
-    """The module itself if its parameters are on the device of an environment's observations, else a copy there."""
+    """Copy a module to the device of an environment's observations, unless it is already there."""
     device = env.obs.device
     if all(parameter.device == device for parameter in module.parameters()):
         return module
@@ -167,7 +169,7 @@ def moved(module: Module, env: Env) -> Module:
 
 
 def trainable(module: Module) -> Module:
-    """The module, whose parameters are learned again if all of them are frozen, as ``lw.load`` leaves them."""
+    """Unfreeze a module if all its parameters are frozen, as after ``lw.load``; returns the module."""
     if isinstance(module, nn.Module) and not any(parameter.requires_grad for parameter in module.parameters()):
         module.requires_grad_(True)
     return module

@@ -1,26 +1,21 @@
-"""Natural policy gradient, in the order of its mathematics.
+"""Learn policies by natural policy gradient (NPG).
 
-Kakade (2002), in the form of Rajeswaran et al. (2017, "Towards Generalization and Simplicity in Continuous
-Control"): generalised advantages, the vanilla gradient, conjugate gradient on the Fisher information, and a
-step of a fixed length in the metric of the Fisher information.
+The algorithm of Kakade (2002), in the form of Rajeswaran et al. (2017, "Towards Generalization and Simplicity in
+Continuous Control"): generalised advantages, the vanilla gradient, conjugate gradient on the Fisher information, and a
+step of fixed length in the Fisher metric.
 """
 
 import copy
-import dataclasses
 import functools
 import logging
-import math
 from typing import Any
 
 import torch
-import warp as wp
 
 from lyceum_warp.algos.dense import DensePolicy, DenseValue
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
-from lyceum_warp.algos.learner import Learner, fitted_config
 from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, score_gradient
-from lyceum_warp.algos.networks import Normalizer, trainable
+from lyceum_warp.algos.networks import Normalizer
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples, least_restarts
 from lyceum_warp.algos.npg_statistics import (
     NPGIteration,
@@ -30,36 +25,33 @@ from lyceum_warp.algos.npg_statistics import (
     prediction_sums,
     summary,
 )
-from lyceum_warp.algos.on_policy import finished, finished_metrics
-from lyceum_warp.algos.policy import GaussianPolicy
-from lyceum_warp.algos.policy_check import check_policy, check_value
-from lyceum_warp.algos.rollout_buffer import Rollout
+from lyceum_warp.algos.on_policy import OnPolicyLearner
+from lyceum_warp.algos.policy import GaussianPolicy, divergence
+from lyceum_warp.algos.rollout_statistics import finished, finished_metrics
 from lyceum_warp.algos.timing import PhaseTimer, beside, one_thread
-from lyceum_warp.algos.value import BOUND, ValueFunction, value_group
+from lyceum_warp.algos.value import BOUND, ValueFunction
 from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.env import Env
-from lyceum_warp.kernels import returns
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_kind, whole_number
 
 log = logging.getLogger(__name__)
 
 _SHORTER = 4
-"""How often a step, and a change of the statistics, is shortened at most."""
+"""Maximum number of times that a step, or a change of the normaliser, is shortened."""
 
 _LARGEST = 1e30
-"""Rewards beyond it count as it, so that float32 holds the sum of an episode's rewards."""
+"""Bound of rewards, so that float32 can represent the sum of an episode's rewards."""
 
 _PATIENCE = 10
-"""Iterations in a row with an update that is not finite, after which learning ends."""
+"""Number of consecutive iterations with a non-finite update after which learning ends."""
 
 _DRIFT = 0.2
-"""The largest part of the wanted KL divergence that new statistics of observations may cause."""
+"""Largest share of the wanted KL divergence that an update of the normaliser may cause."""
 
 
 @document_attributes
-class NPG(Learner):
-    """Learns a policy; an endless iterator that yields an ``NPGIteration`` each time.
+class NPG(OnPolicyLearner):
+    """Learns a policy by NPG; an infinite iterator of ``NPGIteration``.
 
     Example:
         >>> for it in NPG(env):
@@ -67,36 +59,27 @@ class NPG(Learner):
 
     Args:
         env: The environment; do not step it between iterations.
-        policy: The policy; a new one by default. ``GaussianPolicy(nobs, nact, network=...)`` has a network of your own.
+        policy: The policy; a new one by default. ``GaussianPolicy(nobs, nact, network=...)`` wraps any network.
         value: The value function; a new one by default.
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
-        team: The processes that learn together, each with an environment of its share of the worlds. All of them must
-            make the same calls with the same arguments; all get the same numbers.
+        team: The processes that learn together, each with its share of the worlds. All processes must make the same
+            calls with the same arguments, and get the same statistics.
 
     Raises:
-        ValueError: The environment does not reset automatically, or an argument is of the wrong type, or
-            the policy cannot be learned (``lyceum_warp.algos.policy_check``).
-        FloatingPointError: In 10 iterations in a row, the step of the policy or the fit of the value function was not
-            finite. Each such update is left out, and counted in ``NPGIteration.skipped_updates``.
+        ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy
+            cannot be learned (``lyceum_warp.algos.policy_check``).
+        FloatingPointError: In 10 consecutive iterations, the policy's step or the value function's fit was not finite.
+            Such updates are skipped and counted in ``NPGIteration.skipped_updates``.
     """
 
     algorithm = "npg"
     """The name of the algorithm in a run's config.json."""
-    policy: GaussianPolicy
-    """The policy that is learned."""
-    value: ValueFunction
-    """The value function that is learned with it."""
+    config_type, twice = NPGConfig, True
     config: NPGConfig
     """Hyperparameters."""
-    generator: torch.Generator
-    """The source of the noise and of the order of samples."""
-    rollout: Rollout
-    """The samples of the last iteration."""
-    count: int
-    """Samples in an iteration, those of all processes."""
     segments: bool
-    """Whether an iteration continues the episodes of the last one; False if it begins new ones."""
+    """Whether iterations continue the episodes of the last iteration, instead of starting new ones."""
 
     def __init__(
         self,
@@ -108,56 +91,28 @@ class NPG(Learner):
         seed: int = 0,
         team: Team | None = None,
     ) -> None:
-        check_kind("env of NPG", env, Env, "as lw.make(...) makes it")
-        check_kind("config of NPG", config, NPGConfig | None, "as lw.NPGConfig(samples=10000)")
-        check_kind("team of NPG", team, Team | None, "as lyceum_warp.algos.distributed.Team() makes it")
-        seed = whole_number("seed", seed, low=0)
-        check_kind("value of NPG", value, ValueFunction | None, "as lw.load_value(run) returns it")
-        if value is not None:
-            check_value(trainable(value), env)
-        super().__init__(env, seed=seed, team=team)
-        if policy is not None:
-            check_policy(trainable(policy), env)
-        self.config = config = config or NPGConfig()
-        team, nworld = self.team, env.nworld * self.team.size
-
-        # networks
-        device = env.obs.device
-        nobs, nact = env.obs_space.size, env.action_space.size
-        group = value_group(env, config.value_group) if value is None else value.group
-        init = torch.Generator().manual_seed(seed)
-        options: dict[str, Any] = dict(normalize=config.normalize, generator=init)
-        self.policy = policy or GaussianPolicy(
-            nobs, nact, config.hidden, activation=config.activation, log_std=config.log_std, **options
-        )
+        super().__init__(env, policy, value, config, seed=seed, team=team)
+        config, team, nworld, device = self.config, self.team, env.nworld * self.team.size, env.obs.device
         self._value_is_new = value is None
-        self.value = value or ValueFunction(
-            env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation,
-            scale=1.0 / max(1.0 - config.gamma, 1e-3), time_orders=config.time_orders, group=group, **options,
-        )  # fmt: skip
-        self.value.discount = config.gamma
-        self.policy.to(device)
-        self.value.to(device)
+        scale = 1.0 / max(1.0 - config.gamma, 1e-3)
+        self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
 
-        # decisions of one process on the CPU wait for no device and for no other process
+        # on the CPU, in one process, branching on a tensor needs no synchronisation
         self._reads_numbers = device.type == "cpu" and team.size == 1
 
-        # samples, and whether an iteration begins new episodes or continues those of the last one
+        # samples
         samples = enough_samples(config, nworld)
         steps = -(-samples // nworld)
-        self.count = steps * nworld
         whole = 0 < env.horizon <= steps
         self.segments = config.rollout == "segments" or (config.rollout == "auto" and not whole)
-        self.rollout = Rollout(env, steps, groups=(group,), first_only=not self.segments)
+        self._make_rollout(steps, first_only=not self.segments)
         if not self.segments and not whole and team.leads:
             log.warning(
                 "%d samples of %d worlds are %d steps: no episode will reach its horizon of %d; use fewer worlds, "
                 "more samples, or rollout='segments'", samples, nworld, self.rollout.steps, env.horizon,
             )  # fmt: skip
         self._least_restarts = least_restarts(config, nworld, steps, env.horizon) if self.segments else 0
-        self.noise = torch.empty(self.rollout.steps, nworld, nact, device=device)
-        self._advantage = torch.empty_like(self.rollout.reward)
-        self._return = torch.empty_like(self.rollout.reward)
+        self.noise = torch.empty(steps, nworld, env.action_space.size, device=device)
 
         # parts
         self.fit = ValueFit(
@@ -165,13 +120,7 @@ class NPG(Learner):
             batch=config.value_batch or max(64, self.count // 256), team=team,
         )  # fmt: skip
         self._fisher_count = max(1, round(config.fisher_fraction * self.count))
-        self._evaluate_mean = MeanPolicyEvaluation(env, config.mean_episodes, team)
-        # a seed of its own: the same numbers should not make both the weights and the noise
-        self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
-
-        self._dense_policy: DensePolicy | None = None
-        self._dense_value: DenseValue | None = None
-
+        self._dense: DensePolicy | None = None
         self._skipping = 0
         self.rollout.restart()
         if self.segments:
@@ -181,7 +130,7 @@ class NPG(Learner):
         config, rollout, team = self.config, self.rollout, self.team
         timer = PhaseTimer(self.env.obs.device)
 
-        # 1. Samples of the current policy.
+        # 1. Sample with the current policy.
         if not self.segments:
             rollout.restart()
         elif self._least_restarts:
@@ -189,24 +138,24 @@ class NPG(Learner):
         self.sample()
         timer.mark()
 
-        # 2. Statistics that normalise the policy's observations.
+        # 2. Update the normaliser of the policy's observations.
         obs, value_obs = rollout.obs.flatten(0, 1), rollout.obs_groups[self.value.group].flatten(0, 1)
         old_mean = self.observe(obs)
 
-        # 3. Advantages, from the value function that was not yet fitted to these samples.
+        # 3. Advantages, from the value function before its fit to these samples.
         advantage, target, prediction, outliers = self.advantages()
 
         # 4. Vanilla gradient of E[log pi(a|s) A(s, a)].
         action = rollout.action.flatten(0, 1)
         weight = advantage.flatten() / self.count
-        gradient = team.sum(score_gradient(self.policy, obs, action, weight, dense=self.dense_policy()))
+        gradient = team.sum(score_gradient(self.policy, obs, action, weight, dense=self._dense))
         timer.mark()
 
         # 5. Natural gradient x = F^-1 g, and the step x sqrt(delta / (g.x)), so that step.F.step = delta.
         fisher = self.fisher(obs)
 
-        # 6. The value function, on the returns of these samples; on two CPU threads it is fitted at the same time. Its
-        # statistics change just before, so that the fit corrects what they do to its predictions.
+        # 6. Fit the value function to the returns of these samples, on two CPU threads in parallel with 5. Its
+        # normaliser is updated just before, so that the fit corrects the effect on its predictions.
         self.value.observe(value_obs, team)
         fit = functools.partial(self.fit, value_obs, rollout.step.flatten(), target.flatten(), self.generator)
         with beside(fit, allowed=self._reads_numbers) as fit_result:
@@ -216,7 +165,7 @@ class NPG(Learner):
             timer.mark()
             fitted = fit_result()
 
-        # One copy brings the numbers of all processes to the host.
+        # A single copy transfers the statistics of all processes to the host.
         update = UpdateNumbers(
             finite=finite, kl=kl, step_norm=step.norm(), step_fraction=fraction, gradient_norm=gradient.norm(),
             std_mean=self.policy.log_std.detach().exp().mean(), reward=rollout.reward.double().mean(),
@@ -227,23 +176,17 @@ class NPG(Learner):
         self._check_updates(processes[0].update)
         timer.mark()
 
-        # 7. Every few iterations, the mean policy in whole episodes.
+        # 7. Every few iterations, evaluate the mean policy in whole episodes.
         self.iteration += 1
         self.samples += self.count
-        mean: dict[str, Any] = dict.fromkeys(MEAN_STATISTICS)
-        if config.mean_every and self.iteration % config.mean_every == 0:
-            mean = self._evaluate_mean(self.policy)
+        statistics = self._with_mean_policy(summary(processes, len(obs), self.env.task.task.metrics))
         timer.mark()
 
-        statistics = summary(processes, len(obs), self.env.task.task.metrics)
-        if self.env.task.functions["success"] is None:
-            statistics["success"], mean["mean_success"] = math.nan, None
         time_sample, time_gradient, time_solve, time_value, time_mean = timer.seconds()
         return NPGIteration(
             iteration=self.iteration,
             samples=self.samples,
             **statistics,
-            **mean,
             time_sample=time_sample,
             time_gradient=time_gradient,
             time_solve=time_solve,
@@ -253,7 +196,7 @@ class NPG(Learner):
         )
 
     def _check_updates(self, update: UpdateNumbers) -> None:
-        """End learning once too many iterations in a row had an update that is not finite."""
+        """End learning after too many consecutive iterations with a non-finite update."""
         parts = {"the step of the policy": update.finite, "the fit of the value function": update.fitted}
         skipped = [part for part, finite in parts.items() if not finite]
         self._skipping = self._skipping + 1 if skipped else 0
@@ -266,43 +209,33 @@ class NPG(Learner):
             )
 
     def sample(self) -> None:
-        """Fill the rollout buffer with steps of the current policy under new noise."""
+        """Fill the rollout buffer with the current policy and new noise."""
         with one_thread():
             self.noise.normal_(generator=self.generator)
-            self.rollout.collect(self.dense_policy() or self.policy, self.noise[:, self._own])
-
-    def dense_policy(self) -> DensePolicy | None:
-        """The policy with passes that are written out, where it has such, as the default one has on the CPU."""
-        self._dense_policy = DensePolicy.of(self.policy, self._dense_policy)
-        return self._dense_policy
+            self._dense = DensePolicy.of(self.policy)
+            self.rollout.collect(self._dense or self.policy, self.noise[:, self._own])
 
     @torch.no_grad()
     def advantages(self) -> tuple[torch.Tensor, torch.Tensor, ValueSums, torch.Tensor]:
-        """Generalised advantages and discounted returns of the rollout.
+        """Compute generalised advantages and discounted returns of the rollout.
 
-        At a time limit and at the end of the rollout, the value function's prediction stands for the rest of the
-        episode. A state in which the episode terminated is worth 0 (mjrl; Lyceum bootstraps there, too). The returns
-        set the value function's scale, and advantages beyond ten times that scale are set to this bound, so that one
-        extreme reward neither hides all others nor spoils the value function. A prediction that is not finite counts as
-        the mean of the last returns.
+        Returns bootstrap from the value function at time limits and at the end of the rollout. The value of a terminal
+        state is 0 (as in mjrl; Lyceum bootstraps there, too). The returns set the value function's scale, and
+        advantages are clipped to ten times this scale, so that a single extreme reward dominates neither the gradient
+        nor the fit.
 
         Returns:
-            Advantages divided by about the value function's scale, (steps, nworld); returns, (steps, nworld); how well
-            the value function predicted them; and the number of advantages that were bounded.
+            Advantages, (steps, nworld), divided by a power of two close to the value function's scale; returns, (steps,
+            nworld); the error of the predicted returns; and the number of clipped advantages.
         """
         rollout, config, team = self.rollout, self.config, self.team
         value = self.predict(rollout.obs_groups[self.value.group], rollout.step)
         next_value = self.predict(rollout.final_obs_groups[self.value.group], rollout.step + 1.0)
         reward = rollout.reward.clamp(-_LARGEST, _LARGEST)
-        arrays = [reward, value, next_value, rollout.terminated, rollout.done]
-        inputs = [wp.from_torch(array) for array in arrays]
-        outputs = [wp.from_torch(self._advantage), wp.from_torch(self._return)]
-        args = [*inputs, config.gamma, config.lam, *outputs]
-        wp.launch(returns.advantages, self.env.nworld, args, device=self.env.device)
-        advantage, target = self._advantage, self._return
+        advantage, target = self._estimate(reward, value, next_value)
         prediction = prediction_sums(target, value)
         self.value.rescale(target, first=self._value_is_new and self.iteration == 0, team=team)
-        # the step does not depend on the unit; a power of two rounds nothing
+        # the step is invariant to the scale of the advantages; dividing by a power of two is exact
         unit = torch.exp2(torch.floor(torch.log2(self.value.scale)))
         advantage, scale = advantage / unit.float(), (self.value.scale / unit).float()
         bound = BOUND * scale
@@ -315,30 +248,29 @@ class NPG(Learner):
         return advantage, target, prediction, outliers
 
     def predict(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """The value function's finite predictions; in place of others, the mean of the last returns.
+        """Predict returns, (...,); the mean of the last returns replaces a non-finite prediction.
 
         Args:
             obs: Observations, (..., nobs).
             step: Steps since the reset, (...,).
         """
-        self._dense_value = DenseValue.of(self.value, self._dense_value)
-        value = (self._dense_value or self.value)(obs, step)
+        value = (DenseValue.of(self.value) or self.value)(obs, step)
         return torch.where(value.isfinite(), value, self.value.shift.float())
 
     @torch.no_grad()
     def observe(self, obs: torch.Tensor) -> torch.Tensor:
-        """Update the statistics that normalise the policy's observations, in steps that hardly change the policy.
+        """Update the normaliser of the policy's observations, with a bounded effect on the policy.
 
-        A change that would move the policy by more than a fifth of the wanted KL divergence is made in part; later
-        iterations make the rest. The divergence of the whole iteration includes it.
+        An update that would change the policy by more than a fifth of the wanted KL divergence is applied in part;
+        later iterations apply the rest. The KL divergence of the iteration includes this change.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
 
         Returns:
-            The mean actions before, (samples, nact).
+            The mean actions before the update, (samples, nact).
         """
-        mean, normalizer = self.dense_policy() or self.policy, self.policy.normalizer
+        mean, normalizer = self._dense or self.policy, self.policy.normalizer
         old_mean = mean(obs).clone()
         if isinstance(normalizer, Normalizer):
             before = normalizer.shift.clone(), normalizer.scale.clone()
@@ -350,14 +282,14 @@ class NPG(Learner):
                 square = (old_mean - mean(obs)).square()
                 kl = 0.5 * (square * torch.exp(-2 * self.policy.log_std)).sum(-1).mean()
                 kl = self.team.sum(kl) / self.team.size
-                if self._reads_numbers and kl <= limit:  # as all further rounds would find
+                if self._reads_numbers and kl <= limit:  # further rounds would not change it
                     break
                 part = torch.where(kl <= limit, part, part * (limit / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5))
             normalizer.interpolate(before, after, part)
         return old_mean
 
     def fisher(self, obs: torch.Tensor) -> FisherProduct:
-        """Products with the Fisher information, averaged over a share of the samples that is drawn at random.
+        """Products with the Fisher information, averaged over a random subset of the samples.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
@@ -367,23 +299,23 @@ class NPG(Learner):
             subset = torch.randperm(self.count, generator=self.generator, device=obs.device)[: self._fisher_count]
             if self.team.size == 1:
                 obs = obs[subset]
-            else:  # counting the own samples would wait for the device, so the others get the weight 0
+            else:  # selecting own samples would synchronise with the device, so others get the weight 0
                 places, own = self.team.locate(subset, self.env.nworld)
                 obs, weight = obs[places], own.float()
         return FisherProduct(
             self.policy, obs, self.config.damping, count=self._fisher_count, weight=weight, team=self.team,
-            dense=self.dense_policy(),
+            dense=self._dense,
         )  # fmt: skip
 
     @torch.no_grad()
     def move(
         self, step: torch.Tensor, obs: torch.Tensor, old_mean: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Add a step, or a part of it, to the policy's parameters.
+        """Add a step, or a fraction of it, to the policy's parameters.
 
-        The Fisher information describes the KL divergence to second order only, and only on some of the samples. Where
-        the measured divergence exceeds its limit, the step is shortened as the second order suggests, by at least
-        half, at most four times; if that is not enough, or the step is not finite, the policy stays as it is. Nothing
+        The Fisher information approximates the KL divergence to second order, on a subset of the samples. If the
+        measured divergence exceeds its limit, the step is shortened by the second-order estimate and at least by half,
+        up to four times. The policy is left unchanged if that is not enough, or if the step is not finite. Nothing
         waits for the device.
 
         Args:
@@ -392,62 +324,52 @@ class NPG(Learner):
             old_mean: The mean actions of the policy that sampled, (samples, nact).
 
         Returns:
-            Whether the step and the divergence are finite; the share of it that was made; and the KL divergence from
-            the old policy to the new one, averaged over the samples of all processes.
+            Whether the step and the divergence are finite; the fraction of the step that was made; and the KL
+            divergence from the old policy to the new one, averaged over the samples of all processes.
         """
         wanted = 0.5 * self.config.delta
-        limit = self.config.kl_limit * wanted + 1e-6  # and rounding
+        limit = self.config.kl_limit * wanted + 1e-6  # margin for rounding
         parameters = [p for p in self.policy.parameters() if p.requires_grad]
         old = [p.clone() for p in parameters]
         steps = [part.view_as(p) for part, p in zip(step.split([p.numel() for p in parameters]), old, strict=True)]
         old_log_std = self.policy.log_std.clone()
         lowest = old_log_std.clamp_max(self.config.min_log_std)
-        mean = self.dense_policy() or self.policy
+        mean = self._dense or self.policy
 
-        def divergence(fraction: torch.Tensor) -> torch.Tensor:
+        def measured(fraction: torch.Tensor) -> torch.Tensor:
             for parameter, before, part in zip(parameters, old, steps, strict=True):
                 moved = before + fraction * part
                 if parameter is self.policy.log_std:
                     moved = torch.maximum(moved, lowest)
                 parameter.copy_(torch.where(fraction > 0.0, moved, before))
-            log_std = self.policy.log_std
-            square = (old_mean - mean(obs)).square() + torch.exp(2 * old_log_std)
-            kl = (log_std - old_log_std + 0.5 * square * torch.exp(-2 * log_std) - 0.5).sum(-1).mean()
+            kl = divergence(old_mean, old_log_std, mean(obs), self.policy.log_std).mean()
             return self.team.sum(kl) / self.team.size
 
         finite = torch.isfinite(step).all()
         fraction = finite.float()
         for _ in range(_SHORTER):
-            kl = divergence(fraction)
-            if self._reads_numbers and kl <= limit:  # as all further rounds would find
+            kl = measured(fraction)
+            if self._reads_numbers and kl <= limit:  # further rounds would not change it
                 break
             factor = (wanted / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5)
             fraction = torch.where(kl <= limit, fraction, fraction * factor)
         else:
-            kl = divergence(fraction)
+            kl = measured(fraction)
             fraction = torch.where(kl <= limit, fraction, 0.0)
-            kl = divergence(fraction)
+            kl = measured(fraction)
         self.team.copy_leader(self.policy.parameters())
         return finite & kl.isfinite(), fraction, kl
 
     def settings(self) -> dict[str, Any]:
-        """The hyperparameters, with the sizes of the networks, as a run's config.json holds them."""
-        config = fitted_config(self.config, self.policy.shape, self.value.shape)
-        if self.value.group != value_group(self.env, None):
-            config = dataclasses.replace(config, value_group=self.value.group)
-        return dataclasses.asdict(config) | {"samples": enough_samples(config, self.env.nworld * self.team.size)}
+        """The hyperparameters with the sizes of the networks, for a run's config.json."""
+        samples = enough_samples(self.config, self.env.nworld * self.team.size)
+        return super().settings() | {"samples": samples}
 
     def state_dict(self) -> dict[str, Any]:
-        """The state on which the next iteration depends; see ``Learner``."""
-        own = {"optimizer": self.fit.state_dict(), "returns": self.team.gather(self.rollout.running_return)}
-        return super().state_dict() | copy.deepcopy(own)
+        """Copy the complete state; see ``Learner``."""
+        return super().state_dict() | {"optimizer": copy.deepcopy(self.fit.state_dict())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken.
-
-        Raises:
-            ValueError: The state has another number of worlds, or does not fit for another reason.
-        """
+        """Resume from a state of ``state_dict``; see ``Learner``."""
         super().load_state_dict(state)
         self.fit.load_state_dict(state["optimizer"])
-        self.rollout.running_return.copy_(state["returns"][self._own])

@@ -1,130 +1,97 @@
-"""Hyperparameters of NPG."""
+"""Define and check the hyperparameters of NPG."""
 
 import dataclasses
-import math
 from typing import Literal
 
-from lyceum_warp.algos.networks import Activation, check_activation
+from lyceum_warp.algos.hyperparameters import LEAST, check_fields
+from lyceum_warp.algos.networks import Activation
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import finite_number, layer_sizes, whole_number
 
-_WHOLE = {
+_BOUNDS: dict[str, float | tuple[float, float]] = {
     "samples": 1, "cg_iterations": 1, "value_epochs": 0, "value_batch": 1, "time_orders": 0, "mean_every": 0,
-    "mean_episodes": 1,
+    "mean_episodes": 1, "gamma": (0.0, 1.0), "lam": (0.0, 1.0), "delta": 0.0, "damping": 0.0,
+    "fisher_fraction": (0.0, 1.0), "kl_limit": 1.0, "log_std": LEAST, "min_log_std": LEAST, "value_rate": 0.0,
+    "min_restarts": 0.0,
 }  # fmt: skip
-"""The smallest value of each whole number."""
-
-_REAL = {
-    "gamma": (0.0, 1.0), "lam": (0.0, 1.0), "delta": (0.0, math.inf), "damping": (0.0, math.inf),
-    "fisher_fraction": (0.0, 1.0), "kl_limit": (1.0, math.inf), "log_std": (-math.inf, math.inf),
-    "min_log_std": (-math.inf, math.inf), "value_rate": (0.0, math.inf),
-    "min_restarts": (0.0, math.inf),
-}  # fmt: skip
-"""The smallest and the largest value of each number."""
 
 _LONG_EPISODE = 20
-"""Restarts are on by default if an episode lasts longer than this number of iterations. On a few seeds of hopper, NPG's
-return stayed low for long at 63 and 31 iterations and not at 16 (bench/README.md, "NPG's learning curves")."""
-
-_OPTIONAL = ("samples", "value_batch", "min_restarts")
-"""Numbers that may be None."""
+"""Number of iterations in an episode above which restarts are on by default. On some seeds of hopper, NPG's return
+stayed low for long with 63 and 31 iterations, but not with 16 (bench/README.md, "NPG's learning curves")."""
 
 
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NPGConfig:
-    """Hyperparameters of NPG. The defaults are those of Rajeswaran et al. (2017), where nothing else is said.
+    """Hyperparameters of NPG. The defaults are those of Rajeswaran et al. (2017), except as noted.
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.
     """
 
     samples: int | None = None
-    """Samples in an iteration, rounded up to whole steps of all worlds; by default the paper's 10,000, or 16 steps of
-    every world where those are more."""
+    """Samples in an iteration, rounded up to whole steps of all worlds. The default is the paper's 10,000, or 16 steps
+    of every world if that is more."""
     rollout: Literal["auto", "episodes", "segments"] = "auto"
-    """"episodes" begins new episodes in every iteration, as in the paper; "segments" continues those of the last
-    iteration, for many worlds and few steps of each; "auto" selects episodes where whole ones fit, that is where
-    samples / worlds >= horizon."""
+    """"episodes" starts new episodes in every iteration, as in the paper; "segments" continues the episodes of the last
+    iteration, for many worlds with few steps each; "auto" selects "episodes" if samples / worlds >= horizon."""
     min_restarts: float | None = None
-    """With segments and a time limit, the number of worlds that should begin an episode in an iteration, as a multiple
-    of samples / horizon, the average where no episode ends early. If fewer worlds than this began an episode in the
-    last iteration, random further ones restart before the next. The episodes that this cuts off do not count in the
-    statistics; values well above 1 cut off so many long ones that ``return_mean`` favours short ones. Without such
-    restarts, worlds that began at about the same time reach the time limit together, and meanwhile few samples show
-    how episodes begin. 0 means no such restarts. The default is 0.5 if an episode lasts longer than 20 iterations, as
-    with 205 or more worlds, 1,000 steps and the default samples, and 0 otherwise."""
+    """With segments and a time limit, the minimum number of worlds that start an episode in each iteration, as a
+    multiple of samples / horizon, the average without early ends. If fewer worlds started an episode in the last
+    iteration, random worlds are restarted. Otherwise worlds that started together reach the time limit together, and
+    few samples in between show how episodes begin. Interrupted episodes are not counted in the statistics, so that
+    values well above 1 bias ``return_mean`` towards short episodes. 0 turns restarts off. The default is 0.5 if an
+    episode lasts longer than 20 iterations (as with 205 or more worlds, 1,000 steps and the default samples), and 0
+    otherwise."""
     gamma: float = 0.995
-    """Discount."""
+    """Discount factor."""
     lam: float = 0.97
-    """Decay of the generalised advantage estimate."""
+    """Lambda of the generalised advantage estimate."""
     delta: float = 0.1
-    """Squared length of a step in the Fisher metric: twice the KL divergence between old and new policy."""
+    """Squared length of a step in the Fisher metric: twice the KL divergence between the old and the new policy."""
     whiten: bool = True
-    """Whether to scale the advantages to mean 0 and standard deviation 1 (as mjrl, unlike Lyceum)."""
+    """Whether to normalise advantages to mean 0 and standard deviation 1 (as in mjrl, unlike Lyceum)."""
     cg_iterations: int = 10
     """Iterations of conjugate gradient."""
     damping: float = 1e-4
-    """Added to the diagonal of the Fisher information (as mjrl; Lyceum has none)."""
+    """Damping, added to the diagonal of the Fisher information (as in mjrl, unlike Lyceum)."""
     fisher_fraction: float = 1.0
-    """Share of the samples that the Fisher information is averaged over, drawn at random in each iteration."""
+    """Fraction of the samples for the Fisher information, drawn at random in each iteration."""
     kl_limit: float = 1.5
-    """Largest KL divergence of a step, as a multiple of delta / 2, its value to second order. A step that exceeds it
-    is shortened."""
+    """Largest KL divergence of a step, as a multiple of its second-order value delta / 2. Longer steps are
+    shortened."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the policy's hidden layers."""
     activation: Activation = "tanh"
-    """What follows each of the policy's hidden layers."""
+    """Activation of the policy's hidden layers."""
     log_std: float = -0.5
     """Initial logarithm of the policy's standard deviations."""
     min_log_std: float = -3.0
-    """Lower limit of the logarithm of the policy's standard deviations (as mjrl; Lyceum has none)."""
+    """Lower limit of ``log_std`` during learning (as in mjrl, unlike Lyceum)."""
     value_hidden: tuple[int, ...] = (128, 128)
     """Widths of the value function's hidden layers."""
     value_activation: Activation = "tanh"
-    """What follows each of the value function's hidden layers."""
+    """Activation of the value function's hidden layers."""
     value_group: str | None = None
-    """Group of observations that the value function gets; by default "critic" where the task has such a group, else
-    "policy"."""
+    """Group of observations for the value function; by default "critic" if the task has this group, else "policy"."""
     value_epochs: int = 2
-    """Passes over the samples when the value function is fitted."""
+    """Epochs of the value function's fit."""
     value_batch: int | None = None
-    """Samples in a mini-batch of the value function's fit; by default a 256th of all samples, but at least the paper's
-    64, so that more samples cost no more steps."""
+    """Mini-batch size of the value function's fit; by default 1/256 of all samples, but at least the paper's 64, so
+    that the number of steps is bounded."""
     value_rate: float = 1e-3
     """Learning rate of the value function's fit (Adam)."""
     time_orders: int = 0
     """Highest power of the value function's time feature; 0 for none."""
     normalize: bool = True
-    """Whether policy and value function normalise observations by their running mean and variance (unlike the
-    paper)."""
+    """Whether to normalise observations by their running mean and variance (unlike the paper)."""
     mean_every: int = 10
-    """Iterations between two evaluations of the mean policy; 0 for never."""
+    """Iterations between evaluations of the mean policy; 0 for none."""
     mean_episodes: int = 16
     """Episodes in an evaluation of the mean policy."""
 
     def __post_init__(self) -> None:
         """Check every value."""
-        checked: dict[str, object] = {}
-        for name, low in _WHOLE.items():
-            if (number := getattr(self, name)) is not None or name not in _OPTIONAL:
-                checked[name] = whole_number(name, number, low=low)
-        for name, (smallest, largest) in _REAL.items():
-            if (number := getattr(self, name)) is not None or name not in _OPTIONAL:
-                checked[name] = finite_number(name, number, low=smallest, high=largest)
-        for name in ("hidden", "value_hidden"):
-            checked[name] = tuple(layer_sizes(getattr(self, name), name))
-        for name in ("activation", "value_activation"):
-            check_activation(getattr(self, name), name)
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
-        if self.rollout not in ("auto", "episodes", "segments"):
-            raise ValueError(f"rollout must be 'auto', 'episodes' or 'segments', not {self.rollout!r}")
-        for name in ("whiten", "normalize"):
-            if not isinstance(flag := getattr(self, name), bool):
-                raise ValueError(f"{name} must be True or False, not {flag!r}")
-        if self.value_group is not None and not isinstance(self.value_group, str):
-            raise ValueError(f"value_group must be the name of a group of observations, not {self.value_group!r}")
+        check_fields(self, _BOUNDS)
         if self.fisher_fraction == 0.0:
             raise ValueError("fisher_fraction must be greater than 0, as in 0.1 for every tenth sample")
         if self.log_std < self.min_log_std:
@@ -132,18 +99,18 @@ class NPGConfig:
 
 
 def enough_samples(config: NPGConfig, nworld: int) -> int:
-    """Samples in an iteration of ``nworld`` worlds, those of all processes."""
+    """Samples in an iteration, given the worlds of all processes."""
     return max(10_000, 16 * nworld) if config.samples is None else config.samples
 
 
 def least_restarts(config: NPGConfig, nworld: int, steps: int, horizon: int) -> int:
-    """The number of worlds that should begin an episode in an iteration, of those of all processes.
+    """Minimum number of worlds that start an episode in an iteration, of all processes.
 
     Args:
         config: The hyperparameters.
         nworld: Worlds of all processes.
         steps: Steps of each world in an iteration.
-        horizon: Steps of an episode; 0 where the task has no time limit.
+        horizon: Time limit of an episode in steps; 0 for none.
     """
     if horizon == 0:
         return 0

@@ -1,4 +1,4 @@
-"""Statistics of an iteration of NPG: the numbers of each process, and their summary over all processes."""
+"""Collect the statistics of an NPG iteration in each process, and summarise them over all processes."""
 
 import dataclasses
 import itertools
@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from lyceum_warp.algos.on_policy import (
+from lyceum_warp.algos.rollout_statistics import (
     EpisodeSums,
     Moments,
     OnPolicyIteration,
@@ -24,71 +24,60 @@ from lyceum_warp.support.docstrings import document_attributes
 class NPGIteration(OnPolicyIteration):
     """Statistics of one iteration of NPG.
 
-    Numbers about episodes cover those that ended in the iteration; they are nan where none ended.
+    Numbers about episodes cover the episodes that ended in the iteration; they are nan if none ended.
     """
 
     step_norm: float
-    """Euclidean length of the full step in the policy's parameters."""
+    """Euclidean norm of the full step in the policy's parameters."""
     step_fraction: float
-    """Share of the full step that was made; less than 1 where the full step exceeded the limit of the KL divergence."""
+    """Fraction of the full step that was made; less than 1 if the full step exceeded the limit of the KL divergence."""
     gradient_norm: float
-    """Euclidean length of the vanilla policy gradient."""
+    """Euclidean norm of the vanilla policy gradient."""
     value_error: float
     """Squared error of the value function before the fit, relative to the squared error of predicting 0."""
     explained_variance: float
-    """Share of the returns' variance that the value function explained before the fit."""
+    """Fraction of the returns' variance that the value function explained before the fit."""
     outliers: int
-    """Samples whose advantage exceeded ten standard deviations of the returns, and was set to that bound."""
+    """Number of samples whose advantage was clipped to ten standard deviations of the returns."""
     skipped_updates: int
-    """Updates of this iteration that were not finite and were left out: the policy's step, the value function's fit."""
+    """Number of non-finite updates that were skipped: the policy's step, the value function's fit."""
     time_gradient: float
     """Seconds for advantages and the vanilla gradient."""
     time_solve: float
-    """Seconds of conjugate gradient and of the step."""
+    """Seconds for conjugate gradient and the step."""
     time_value: float
-    """Seconds of fitting the value function; on two CPU threads only those after ``time_solve``, which it overlaps."""
+    """Seconds for the value function's fit; on two CPU threads, without the part that overlaps ``time_solve``."""
 
 
 class UpdateNumbers(NamedTuple):
-    """The policy's update."""
+    """The policy's update, under the names of ``NPGIteration``."""
 
-    finite: Scalar
-    """Whether the step is finite; all processes have the same."""
+    # equal in all processes
+    finite: Scalar  # whether the step is finite
     kl: Scalar
-    """KL divergence from the old to the new policy, averaged over all samples; all processes have the same."""
     step_norm: Scalar
-    """Euclidean length of the full step; all processes have the same."""
     step_fraction: Scalar
-    """Share of the full step that was made; all processes have the same."""
     gradient_norm: Scalar
-    """Euclidean length of the gradient; all processes have the same."""
     std_mean: Scalar
-    """Mean standard deviation of the policy's actions; all processes have the same."""
+    # of the process's own samples
     reward: Scalar
-    """Mean reward of the process's samples."""
     faults: Scalar
-    """Faults of the process's worlds."""
     outliers: Scalar
-    """Samples of the process whose advantage was set to its bound."""
-    fitted: Scalar
-    """Whether the value function's fit is finite; all processes have the same."""
+    # equal in all processes
+    fitted: Scalar  # whether the value function's fit is finite
 
 
 class ValueSums(NamedTuple):
-    """How well the value function predicted the returns of a process's samples."""
+    """Moments of a process's discounted returns, and of the errors (return minus prediction) of a value function."""
 
     return_mean: Scalar
-    """Mean of the discounted returns."""
-    return_square: Scalar
-    """Sum of the squared deviations of the discounted returns from their mean."""
+    return_square: Scalar  # sum of the squared deviations from the mean
     error_mean: Scalar
-    """Mean of the errors, return minus prediction."""
     error_square: Scalar
-    """Sum of the squared deviations of the errors from their mean."""
 
 
 class ProcessNumbers(NamedTuple):
-    """The contribution of one process to the statistics of an iteration."""
+    """One process's contribution to the statistics of an iteration."""
 
     update: UpdateNumbers
     values: ValueSums
@@ -97,12 +86,12 @@ class ProcessNumbers(NamedTuple):
     """Sums of the task's metrics over the episodes that ended, in the order of their names."""
 
     def pack(self) -> torch.Tensor:
-        """All numbers in one float64 tensor, so that one copy brings them to other processes and to the host."""
+        """Pack all numbers into one float64 tensor, for a single transfer to other processes and to the host."""
         return torch.stack([number.double() for part in self for number in part])
 
     @classmethod
     def unpack(cls, numbers: Iterable[float]) -> "ProcessNumbers":
-        """The numbers of a tensor from ``pack``, once they are floats on the host."""
+        """Unpack the numbers of ``pack``, as floats on the host."""
         rest = iter(numbers)
         return cls(
             update=UpdateNumbers(*itertools.islice(rest, len(UpdateNumbers._fields))),
@@ -113,7 +102,7 @@ class ProcessNumbers(NamedTuple):
 
 
 def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums:
-    """How well a value function predicted returns, scalar tensors on their device."""
+    """Compute the moments of returns and of prediction errors, scalar tensors on their device."""
     target, error = returns.double(), (returns - predicted).double()
     return ValueSums(
         return_mean=(return_mean := target.mean()),
@@ -124,7 +113,7 @@ def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums
 
 
 def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence[str] = ()) -> dict[str, Any]:
-    """Statistics of an iteration from the numbers of all processes, by their names in ``NPGIteration``.
+    """Summarise the numbers of all processes, by their names in ``NPGIteration``.
 
     Args:
         processes: The numbers of each process, as floats.
@@ -151,7 +140,7 @@ def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence
 
 
 def value_statistics(sums: Sequence[ValueSums], samples: int) -> dict[str, float]:
-    """How well a value function predicted returns, from the sums of all processes; ``samples`` in each of them."""
+    """Compute ``value_error`` and ``explained_variance`` from the sums of all processes with ``samples`` each."""
     n, mean, square = pooled([Moments(samples, part.return_mean, part.return_square) for part in sums])
     _, error_mean, error_square = pooled([Moments(samples, part.error_mean, part.error_square) for part in sums])
     error, size = error_square + n * error_mean**2, square + n * mean**2

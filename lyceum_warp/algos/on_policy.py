@@ -1,150 +1,147 @@
-"""Compute the statistics that on-policy learners share: those of the episodes that ended in a rollout."""
+"""Share networks, rollouts, advantages, evaluation and checkpoints between NPG and PPO."""
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, ClassVar
 
 import torch
+import warp as wp
 
-from lyceum_warp.algos.learner import Iteration
+from lyceum_warp.algos.distributed import Team
+from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
+from lyceum_warp.algos.learner import Learner
+from lyceum_warp.algos.networks import LIMIT, initialize_as_torch, trainable
+from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.policy_check import check_policy, check_value
 from lyceum_warp.algos.rollout_buffer import Rollout
+from lyceum_warp.algos.value import ValueFunction, value_group
+from lyceum_warp.env import Env
+from lyceum_warp.kernels import returns
 from lyceum_warp.support.docstrings import document_attributes
-
-Scalar: TypeAlias = Any
-"""A tensor of one number on the device, or, after the copy to the host, a float."""
+from lyceum_warp.support.validate import check_kind
 
 
 @document_attributes
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class OnPolicyIteration(Iteration):
-    """Statistics of one iteration of a learner that samples with a diagonal Gaussian.
+class OnPolicyLearner(Learner):
+    """Base class of NPG and PPO, which learn a Gaussian policy and a value function from a rollout buffer.
 
-    Numbers about episodes cover those that ended in the iteration; they are nan where none ended.
+    Raises:
+        ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy
+            cannot be learned (``lyceum_warp.algos.policy_check``).
     """
 
-    kl: float
-    """KL divergence from the old to the new policy, averaged over the samples."""
-    std_mean: float
-    """Mean standard deviation of the policy's actions."""
-    faults: int
-    """Faults of worlds in this iteration."""
-    time_sample: float
-    """Seconds of sampling."""
-    time_mean: float
-    """Seconds of evaluating the mean policy."""
-    samples_per_second: float
-    """Samples divided by the seconds of sampling."""
+    config_type: ClassVar[type]
+    """The class of the hyperparameters."""
+    twice: ClassVar[bool]
+    """Whether the policy must be differentiable twice."""
+    policy: GaussianPolicy
+    """The policy that is learned."""
+    value: ValueFunction
+    """The value function."""
+    generator: torch.Generator
+    """The random generator of the noise and of the order of samples."""
+    rollout: Rollout
+    """The samples of the last iteration."""
+    count: int
+    """Samples in an iteration, of all processes."""
 
-    def row(self) -> dict[str, Any]:
-        """The numbers by the names of their columns in metrics.csv; those that are None are columns, too."""
-        names = [field.name for field in dataclasses.fields(self) if field.name not in ("metrics", "numbers")]
-        return {name: getattr(self, name) for name in names} | super().row()
+    def __init__(
+        self,
+        env: Env,
+        policy: GaussianPolicy | None,
+        value: ValueFunction | None,
+        config: Any,
+        *,
+        seed: int,
+        team: Team | None,
+    ) -> None:
+        name, kind = type(self).__name__, self.config_type
+        check_kind(f"env of {name}", env, Env, "as lw.make(...) makes it")
+        check_kind(f"config of {name}", config, kind | None, f"as lw.{kind.__name__}(hidden=(64, 64))")
+        check_kind(f"team of {name}", team, Team | None, "as lyceum_warp.algos.distributed.Team() makes it")
+        check_kind(f"value of {name}", value, ValueFunction | None, "as lw.load_value(run) returns it")
+        super().__init__(env, seed=seed, team=team)
+        if value is not None:
+            check_value(trainable(value), env)
+        if policy is not None:
+            check_policy(trainable(policy), env, twice=self.twice)
+        self.config = config or kind()
 
+    def _make_networks(
+        self,
+        policy: GaussianPolicy | None,
+        value: ValueFunction | None,
+        *,
+        scale: float,
+        time_orders: int = 0,
+        limit: float = LIMIT,
+        as_torch: bool = False,
+    ) -> None:
+        """Take the given networks or make new ones, and make the generator."""
+        env, config, device = self.env, self.config, self.env.obs.device
+        nobs, nact = env.obs_space.size, env.action_space.size
+        group = value_group(env, config.value_group) if value is None else value.group
+        init = torch.Generator().manual_seed(self.seed)
+        options: dict[str, Any] = dict(normalize=config.normalize, limit=limit, generator=init)
+        self.policy = policy or GaussianPolicy(
+            nobs, nact, config.hidden, activation=config.activation, log_std=config.log_std, **options
+        )
+        self.value = value or ValueFunction(
+            env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation, scale=scale,
+            time_orders=time_orders, group=group, **options,
+        )  # fmt: skip
+        for given, module in ((policy, self.policy), (value, self.value)):
+            if given is None and as_torch:
+                initialize_as_torch(module, init)
+        self.value.discount = config.gamma
+        self.policy.to(device)
+        self.value.to(device)
+        # a separate seed, so that weights and noise are independent
+        self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
 
-class EpisodeSums(NamedTuple):
-    """Sums over the episodes that ended in a process's worlds."""
+    def _make_rollout(self, steps: int, *, first_only: bool = False) -> None:
+        """Allocate the rollout buffer, and the buffers of advantages and returns."""
+        self.count = steps * self.env.nworld * self.team.size
+        self.rollout = Rollout(self.env, steps, groups=(self.value.group,), first_only=first_only)
+        self._advantage, self._return = (torch.empty_like(self.rollout.reward) for _ in range(2))
+        self._evaluate_mean = MeanPolicyEvaluation(self.env, self.config.mean_episodes, self.team)
 
-    episodes: Scalar
-    """Number of episodes."""
-    return_mean: Scalar
-    """Mean of their returns."""
-    return_square: Scalar
-    """Sum of the squared deviations of their returns from their mean."""
-    return_min: Scalar
-    """Smallest return; infinity where no episode ended."""
-    return_max: Scalar
-    """Largest return; minus infinity where no episode ended."""
-    length: Scalar
-    """Sum of their lengths."""
-    terminal_reward: Scalar
-    """Sum of their last rewards."""
-    eval: Scalar
-    """Sum of the evaluation metrics at their ends."""
-    success: Scalar
-    """Number of episodes that ended with the goal met."""
+    def _estimate(
+        self, reward: torch.Tensor, value: torch.Tensor, next_value: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute generalised advantages and discounted returns, (steps, nworld), by ``kernels/returns.py``."""
+        arrays = (reward, value, next_value, self.rollout.terminated, self.rollout.done)
+        outputs = [wp.from_torch(self._advantage), wp.from_torch(self._return)]
+        args = [*map(wp.from_torch, arrays), self.config.gamma, self.config.lam, *outputs]
+        wp.launch(returns.advantages, self.env.nworld, args, device=self.env.device)
+        return self._advantage, self._return
 
+    def _with_mean_policy(self, statistics: dict[str, Any]) -> dict[str, Any]:
+        """Add the statistics of the mean policy, evaluated every ``mean_every`` iterations, to those of the samples."""
+        every = self.config.mean_every
+        mean: dict[str, Any] = dict.fromkeys(MEAN_STATISTICS)
+        if every and self.iteration % every == 0:
+            mean = self._evaluate_mean(self.policy)
+        if self.env.task.functions["success"] is None:
+            statistics["success"], mean["mean_success"] = math.nan, None
+        return statistics | mean
 
-class Moments(NamedTuple):
-    """Number, mean and sum of squared deviations from the mean of a set of numbers."""
+    def settings(self) -> dict[str, Any]:
+        """The hyperparameters with the sizes of the networks, for a run's config.json."""
+        policy, value = self.policy.shape, self.value.shape
+        found = {name: policy.get(name) for name in ("hidden", "activation", "normalize")}
+        found |= {f"value_{name}": value[name] for name in ("hidden", "activation")}
+        found["time_orders"] = value["time_orders"]
+        if self.config.value_group is not None or value["group"] != value_group(self.env, None):
+            found["value_group"] = value["group"]
+        own = {name: setting for name, setting in found.items() if setting is not None and hasattr(self.config, name)}
+        return dataclasses.asdict(dataclasses.replace(self.config, **own))
 
-    n: float
-    mean: float
-    square: float
+    def state_dict(self) -> dict[str, Any]:
+        """Copy the complete state; see ``Learner``."""
+        return super().state_dict() | {"returns": self.team.gather(self.rollout.running_return).clone()}
 
-
-def finished(rollout: Rollout) -> EpisodeSums:
-    """Sums over the episodes that ended within a rollout, scalar tensors on its device."""
-    ended = _ended(rollout)
-    returns = rollout.episode_return.double()
-    infinity = torch.inf
-
-    def total(part: torch.Tensor) -> torch.Tensor:
-        return part.double().masked_fill(~ended, 0.0).sum()
-
-    episodes = ended.sum().double()
-    mean = total(returns) / episodes.clamp_min(1.0)
-    return EpisodeSums(
-        episodes=episodes,
-        return_mean=mean,
-        return_square=total((returns - mean).square()),
-        return_min=returns.masked_fill(~ended, infinity).min(),
-        return_max=returns.masked_fill(~ended, -infinity).max(),
-        length=total(rollout.episode_length),
-        terminal_reward=total(rollout.reward),
-        eval=total(rollout.eval),
-        success=total(rollout.success),
-    )
-
-
-def finished_metrics(rollout: Rollout) -> tuple[torch.Tensor, ...]:
-    """Sums of the task's metrics over the episodes that ended within a rollout, scalar tensors on its device."""
-    ended = _ended(rollout)
-    return tuple(sums.double().masked_fill(~ended, 0.0).sum() for sums in rollout.episode_metrics.values())
-
-
-def _ended(rollout: Rollout) -> torch.Tensor:
-    """The last steps of the episodes that count, (steps, nworld) bool."""
-    return rollout.done & ~rollout.episode_return.isnan()
-
-
-def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, float]:
-    """Means of the task's metrics over the episodes that ended; nan where none ended.
-
-    Args:
-        episodes: Number of episodes of all processes.
-        sums: The sums over the episodes of each process, in the order of the names.
-        names: Names of the metrics.
-    """
-    totals = (sum(parts) for parts in zip(*sums, strict=True))
-    return {name: total / episodes if episodes else math.nan for name, total in zip(names, totals, strict=True)}
-
-
-def episode_statistics(sums: Sequence[EpisodeSums]) -> dict[str, float]:
-    """Statistics of finished episodes from the sums of all processes; nan where none ended."""
-    episodes, mean, square = pooled([Moments(part.episodes, part.return_mean, part.return_square) for part in sums])
-    if not episodes:
-        return dict.fromkeys(_EPISODE_STATISTICS, math.nan)
-    numbers = (
-        mean,
-        math.sqrt(square / episodes),
-        min(part.return_min for part in sums),
-        max(part.return_max for part in sums),
-        sum(part.length for part in sums) / episodes,
-        sum(part.terminal_reward for part in sums) / episodes,
-        sum(part.eval for part in sums) / episodes,
-        sum(part.success for part in sums) / episodes,
-    )
-    return dict(zip(_EPISODE_STATISTICS, numbers, strict=True))
-
-
-_EPISODE_STATISTICS = (
-    "return_mean", "return_std", "return_min", "return_max", "length_mean", "terminal_reward", "eval_mean", "success",
-)  # fmt: skip
-
-
-def pooled(parts: Sequence[Moments]) -> Moments:
-    """The moments of several sets of numbers together, from the moments of each."""
-    n = sum(part.n for part in parts)
-    mean = sum(part.n * part.mean for part in parts) / n if n else 0.0
-    return Moments(n, mean, sum(part.square + part.n * (part.mean - mean) ** 2 for part in parts))
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Resume from a state of ``state_dict``; see ``Learner``."""
+        super().load_state_dict(state)
+        self.rollout.running_return.copy_(state["returns"][self._own])

@@ -36,11 +36,12 @@ import warp as wp
 
 from lyceum_warp.algos.cem import CrossEntropy
 from lyceum_warp.algos.mppi import ExponentialWeights
-from lyceum_warp.algos.mppi_arguments import explained_worlds, plain, planner_arguments, plant_seeds, words_of_update
+from lyceum_warp.algos.mppi_arguments import explained_worlds, plain, planner_arguments, plant_seeds
 from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.plan_update import PlanSamples, PlanUpdate, launch_blocks
 from lyceum_warp.algos.planner_state import checked_state, state_from_parts
+from lyceum_warp.algos.policy_check import check_value
 from lyceum_warp.algos.predictive_sampling import BestSample
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.binding.registry import find_task
@@ -150,12 +151,10 @@ class Planner:
         self.plants = whole_number("plants", plants, low=1)
         seeds = plant_seeds(seed, self.plants)
         task = find_task(task)
-        words = words_of_update(self._only_update, words)
+        if (only := self._only_update) is not None and words.setdefault("update", only) != only:
+            raise ValueError(f"update={words['update']!r} is another planner than {only!r}: call lw.MPPI with it")
         self.config, options, own_params = planner_arguments(task, config, words, params, value, self.plants)
-        self.horizon, self.samples, self.iterations = self.config.horizon, self.config.samples, self.config.iterations
-        self.temperature, self.discount = self.config.temperature, self.config.discount
-        self.termination = self.config.termination
-
+        self.horizon, self.samples = self.config.horizon, self.config.samples
         self.settings = plain(options.given() | own_params | vars(self.config))
         nworld = self.plants * self.samples * self.config.models
         with explained_worlds(self.config, self.plants):
@@ -185,7 +184,7 @@ class Planner:
         self._update.prepare(self._arrays)
         self._take_value(value)
         first, others = self._program(first=True), self._program(first=False)
-        self._calls = first + others * (self.iterations - 1)
+        self._calls = first + others * (self.config.iterations - 1)
         self.reset(seeds)
         self._made = True
 
@@ -204,24 +203,12 @@ class Planner:
 
     def _take_value(self, value: Value | None) -> None:
         """Take the value function, and check that it fits the task's observations."""
-        self.value = value
+        self.value, group = value, "policy"
         self._value_kernel, self._value_in_torch = None, False
-        group = getattr(value, "group", "policy") if isinstance(value, ValueFunction) else "policy"
-        if group not in self._loop.final_obs_groups:
-            groups = ", ".join(map(repr, self._loop.final_obs_groups))
-            raise ValueError(
-                f"value takes the observations {group!r}, and the task {self.env.task.name!r} has {groups}: give a "
-                "value function that was trained on this task"
-            )
-        self._value_obs = self._loop.final_obs_groups[group]
         if isinstance(value, ValueFunction):
-            self.value = moved(value, self.env)
-            wanted, found = value.shape["nobs"], self._value_obs.shape[1]
-            if wanted != found:
-                raise ValueError(
-                    f"value takes {wanted} observations, and the task {self.env.task.name!r} has {found}: give a value "
-                    "function that was trained on this task"
-                )
+            check_value(value, self.env)
+            self.value, group = moved(value, self.env), value.group
+        self._value_obs = self._loop.final_obs_groups[group]
         if isinstance(value, wp.Function):
             self._value_kernel = planning.value_kernel(value)
         elif value is not None:
@@ -233,15 +220,13 @@ class Planner:
                 raise ValueError(f"value cannot take observations {observations}: {error}") from error
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if "_made" in self.__dict__:
-            if name in (*SETTINGS, "config", "value", "seed", "plants"):
-                raise AttributeError(
-                    f"{name} is part of the planner's graphs: make another {type(self).__name__} with {name}={value!r}"
-                )
-            if name in _BUFFERS:
-                raise AttributeError(
-                    f"plan.{name} is a buffer of fixed address: write into it, as plan.{name}.copy_(...)"
-                )
+        made = "_made" in self.__dict__
+        if made and name in (*SETTINGS, "config", "value", "seed", "plants"):
+            raise AttributeError(
+                f"{name} is part of the planner's graphs: make another {type(self).__name__} with {name}={value!r}"
+            )
+        if made and name in _BUFFERS:
+            raise AttributeError(f"plan.{name} is a buffer of fixed address: write into it, as plan.{name}.copy_(...)")
         super().__setattr__(name, value)
 
     def _allocate(self) -> None:
@@ -396,7 +381,7 @@ class Planner:
         if self._value_kernel is not None:
             values = [wp.from_torch(self._value_obs), self._terminal]
             wp.launch(self._value_kernel, self.env.nworld, values, device=device)
-        returns = [*self._earned, self._terminal, self.discount, self.termination == "stop", self._world_return]
+        returns = [*self._earned, self._terminal, config.discount, config.termination == "stop", self._world_return]
         wp.launch(planning.add_up, self.env.nworld, returns, device=device)
         if config.models > 1:
             combined = [self._world_return, config.risk == "worst", self._return]

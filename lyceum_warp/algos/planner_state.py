@@ -12,21 +12,7 @@ from lyceum_warp.support.validate import described
 
 
 def state_from_parts(env: Env, initial: torch.Tensor, parts: Mapping[str, Any]) -> torch.Tensor:
-    """A copy of a state in which some parts have other values.
-
-    A ``time`` sets the step counter, too, unless ``step`` is among the parts.
-
-    Args:
-        env: The environment whose states these are.
-        initial: The state to copy, (state_space.size,) float64.
-        parts: Values by the names in ``env.state_space.parts``.
-
-    Returns:
-        (state_space.size,) float64.
-
-    Raises:
-        ValueError: A part is unknown, or its value has another size or is not a number.
-    """
+    """Copy a state, (state_space.size,) float64, and replace the given parts; see ``Planner.state_of``."""
     space, state = env.state_space, initial.clone()
     for name, value in parts.items():
         if name not in space.parts:

@@ -1,4 +1,4 @@
-"""Policies: a diagonal Gaussian around a small network."""
+"""Define policies: diagonal Gaussians around the output of a network."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -7,15 +7,16 @@ from typing import Any, TypeAlias
 import torch
 from torch import nn
 
-from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.networks import LIMIT, Activation, Normalizer, check_network, mlp
+from lyceum_warp.algos.networks import LIMIT, Activation, Normalized, mlp
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import described, finite_number, layer_sizes, whole_number
 
+_LARGEST = torch.finfo(torch.float32).max
+
 
 @document_attributes
-class GaussianPolicy(nn.Module):
-    """Actions from N(mean(obs), exp(log_std)^2), with a log_std that does not depend on the observation.
+class GaussianPolicy(Normalized):
+    """Actions from N(mean(obs), exp(log_std)^2), with a log_std that is independent of the observation.
 
     Example:
         >>> policy = GaussianPolicy(nobs, nact, network=MyNetwork())  # any nn.Module, (..., nobs) -> (..., nact)
@@ -25,22 +26,21 @@ class GaussianPolicy(nn.Module):
         nobs: Numbers in an observation.
         nact: Numbers in an action.
         hidden: Widths of the hidden layers.
-        network: A network of your own, instead of one with ``hidden`` layers and an ``activation``: it maps
-            (normalised) observations, (..., nobs), to mean actions, (..., nact), each row alone, in float32. NPG also
-            needs it to be differentiable twice.
-        activation: What follows each hidden layer.
+        network: A module that replaces the default network. It maps (normalised) observations, (..., nobs), to mean
+            actions, (..., nact), independently for each row, in float32. NPG also requires second derivatives.
+        activation: Activation of the hidden layers.
         log_std: Initial logarithm of the standard deviations.
         normalize: Whether to normalise observations by their running mean and variance.
-        limit: Normalised observations are clipped to plus and minus this; inf for no limit.
+        limit: Normalised observations are clipped to [-limit, limit]; inf for no limit.
         generator: Draws the initial weights.
 
     Raises:
-        ValueError: ``hidden`` is not a sequence of positive whole numbers, ``activation`` is not a known name, or
-            ``network`` is not a module of torch.
+        ValueError: ``hidden`` is not a sequence of positive whole numbers, ``activation`` is unknown, or ``network`` is
+            not a torch module.
     """
 
     shape: dict[str, Any]
-    """What ``like`` makes a policy of that takes the same weights."""
+    """Arguments for ``like``, which makes a policy with the same structure."""
 
     def __init__(
         self,
@@ -55,17 +55,15 @@ class GaussianPolicy(nn.Module):
         limit: float = LIMIT,
         generator: torch.Generator | None = None,
     ) -> None:
-        super().__init__()
         nobs, nact = whole_number("nobs", nobs, low=1), whole_number("nact", nact, low=1)
+        super().__init__(nobs, normalize, limit)
         self.nobs, self.nact = nobs, nact
-        check_network(normalize, limit, generator)
-        self.normalizer: nn.Module = Normalizer(nobs, limit) if normalize else nn.Identity()
         self.shape = {"nobs": nobs, "nact": nact, "normalize": normalize}
-        if limit != LIMIT:  # which files of earlier releases do not name
+        if limit != LIMIT:  # files of earlier releases lack it
             self.shape["limit"] = limit
         if network is None:
             self.shape |= {"hidden": layer_sizes(hidden), "activation": activation}
-            # a last layer near zero starts every mean near the middle of its range (mjrl)
+            # with a last layer near zero, mean actions start near the middle of their range (as in mjrl)
             network = mlp([nobs, *hidden, nact], activation=activation, last_scale=1e-2, generator=generator)
         elif isinstance(network, nn.Module):
             self.shape["own"] = _class_name(network)
@@ -74,14 +72,17 @@ class GaussianPolicy(nn.Module):
         if type(self) is not GaussianPolicy:
             self.shape["own"] = _class_name(self)
         self.network = network
-        self.log_std = nn.Parameter(torch.full((nact,), finite_number("log_std", log_std)))
+        log_std = finite_number("log_std", log_std, low=-_LARGEST, high=_LARGEST)
+        self.log_std = nn.Parameter(
+            torch.full((nact,), finite_number("log_std", log_std, low=-_LARGEST, high=_LARGEST))
+        )
 
     @staticmethod
     def like(shape: Mapping[str, Any]) -> "GaussianPolicy":
-        """A new policy that takes the weights of one with this ``shape``.
+        """Make a new policy with the given ``shape``.
 
         Raises:
-            ValueError: That policy, or its network, is of a class of the user's own.
+            ValueError: The shape belongs to a custom policy class or a custom network.
         """
         if (own := shape.get("own")) is not None:
             normalize = ", normalize=True" if shape["normalize"] else ""
@@ -92,11 +93,11 @@ class GaussianPolicy(nn.Module):
         return GaussianPolicy(**shape)
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        """Mean actions, (..., nact)."""
+        """Compute mean actions, (..., nact)."""
         return self.network(self.normalizer(obs))
 
     def act(self, obs: torch.Tensor) -> torch.Tensor:
-        """Actions without noise, (..., nact): the mean actions."""
+        """Compute actions without noise, (..., nact): the mean actions."""
         return self(obs)
 
     @torch.no_grad()
@@ -106,20 +107,9 @@ class GaussianPolicy(nn.Module):
         Args:
             obs: Observations, (..., nobs).
             noise: Standard normal numbers, (..., nact).
-            out: Where to write the actions, (..., nact).
+            out: Buffer for the actions, (..., nact).
         """
         return torch.addcmul(self(obs), noise, self.log_std.exp(), out=out)
-
-    def observe(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
-        """Take observations into the normaliser's statistics, where it has one; this changes the mean actions.
-
-        Args:
-            obs: Observations, (..., nobs).
-            team: The processes; each brings the same number of observations.
-            eps: Added to the standard deviations.
-        """
-        if isinstance(self.normalizer, Normalizer):
-            self.normalizer.update(obs, team, eps=eps)
 
     def log_prob(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Log-density of actions, (...,)."""
@@ -145,7 +135,7 @@ Policy: TypeAlias = nn.Module | Callable[[torch.Tensor], torch.Tensor]
 
 
 def acting(policy: Policy) -> Callable[[torch.Tensor], torch.Tensor]:
-    """The function from observations to actions without noise: a policy's ``act``, or a function itself."""
+    """Get the function from observations to actions: a policy's ``act``, or the function itself."""
     act: Callable[[torch.Tensor], torch.Tensor] = getattr(policy, "act", policy)
     return act
 

@@ -1,33 +1,31 @@
-"""Check networks that a user gave, before an algorithm learns with them."""
+"""Check policies and value functions that a user passes to an algorithm."""
 
 import torch
-from torch import nn
 
 from lyceum_warp.algos.natural_gradient import FisherProduct, flatten
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
-from lyceum_warp.support.validate import described
+from lyceum_warp.support.validate import check_group, described
 
 _ROWS = 4
-"""Observations that the policy is called with."""
+"""Number of observations in the test batch."""
 
 
 def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
     """Check that an algorithm can learn a policy in an environment.
 
-    A policy is a ``GaussianPolicy``, with the package's network or one of the user's. Called with observations
-    (..., nobs) it returns mean actions (..., nact), which depend on the observation in the same row alone, and which
-    are differentiable by the parameters that are learned.
+    The policy must be a ``GaussianPolicy``. It must map observations (..., nobs) to mean actions (..., nact),
+    deterministically and independently for each row, and be differentiable with respect to its trainable parameters.
 
     Args:
         policy: The policy.
-        env: The environment; its worlds are left as they are.
-        twice: Whether the policy must be differentiable twice, as NPG needs it.
+        env: The environment; its worlds do not change.
+        twice: Whether the policy must be differentiable twice, as NPG requires.
 
     Raises:
-        ValueError: The policy breaks one of these rules.
+        ValueError: The policy violates one of these rules.
     """
     if not isinstance(policy, GaussianPolicy):
         kind = getattr(policy, "__name__", None) or type(policy).__name__
@@ -40,25 +38,13 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
             f"the policy takes {sizes[0]} observations and gives {sizes[1]} actions, but the task {env.task.name!r} "
             f"has {wanted[0]} and {wanted[1]}"
         )
-    _check_parameters(policy)
+    if not any(p.requires_grad for p in policy.parameters() if p is not policy.log_std):
+        raise ValueError("the policy's network has no parameter to learn: unfreeze it with policy.requires_grad_(True)")
     obs = env.obs.repeat(-(-_ROWS // env.nworld), 1)[:_ROWS]
-    noise = torch.randn(obs.shape, generator=torch.Generator().manual_seed(0))  # rows differ from each other
+    noise = torch.randn(obs.shape, generator=torch.Generator().manual_seed(0))  # make the rows differ
     obs = obs + 0.1 * noise.to(obs.device)
     _check_output(policy, obs)
     _check_derivatives(policy, obs, twice=twice)
-
-
-def _check_parameters(policy: GaussianPolicy) -> None:
-    log_std = getattr(policy, "log_std", None)
-    if not isinstance(log_std, nn.Parameter) or log_std.shape != (policy.nact,):
-        raise ValueError(f"policy.log_std must be an nn.Parameter of shape ({policy.nact},), not {described(log_std)}")
-    for name, parameter in policy.named_parameters():
-        if parameter.dtype != torch.float32:
-            raise ValueError(f"the policy's parameter {name!r} must be float32, not {described(parameter)}")
-        if not parameter.isfinite().all():
-            raise ValueError(f"the policy's parameter {name!r} is not finite: initialise it")
-    if not any(p.requires_grad for p in policy.parameters() if p is not log_std):
-        raise ValueError("the policy's network has no parameter to learn: unfreeze it with policy.requires_grad_(True)")
 
 
 @torch.no_grad()
@@ -80,11 +66,11 @@ def _check_output(policy: GaussianPolicy, obs: torch.Tensor) -> None:
 
 
 def _called(policy: GaussianPolicy, obs: torch.Tensor) -> torch.Tensor:
-    """The mean actions for observations, (rows, nact)."""
+    """Call the policy, and check the type and shape of the mean actions, (rows, nact)."""
     shape = (len(obs), policy.nact)
     try:
         mean: object = policy(obs)
-    except Exception as error:  # of any type, from the user's network
+    except Exception as error:  # the user's network may raise anything
         reason = f"{type(error).__name__}: {_first_line(error)}"
         raise ValueError(f"the policy fails for observations of shape {tuple(obs.shape)} ({reason})") from error
     if not isinstance(mean, torch.Tensor) or mean.shape != shape or mean.dtype != obs.dtype:
@@ -123,17 +109,13 @@ def _check_derivatives(policy: GaussianPolicy, obs: torch.Tensor, *, twice: bool
 
 
 def check_value(value: ValueFunction, env: Env) -> None:
-    """Check that a value function takes observations of an environment.
+    """Check that a value function fits an environment's observations.
 
     Raises:
-        ValueError: It takes others, or a number of it is not finite.
+        ValueError: Its group or its number of observations does not fit, or a parameter is not finite.
     """
     name = env.task.name
-    if value.group not in env.obs_groups:
-        raise ValueError(
-            f"the value function takes the group {value.group!r} of observations, which the task {name!r} lacks: it "
-            f"has {', '.join(env.obs_groups)}"
-        )
+    check_group(value.group, env.obs_groups, name)
     size, wanted = value.shape["nobs"], env.obs_spaces[value.group].size
     if size != wanted:
         raise ValueError(
@@ -146,5 +128,5 @@ def check_value(value: ValueFunction, env: Env) -> None:
 
 
 def _first_line(error: BaseException) -> str:
-    """The first line of an error's message; torch's messages fill a page."""
+    """Shorten an error's message to its first sentence; torch's messages can fill a page."""
     return (str(error).strip() or type(error).__name__).splitlines()[0].split(". ")[0][:200]

@@ -1,4 +1,4 @@
-"""Policies as files that run without this package: ONNX, or torch's own format."""
+"""Export policies to ONNX or to torch's format, to run them without this package."""
 
 import contextlib
 import copy
@@ -21,10 +21,10 @@ _SUFFIXES = (".onnx", ".pt2")
 
 
 def export_policy(policy: torch.nn.Module, path: str | Path) -> Path:
-    """Write a policy to a file that runs without this package: observations in, actions without noise out.
+    """Export a policy's ``act`` to a file that runs without this package.
 
-    The normaliser of observations is part of the file. The number of observations, (n, nobs) float32, is free. Actions
-    are those of ``policy.act(obs)``; an environment also clips controls to the ranges of the model's actuators.
+    The file maps observations, (n, nobs) float32 for any n, to actions without noise, and includes the normaliser. An
+    environment also clips controls to the ranges of the model's actuators.
 
     ===========  ======================================================================================
     ``.onnx``    input ``obs``, output ``action``; for ONNX Runtime, TensorRT, OpenVINO, ...
@@ -38,13 +38,13 @@ def export_policy(policy: torch.nn.Module, path: str | Path) -> Path:
 
     Args:
         policy: The policy, on any device: a module with the method ``act`` and the attribute ``nobs``.
-        path: The file, which is replaced if it exists.
+        path: The file; an existing file is replaced.
 
     Returns:
         The file's path.
 
     Raises:
-        ImportError: The extra ``export``, which ``.onnx`` needs, is not installed.
+        ImportError: The extra ``export``, which ``.onnx`` requires, is not installed.
         ValueError: The file has another suffix, or the policy's network cannot be exported.
     """
     if not (isinstance(policy, torch.nn.Module) and hasattr(policy, "act") and hasattr(policy, "nobs")):
@@ -61,7 +61,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path) -> Path:
                 program = torch.onnx.export(
                     program, input_names=["obs"], output_names=["action"], dynamo=True, verbose=False
                 )
-    except Exception as error:  # of many types, from torch
+    except Exception as error:  # torch raises many types
         first = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
         raise ValueError(f"the policy's network cannot be exported to {path.suffix} ({first})") from error
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -75,7 +75,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path) -> Path:
 
 
 class _Acting(torch.nn.Module):
-    """A policy whose ``forward`` is its ``act``: what torch exports."""
+    """Wraps a policy so that ``forward``, which torch exports, is its ``act``."""
 
     def __init__(self, policy: Any) -> None:
         super().__init__()
@@ -87,12 +87,7 @@ class _Acting(torch.nn.Module):
 
 
 def check_export(path: Path) -> None:
-    """Check that a policy can be written to a file of this name.
-
-    Raises:
-        ImportError: The packages for the file's format are not installed.
-        ValueError: The format is not known.
-    """
+    """Check the suffix of a file, and that the packages for its format are installed; see ``export_policy``."""
     if path.suffix not in _SUFFIXES:
         raise ValueError(f"{path} must end with {' or '.join(_SUFFIXES)}")
     missing = [name for name in ("onnx", "onnxscript") if importlib.util.find_spec(name) is None]
@@ -102,7 +97,7 @@ def check_export(path: Path) -> None:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence torch's exporter, which warns of its own parts and of absent packages."""
+    """Silence warnings of torch's exporter about its internals and about optional packages."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

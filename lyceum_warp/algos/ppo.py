@@ -1,8 +1,8 @@
-"""Proximal policy optimisation, in the order of its mathematics.
+"""Learn policies by proximal policy optimisation (PPO).
 
-Schulman et al. (2017, "Proximal Policy Optimization Algorithms"), with the choices of rsl_rl (Rudin et al. 2022,
-"Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement Learning"): a clipped value loss, a learning
-rate that follows the KL divergence, and the same mini-batches in every epoch.
+The algorithm of Schulman et al. (2017, "Proximal Policy Optimization Algorithms") as implemented in rsl_rl (Rudin et
+al. 2022, "Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement Learning"): with a clipped value
+loss, a learning rate that follows the KL divergence, and the same mini-batches in every epoch.
 """
 
 import collections
@@ -12,15 +12,15 @@ import math
 from typing import Any
 
 import torch
-import warp as wp
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.evaluation import MEAN_STATISTICS, MeanPolicyEvaluation
-from lyceum_warp.algos.learner import Learner, fitted_config
 from lyceum_warp.algos.minibatches import Minibatches, Samples, precision
-from lyceum_warp.algos.networks import initialize_as_torch, trainable
-from lyceum_warp.algos.on_policy import (
+from lyceum_warp.algos.networks import LIMIT
+from lyceum_warp.algos.on_policy import OnPolicyLearner
+from lyceum_warp.algos.policy import GaussianPolicy, divergence, log_density
+from lyceum_warp.algos.ppo_config import PPOConfig
+from lyceum_warp.algos.rollout_statistics import (
     EpisodeSums,
     OnPolicyIteration,
     episode_statistics,
@@ -28,27 +28,21 @@ from lyceum_warp.algos.on_policy import (
     finished_metrics,
     metric_means,
 )
-from lyceum_warp.algos.policy import GaussianPolicy, divergence, log_density
-from lyceum_warp.algos.policy_check import check_policy, check_value
-from lyceum_warp.algos.ppo_config import PPOConfig
-from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.timing import PhaseTimer, one_thread
-from lyceum_warp.algos.value import ValueFunction, value_group
+from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
-from lyceum_warp.kernels import returns
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_kind
 
 RECENT = 100
 """Episodes in ``return_recent``."""
 
 _EPS = 1e-2
-"""Added to the standard deviations that normalise observations, as in rsl_rl."""
+"""Added to the standard deviations of the normaliser, as in rsl_rl."""
 
 _SMALLEST_STD = 1e-6
 
 _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
-"""Limits of the adaptive learning rate, and the factor by which it changes."""
+"""Lower and upper limit of the adaptive learning rate, and the factor by which it changes."""
 
 
 @document_attributes
@@ -56,12 +50,12 @@ _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
 class PPOIteration(OnPolicyIteration):
     """Statistics of one iteration of PPO.
 
-    Numbers about episodes cover those that ended in the iteration; they are nan if none ended. The first episodes of
-    the worlds, which may begin at a random step, do not count.
+    Numbers about episodes cover the episodes that ended in the iteration; they are nan if none ended. The worlds' first
+    episodes are not counted if they started at a random step (``stagger``).
     """
 
     return_recent: float
-    """Mean return of the last 100 episodes that ended, in this iteration or before."""
+    """Mean return of the last 100 episodes, of this iteration or earlier ones."""
     learning_rate: float
     """Learning rate after the iteration."""
     surrogate_loss: float
@@ -71,12 +65,12 @@ class PPOIteration(OnPolicyIteration):
     value_loss: float
     """Mean of the value function's loss over the mini-batches."""
     time_update: float
-    """Seconds of the update."""
+    """Seconds for the update."""
 
 
 @document_attributes
-class PPO(Learner):
-    """Learns a policy by PPO; an endless iterator that yields a ``PPOIteration`` each time.
+class PPO(OnPolicyLearner):
+    """Learns a policy by PPO; an infinite iterator of ``PPOIteration``.
 
     Example:
         >>> for it in PPO(env, config=PPOConfig(hidden=(64, 64))):
@@ -84,12 +78,12 @@ class PPO(Learner):
 
     Args:
         env: The environment; do not step it between iterations.
-        policy: The policy; a new one by default. ``GaussianPolicy(nobs, nact, network=...)`` has a network of your own.
+        policy: The policy; a new one by default. ``GaussianPolicy(nobs, nact, network=...)`` wraps any network.
         value: The value function; a new one by default.
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
-        team: The processes that learn together, each with an environment of its share of the worlds. All of them must
-            make the same calls with the same arguments; all get the same numbers.
+        team: The processes that learn together, each with its share of the worlds. All processes must make the same
+            calls with the same arguments, and get the same statistics.
 
     Raises:
         ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy
@@ -99,20 +93,11 @@ class PPO(Learner):
 
     algorithm = "ppo"
     """The name of the algorithm in a run's config.json."""
-    policy: GaussianPolicy
-    """The policy that is learned."""
-    value: ValueFunction
-    """The value function that is learned with it."""
+    config_type, twice = PPOConfig, False
     config: PPOConfig
     """Hyperparameters."""
-    generator: torch.Generator
-    """The source of the noise and of the order of samples."""
-    rollout: Rollout
-    """The samples of the last iteration."""
     rate: torch.Tensor
     """The learning rate, on the device."""
-    count: int
-    """Samples in an iteration, those of all processes."""
 
     def __init__(
         self,
@@ -124,51 +109,19 @@ class PPO(Learner):
         seed: int = 0,
         team: Team | None = None,
     ) -> None:
-        check_kind("env of PPO", env, Env, "as lw.make(...) makes it")
-        check_kind("config of PPO", config, PPOConfig | None, "as lw.PPOConfig(num_steps=24)")
-        check_kind("value of PPO", value, ValueFunction | None, "as lw.load_value(run) returns it")
-        super().__init__(env, seed=seed, team=team)
-        self.config = config = config or PPOConfig()
-        team, device, steps = self.team, env.obs.device, config.num_steps
-        self.count = steps * env.nworld * team.size
-        if config.minibatches > self.count:
+        super().__init__(env, policy, value, config, seed=seed, team=team)
+        config, team, device, steps = self.config, self.team, env.obs.device, self.config.num_steps
+        if config.minibatches > (count := steps * env.nworld * team.size):
             raise ValueError(
-                f"{config.minibatches} mini-batches are more than the {self.count} samples: give more worlds, or make "
+                f"{config.minibatches} mini-batches are more than the {count} samples: give more worlds, or make "
                 "minibatches smaller"
             )
-        if value is not None:
-            check_value(trainable(value), env)
-        if policy is not None:
-            check_policy(trainable(policy), env, twice=False)
-
-        # networks
-        nobs, nact = env.obs_space.size, env.action_space.size
-        group = value_group(env, config.value_group) if value is None else value.group
-        init = torch.Generator().manual_seed(seed)
-        options: dict[str, Any] = dict(normalize=config.normalize, generator=init)
-        if config.normalize:
-            options["limit"] = math.inf
-        self.policy = policy or GaussianPolicy(
-            nobs, nact, config.hidden, activation=config.activation, log_std=config.log_std, **options
-        )
-        self.value = value or ValueFunction(
-            env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation, scale=1.0,
-            group=group, **options,
-        )  # fmt: skip
-        for given, module in ((policy, self.policy), (value, self.value)):
-            if given is None:  # a policy's last layer near zero, as NPG's, lets the adaptive rate begin much higher
-                initialize_as_torch(module, init)
-        self.value.discount = config.gamma
-        self.policy.to(device)
-        self.value.to(device)
-
-        # samples
-        self.rollout = Rollout(env, steps, groups=(group,))
-        self.noise = torch.empty(steps, env.nworld * team.size, nact, device=device)
+        # with a last layer near zero, as NPG's, the adaptive learning rate would start much too high
+        limit = math.inf if config.normalize else LIMIT
+        self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
+        self._make_rollout(steps)
+        self.noise = torch.empty(steps, env.nworld * team.size, env.action_space.size, device=device)
         self._mean = torch.empty_like(self.rollout.action)
-        self._advantage, self._return = (torch.empty_like(self.rollout.reward) for _ in range(2))
-        # a seed of its own: the same numbers should not make both the weights and the noise
-        self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
 
         # the update
         log_std = self.policy.log_std
@@ -180,7 +133,7 @@ class PPO(Learner):
         self.rate = torch.tensor(config.learning_rate, device=device)
         self._cuda = device.type == "cuda"
         self.optimizer = torch.optim.Adam(self._parameters, lr=self.rate, fused=True, capturable=self._cuda)
-        # gradients, KL divergence and losses are parts of one tensor, which the processes sum in one call
+        # gradients, KL divergence and losses are views of one tensor, for a single all-reduce
         sizes = [p.numel() for p in self._parameters]
         self._sums = self._parameters[0].new_zeros(sum(sizes) + 4)
         for parameter, part in zip(self._parameters, self._sums[:-4].split(sizes), strict=True):
@@ -192,7 +145,6 @@ class PPO(Learner):
         )
 
         self._recent: collections.deque[float] = collections.deque(maxlen=RECENT)
-        self._evaluate_mean = MeanPolicyEvaluation(env, config.mean_episodes, team)
         self.rollout.restart()
         if config.stagger:
             self.rollout.stagger(self.generator, team)
@@ -201,18 +153,18 @@ class PPO(Learner):
         config, rollout, team = self.config, self.rollout, self.team
         timer = PhaseTimer(self.env.obs.device)
         with precision(tf32=config.tf32 and self._cuda):
-            # 1. Samples of the current policy.
+            # 1. Sample with the current policy.
             self.sample()
 
-            # 2. Values and advantages, from the value function that was not yet fitted to these samples.
+            # 2. Values and advantages, from the value function before its fit to these samples.
             samples = self.evaluated_samples()
             timer.mark()
 
-            # 3. Epochs of mini-batches: a step on the clipped surrogate, the value loss and the entropy in each.
+            # 3. Epochs of mini-batches; each is a step on the clipped surrogate, the value loss and the entropy.
             self.update(samples)
             kl = self.divergence()
 
-        # One copy brings the numbers of all processes to the host, and another one the returns.
+        # One copy transfers the statistics of all processes to the host, another one the returns.
         losses = self._losses / (config.epochs * config.minibatches)
         finite = torch.stack([numbers.isfinite().all() for numbers in (losses, *self._parameters)]).all()
         numbers = [
@@ -233,24 +185,18 @@ class PPO(Learner):
                 "smaller"
             )
 
-        # 4. Every few iterations, the mean policy in whole episodes.
+        # 4. Every few iterations, evaluate the mean policy in whole episodes.
         self.iteration += 1
         self.samples += self.count
-        mean: dict[str, Any] = dict.fromkeys(MEAN_STATISTICS)
-        if config.mean_every and self.iteration % config.mean_every == 0:
-            mean = self._evaluate_mean(self.policy)
+        statistics = self._with_mean_policy(episode_statistics(episodes))
         timer.mark()
 
-        statistics: dict[str, Any] = episode_statistics(episodes)
-        if self.env.task.functions["success"] is None:
-            statistics["success"], mean["mean_success"] = math.nan, None
         time_sample, time_update, time_mean = timer.seconds()
         return PPOIteration(
             iteration=self.iteration,
             samples=self.samples,
             reward_mean=sum(process[0] for process in sums) / len(sums),
             **statistics,
-            **mean,
             kl=kl,
             std_mean=std,
             return_recent=sum(self._recent) / len(self._recent) if self._recent else math.nan,
@@ -268,10 +214,10 @@ class PPO(Learner):
 
     @torch.no_grad()
     def sample(self) -> None:
-        """Fill the rollout buffer with steps of the current policy under new noise.
+        """Fill the rollout buffer with the current policy and new noise.
 
-        The observations that each step leads to are taken into the statistics that normalise them. A step computes
-        nothing else but its actions: values and densities follow once for all steps.
+        Each step updates the normalisers with its observations. Values and densities are computed for all steps at once
+        in ``evaluated_samples``.
         """
         env, rollout, std = self.env, self.rollout, self.policy.log_std.exp()
         with one_thread():
@@ -289,20 +235,18 @@ class PPO(Learner):
 
     @torch.no_grad()
     def evaluated_samples(self) -> dict[str, torch.Tensor]:
-        """The samples with what the update needs of the old networks, each (steps, nworld, ...).
+        """Compute the inputs of the update from the samples and the old networks, each (steps, nworld, ...).
 
-        At a time limit, after a fault and at the end of the rollout, the value of the final observation stands for the
-        rest of the episode. The value function's targets are its predictions plus the advantages.
+        Every transition bootstraps from the observation that it led to, before events of the task: a push or a new
+        command between two steps changes the value of the state, but no action caused that change, so advantages and
+        targets leave it out. Time limits, faults and the end of the rollout bootstrap in the same way. The value
+        function's targets are its predictions plus the advantages.
         """
         rollout, config, team = self.rollout, self.config, self.team
         obs, final_obs = rollout.obs_groups[self.value.group], rollout.final_obs_groups[self.value.group]
         value, next_value = self.value(obs, rollout.step), self.value(final_obs, rollout.step + 1.0)
-        arrays = [rollout.reward, value, next_value, rollout.terminated, rollout.done]
-        inputs = [wp.from_torch(array) for array in arrays]
-        outputs = [wp.from_torch(self._advantage), wp.from_torch(self._return)]
-        args = [*inputs, config.gamma, config.lam, *outputs]
-        wp.launch(returns.advantages, self.env.nworld, args, device=self.env.device)
-        advantage, target = self._advantage, value + self._advantage
+        advantage, _ = self._estimate(rollout.reward, value, next_value)
+        target = value + advantage
         if not config.whiten_minibatches:
             advantage = advantage - team.sum(advantage.sum()) / self.count
             variance = team.sum(advantage.square().sum()) / max(self.count - 1, 1)
@@ -315,7 +259,7 @@ class PPO(Learner):
         }  # fmt: skip
 
     def update(self, samples: Samples) -> None:
-        """Learn from samples of ``evaluated_samples`` in epochs of mini-batches."""
+        """Learn from the samples of ``evaluated_samples`` in epochs of mini-batches."""
         config, team = self.config, self.team
         parts = self.minibatches.shuffle(samples, self.generator)
         if config.whiten_minibatches:
@@ -331,11 +275,11 @@ class PPO(Learner):
         self._apply_std()
 
     def learn(self, samples: Samples, weight: torch.Tensor) -> None:
-        """One step of Adam on a mini-batch.
+        """Make one step of Adam on a mini-batch.
 
         Args:
             samples: This process's samples of the mini-batch, each (samples, ...).
-            weight: Their weights, (samples,), whose sum over all processes is 1.
+            weight: Weights of the samples, (samples,), which sum to 1 over all processes.
         """
         config, clip = self.config, self.config.clip
         mean, log_std = self.policy(samples["obs"]), self._log_std()
@@ -350,7 +294,7 @@ class PPO(Learner):
         entropy = (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
         losses = torch.stack([(weight * error).sum(), (weight * surrogate).sum(), weight.sum() * entropy])
         loss = config.value_coef * losses[0] + losses[1] - self._entropy_coef * losses[2]
-        # not backward(), whose sums of gradients belong to the stream of the first call
+        # not backward(), which accumulates gradients on the stream of the first call
         gradients = torch.autograd.grad(loss, self._parameters)
 
         with torch.no_grad():
@@ -372,7 +316,7 @@ class PPO(Learner):
         self.rate.copy_(torch.where(kl > wanted * 2.0, lower, raised))
 
     def _log_std(self) -> torch.Tensor:
-        """Logarithms of the standard deviations that Adam learns, (nact,)."""
+        """Logarithms of the learned standard deviations, (nact,)."""
         if self.config.std_type == "log":
             return self.std.clamp_min(math.log(_SMALLEST_STD))
         return self.std.clamp_min(_SMALLEST_STD).log()
@@ -383,40 +327,28 @@ class PPO(Learner):
 
     @torch.no_grad()
     def divergence(self) -> torch.Tensor:
-        """KL divergence from the policy that sampled to the present one, averaged over the samples."""
+        """KL divergence from the policy that sampled to the current policy, averaged over the samples."""
         kl = divergence(self._mean, self._old_log_std, self.policy(self.rollout.obs), self.policy.log_std).mean()
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
-        """Returns of the episodes of all processes that ended in the iteration and count, in the order of the steps."""
+        """Returns of the counted episodes of all processes that ended in the iteration, in the order of the steps."""
         ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
         ended = self.team.gather(ended.T).T
         found: list[float] = ended[~ended.isnan()].tolist()
         return found
 
-    def settings(self) -> dict[str, Any]:
-        """The hyperparameters, with the sizes of the networks, as a run's config.json holds them."""
-        config = fitted_config(self.config, self.policy.shape, self.value.shape)
-        if self.value.group != value_group(self.env, None):
-            config = dataclasses.replace(config, value_group=self.value.group)
-        return dataclasses.asdict(config)
-
     def state_dict(self) -> dict[str, Any]:
-        """The state on which the next iteration depends; see ``Learner``."""
+        """Copy the complete state; see ``Learner``."""
         own = {
             "optimizer": self.optimizer.state_dict(),
             "std": self.std.detach(),
-            "returns": self.team.gather(self.rollout.running_return),
             "recent": list(self._recent),
         }
         return super().state_dict() | copy.deepcopy(own)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where ``state_dict`` was taken.
-
-        Raises:
-            ValueError: The state has another number of worlds, or does not fit for another reason.
-        """
+        """Resume from a state of ``state_dict``; see ``Learner``."""
         super().load_state_dict(state)
         self.optimizer.load_state_dict(state["optimizer"])
         for group in self.optimizer.param_groups:
@@ -424,7 +356,6 @@ class PPO(Learner):
             group["lr"], group["capturable"] = self.rate, self._cuda
         with torch.no_grad():
             self.std.copy_(state["std"])
-        self.rollout.running_return.copy_(state["returns"][self._own])
         self._recent.clear()
         self._recent.extend(state["recent"])
-        self.minibatches.forget()  # its graph holds the addresses of the old moments
+        self.minibatches.forget()  # the graph holds the addresses of the old moments

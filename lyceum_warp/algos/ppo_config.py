@@ -1,33 +1,24 @@
-"""Hyperparameters of PPO."""
+"""Define and check the hyperparameters of PPO."""
 
 import dataclasses
-import math
 from typing import Any, Literal
 
-from lyceum_warp.algos.networks import Activation, check_activation
+from lyceum_warp.algos.hyperparameters import check_fields
+from lyceum_warp.algos.networks import Activation
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import finite_number, layer_sizes, whole_number
+from lyceum_warp.support.validate import whole_number
 
-_WHOLE = {"num_steps": 1, "epochs": 1, "minibatches": 1, "mean_every": 0, "mean_episodes": 1}
-"""The smallest value of each whole number."""
-
-_REAL = {
-    "gamma": (0.0, 1.0), "lam": (0.0, 1.0), "clip": (0.0, math.inf), "value_coef": (0.0, math.inf),
-    "entropy_coef": (0.0, math.inf), "final_entropy_coef": (0.0, math.inf), "learning_rate": (0.0, math.inf),
-    "desired_kl": (0.0, math.inf), "max_grad_norm": (0.0, math.inf), "log_std": (-13.8, 13.8),
+_BOUNDS: dict[str, float | tuple[float, float]] = {
+    "num_steps": 1, "epochs": 1, "minibatches": 1, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0),
+    "lam": (0.0, 1.0), "clip": 0.0, "value_coef": 0.0, "entropy_coef": 0.0, "final_entropy_coef": 0.0,
+    "learning_rate": 0.0, "desired_kl": 0.0, "max_grad_norm": 0.0, "log_std": (-13.8, 13.8),
 }  # fmt: skip
-"""The smallest and the largest value of each number."""
-
-_CHOICES = {"schedule": ("adaptive", "fixed"), "std_type": ("scalar", "log")}
-"""The values of each choice."""
-
-_FLAGS = ("clip_value_loss", "whiten_minibatches", "normalize", "stagger", "tf32")
 
 
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PPOConfig:
-    """Hyperparameters of PPO. The defaults are mjlab's for legged robots, but with a ``desired_kl`` of 0.02.
+    """Hyperparameters of PPO. The defaults are mjlab's for legged robots, except ``desired_kl``.
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.
@@ -38,42 +29,41 @@ class PPOConfig:
     epochs: int = 5
     """Passes over the samples of an iteration."""
     minibatches: int = 4
-    """Mini-batches in a pass. Samples that are left over when all of them have the same size are not used."""
+    """Mini-batches in an epoch, of equal size. Remaining samples are not used."""
     gamma: float = 0.99
-    """Discount."""
+    """Discount factor."""
     lam: float = 0.95
-    """Decay of the generalised advantage estimate."""
+    """Lambda of the generalised advantage estimate."""
     clip: float = 0.2
-    """How far the probability ratio of the new to the old policy may be from 1 in the surrogate, and, with
-    clip_value_loss, a value from its old one."""
+    """Clipping range of the probability ratio around 1, and with clip_value_loss of the values around the old
+    values."""
     clip_value_loss: bool = True
-    """Whether the value function's loss also counts its prediction clipped to the old one plus and minus clip, and
-    takes the larger error."""
+    """Whether the value loss is the larger of the errors of the prediction and of the clipped prediction."""
     value_coef: float = 1.0
-    """Weight of the value function's loss."""
+    """Coefficient of the value loss."""
     entropy_coef: float = 0.01
-    """Weight of the policy's entropy."""
+    """Coefficient of the policy's entropy."""
     final_entropy_coef: float | None = None
-    """Weight of the policy's entropy from the last iteration of entropy_decay on; by default it stays the same."""
+    """Coefficient of the entropy after entropy_decay; by default the coefficient is constant."""
     entropy_decay: tuple[int, int] = (150, 200)
-    """Iterations between which the entropy's weight falls linearly, if final_entropy_coef is given."""
+    """First and last iteration of the coefficient's linear change to final_entropy_coef."""
     learning_rate: float = 1e-3
-    """Learning rate (Adam), at first if it is adaptive."""
+    """Learning rate of Adam; the initial one if it is adaptive."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
-    """"adaptive" divides the learning rate by 1.5 after a mini-batch with a KL divergence of more than twice
-    desired_kl, and multiplies it by 1.5 after one of less than half, between 1e-5 and 1e-2."""
+    """"adaptive" divides the learning rate by 1.5 after a mini-batch with a KL divergence above twice desired_kl, and
+    multiplies it by 1.5 after one below half of desired_kl, within 1e-5 and 1e-2."""
     desired_kl: float = 0.02
-    """The KL divergence that the adaptive learning rate aims at. On go1_velocity PPO learns faster with 0.02 than
-    with mjlab's 0.01 (bench/README.md)."""
+    """KL divergence that the adaptive learning rate aims at. With 0.02 PPO learns go1_velocity faster than with mjlab's
+    0.01 (bench/README.md)."""
     max_grad_norm: float = 1.0
-    """Largest Euclidean length of the gradient, of the policy's and of the value function's apart."""
+    """Maximum Euclidean norm of the gradient, for the policy and the value function separately."""
     whiten_minibatches: bool = False
-    """Whether to scale the advantages to mean 0 and standard deviation 1 in each mini-batch, rather than over all
+    """Whether to normalise advantages to mean 0 and standard deviation 1 in each mini-batch, instead of over all
     samples."""
     hidden: tuple[int, ...] = (512, 256, 128)
     """Widths of the policy's hidden layers."""
     activation: Activation = "elu"
-    """What follows each of the policy's hidden layers."""
+    """Activation of the policy's hidden layers."""
     log_std: float = 0.0
     """Initial logarithm of the policy's standard deviations."""
     std_type: Literal["scalar", "log"] = "scalar"
@@ -81,48 +71,27 @@ class PPOConfig:
     value_hidden: tuple[int, ...] = (512, 256, 128)
     """Widths of the value function's hidden layers."""
     value_activation: Activation = "elu"
-    """What follows each of the value function's hidden layers."""
+    """Activation of the value function's hidden layers."""
     value_group: str | None = None
-    """Group of observations that the value function gets; by default "critic" if the task has such a group, else
-    "policy"."""
+    """Group of observations for the value function; by default "critic" if the task has this group, else "policy"."""
     normalize: bool = True
-    """Whether policy and value function normalise observations by their running mean and variance, which every step
-    updates."""
+    """Whether to normalise observations by their running mean and variance, updated in every step."""
     stagger: bool = True
-    """Whether the first episodes begin at random steps, so that time limits fall at all times."""
+    """Whether the first episodes start at random steps, so that time limits are spread over time."""
     tf32: bool = True
     """Whether matrix products on a GPU use TensorFloat-32."""
     mean_every: int = 20
-    """Iterations between two evaluations of the mean policy; 0 for never. A shorter run has no best policy."""
+    """Iterations between evaluations of the mean policy; 0 for none. A run with fewer iterations has no best policy."""
     mean_episodes: int = 16
     """Episodes in an evaluation of the mean policy."""
 
     def __post_init__(self) -> None:
         """Check every value."""
-        checked: dict[str, Any] = {
-            name: whole_number(name, getattr(self, name), low=low) for name, low in _WHOLE.items()
-        }
-        for name, (smallest, largest) in _REAL.items():
-            if (number := getattr(self, name)) is not None or name != "final_entropy_coef":
-                checked[name] = finite_number(name, number, low=smallest, high=largest)
-        for name in ("hidden", "value_hidden"):
-            checked[name] = tuple(layer_sizes(getattr(self, name), name))
-        checked["entropy_decay"] = _iterations("entropy_decay", self.entropy_decay)
-        for name in ("activation", "value_activation"):
-            check_activation(getattr(self, name), name)
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
-        for name, choices in _CHOICES.items():
-            if (choice := getattr(self, name)) not in choices:
-                raise ValueError(f"{name} must be {' or '.join(map(repr, choices))}, not {choice!r}")
-        for name in _FLAGS:
-            if not isinstance(flag := getattr(self, name), bool):
-                raise ValueError(f"{name} must be True or False, not {flag!r}")
-        if self.value_group is not None and not isinstance(self.value_group, str):
-            raise ValueError(f"value_group must be the name of a group of observations, not {self.value_group!r}")
+        check_fields(self, _BOUNDS)
+        object.__setattr__(self, "entropy_decay", _iterations("entropy_decay", self.entropy_decay))
 
     def entropy_weight(self, iteration: int) -> float:
-        """Weight of the policy's entropy in an iteration, of which the first one is 1."""
+        """Coefficient of the entropy in an iteration, counted from 1."""
         if self.final_entropy_coef is None:
             return self.entropy_coef
         first, last = self.entropy_decay
@@ -131,11 +100,7 @@ class PPOConfig:
 
 
 def _iterations(name: str, value: Any) -> tuple[int, int]:
-    """Two numbers of iterations, the second of which is larger.
-
-    Raises:
-        ValueError: The value is something else.
-    """
+    """Check a pair of increasing numbers of iterations."""
     try:
         first, last = value
     except (TypeError, ValueError):

@@ -1,24 +1,31 @@
-"""The buffer of NPG's samples."""
+"""Store the samples of a fixed number of steps in a preallocated buffer."""
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from typing import Any, Protocol
 
 import torch
 import warp as wp
 
-from lyceum_warp.algos.dense import DensePolicy
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.capture import Graphs, Phase
 from lyceum_warp.kernels import collect
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_flag, check_kind, whole_number
+from lyceum_warp.support.validate import check_flag, check_group, check_kind, whole_number
 
 _LARGE = 1e18
-"""Observations beyond it have squares that float32 cannot hold."""
+"""Bound of observations whose squares float32 can represent."""
+
+
+class Sampler(Protocol):
+    """A policy with ``GaussianPolicy.sample``."""
+
+    def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> Any:
+        """Write actions, (nworld, nact), into ``out``."""
+        ...
 
 
 @document_attributes
@@ -28,9 +35,9 @@ class Rollout:
     Args:
         env: The environment.
         steps: Number of steps.
-        groups: Groups of observations to store beside "policy", as ``("critic",)``.
-        first_only: Whether only the first episode of each world since ``restart`` counts. Where all worlds began
-            together, counting all episodes that ended would favour short ones.
+        groups: Groups of observations to store in addition to "policy", such as ``("critic",)``.
+        first_only: Whether to count only each world's first episode since ``restart``. If all worlds start together,
+            counting all episodes that end is biased towards short episodes.
 
     Raises:
         ValueError: The task has no such group of observations.
@@ -43,43 +50,41 @@ class Rollout:
     step: torch.Tensor
     """Steps since the reset before each step, (steps, nworld)."""
     final_obs: torch.Tensor
-    """Observations of the states that each step led to, before any reset, (steps, nworld, nobs)."""
+    """Observations after each step, before any reset, (steps, nworld, nobs)."""
     obs_groups: dict[str, torch.Tensor]
-    """Observations before each step by the names of their groups; ``policy`` is ``obs``."""
+    """Observations before each step by group; ``policy`` is ``obs``."""
     final_obs_groups: dict[str, torch.Tensor]
-    """The same for ``final_obs``."""
+    """Observations after each step by group; ``policy`` is ``final_obs``."""
     reward: torch.Tensor
     """Rewards, (steps, nworld)."""
     eval: torch.Tensor
     """Evaluation metric after each step, (steps, nworld)."""
     terminated: torch.Tensor
-    """Whether the task ended the episode, (steps, nworld) bool. An episode with a fault is cut off instead: the value
-    of its last good observation stands for the rest, so that a fault is neither worth a return of 0 nor punished."""
+    """Whether the task ended the episode, (steps, nworld) bool. A fault counts as truncation: learners bootstrap from
+    the last good observation."""
     done: torch.Tensor
     """Whether the episode ended for any reason, (steps, nworld) bool."""
     success: torch.Tensor
     """Whether the goal was met after each step, (steps, nworld) bool."""
     episode_return: torch.Tensor
-    """Sum of the rewards of the episode so far, (steps, nworld); nan in an episode that does not count."""
+    """Sum of the rewards of the episode so far, (steps, nworld); nan in episodes that are not counted."""
     episode_length: torch.Tensor
     """Steps of the episode so far, (steps, nworld)."""
     episode_metrics: dict[str, torch.Tensor]
-    """Sums of the task's metrics over the episode so far, by the metrics' names, each (steps, nworld)."""
+    """Sums of the task's metrics over the episode so far by name, each (steps, nworld)."""
 
     running_return: torch.Tensor
-    """Sum of the rewards of each world's current episode, (nworld,); nan in an episode that does not count."""
+    """Sum of the rewards of each world's current episode, (nworld,); nan in episodes that are not counted."""
     faults: torch.Tensor
     """Faults of each world within these steps, (nworld,) int32."""
 
     def __init__(self, env: Env, steps: int, *, groups: Collection[str] = (), first_only: bool = False) -> None:
         check_kind("env of Rollout", env, Env, "as lw.make(...) makes it")
-        check_kind("groups", groups, Collection, "as in groups=['critic']")
+        check_kind("groups", groups, list | tuple | set | frozenset, "as in groups=['critic']")
         check_flag("first_only", first_only)
         steps = whole_number("steps", steps, low=1)
-        if unknown := [group for group in groups if group not in [*env.obs_groups]]:
-            raise ValueError(
-                f"the task {env.task.name!r} has no group {unknown[0]!r} of observations: it has {list(env.obs_groups)}"
-            )
+        for group in groups:
+            check_group(group, env.obs_groups, env.task.name)
         self.env = env
         self.steps = steps
         self._first_only = first_only
@@ -118,13 +123,13 @@ class Rollout:
         self._after_step = graphs.sequence([Phase("store outputs", self._launch_outputs)])
 
     def _stored(self, source: torch.Tensor, into: list["_Rows"]) -> torch.Tensor:
-        """Storage for rows of the environment, (steps, nworld, size), filled by the phases before or after a step."""
+        """Allocate storage, (steps, nworld, size), that is filled before or after each step."""
         into.append(_Rows(source, self.steps, self.env.device))
         return into[-1].stored
 
     @torch.no_grad()
-    def collect(self, policy: GaussianPolicy | DensePolicy, noise: torch.Tensor) -> None:
-        """Run the policy for ``steps`` steps from the worlds' current states.
+    def collect(self, policy: Sampler, noise: torch.Tensor) -> None:
+        """Fill the buffer: run the policy for ``steps`` steps from the current states.
 
         Args:
             policy: The policy.
@@ -139,31 +144,30 @@ class Rollout:
             self.store_outputs()
 
     def begin(self) -> None:
-        """Begin to fill the buffer from its first step on, for callers that step the environment themselves."""
+        """Start filling the buffer from its first step, for callers that step the environment themselves."""
         self._index.zero_()
         self._fault.zero_()
 
     def store_inputs(self) -> None:
-        """Store what the next step starts from, the action included."""
+        """Store the observations, the action and the step counters before a step."""
         for call in self._before_step:
             call()
 
     def store_outputs(self) -> None:
-        """Store the results of the step; the next ones go to the next place."""
+        """Store the results of a step, and advance the index."""
         for call in self._after_step:
             call()
 
     def restart(self) -> None:
-        """Begin new episodes in all worlds."""
+        """Start new episodes in all worlds."""
         self.env.rand_reset()
         self.running_return.zero_()
 
     def stagger(self, generator: torch.Generator, team: Team | None = None) -> None:
-        """Set the worlds' step counters to random steps of an episode, so that time limits fall at all times.
+        """Set the worlds' step counters to random steps of an episode, so that time limits are spread over time.
 
-        Worlds that began together and never terminate would otherwise also end together: most rollouts would hold
-        no end of an episode, and the others would hold all of them. The returns of these first, shortened episodes
-        do not count.
+        Otherwise worlds that start together and never terminate would reach their time limits in the same rollout. The
+        returns of these shortened episodes are not counted.
 
         Args:
             generator: Draws the steps, the same in every process.
@@ -180,13 +184,13 @@ class Rollout:
         self.running_return.masked_fill_(first > 0, torch.nan)
 
     def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
-        """Restart random worlds so that at least ``least`` worlds began an episode within the last ``steps`` steps.
+        """Restart random worlds so that at least ``least`` worlds started an episode within the last ``steps`` steps.
 
-        The episodes that this cuts off do not count. With ``first_only`` a restarted world would count again, so do not
-        call it there. Nothing waits for the device.
+        Interrupted episodes are not counted. Not for buffers with ``first_only``, which would count restarted worlds
+        twice. Nothing waits for the device.
 
         Args:
-            least: Number of worlds, of those of all processes.
+            least: Number of worlds of all processes.
             generator: Draws the worlds, the same in every process.
             team: The processes.
         """
@@ -200,29 +204,27 @@ class Rollout:
         self.running_return.masked_fill_(mask, 0.0)
 
     def explain_not_finite(self) -> str:
-        """A sentence that names what is not finite, or too large for float32, and how to fix it; waits for the device.
+        """Describe the first number that is not finite or too large for float32, and how to fix it, in a sentence.
 
-        Rewards and observations that are not finite are faults; only a caller can write such numbers.
+        Waits for the device. A task's own rewards and observations are finite, because others are faults.
         """
-        spaces = self.env.obs_spaces
-        kinds: list[tuple[str, torch.Tensor, float, str]] = [("reward", self.reward, torch.inf, "")]
+        kinds: list[tuple[str, torch.Tensor, float, Mapping[str, slice]]] = [("reward", self.reward, torch.inf, {})]
         for groups in (self.obs_groups, self.final_obs_groups):
-            kinds += [("observation", obs, _LARGE, group) for group, obs in groups.items()]
-        for name, values, limit, group in kinds:
-            bad = ~(values.abs() < limit)
-            if not bad.any():
+            parts = {group: self.env.obs_spaces[group].parts for group in groups}
+            kinds += [("observation", obs, _LARGE, parts[group]) for group, obs in groups.items()]
+        for name, values, limit, spans in kinds:
+            if not (bad := ~(values.abs() < limit)).any():
                 continue
-            samples = bad.view(*bad.shape[:2], -1).any(-1)
             t, world, *place = bad.nonzero()[0].tolist()
             number = values[t, world, *place].item()
-            spans = spaces[group].parts.items() if group else ()
-            part = [f" in {part!r}" for part, span in spans for i in place if span.start <= i < span.stop]
-            finite = math.isfinite(number)
+            part = [f" in {part!r}" for part, span in spans.items() for i in place if span.start <= i < span.stop]
+            samples = bad.view(*bad.shape[:2], -1).any(-1)
+            found, fix = "not finite", ""
+            if math.isfinite(number):
+                found, fix = f"beyond {limit:g}", ": scale it in observe, or normalise observations (normalize)"
             return (
                 f"The {name} of the task {self.env.task.name!r} is {number:g}{''.join(part)} in step {t + 1} of world "
-                f"{self.env.first_world + world}, and {f'beyond {limit:g}' if finite else 'not finite'} in "
-                f"{int(samples.sum())} of {samples.numel()} samples"
-                f"{': scale it in observe, or normalise observations (normalize)' if finite else ''}"
+                f"{self.env.first_world + world}, and {found} in {int(samples.sum())} of {samples.numel()} samples{fix}"
             )
         if not self.action.isfinite().all():
             return "Rewards and observations are finite, actions are not: make the step (delta) smaller"
@@ -248,7 +250,7 @@ class Rollout:
 
 
 class _Rows:
-    """Storage for one of an environment's buffers of rows, (nworld, size)."""
+    """Storage, (steps, nworld, size), for one of an environment's buffers, (nworld, size)."""
 
     def __init__(self, source: torch.Tensor, steps: int, device: wp.Device) -> None:
         self._source = wp.from_torch(source)
@@ -256,6 +258,6 @@ class _Rows:
         self.stored = torch_view(self._rows)
 
     def store(self, index: wp.array) -> None:
-        """Store the rows of the step at an index; a launch."""
+        """Launch a copy of the buffer to the step at an index."""
         args = [index, self._source, self._rows]
         wp.launch(collect.store_rows, self._source.shape, args, device=self._rows.device)

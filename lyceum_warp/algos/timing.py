@@ -1,4 +1,4 @@
-"""Seconds of an iteration's phases, and torch's threads on the CPU."""
+"""Measure the phases of an iteration, and control torch's threads on the CPU."""
 
 import contextlib
 import time
@@ -12,9 +12,9 @@ Result = TypeVar("Result")
 
 
 class PhaseTimer:
-    """Measures the seconds between calls of ``mark``; making the timer is the first mark.
+    """Measures the seconds between calls of ``mark``, starting at construction.
 
-    On a GPU a mark is an event in the device's stream: only ``seconds`` waits for the device.
+    On a GPU a mark is an event in the current stream: only ``seconds`` waits for the device.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -24,7 +24,7 @@ class PhaseTimer:
         self.mark()
 
     def mark(self) -> None:
-        """End one phase and begin the next."""
+        """End one phase and start the next."""
         if self.cuda:
             event = torch.cuda.Event(enable_timing=True)
             event.record(torch.cuda.current_stream(self.device))
@@ -33,7 +33,7 @@ class PhaseTimer:
             self._times.append(time.perf_counter())
 
     def seconds(self) -> list[float]:
-        """Duration of each phase; waits until the device has done the last."""
+        """Durations of the phases, seconds; waits for the device."""
         if not self.cuda:
             return [end - start for start, end in zip(self._times, self._times[1:], strict=False)]
         self._events[-1].synchronize()
@@ -43,9 +43,9 @@ class PhaseTimer:
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Limit torch to one CPU thread: operations on one step or one mini-batch are too small to divide.
+    """Limit torch to one CPU thread, for operations that are too small to divide.
 
-    On a busy machine torch's threads would wait for each other much longer than they compute.
+    On a busy machine torch's threads would spend more time waiting for each other than computing.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -57,20 +57,20 @@ def one_thread() -> Iterator[None]:
 
 @contextlib.contextmanager
 def beside(function: Callable[[], Result], *, allowed: bool) -> Iterator[Callable[[], Result]]:
-    """Call a function while the block runs, each in one of torch's CPU threads, where torch has two.
+    """Run a function in parallel with the block, each with one torch thread, if torch has exactly two threads.
 
-    Mini-batches gain nothing from a second thread, and large products less than twice. With more threads, with one, or
-    where it is not allowed, the function is called when the block asks for its result.
+    Mini-batches do not profit from a second thread, and large products speed up by less than two. With another number
+    of threads, or if not allowed, the function is called when the block requests its result.
 
     Args:
-        function: The function; the block must not touch what it changes.
+        function: The function; it must not share state with the block.
         allowed: Whether both may run at the same time.
 
     Yields:
-        What waits for the function's result, and returns it.
+        A function that waits for the result and returns it.
     """
     if not allowed or torch.get_num_threads() != 2:
         yield function
         return
-    with one_thread(), ThreadPoolExecutor(1) as pool:  # waits for the function, after an error too
+    with one_thread(), ThreadPoolExecutor(1) as pool:  # joins the function also after an error
         yield pool.submit(function).result

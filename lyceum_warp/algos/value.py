@@ -1,4 +1,4 @@
-"""Value functions: predictions of the discounted return from a state."""
+"""Define value functions, which predict discounted returns from observations."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,44 +7,44 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.networks import LIMIT, Activation, Normalizer, check_network, mlp
+from lyceum_warp.algos.networks import LIMIT, Activation, Normalized, mlp
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_kind, finite_number, layer_sizes, whole_number
+from lyceum_warp.support.validate import check_group, check_kind, finite_number, layer_sizes, whole_number
 
 
 @document_attributes
-class ValueFunction(nn.Module):
+class ValueFunction(Normalized):
     """A network that predicts discounted returns.
 
     Args:
         nobs: Numbers in an observation.
         hidden: Widths of the hidden layers.
-        activation: What follows each hidden layer.
+        activation: Activation of the hidden layers.
         scale: Factor of the network's output until ``rescale`` fits it to returns.
-        time_orders: Highest power of the time feature; 0 for none. A time limit that the observation does not show
-            makes the return depend on the step; the features t, t^2, ... with t = step / 1000 show it (mjrl).
+        time_orders: Highest power of the time features t, t^2, ... with t = step / 1000 (as in mjrl); 0 for none. With
+            a time limit that observations do not contain, the return depends on the step.
         normalize: Whether to normalise observations by their running mean and variance.
-        limit: Normalised observations are clipped to plus and minus this; inf for no limit.
-        discount: The discount of the returns that it is fitted to, where known.
-        group: The group of observations that it gets.
+        limit: Normalised observations are clipped to [-limit, limit]; inf for no limit.
+        discount: Discount factor of the predicted returns, if known.
+        group: The group of observations that is the input.
         generator: Draws the initial weights.
 
     Raises:
-        ValueError: ``hidden`` is not a sequence of positive whole numbers, or ``activation`` is not a known name.
+        ValueError: ``hidden`` is not a sequence of positive whole numbers, or ``activation`` is unknown.
     """
 
     LATER = ("shift", "scale")
-    """Buffers that files of earlier releases lack: their shift was 0, and their scale is among the arguments."""
+    """Buffers that files of earlier releases lack: their shift is 0, and their scale is an argument."""
 
     group: str
-    """The group of observations that it gets."""
+    """The group of observations that is the input."""
     shift: torch.Tensor
-    """What is added to the network's scaled output: the mean of the returns."""
+    """Offset of the scaled output: the mean of the returns."""
     scale: torch.Tensor
     """Factor of the network's output: the standard deviation of the returns."""
     discount: float | None
-    """The discount of the returns that it was fitted to, where known."""
+    """Discount factor of the predicted returns, if known."""
     orders: torch.Tensor
     """The powers of the time feature, (time_orders,)."""
 
@@ -62,10 +62,9 @@ class ValueFunction(nn.Module):
         group: str = "policy",
         generator: torch.Generator | None = None,
     ) -> None:
-        super().__init__()
         nobs, time_orders = whole_number("nobs", nobs, low=1), whole_number("time_orders", time_orders, low=0)
+        super().__init__(nobs, normalize, limit)
         scale = finite_number("scale", scale)
-        check_network(normalize, limit, generator)
         check_kind("group", group, str, "as 'policy'")
         self.discount = None if discount is None else finite_number("discount", discount, low=0.0, high=1.0)
         self.group = group
@@ -73,22 +72,21 @@ class ValueFunction(nn.Module):
             "nobs": nobs, "hidden": layer_sizes(hidden), "activation": activation, "scale": scale,
             "time_orders": time_orders, "normalize": normalize, "group": group,
         }  # fmt: skip
-        if limit != LIMIT:  # which files of earlier releases do not name
+        if limit != LIMIT:  # files of earlier releases lack it
             self._shape["limit"] = limit
-        self.normalizer: nn.Module = Normalizer(nobs, limit) if normalize else nn.Identity()
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
-        # a last layer of zeros predicts the mean of the returns, whatever their scale
+        # with a last layer of zeros, the prediction is the mean of the returns
         self.network = mlp([nobs + time_orders, *hidden, 1], activation=activation, last_scale=0.0, generator=generator)
         self.register_buffer("shift", torch.zeros((), dtype=torch.float64))
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
 
     @property
     def shape(self) -> dict[str, Any]:
-        """The arguments of a value function that takes the same weights."""
+        """Arguments that make a value function with the same structure."""
         return self._shape | {"discount": self.discount}
 
     def features(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """The network's input, (..., nobs + time_orders).
+        """Compute the network's input, (..., nobs + time_orders).
 
         Args:
             obs: Observations, (..., nobs).
@@ -101,33 +99,21 @@ class ValueFunction(nn.Module):
         return torch.cat([obs, time], dim=-1)
 
     def forward(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Predicted returns, (...,)."""
+        """Predict discounted returns, (...,)."""
         return self.network(self.features(obs, step)).squeeze(-1) * self.scale.float() + self.shift.float()
-
-    def observe(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
-        """Take observations into the normaliser's statistics, where it has one; this changes the predictions.
-
-        Args:
-            obs: Observations, (..., nobs).
-            team: The processes; each brings the same number of observations.
-            eps: Added to the standard deviations.
-        """
-        if isinstance(self.normalizer, Normalizer):
-            self.normalizer.update(obs, team, eps=eps)
 
     @torch.no_grad()
     def rescale(self, returns: torch.Tensor, *, first: bool = False, team: Team | None = None) -> None:
-        """Set shift and scale to mean and standard deviation of returns, and keep the predictions.
+        """Set shift and scale to mean and standard deviation of returns, and preserve the predictions.
 
         The last layer compensates the change (Pop-Art; van Hasselt et al. 2016, "Learning values across many orders of
-        magnitude"). Outliers are bounded: a return counts as at most ``BOUND`` scales away from the shift, and the
-        scale changes by at most that factor. Where more than a quarter of the returns lie beyond that bound, as after a
-        change of the task, they are not outliers: the bound then follows from their quartiles. Returns that are all
-        equal leave the scale as it is.
+        magnitude"). Returns are clipped to ``BOUND`` scales around the shift, and the scale changes at most by this
+        factor. If more than a quarter of the returns lie outside, as after a change of the task, they are no outliers,
+        and the bounds follow from their quartiles. Equal returns leave the scale unchanged.
 
         Args:
             returns: Returns, of any shape.
-            first: Whether the function was never fitted, so that its scale means nothing.
+            first: Whether the function was never fitted, so that its scale is arbitrary.
             team: The processes; each brings the same number of returns.
         """
         team = team or Team()
@@ -139,12 +125,12 @@ class ValueFunction(nn.Module):
         ordered = team.gather(returns).nan_to_num().sort().values
         quartile, median, other = (ordered[i * (len(ordered) - 1) // 4] for i in (1, 2, 3))
         width = 20.0 * (other - quartile)
-        width.masked_fill_(width == 0.0, torch.inf)  # as where few rewards are not zero
+        width.masked_fill_(width == 0.0, torch.inf)  # as with sparse rewards
         low, high = torch.where(new, median - width, low), torch.where(new, median + width, high)
         returns = torch.minimum(torch.maximum(returns, low), high).nan_to_num()
         mean = team.sum(returns.sum()) / count
         std = (team.sum((returns - mean).square().sum()) / count).sqrt()
-        # float32 returns differ by rounding alone where they are equal
+        # equal returns differ by float32 rounding
         scale = torch.where(std > 1e-6 * mean.abs(), torch.maximum(std, 1e-3 * mean.abs()), self.scale)
         near = torch.minimum(torch.maximum(scale, self.scale / BOUND), self.scale * BOUND)
         scale = torch.where(new, scale, near)
@@ -162,19 +148,15 @@ class ValueFunction(nn.Module):
 
 
 BOUND = 10.0
-"""How many scales a return or an advantage may lie away from the mean; what lies further is an outlier."""
+"""Returns and advantages further than this number of scales from the mean are outliers."""
 
 
 def value_group(env: Env, given: str | None) -> str:
-    """The group of observations for a new value function: the given one, else "critic" if there is one, or "policy".
+    """Choose the group of observations of a new value function: by default "critic" if the task has it, else "policy".
 
     Raises:
         ValueError: The task has no such group.
     """
     group = given or ("critic" if "critic" in env.obs_groups else "policy")
-    if group not in env.obs_groups:
-        raise ValueError(
-            f"the task {env.task.name!r} has no group {group!r} of observations for the value function: it has "
-            f"{', '.join(env.obs_groups)}"
-        )
+    check_group(group, env.obs_groups, env.task.name)
     return group

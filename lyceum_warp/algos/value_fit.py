@@ -1,4 +1,4 @@
-"""Regression of a value function on returns."""
+"""Fit a value function to returns by regression."""
 
 import math
 from typing import Any
@@ -6,18 +6,17 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.dense import DensePasses, DenseValue
-from lyceum_warp.algos.distributed import Team
+from lyceum_warp.algos.distributed import Team, side_stream
 from lyceum_warp.algos.timing import one_thread
 from lyceum_warp.algos.value import BOUND, ValueFunction
-from lyceum_warp.graphs.capture import capturing
 
 
 class ValueFit:
-    """Fits a value function by mini-batch Adam on its squared error, in random order.
+    """Fits a value function by mini-batch Adam on the squared error, in random order.
 
-    The mini-batches are the same for any number of processes: each process takes the samples of its own worlds, and
-    the gradients are summed. On CUDA the step of a mini-batch is one graph, captured once and replayed, in place of
-    some 40 launches; on the CPU its derivatives are written out, where the network is one of ``mlp``.
+    The mini-batches do not depend on the number of processes: each process uses the samples of its own worlds, and the
+    gradients are summed. On CUDA the step of a mini-batch is one graph, which replaces some 40 launches. On the CPU a
+    network of ``mlp`` is fitted without autograd.
 
     Args:
         value: The value function.
@@ -37,7 +36,7 @@ class ValueFit:
         self.parameters = list(value.parameters())
         self.cuda = self.parameters[0].is_cuda
         self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=self.cuda)
-        # the gradients are views of one tensor, which the processes sum in one call
+        # gradients are views of one tensor, for a single all-reduce
         self.gradient = torch.zeros(sum(p.numel() for p in self.parameters), device=self.parameters[0].device)
         for parameter, part in zip(self.parameters, self._split(self.gradient), strict=True):
             parameter.grad = part.view_as(parameter)
@@ -50,16 +49,16 @@ class ValueFit:
     def __call__(
         self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor, generator: torch.Generator
     ) -> torch.Tensor:
-        """Fit to returns. If that leaves a parameter or a moment that is not finite, restore all from before.
+        """Fit to returns. If a parameter or a moment becomes non-finite, all are restored.
 
         Args:
             obs: Observations of this process's worlds, (samples, nobs).
             step: Steps since the reset, (samples,).
-            target: Returns, (samples,). One further than ``BOUND`` scales from the value's shift is set to that bound.
+            target: Returns, (samples,); clipped to ``BOUND`` scales around the value function's shift.
             generator: Draws the order of all processes' samples.
 
         Returns:
-            Whether the fit is finite, as a tensor.
+            Whether the fit is finite, a bool tensor.
         """
         with torch.no_grad():
             features = self.value.features(obs, step)
@@ -88,15 +87,15 @@ class ValueFit:
         return finite
 
     def _numbers(self) -> list[torch.Tensor]:
-        """Parameters and Adam's moments, which exist from the first step on."""
+        """Parameters and, after the first step, Adam's moments."""
         moments = [moment for p in self.parameters for moment in self.optimizer.state.get(p, {}).values()]
         return [*self.parameters, *moments]
 
     @torch.no_grad()
     def _keep_if_finite(self) -> torch.Tensor:
-        """Copy all numbers, unless one is not finite; nothing waits for the device."""
+        """Back up parameters and moments, unless one is not finite; nothing waits for the device."""
         present = torch.cat([numbers.reshape(-1) for numbers in self._numbers()])
-        # the first moments are zeros
+        # initial moments are zero
         good = torch.nn.functional.pad(self._good, (0, len(present) - len(self._good)))
         finite = self.team.sum((~present.isfinite()).any().float()) == 0
         self._good = torch.where(finite, present, good)
@@ -104,22 +103,22 @@ class ValueFit:
 
     @torch.no_grad()
     def _restore(self) -> None:
-        """Copy back the last numbers that were finite."""
+        """Restore the last finite parameters and moments."""
         numbers = self._numbers()
         for tensor, part in zip(numbers, self._good.split([tensor.numel() for tensor in numbers]), strict=True):
             tensor.copy_(part.view_as(tensor))
 
     def _own(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | float]:
-        """The process's samples of a mini-batch, and their weights in the mean over the whole mini-batch."""
+        """Select this process's samples of a mini-batch, and their weights in the mean over the mini-batch."""
         if self.team.size == 1:
             return index, 1.0 / len(index)
         places, own = self.team.locate(index, self.nworld)
-        if self.cuda:  # counting the own samples would wait for the device, so the others get the weight 0
+        if self.cuda:  # selecting own samples would synchronise with the device, so others get the weight 0
             return places, own.unsqueeze(-1) / len(index)
         return places[own], 1.0 / len(index)
 
     def learn(self, features: torch.Tensor, target: torch.Tensor, weight: torch.Tensor | float) -> None:
-        """One step of Adam on a weighted sum of squared errors."""
+        """Make one step of Adam on a weighted sum of squared errors."""
         loss = ((self.value.network(features) - target).square() * weight).sum()
         gradients = torch.autograd.grad(loss, self.parameters)
         torch.cat([gradient.reshape(-1) for gradient in gradients], out=self.gradient)
@@ -127,25 +126,21 @@ class ValueFit:
         self.optimizer.step()
 
     def state_dict(self) -> dict[str, Any]:
-        """Adam's moments."""
+        """Get the optimizer's state."""
         return self.optimizer.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue with the moments of ``state_dict``, on this device."""
+        """Restore the optimizer's state on this device."""
         self.optimizer.load_state_dict(state)
         for group in self.optimizer.param_groups:
             group["capturable"] = self.cuda
-        self.captured = None  # its graph holds the addresses of the old moments
+        self.captured = None  # the graph holds the addresses of the old moments
 
 
 class DenseSteps:
-    """The mini-batch steps of one call of a ``ValueFit`` on the CPU, with derivatives and Adam written out.
+    """Mini-batch steps of a ``ValueFit`` on the CPU without autograd and torch's Adam.
 
-    Parameters and moments are vectors of their own, which ``store`` copies into the value function and the optimizer.
-
-    Args:
-        fit: The fit.
-        passes: Passes through the value function's network.
+    Parameters and moments are flat copies, which ``store`` writes back into the value function and the optimizer.
     """
 
     def __init__(self, fit: ValueFit, passes: DensePasses) -> None:
@@ -165,7 +160,7 @@ class DenseSteps:
         self.gradients = self._shaped(self.gradient)
 
     def _shaped(self, flat: torch.Tensor) -> list[torch.Tensor]:
-        """Views of a vector, of the parameters' shapes."""
+        """Split a vector into views of the parameters' shapes."""
         sizes = [p.numel() for p in self.fit.parameters]
         return [part.view_as(p) for part, p in zip(flat.split(sizes), self.fit.parameters, strict=True)]
 
@@ -185,7 +180,7 @@ class DenseSteps:
             self.learn(x, y, 1.0 / size)
 
     def learn(self, features: torch.Tensor, target: torch.Tensor, weight: float) -> None:
-        """One step of Adam on a weighted sum of squared errors."""
+        """Make one step of Adam on a weighted sum of squared errors."""
         error = self.passes(features).sub_(target)
         self.passes.pull(error.mul_(2.0 * weight), self.gradients)
         self.team.sum(self.gradient)
@@ -194,7 +189,7 @@ class DenseSteps:
         self.count += 1
         self.first.lerp_(self.gradient, 1.0 - decay)
         self.second.mul_(slow).addcmul_(self.gradient, self.gradient, value=1.0 - slow)
-        # both corrections of the moments' start from 0 are in the factor of the step
+        # the factor includes the bias corrections of both moments
         unbias = math.sqrt(1.0 - slow**self.count)
         torch.sqrt(self.second, out=self.root).add_(group["eps"] * unbias)
         factor = group["lr"] * unbias / (1.0 - decay**self.count)
@@ -202,7 +197,7 @@ class DenseSteps:
 
     @torch.no_grad()
     def store(self) -> None:
-        """Copy parameters and moments into the value function and the optimizer."""
+        """Write parameters and moments back into the value function and the optimizer."""
         shaped = zip(*map(self._shaped, (self.parameters, self.first, self.second)), strict=True)
         for parameter, (new, first, second) in zip(self.fit.parameters, shaped, strict=True):
             parameter.copy_(new)
@@ -212,12 +207,9 @@ class DenseSteps:
 
 
 class CapturedStep:
-    """The mini-batch step of a ``ValueFit`` as one CUDA graph. A counter on the device selects the mini-batch.
+    """Mini-batch steps of a ``ValueFit`` as a CUDA graph, in which a device counter selects the mini-batch.
 
-    Args:
-        fit: The fit.
-        features: The network's inputs, (samples, features); only their shape and device are used here.
-        target: Scaled returns, (samples, 1); likewise.
+    The constructor uses only the shapes and the device of ``features`` and ``target``.
     """
 
     def __init__(self, fit: ValueFit, features: torch.Tensor, target: torch.Tensor) -> None:
@@ -228,20 +220,14 @@ class CapturedStep:
         self.places = torch.zeros(self.count, fit.batch, dtype=torch.long, device=device)
         self.weight = torch.zeros(self.count, fit.batch, device=device)
         self.at = torch.zeros(1, dtype=torch.long, device=device)
-        # the last mini-batch may be smaller: it is filled up with samples of weight 0
+        # a smaller last mini-batch is padded with samples of weight 0
         place = torch.arange(self.count * fit.batch, device=device).view(self.count, fit.batch)
         self.inside = (place < fit.samples).float()
         self.inside /= self.inside.sum(1, keepdim=True)
         self.graph: Any = None
 
     def __call__(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
-        """Run an epoch.
-
-        Args:
-            features: The network's inputs, (samples, features).
-            target: Scaled returns, (samples, 1).
-            order: A permutation of all processes' samples.
-        """
+        """Run an epoch; arguments as for ``DenseSteps``."""
         self.load(features, target, order)
         done = 0
         if self.graph is None:
@@ -252,7 +238,7 @@ class CapturedStep:
             self.graph.replay()
 
     def load(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
-        """Begin an epoch: copy the samples, and the places and weights of its mini-batches."""
+        """Start an epoch: copy the samples, and the indices and weights of its mini-batches."""
         self.features.copy_(features)
         self.target.copy_(target)
         filled = torch.nn.functional.pad(order, (0, self.places.numel() - len(order))).view_as(self.places)
@@ -262,22 +248,11 @@ class CapturedStep:
         self.at.zero_()
 
     def _capture(self, times: int) -> None:
-        """Run some steps directly, on another stream than the default one, then capture the graph.
-
-        The direct steps allocate lasting memory, such as Adam's moments.
-        """
-        stream = torch.cuda.Stream()
-        stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
+        """Run some steps directly, which allocate Adam's moments, and then capture the graph."""
+        with side_stream():
             for _ in range(times):
                 self.learn()
-        torch.cuda.current_stream().wait_stream(stream)
-        graph = torch.cuda.CUDAGraph()
-        # other threads, such as NCCL's, call CUDA during the capture
-        with capturing(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
-            self.learn()
-        self.fit.team.keep(graph)
-        self.graph = graph
+        self.graph = self.fit.team.capture(self.learn)
 
     def learn(self) -> None:
         """Learn from the next mini-batch."""

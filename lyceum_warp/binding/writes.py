@@ -1,7 +1,7 @@
 """Find what a Warp function writes into its arguments, from its source and the sources of the functions that it calls.
 
-The analysis follows elements, components, calls and local names of a row. A row that is used in any other way (returned,
-put into a tuple or a struct, chosen by ``wp.where``, given to a native function) counts as written.
+The analysis follows elements, components, calls and local names of a row. A row that is used in any other way
+(returned, put into a tuple or a struct, chosen by ``wp.where``, given to a native function) counts as written.
 """
 
 import ast
@@ -249,7 +249,7 @@ class _Reader:
         expressions: dict[str, ast.expr] = dict(zip(callee.input_types, node.args, strict=False))
         expressions |= {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg}
         places = {name: place for name, given in expressions.items() if (place := self._read(given)) is not None}
-        given = []
+        given: list[_Place | None] = []
         for name, expected in callee.input_types.items():
             place = places.get(name)
             if hasattr(expected, "value_type") and place is not None:  # a wp.ref

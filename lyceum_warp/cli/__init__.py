@@ -1,36 +1,32 @@
-"""The command line: tasks, new, check, train, eval, export, plan, view, warmup, bench."""
+"""Run a command of the shell: find its module by its name, parse its options, print its errors."""
 
+import difflib
+import importlib
 import importlib.metadata
 import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Any
 
 import tyro
 
-from lyceum_warp.cli.bench import Bench
-from lyceum_warp.cli.check import Check
-from lyceum_warp.cli.evaluate import Eval
-from lyceum_warp.cli.export import Export
-from lyceum_warp.cli.list_tasks import Tasks
-from lyceum_warp.cli.new_task import New
-from lyceum_warp.cli.plan import Plan
-from lyceum_warp.cli.train import Train
-from lyceum_warp.cli.view import View
-from lyceum_warp.cli.warmup import Warmup
 from lyceum_warp.support.interrupts import Interrupted, signals
-from lyceum_warp.viz.video import NoVideoError
+from lyceum_warp.viz import NoVideoError
 
-_Command = Annotated[Tasks, tyro.conf.subcommand("tasks")] \
-    | Annotated[New, tyro.conf.subcommand("new")] \
-    | Annotated[Check, tyro.conf.subcommand("check")] \
-    | Annotated[Train, tyro.conf.subcommand("train")] \
-    | Annotated[Eval, tyro.conf.subcommand("eval")] \
-    | Annotated[Export, tyro.conf.subcommand("export")] \
-    | Annotated[Plan, tyro.conf.subcommand("plan")] \
-    | Annotated[View, tyro.conf.subcommand("view")] \
-    | Annotated[Warmup, tyro.conf.subcommand("warmup")] \
-    | Annotated[Bench, tyro.conf.subcommand("bench")]  # fmt: skip
+_COMMANDS = {
+    "tasks": ("list_tasks", "Tasks", "List the tasks of the package, their sizes and the sources of their models."),
+    "new": ("new_task", "New", "Write a task file for a model."),
+    "check": ("check", "Check", "Check that a task keeps every rule of an environment."),
+    "train": ("train", "Train", "Train a policy on a task, with the natural policy gradient or with PPO."),
+    "eval": ("evaluate", "Eval", "Evaluate the policy of a run, and print statistics of its episodes."),
+    "export": ("export", "Export", "Write the policy of a run to an ONNX or .pt2 file."),
+    "plan": ("plan", "Plan", "Control a task with a planner, and report rewards, success and planning times."),
+    "view": ("view", "View", "Show a task, a policy, a planner or saved episodes in a browser or a window."),
+    "warmup": ("warmup", "Warmup", "Compile a task's kernels ahead of time, and print the memory of a world."),
+    "bench": ("bench", "Bench", "Run an experiment or another program of bench/."),
+}
+"""The module of each command, its class, and its line in the help. A command's module is imported once it is named:
+most of them load torch, Warp and MuJoCo."""
 
 _DESCRIPTION = """Batched MuJoCo worlds for robot learning.
 
@@ -44,11 +40,13 @@ $ lyceum-warp plan reach --real-time
 $ lyceum-warp view reach --mppi
 $ lyceum-warp warmup hopper --device cuda:0
 $ lyceum-warp bench throughput --short
+
+lyceum-warp COMMAND --help describes a command and its options.
 """
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The program ``lyceum-warp``.
+    """Run the program ``lyceum-warp``.
 
     Returns:
         0; 1 if --require-return was not met, or if check found a broken rule; 2 for bad input; 130 or 143 after
@@ -58,25 +56,49 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv == ["--version"]:
         print(f"lyceum-warp {importlib.metadata.version('lyceum-warp')}")
         return 0
-    # what follows the name of a program of bench/ is parsed by that program
-    argv, rest = (argv[:2], argv[2:]) if argv[:1] == ["bench"] else (argv, [])
     try:
         with signals():
-            command = tyro.cli(
-                _Command, prog="lyceum-warp", description=_DESCRIPTION, args=argv,
-                config=(tyro.conf.OmitSubcommandPrefixes,),
-            )  # fmt: skip
-            return int(command.run(*rest))
+            return _run(argv)
     except (ValueError, FileNotFoundError, FloatingPointError, ImportError, NoVideoError) as error:
         text = "; ".join([str(error), *getattr(error, "__notes__", [])])
         print(f"lyceum-warp: {' '.join(text.split())}", file=sys.stderr)
         return 2
     except Interrupted as signalled:
         return 128 + signalled.number
-    except BrokenPipeError:  # as in: lyceum-warp tasks | head
+    except BrokenPipeError:  # for example, lyceum-warp tasks | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except OSError as error:  # as a full disk, or a folder that cannot be written
+    except OSError as error:  # for example, a full disk, or a folder that cannot be written
         text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
         print(f"lyceum-warp: {'; '.join([text, *getattr(error, '__notes__', [])])}", file=sys.stderr)
         return 2
+
+
+def _run(argv: list[str]) -> int:
+    """Import the module of a command, parse its options, and run it.
+
+    Raises:
+        ValueError: There is no such command.
+        SystemExit: The help was printed, or an option is wrong.
+    """
+    if argv[:1] in (["-h"], ["--help"]):
+        commands: Any = {name: type(name, (), {"__doc__": line}) for name, (*_, line) in _COMMANDS.items()}
+        tyro.extras.subcommand_cli_from_dict(commands, prog="lyceum-warp", description=_DESCRIPTION, args=["--help"])
+    if not argv:
+        raise ValueError(f"which command? There are {', '.join(_COMMANDS)}; lyceum-warp --help describes them")
+    name, *words = argv
+    if name not in _COMMANDS:
+        close = difflib.get_close_matches(name, _COMMANDS, 1)
+        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(_COMMANDS)}"
+        raise ValueError(f"there is no command {name!r}: {hint}")
+    if old := [word for word in words if word.startswith("--config.")]:
+        flag = old[0].partition("=")[0]
+        raise ValueError(
+            f"{flag} was a flag of rsl-rl, which ppo has replaced: give --algorithm ppo, whose flags have no prefix "
+            f"(lyceum-warp {name} --help)"
+        )
+    module, kind, _ = _COMMANDS[name]
+    command = getattr(importlib.import_module(f"lyceum_warp.cli.{module}"), kind)
+    # the words after the name of a program of bench/ belong to that program
+    words, rest = (words[:1], words[1:]) if name == "bench" else (words, [])
+    return int(tyro.cli(command, prog=f"lyceum-warp {name}", args=words).run(*rest))

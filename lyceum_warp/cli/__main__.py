@@ -1,4 +1,4 @@
-"""python -m lyceum_warp.cli."""
+"""Run the command line: python -m lyceum_warp.cli."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Make flags of the hyperparameters of all algorithms of lyceum-warp train."""
+"""Make flags of the hyperparameters of all algorithms that lyceum-warp train knows."""
 
 import dataclasses
 from typing import Any
@@ -6,31 +6,30 @@ from typing import Any
 from lyceum_warp.cli.arguments import given, optional_flags
 from lyceum_warp.runs.configuration import ALGORITHMS, algorithm_of
 
-
-def _default(name: str) -> str:
-    """Which algorithms have a hyperparameter, and its default in each."""
-    texts = []
-    for algorithm, (_, config) in ALGORITHMS.items():
-        if name in config.__dataclass_fields__:
-            value = getattr(config, name)
-            words = " ".join(map(str, value)) if isinstance(value, tuple) else "" if value is None else str(value)
-            texts.append(f"{algorithm} {words}".strip())
-    return f"({', '.join(texts)})"
+_DEFAULTS: dict[str, list[str]] = {}
+for _algorithm, (_, _config) in ALGORITHMS.items():
+    for _name in _config.__dataclass_fields__:
+        _value = getattr(_config, _name)
+        _words = " ".join(map(str, _value)) if isinstance(_value, tuple) else "" if _value is None else str(_value)
+        _DEFAULTS.setdefault(_name, []).append(f"{_algorithm} {_words}".strip())
 
 
-@optional_flags(*(config for _, config in ALGORITHMS.values()), default=_default)
+@optional_flags(
+    *(config for _, config in ALGORITHMS.values()),
+    default={name: f"({', '.join(words)})" for name, words in _DEFAULTS.items()},
+)
 class Hyperparameters:
-    """Hyperparameters, each with the algorithms that have it and their defaults."""
+    """Hyperparameters. The help lists the algorithms that have each one, with their defaults."""
 
     def on_top_of(self, config: Any, algorithm: str) -> Any:
-        """The hyperparameters of an algorithm, with those that are given.
+        """Replace hyperparameters of a configuration by the given flags.
 
         Args:
-            config: Those that are not given; None for the defaults.
-            algorithm: The algorithm.
+            config: The configuration; None for the algorithm's defaults.
+            algorithm: Name of the algorithm.
 
         Raises:
-            ValueError: A value is not valid, or belongs to another algorithm.
+            ValueError: A value is not valid, or the algorithm has no such hyperparameter.
         """
         values, (_, kind) = given(self), algorithm_of(algorithm)
         for name in values.keys() - kind.__dataclass_fields__.keys():

@@ -1,11 +1,11 @@
-"""Arguments that several commands share: flags made from options, and values as NAME=VALUE."""
+"""Define the arguments that commands share: flags made from options, and values as NAME=VALUE."""
 
 import ast
 import dataclasses
-import types
 import typing
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
+from types import UnionType
 from typing import Annotated, Any, TypeVar
 
 import tyro
@@ -14,64 +14,82 @@ from lyceum_warp.options import OPTIONS, EnvOptions, PhysicsOptions
 from lyceum_warp.support.docstrings import attribute_docs
 
 Repeated = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")]
-"""A flag that may be given several times, each time with one NAME=VALUE."""
+"""A flag that may be given several times, with one NAME=VALUE each."""
 
-CameraWords = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME|PART=VALUE")]
-"""The flag --camera; ``viz.cameras.parsed_camera`` reads it."""
+ParamWords = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    tyro.conf.arg(
+        metavar="NAME=VALUE",
+        help="A parameter of the task. A vector is written as NAME=0.7,inf, a table as NAME=file.npy. May be given "
+        "several times.",
+    ),
+]
+"""The flag --param; ``parameters`` parses it."""
+
+CameraWords = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    tyro.conf.arg(
+        metavar="NAME|PART=VALUE",
+        help='Camera of videos: a camera of the model by name or index, "free" for MuJoCo\'s default free camera, or a '
+        "part of a free camera's pose: azimuth=90, elevation=-20, distance=3, lookat=0,0,1 or track=BODY. May be given "
+        "several times.",
+    ),
+]
+"""The flag --camera; ``viz.cameras.parsed_camera`` parses it."""
+
+TaskWord = Annotated[
+    tyro.conf.Positional[str],
+    tyro.conf.arg(
+        metavar="TASK",
+        help="A task's name (see lyceum-warp tasks), or its file: path/to/file.py, or path/to/file.py:Class.",
+    ),
+]
+"""The argument TASK."""
 
 Class = TypeVar("Class")
+
+_UNIONS = (UnionType, type(typing.Union[int, str]))  # noqa: UP007 (the type of such a hint)
 
 
 @typing.dataclass_transform(kw_only_default=True, frozen_default=True)
 def optional_flags(
-    *options: type, omit: Collection[str] = (), default: str | Callable[[str], str] | None = None
+    *options: type, omit: Collection[str] = (), default: str | Mapping[str, str] | None = None
 ) -> Callable[[type[Class]], type[Class]]:
     """Class decorator: add the fields of dataclasses as flags, with their docstrings as help texts.
 
-    The class itself declares the fields that need another type or another help text in a shell. It must declare those
-    of more than one type. Values are checked when the dataclass is made of them, not before: the parser would print an
-    error as several lines in a box.
+    The class declares fields that need another type or help text in a shell, and all fields of several types. Values
+    are validated when the dataclass is made, because the parser would print errors in a box of several lines.
 
     Args:
-        options: The dataclasses. A field of several of them has the type and the help text of the first.
+        options: The dataclasses. If several have a field, the first one determines its type and help text.
         omit: Fields that get no flag.
-        default: The default of a flag as its help text describes it, or a function that gives it for the name of a
-            field. Flags that are not given then are None. Without this text all flags have the defaults of the
-            dataclass.
+        default: Text for the default in the help, for all flags or by the name of the field; flags then default to
+            None. Without it flags have the defaults of the dataclass.
     """
 
     def decorated(cls: type[Class]) -> type[Class]:
         own = dict(vars(cls).get("__annotations__", {}))
-        inherited = getattr(cls, "__dataclass_fields__", {})
         flags: dict[str, Any] = {}
         for kind in options:
             hints, docs = typing.get_type_hints(kind), attribute_docs(kind) | attribute_docs(cls)
             for field in dataclasses.fields(kind):
                 name = field.name
-                if name in omit or name in flags or (name in inherited and name not in own):
+                if name in omit or name in flags:
                     continue
                 if name not in vars(cls):
                     setattr(cls, name, field.default if default is None else None)
                 value = getattr(cls, name)
-                flag = own.pop(name, None) or (_optional(hints[name]) if value is None else hints[name])
-                # a docstring says what None stands for
-                text = default(name) if callable(default) else default or ""
+                flag = own.pop(name, None) or hints[name]
+                if value is None and flag is hints[name]:  # the docstring explains None, and the shell cannot give it
+                    (kind_of_flag,) = {*(typing.get_args(flag) if isinstance(flag, _UNIONS) else [flag])} - {type(None)}
+                    flag = Annotated[kind_of_flag | None, tyro.conf.DisallowNone]
+                text = default[name] if isinstance(default, Mapping) else default or ""
                 help_text, hint = " ".join(docs.get(name, "").split()), text if value is None else None
                 flags[name] = Annotated[flag, tyro.conf.arg(help=help_text, help_behavior_hint=hint)]
         cls.__annotations__ = flags | own
         return dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
     return decorated
-
-
-def _optional(hint: Any) -> Any:
-    """The annotation of a flag that may be left out, for a field of one type, or of one type and None."""
-    (kind,) = [kind for kind in typing.get_args(hint) if kind is not type(None)] if _is_union(hint) else [hint]
-    return Annotated[kind | None, tyro.conf.DisallowNone]
-
-
-def _is_union(hint: Any) -> bool:
-    return typing.get_origin(hint) in (typing.Union, types.UnionType)
 
 
 def given(flags: Any) -> dict[str, Any]:
@@ -81,8 +99,8 @@ def given(flags: Any) -> dict[str, Any]:
 
 
 NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "nvtx", "model", "fields", "dynamics", "physics")
-"""Options of an environment that do not become flags automatically: commands define nworld, seed and the model in their
-own way, Physics has the flags of ``physics``, and the others are for programs in Python."""
+"""Options of an environment without a generated flag. Commands define nworld, seed and the model themselves,
+``Physics`` has the flags of ``physics``, and the others are for Python alone."""
 
 
 @optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"))
@@ -97,23 +115,23 @@ class Placement:
 
 @optional_flags(PhysicsOptions, default="")
 class Physics:
-    """How the worlds are simulated. Options that are left out are those of the task or of its model."""
+    """How the worlds are simulated. Options that are not given come from the task or its model."""
 
     solver: Repeated = ()
-    """Another limit of the constraint solver than the model's, as iterations=4, ls_iterations=10 or
-    noslip_iterations=0; may be given several times."""
+    """A limit of the constraint solver, such as iterations=4, ls_iterations=10 or noslip_iterations=0; may be given
+    several times. By default the model's."""
 
     def given(self) -> dict[str, Any]:
-        """The options that the flags stand for, by name.
+        """The options that were given, by name.
 
         Raises:
-            ValueError: A limit is written in another way.
+            ValueError: A limit is not written as NAME=VALUE.
         """
         limits = {"solver": dict(map(parameter, self.solver))} if self.solver else {}
         return given(self) | limits
 
     def options(self) -> PhysicsOptions:
-        """The same, checked.
+        """The options that were given, validated.
 
         Raises:
             ValueError: A value is not valid.
@@ -122,15 +140,15 @@ class Physics:
 
 
 def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """The parameters of a task from the texts of a repeated flag, each NAME=VALUE.
+    """Parse the parameters of a task from the texts of a repeated flag.
 
     Args:
-        texts: The texts.
-        command: The command's arguments: their flags are named where a text sets an option.
-        instead: The flags of options that the command calls by another name.
+        texts: The texts, each NAME=VALUE.
+        command: The command's arguments; the error for an option among the parameters names their flags.
+        instead: Flags for options that have another name in this command.
 
     Raises:
-        ValueError: A text is written in another way, or sets an option.
+        ValueError: A text is not written as NAME=VALUE, or sets an option.
     """
     found: dict[str, Any] = {}
     for text in texts:
@@ -149,12 +167,12 @@ def _flag_names(command: Any) -> list[str]:
 
 
 def parameter(text: str) -> tuple[str, Any]:
-    """Name and value of a parameter of a task, or of a limit of the solver, from NAME=VALUE or NAME=0.7,inf.
+    """Parse NAME=VALUE or NAME=0.7,inf: a parameter of a task, or a limit of the solver.
 
-    The path of a ``.npy`` file, which holds a table, becomes absolute.
+    The path of a table, a ``.npy`` file, becomes absolute.
 
     Raises:
-        ValueError: The text is written in another way.
+        ValueError: The text has another form.
     """
     name, equals, value = text.partition("=")
     if not equals or not name.strip():

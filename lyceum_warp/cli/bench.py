@@ -1,4 +1,4 @@
-"""lyceum-warp bench."""
+"""Run programs of bench/: lyceum-warp bench."""
 
 import contextlib
 import dataclasses
@@ -14,14 +14,14 @@ import tyro
 from lyceum_warp.support.interrupts import Interrupted
 
 FOLDER = Path(__file__).resolve().parents[2] / "bench"
-"""The programs of a checkout; an installed package comes without them."""
+"""The folder of the programs in a checkout. An installed package has none."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Bench:
     """Run an experiment or another program of bench/ in a checkout; without a name, list the experiments.
 
-    What follows the name goes to the program, which explains its options itself (--help).
+    The program gets all arguments after its name, and explains them with --help.
 
     $ lyceum-warp bench
     $ lyceum-warp bench throughput --short
@@ -36,14 +36,14 @@ class Bench:
         """Run the command.
 
         Args:
-            arguments: What the program is given.
+            arguments: Arguments of the program.
 
         Returns:
             The program's exit code.
 
         Raises:
             ValueError: There is no such program.
-            FileNotFoundError: The package does not lie in a checkout.
+            FileNotFoundError: The package is not in a checkout.
         """
         if not (FOLDER / "experiment.py").exists():
             raise FileNotFoundError(
@@ -61,7 +61,7 @@ class Bench:
             code = child.wait()
         except Interrupted:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                child.wait(3.0)  # a terminal's Ctrl-C has reached it, too
+                child.wait(3.0)  # Ctrl-C in a terminal has also reached the child
             child.terminate()
             child.wait()
             raise

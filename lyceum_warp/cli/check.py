@@ -1,4 +1,4 @@
-"""lyceum-warp check."""
+"""Check the rules of an environment for a task: lyceum-warp check."""
 
 import dataclasses
 import difflib
@@ -7,25 +7,24 @@ from typing import Annotated
 
 import tyro
 
-from lyceum_warp.cli.arguments import Physics, Placement, Repeated, parameters
+from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, TaskWord, parameters
 from lyceum_warp.cli.display import make_console
 from lyceum_warp.testing import CHECKS, Context, check_task
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Check:
-    """Check that a task keeps every rule of an environment, and print the rules with the seconds that each took.
+    """Check that a task keeps every rule of an environment, and print the rules with the time of each check.
 
-    The rules are those that the package's own tasks keep: a saved state steps to the same numbers, functions write
-    only what they may and read within bounds, a fault stays in its world, and others. Check a new task on both engines.
-    The exit code is 1 where a rule is broken. check_task of lyceum_warp.testing does the same in Python.
+    The rules hold for all tasks of the package: a saved state steps to the same numbers, functions write only their
+    outputs and read within bounds, a fault stays in its world, and others. Check a new task on both engines. The exit
+    code is 1 if a rule is broken. In Python, use check_task of lyceum_warp.testing.
 
     $ lyceum-warp check path/to/my_task.py
     $ lyceum-warp check path/to/my_task.py --engine warp --steps 50
     """
 
-    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
-    """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
+    task: TaskWord
     nworld: int = 4
     """Number of worlds, at least 2."""
     steps: int = 200
@@ -33,10 +32,8 @@ class Check:
     seed: int = 0
     """Seed of the worlds and of the random actions."""
     rule: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
-    """A rule to check, by the name that the report gives it; may be given several times. By default all."""
-    param: Repeated = ()
-    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf, a table as NAME=file.npy; may be given several
-    times."""
+    """A rule to check, by its name in the report; may be given several times. By default all."""
+    param: ParamWords = ()
     env: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 

@@ -1,14 +1,16 @@
-"""Output of the command line: progress, tables, plots and videos."""
+"""Print the output of commands: progress, tables, and paths of plots and videos."""
 
+import contextlib
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import rich.box
 import torch
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -29,20 +31,20 @@ _TABLE_ROWS = 15
 
 
 def make_console() -> Console:
-    """A console; 120 columns wide where the output is not a terminal, so that tables stay whole."""
+    """A console; without a terminal it has 120 columns, so that tables are not wrapped."""
     return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=120)
 
 
 def note(line: str) -> None:
-    """Print a line that is not a result, to stderr."""
+    """Print a message to stderr."""
     print(f"lyceum-warp: {line}", file=sys.stderr)
 
 
 class Display(training.Display):
-    """Progress of a training run: a live bar of at most 80 columns on a terminal, a line for each iteration elsewhere.
+    """Progress of a training run: a live bar of at most 80 columns on a terminal, otherwise a line for each iteration.
 
     Args:
-        console: Where it is shown.
+        console: The output.
     """
 
     def __init__(self, console: Console) -> None:
@@ -54,43 +56,39 @@ class Display(training.Display):
             console=console, disable=not console.is_terminal,
         )  # fmt: skip
 
-    def begin(self, run: Run, learner: Learner, iterations: int) -> None:
-        """Show the task, its worlds and where the run goes."""
+    @contextlib.contextmanager
+    def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
+        """Print the task, its worlds and the run's folder, and show the bar within the context."""
         env, size = learner.env, learner.team.size
         processes = f" each in {size} processes" if size > 1 else ""
         self.console.print(
             f"[bold]{env.task.name}[/]: {env.obs_space.size} observations, {env.action_space.size} actions; "
             f"{env.nworld} worlds{processes}, {env.engine.name} engine on {env.options.device or 'cpu'}, "
-            f"{learner.algorithm}; run in {run.folder}", soft_wrap=True,
+            f"{learner.algorithm}; run in {escape(str(run.folder))}", soft_wrap=True,
         )  # fmt: skip
         self.total = iterations
         self.bar = self.progress.add_task("", total=iterations, completed=learner.iteration, text="")
-        self.progress.start()
+        with self.progress:
+            yield
 
-    def end(self) -> None:
-        """Remove the bar."""
-        self.progress.stop()
-
-    def note(self, line: str) -> None:
-        """Print a line to stderr."""
-        note(line)
+    note = staticmethod(note)
 
     def __call__(self, it: Iteration) -> None:
         """Show an iteration."""
         if it.mean_return is not None:
             self.mean = it.mean_return
         shown = self.mean if self.console.is_terminal else math.nan if it.mean_return is None else self.mean
-        row = it.row()
-        # until an episode has ended, the reward shows how the policy does
-        reward = "" if _missing(row, "reward_mean") else f"reward {row['reward_mean']:.3g} a step"
-        result = reward if _missing(row, "return_mean") else f"return {row['return_mean']:.4g}"
+        row = _known(it.row())
+        # no return is known before an episode has ended
+        reward = f"reward {row['reward_mean']:.3g} a step" if "reward_mean" in row else ""
+        result = f"return {row['return_mean']:.4g}" if "return_mean" in row else reward
         mean = "" if math.isnan(shown) else f"(mean policy {shown:.4g})"
-        success = "" if _missing(row, "success") else f"success {row['success']:.0%}"
+        success = f"success {row['success']:.0%}" if "success" in row else ""
         bad = []
         for column, what in _COUNTED.items():
             if number := row.get(column):
                 bad.append(counted(number, what))
-        rate = "" if _missing(row, "samples_per_second") else f"{row['samples_per_second'] / 1000:.3g}k samples/s"
+        rate = f"{row['samples_per_second'] / 1000:.3g}k samples/s" if "samples_per_second" in row else ""
         if self.console.is_terminal:
             most = [result, mean, success, *bad, rate.replace(" samples", "")]
             for parts in (most, most[:-1], [result, success, *bad], [result, *bad]):
@@ -104,7 +102,7 @@ class Display(training.Display):
             sys.stdout.flush()
 
     def work(self, text: str, unit: str, done: int, total: int) -> None:
-        """Show the progress of other work between two iterations."""
+        """Show the progress of work between two iterations."""
         if self.console.is_terminal:
             self.progress.update(self.bar, text=f"{text}: {done}/{total} {unit}")
             return
@@ -116,14 +114,14 @@ class Display(training.Display):
 
 
 _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skipped update"}
-"""Columns with numbers of what went wrong, and the names of these things; not every algorithm has all of them."""
+"""Columns that count problems, with their names in messages. Not every algorithm has all of them."""
 
 _BAR_WIDTH = 36
-"""Columns that the bar, the number of the iteration and the times take."""
+"""Width of the bar, the number of the iteration and the times, in columns."""
 
 
 def counted(number: int, what: str) -> str:
-    """A number of things in words."""
+    """A number with a noun."""
     return f"{number:,d} {what}{'s' if number > 1 else ''}"
 
 
@@ -133,21 +131,28 @@ _COLUMNS = [
     ("length", "length_mean", ".0f"), ("eval", "eval_mean", ".3g"), ("success", "success", ".0%"),
     ("KL", "kl", ".3f"), ("samples/s", "samples_per_second", ",.0f"),
 ]  # fmt: skip
-"""Headings of the table of a run, columns of metrics.csv, and formats."""
+"""Headings of the table of iterations, with their columns in metrics.csv and formats."""
 
 
 def curve_table(rows: list[dict[str, float | None]]) -> Table:
-    """A run's iterations, at most 15 of them; columns without a number are left out."""
-    table = Table(box=rich.box.SIMPLE, padding=0, pad_edge=False)  # whole on 80 columns
-    shown, columns = _spread(rows), []
+    """A table of a run's iterations, at most 15 of them, without empty columns.
+
+    If at least 5 iterations have an evaluation of the mean policy, the table has only these, the first and the last.
+    """
+    table = Table(box=rich.box.SIMPLE, padding=0, pad_edge=False)  # fits into 80 columns
+    known = [_known(row) for row in rows]
+    between = [row for row in known[1:-1] if "mean_return" in row]
+    shown = [known[0], *between, known[-1]] if len(between) >= 4 else known
+    if len(shown) > _TABLE_ROWS:
+        shown = [shown[round(i * (len(shown) - 1) / (_TABLE_ROWS - 1))] for i in range(_TABLE_ROWS)]
+    columns = []
     for heading, name, form in _COLUMNS:
         cells = []
         for row in shown:
-            value = 0.0 if _missing(row, name) else row[name] or 0.0
-            text = format(int(value) if form.endswith("d") else value, form)
-            cells.append("" if _missing(row, name) else text)
-        if name == "reward_mean" and not any(_missing(row, "return_mean") for row in rows):
-            continue  # it stands for the return until an episode has ended
+            value = row.get(name, 0.0)
+            cells.append(format(int(value) if form.endswith("d") else value, form) if name in row else "")
+        if name == "reward_mean" and all("return_mean" in row for row in known):
+            continue  # shown only until an episode has ended
         if any(cells):
             table.add_column(heading, justify="right", no_wrap=True)
             columns.append(cells)
@@ -162,25 +167,15 @@ def curve_table(rows: list[dict[str, float | None]]) -> Table:
     return table
 
 
-def _missing(row: dict[str, float | None], name: str) -> bool:
-    value = row.get(name)
-    return value is None or math.isnan(value)
-
-
-def _spread(rows: list[dict[str, float | None]]) -> list[dict[str, float | None]]:
-    """At most 15 rows, with the first and the last; if at least 5 have an evaluation, only those between them."""
-    between = [row for row in rows[1:-1] if row.get("mean_return") is not None]
-    if len(between) >= 4:
-        rows = [rows[0], *between, rows[-1]]
-    if len(rows) <= _TABLE_ROWS:
-        return rows
-    return [rows[round(i * (len(rows) - 1) / (_TABLE_ROWS - 1))] for i in range(_TABLE_ROWS)]
+def _known(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row without empty cells and NaN."""
+    return {name: value for name, value in row.items() if value is not None and not math.isnan(value)}
 
 
 def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
-    """The path that a function returns, or "none" and the reason why there is none.
+    """The path that a function returns, or "none" with the reason.
 
-    For what is made of results that are saved: its failure must not look like theirs.
+    Plots and videos are made of saved results. If one fails, the command has still succeeded.
     """
     try:
         return str(make(*args, **words))
@@ -189,15 +184,7 @@ def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
 
 
 def policy_video(env: Env, policy: Policy, path: Path, seed: int, *, camera: CameraChoice = None) -> Path:
-    """Write a video of an episode under a policy; returns its path.
-
-    Args:
-        env: The policy's environment; the episode runs in a world of its own.
-        policy: The policy.
-        path: The mp4 file.
-        seed: Seed of the initial state.
-        camera: The camera; see ``write_video``.
-    """
+    """Run an episode of a policy in a new world, and write a video of it; returns the video's path."""
     with LongWork("running an episode for the video", "steps", make_console()) as work:
         one, states = policy_states(env, policy, seed, progress=work)
     return states_video(one, states, path, camera=camera)
@@ -213,10 +200,10 @@ def states_video(env: Env, states: torch.Tensor, path: Path, *, camera: CameraCh
 
 
 class PlanDisplay:
-    """Progress of an episode under a planner: a live line on a terminal, and a line at the end of each episode.
+    """Progress of an episode under a planner: a live line on a terminal, and a line at the end of the episode.
 
-    Rates and the real-time factor are of the episode so far. For a plant that waits for its plans, the live line shows
-    the speed of the plant; for one that keeps its own rate, the rate of the plans and the age of the action.
+    Without ``real_time`` the live line shows the rate of the plant, otherwise the rate of the plans and the age of the
+    action. Rates are means over the episode so far.
     """
 
     def __init__(
@@ -260,12 +247,7 @@ class PlanDisplay:
 
 
 def report_table(report: ControlReport, *, success: bool = True) -> Table:
-    """A controller's report.
-
-    Args:
-        report: The report.
-        success: Whether the task has a success.
-    """
+    """A table of a controller's report, with its row ``success`` only if the task has a goal."""
     table = Table(box=rich.box.SIMPLE, show_header=False)
     for row in report.rows():
         if success or row[0] != "success":

@@ -1,4 +1,4 @@
-"""lyceum-warp eval."""
+"""Evaluate the policy of a run: lyceum-warp eval."""
 
 import dataclasses
 from pathlib import Path
@@ -11,7 +11,7 @@ from rich.table import Table
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, Repeated, given, optional_flags, parameters
+from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, ParamWords, given, optional_flags, parameters
 from lyceum_warp.cli.display import make_console, note, policy_video, tried
 from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.controllers.trajectory import source
@@ -29,25 +29,21 @@ from lyceum_warp.viz.video import check_video
 
 @optional_flags(EnvOptions, omit=NO_FLAGS, default="(default: the run's)")
 class OtherEnv:
-    """Other options than the run's."""
+    """Options of the environment."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu, or a CUDA device such as cuda:0. Without this flag a run whose engine is auto is evaluated on the CPU: a few
-    worlds step fastest there."""
-    nthread: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Threads of the C engine."""
-    horizon: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Steps after which an episode is truncated, 0 for never."""
+    """cpu, or a CUDA device such as cuda:0. Without this flag a run with the engine auto is evaluated on the CPU, where
+    a few worlds step fastest."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Eval:
-    """Run the mean policy of a run for whole episodes, in the run's own physics, and print statistics of them.
+    """Evaluate the mean policy of a run in whole episodes, in the run's own physics, and print statistics.
 
-    If the task's file or model has moved or changed since the run began, the run's own copy is used, and a line says
-    so.
+    If the task's file or model has moved or changed since the run began, the command uses the run's own copy and prints
+    a line.
 
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
     $ lyceum-warp eval runs/hopper-20260101-120000 --video --camera track=torso --camera azimuth=45
@@ -59,24 +55,20 @@ class Eval:
     which: str = "last"
     """Which policy: last, best, or the number of an iteration that was kept."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """Another task than the run's, a name or a file, with its own physics and defaults, or the present version of the
-    run's task. Its observations and actions must have the same sizes."""
-    param: Repeated = ()
-    """Another parameter of the task than the run's, as NAME=VALUE; may be given several times."""
+    """A task, by name or file, that is used with its own physics and defaults instead of the run's task. It may be the
+    present version of the run's task. Observations and actions must have the same sizes."""
+    param: ParamWords = ()
     episodes: int = 32
     """Number of episodes."""
     seed: int = 1
-    """Seed of the initial states, which differ from those that training with the same seed draws."""
+    """Seed of the initial states. They differ from the initial states of training with this seed."""
     nworld: int = 32
     """Largest number of worlds; never more than episodes."""
     video: bool = False
     """Whether to write a video of one episode, eval.mp4 in the run's folder."""
     camera: CameraWords = ()
-    """Camera of the video: a name or an index of the model's, "free" for MuJoCo's default free camera, or a part of a
-    free camera's pose, as azimuth=90, elevation=-20, distance=3, lookat=0,0,1 or track=BODY; may be given several
-    times."""
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Folder, new or empty, for a file of each episode, as lyceum-warp plan writes them: episode-000.npz and so on."""
+    """Folder, new or empty, for a file of each episode in the format of lyceum-warp plan: episode-000.npz and so on."""
     env: tyro.conf.OmitArgPrefixes[OtherEnv] = dataclasses.field(default_factory=OtherEnv)
 
     def run(self) -> int:
@@ -92,18 +84,8 @@ class Eval:
             Run.check_free(self.episodes_to)
         run = Run.open(self.folder)
         nworld = min(self.nworld, self.episodes)
-        saved = Configuration.of(run)
-        known, params = saved.options.changed({"seed": 0}), dict(saved.params)
-        if self.task is not None and task_name(find_task(self.task)) != run.task_name:
-            known, params = EnvOptions(engine=known.engine, device=known.device, nthread=known.nthread), {}
-        params |= parameters(self.param, self)
-        known = known.changed({"nworld": nworld} | given(self.env))
-        if self.env.device is None:
-            known = known.changed(options_for_few_worlds(known.engine, known.device))
         path = run.policy_file(self.which)
-        env = run_env(run, known, params, note=note, task=self.task)
-        if self.task is None:
-            note_changes(run, env, note=note)
+        env = run_worlds(run, self.env, parameters(self.param, self), nworld=nworld, task=self.task)
         find_camera(env.model, camera)
         origin = _source(env, run)
         if env.horizon == 0:
@@ -137,8 +119,31 @@ class Eval:
         return 0
 
 
+def run_worlds(run: Run, flags: Any, params: dict[str, Any], *, nworld: int, task: str | None) -> Env:
+    """Make worlds of a run's task, with the run's options and parameters unless they are given.
+
+    Args:
+        run: The run.
+        flags: Flags of options; without a device, few worlds run on the CPU.
+        params: Parameters that replace the run's.
+        nworld: Number of worlds.
+        task: Another task, which is used with its own options and parameters.
+    """
+    saved = Configuration.of(run)
+    known, own = saved.options.changed({"seed": 0}), dict(saved.params)
+    if task is not None and task_name(find_task(task)) != run.task_name:
+        known, own = EnvOptions(engine=known.engine, device=known.device, nthread=known.nthread), {}
+    known = known.changed({"nworld": nworld} | given(flags))
+    if flags.device is None:
+        known = known.changed(options_for_few_worlds(known.engine, known.device))
+    env = run_env(run, known, own | params, note=note, task=task)
+    if task is None:
+        note_changes(run, env, note=note)
+    return env
+
+
 def _save_episodes(env: Env, policy: Policy, options: Eval, source: dict[str, Any]) -> str:
-    """Run the same episodes again, and write a file of each; returns what names them all."""
+    """Run the same episodes again, and write a file of each; returns a pattern that matches the files."""
     assert options.episodes_to is not None
     whose = {"name": type(policy).__name__, "run": str(options.folder.resolve()), "which": options.which}
     with LongWork("running the episodes that are saved", "steps", make_console()) as work:
@@ -153,7 +158,7 @@ def _save_episodes(env: Env, policy: Policy, options: Eval, source: dict[str, An
 
 
 def _source(env: Env, run: Run) -> dict[str, Any]:
-    """How to make the environment of a run again; with the run's copy of a model where it was used."""
+    """The entry ``source`` of saved episodes, with the run's copy of the model if it was used."""
     made, copy = source(env), run.config.get("kept", {}).get("model")
     if copy is not None and env.options.model is not None and "model" not in made["options"]:
         made["options"]["model"] = str((run.task_folder / copy).resolve())

@@ -1,4 +1,4 @@
-"""lyceum-warp export."""
+"""Export the policy of a run: lyceum-warp export."""
 
 import dataclasses
 from pathlib import Path
@@ -13,10 +13,10 @@ from lyceum_warp.runs.folder import Run, load
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write the policy of a run to a file that runs without lyceum_warp, with its normaliser of observations.
+    """Write the policy of a run, with its observation normaliser, to a file that runs without lyceum_warp.
 
-    An .onnx file takes observations as "obs", (n, observations) float32 with any n, and gives mean actions as "action".
-    It needs pip install 'lyceum-warp[export]'. A .pt2 file is torch's own: torch.export.load(file).module()(obs).
+    An .onnx file has the input "obs", (n, observations) float32 with any n, and the output "action", the mean actions.
+    It needs pip install 'lyceum-warp[export]'. A .pt2 file is loaded by torch: torch.export.load(file).module()(obs).
 
     $ lyceum-warp export runs/hopper-20260101-120000
     $ lyceum-warp export runs/hopper-20260101-120000 --which best --to robot/policy.onnx

@@ -1,10 +1,9 @@
-"""lyceum-warp tasks."""
+"""List the tasks: lyceum-warp tasks."""
 
 import dataclasses
 import inspect
 import sys
 import textwrap
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,8 +22,6 @@ from lyceum_warp.options import PhysicsOptions
 from lyceum_warp.task import Task
 
 _HEADINGS = ("task", "obs", "act", "skip", "dt", "horizon", "model")
-_RIGHT = slice(1, 6)
-"""The columns of numbers."""
 
 _LEGEND = """obs, act: numbers in an observation and an action; skip: substeps in a step; dt: seconds in a step.
 A task of your own: lyceum-warp new --help"""
@@ -35,15 +32,14 @@ _ONE_CONTROL = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE, mujoc
 """Types of actuators that have one control each."""
 
 _WIDTH = 100
-"""Columns that a description may take."""
+"""Columns of a description, at most."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Tasks:
-    """List the tasks that come with the package: their sizes, and where their models come from.
+    """List the tasks of the package, their sizes and the sources of their models.
 
-    A task whose model comes with an extra or with MuJoCo Menagerie is listed also where that is not installed, with
-    what it needs.
+    The list includes tasks whose models need an extra or MuJoCo Menagerie, with the missing package.
 
     $ lyceum-warp tasks
     $ lyceum-warp tasks gymnasium
@@ -54,72 +50,64 @@ class Tasks:
 
     def run(self) -> int:
         """Run the command; returns the exit code."""
-        entries = [entry for entry in map(_entry, task_names()) if entry.found(self.word)]
+        entries = [entry for entry in map(_entry, task_names()) if entry.has(self.word)]
         if not entries:
             raise ValueError(
                 f"no task has {self.word!r} in its name, description or model: lyceum-warp tasks lists all"
             )
-        rows, notes = zip(*map(_row, entries), strict=True)
-        table = [_HEADINGS, *rows]
+        table = [_HEADINGS, *map(_cells, entries)]
         widths = [max(len(row[i]) for row in table) for i in range(len(_HEADINGS))]
-        sides: list[Callable[[str, int], str]] = [str.ljust] * len(_HEADINGS)
-        sides[_RIGHT] = [str.rjust] * len(sides[_RIGHT])
         heading, *lines = (
-            "  ".join(side(*cell) for side, *cell in zip(sides, row, widths, strict=True)) for row in table
+            "  ".join(f"{cell:{'>' if 1 <= i <= 5 else '<'}{widths[i]}}" for i, cell in enumerate(row)) for row in table
         )
         console = make_console()
-
-        def show(text: str, style: str = "", indent: str = "") -> None:
-            if indent:
-                text = textwrap.fill(text, min(console.width, _WIDTH), initial_indent=indent, subsequent_indent=indent)
-            console.print(escape(text.rstrip()), style=style, soft_wrap=True)
-
-        show(heading, "bold")
-        for line, entry, note in zip(lines, entries, notes, strict=True):
-            show(line)
-            show(entry.about or _UNKNOWN, "dim", "    ")
-            if note:
-                show(note, "yellow", "    ")
-        show("")
-        show(_LEGEND, "dim")
+        indented: dict[str, Any] = {"width": min(console.width, _WIDTH)}
+        indented |= dict.fromkeys(("initial_indent", "subsequent_indent"), "    ")
+        console.print(heading.rstrip(), style="bold", soft_wrap=True)
+        for line, entry in zip(lines, entries, strict=True):
+            console.print(escape(line.rstrip()), soft_wrap=True)
+            console.print(escape(textwrap.fill(entry.about or _UNKNOWN, **indented)), style="dim", soft_wrap=True)
+            if entry.note:
+                console.print(escape(textwrap.fill(entry.note, **indented)), style="yellow", soft_wrap=True)
+        console.print(f"\n{_LEGEND}", style="dim", soft_wrap=True)
         return 0
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class _Entry:
-    """A task in the list. What its model must be read for is read on demand."""
+    """A task in the list."""
 
     name: str
-    task: type[Task] | None
-    """None where the task's file cannot be run."""
-    about: str
-    source: str
-    note: str
-    """Why something of it is not known; empty where there is no reason."""
+    task: type[Task] | None = None
+    """None if the task's file raises an error."""
+    about: str = ""
+    source: str = _UNKNOWN
+    note: str = ""
+    """Why a value is unknown."""
 
-    def found(self, word: str) -> bool:
-        """Whether the entry has a word, in any case."""
+    def has(self, word: str) -> bool:
+        """Whether the entry contains a word, in any case."""
         return word.lower() in " ".join((self.name, self.about, self.source)).lower()
 
 
 def _entry(name: str) -> _Entry:
+    """The entry of a task, without the sizes, for which the model must be read."""
+    entry = _Entry(name)
     try:
-        task = find_task(name)
-    except Exception as error:  # a broken file may raise any
-        return _Entry(name, None, "", _UNKNOWN, _reason(error))
-    about = (inspect.getdoc(sys.modules[task.__module__]) or "").partition("\n")[0]
-    about = (about.partition(": ")[2] or about).rstrip(".")
-    try:
-        return _Entry(name, task, about, _source(task), "")
-    except Exception as error:
-        return _Entry(name, task, about, _UNKNOWN, _reason(error))
+        task = entry.task = find_task(name)
+        about = (inspect.getdoc(sys.modules[task.__module__]) or "").partition("\n")[0]
+        entry.about = (about.partition(": ")[2] or about).rstrip(".")
+        entry.source = _source(task)
+    except Exception as error:  # a broken task file may raise any error
+        entry.note = _reason(error)
+    return entry
 
 
-def _row(entry: _Entry) -> tuple[tuple[str, ...], str]:
-    """The cells of a task, and what keeps the model's from being known."""
-    task, note = entry.task, entry.note
+def _cells(entry: _Entry) -> tuple[str, ...]:
+    """The cells of a task's row. If its model cannot be read, the entry's note says why."""
+    task = entry.task
     if task is None:
-        return (entry.name, *[_UNKNOWN] * (len(_HEADINGS) - 2), entry.source), note
+        return (entry.name, *[_UNKNOWN] * 5, entry.source)
     obs = actions = timestep = _UNKNOWN
     try:
         actions = _UNKNOWN if task.actions is None else str(sum(task.actions.values()))
@@ -127,24 +115,20 @@ def _row(entry: _Entry) -> tuple[tuple[str, ...], str]:
         spec = task_spec(task)
         actions = str(_controls(spec)) if task.actions is None else actions
         timestep = f"{spec.option.timestep * task.frame_skip:g} s"
-    except Exception as error:  # a package that is not installed, with a model's files, or a mistake in the task
-        note = note or _reason(error)
-    numbers = (obs, actions, str(task.frame_skip), timestep, str(task.horizon or "none"))
-    return (entry.name, *numbers, entry.source), note
+    except Exception as error:  # a missing package with the model, or a mistake in the task
+        entry.note = entry.note or _reason(error)
+    return (entry.name, obs, actions, str(task.frame_skip), timestep, str(task.horizon or "none"), entry.source)
 
 
 def _controls(spec: mujoco.MjSpec) -> int:
-    """The number of a model's controls; the model is compiled only where an actuator may have several.
-
-    To compile the meshes of a robot takes up to a second.
-    """
+    """The number of a model's controls. Compiling a model takes up to a second, so it is avoided if possible."""
     if all(actuator.gaintype in _ONE_CONTROL for actuator in spec.actuators):
         return len(spec.actuators)
     return compile_model(spec, (), PhysicsOptions()).nu
 
 
 def _source(task: type[Task]) -> str:
-    """What brings a task's model, with its extra where it has one."""
+    """The source of a task's model, with its extra if it needs one."""
     model: Any = task.model() if callable(task.model) else task.model
     if not isinstance(model, str | ModelFile):
         return f"made in {task.__module__.rpartition('.')[2]}.py"
@@ -156,7 +140,7 @@ def _source(task: type[Task]) -> str:
 
 
 def _reason(error: Exception) -> str:
-    """An error in one line; the command that fixes it alone, where the error names one."""
+    """An error in one line, reduced to the command that fixes it if it names one."""
     text = " ".join(str(error).split())
     command = text.rpartition(": ")[2]
     if command.startswith("pip install"):

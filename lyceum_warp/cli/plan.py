@@ -1,4 +1,4 @@
-"""lyceum-warp plan."""
+"""Control a task with a planner: lyceum-warp plan."""
 
 import dataclasses
 import datetime
@@ -16,9 +16,11 @@ from lyceum_warp.algos.planner import MPPI
 from lyceum_warp.binding.registry import find_task, snake_case, spelled_task, task_name
 from lyceum_warp.cli.arguments import (
     CameraWords,
+    ParamWords,
     Physics,
     Placement,
     Repeated,
+    TaskWord,
     given,
     optional_flags,
     parameters,
@@ -39,11 +41,11 @@ from lyceum_warp.viz.control_plot import control_plot
 
 @optional_flags(MPPIConfig, default="(default: the task's)")
 class Settings:
-    """How the planner plans. Settings that are left out are those of the task."""
+    """Settings of the planner. By default they are the task's."""
 
     noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
-    """Standard deviation of the noise around the plan, in units of the action: one number or one for each action (its
-    covariance only in Python)."""
+    """Standard deviation of the noise around the plan, in units of the action: one number, or one for each action. A
+    covariance can be given in Python."""
     smoothing: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="B0 B1 B2")] = None
     fill: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="WORD|FLOAT ...")] = None
     termination: Annotated[str | None, tyro.conf.arg(metavar="stop|ignore")] = None
@@ -54,7 +56,7 @@ class Settings:
     risk: Annotated[str | None, tyro.conf.arg(metavar="mean|worst")] = None
 
     def on_top_of(self, config: MPPIConfig) -> MPPIConfig:
-        """A configuration with the settings that were given.
+        """Replace settings of a configuration by the given flags.
 
         Raises:
             ValueError: A setting is not valid.
@@ -70,16 +72,14 @@ class Settings:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Plan:
-    """Control a task by planning again at every step, and report rewards, success and planning times.
+    """Control a task with a planner that replans at every step, and report rewards, success and planning times.
 
-    The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling.
+    The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling. Its settings come from
+    the task unless they are given. Options of the physics (--integrator, --solver, ...) apply to the planner alone.
 
-    The folder then holds config.json, versions.json, a file for each episode (episode-000.npz: states, actions,
-    rewards, evaluations, times; numpy reads it), report.json, plan.png and video.mp4 of the first episode. Settings of
-    the planner that are not given come from the task. After Ctrl-C the episode that was interrupted has a file, too,
-    but is not in the report.
-
-    Options of the physics (--integrator, --solver, ...) are the planner's: the controlled world keeps its own.
+    The folder then holds config.json, versions.json, report.json, plan.png, video.mp4 of the first episode, and a file
+    for each episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy). After Ctrl-C the
+    interrupted episode has a file, but is not in the report.
 
     $ lyceum-warp plan reach
     $ lyceum-warp plan reach --real-time --episodes 10
@@ -89,42 +89,36 @@ class Plan:
     $ lyceum-warp plan adroit_pen --device cuda:0 --samples 1024 --solver noslip_iterations=0
     """
 
-    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
-    """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
+    task: TaskWord
     episodes: int = 1
     """Number of episodes."""
     steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Steps of an episode; by default the task's horizon."""
     replan_every: int = 1
-    """Steps from one plan to the next; the steps between apply the plan's further actions."""
+    """Steps between two plans. The steps in between apply the plan's next actions."""
     seed: int = 0
-    """Seed of the first episode's initial state and noise; the next episode has the next number."""
+    """Seed of the first episode's initial state and noise; it increases by one with each episode."""
     real_time: bool = False
-    """Let the world run at its own rate while the planner plans, instead of waiting for each plan."""
+    """Step the world in real time while the planner plans, instead of waiting for each plan."""
     rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None
-    """Plans per second, which sets the deadline of each plan in the report; by default one per step, or one in the
-    steps of --replan-every."""
+    """Plans per second, which define the deadline of a plan in the report; by default one plan for each step, or for
+    the steps of --replan-every."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """The folder, new or empty; runs/plan-TASK-DATE by default."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """NPG run of this task whose value function gives the value of the state where a plan ends."""
-    param: Repeated = ()
-    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf, a table as NAME=file.npy; may be given several
-    times."""
+    """NPG run of this task. Its value function is the value of the last state of each sample."""
+    param: ParamWords = ()
     planner_param: Repeated = ()
-    """Another value of a parameter, only for the planner."""
+    """A parameter of the planner's task, if it differs from the controlled world's."""
     planner_model: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Another model, only for the planner."""
+    """The planner's model, if it differs from the controlled world's."""
     video: bool = True
     """Whether to make a video of the first episode."""
     camera: CameraWords = ()
-    """Camera of the video: a name or an index of the model's, "free" for MuJoCo's default free camera, or a part of a
-    free camera's pose, as azimuth=90, elevation=-20, distance=3, lookat=0,0,1 or track=BODY; may be given several
-    times."""
     plot: bool = True
     """Whether to draw rewards, planning times and ages."""
     planner: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
-    """Where the planner's worlds run. The controlled world runs on one thread of the mujoco engine."""
+    """Where the planner's worlds run. The controlled world runs in one thread of the mujoco engine."""
     mppi: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
     planner_physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
@@ -152,7 +146,9 @@ class Plan:
         if camera is not None and not self.video:
             raise ValueError("--camera has no effect with --no-video: leave out one of them")
         torch.set_num_threads(1)
-        params, planner_params = _parameters(self)
+        instead = {"model": "--planner-model"}
+        params = parameters(self.param, self, instead=instead | {"horizon": "--steps"})
+        planner_params = parameters(self.planner_param, self, instead=instead | {"nworld": "--samples"})
         plant, planner = _worlds(self, params, planner_params)
         CheckedController(planner, plant).check_horizon(planner.horizon, every)
         find_camera(plant.model, camera)
@@ -191,17 +187,8 @@ def _stem(task: str) -> str:
     return Path(task.partition(":")[0]).stem
 
 
-def _parameters(options: Plan) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The parameters of the task, and those of them that are different for the planner."""
-    both = {"model": "--planner-model"}
-    return (
-        parameters(options.param, options, instead=both | {"horizon": "--steps"}),
-        parameters(options.planner_param, options, instead=both | {"nworld": "--samples"}),
-    )
-
-
 def _worlds(options: Plan, params: dict[str, Any], planner_params: dict[str, Any]) -> tuple[Env, MPPI]:
-    """The world to control, and its planner."""
+    """Make the controlled world and its planner."""
     steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
     if plant.horizon == 0:
@@ -215,7 +202,7 @@ def _worlds(options: Plan, params: dict[str, Any], planner_params: dict[str, Any
 
 
 def _fill(words: tuple[str, ...]) -> Any:
-    """A word, one number, or numbers."""
+    """Parse --fill: a word, one number, or several."""
     try:
         numbers = [float(word) for word in words]
     except ValueError:
@@ -224,7 +211,7 @@ def _fill(words: tuple[str, ...]) -> Any:
 
 
 def _model(path: Path) -> Path:
-    """The file of a model, which here is a path; a task may also name one that a package ships."""
+    """The path of the planner's model."""
     path = path.expanduser().resolve()
     if not path.is_file():
         raise FileNotFoundError(f"--planner-model: there is no file {path}")
@@ -232,9 +219,10 @@ def _model(path: Path) -> Path:
 
 
 def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
-    console, simulated = make_console(), planner.env
+    console, simulated, update = make_console(), planner.env, planner.settings["update"]
+    name = {"mppi": "MPPI", "cem": "CEM", "predictive_sampling": "predictive sampling"}.get(update, update)
     console.print(
-        f"[bold]{plant.task.name}[/]: {_planner_name(planner)}, {planner.samples} samples of {planner.horizon} steps "
+        f"[bold]{plant.task.name}[/]: {name}, {planner.samples} samples of {planner.horizon} steps "
         f"({planner.horizon * planner.timestep:.3g} s), {simulated.engine.name} engine on {simulated.device.alias}; "
         f"{'real time' if options.real_time else 'the world waits'}; files in {run.folder}",
         soft_wrap=True,
@@ -251,7 +239,7 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
             done.append(trajectory)
             display.done(trajectory)
             _save(run, done, options)
-    except BaseException as error:  # later signals are ignored, so that the files below are written
+    except BaseException as error:  # later signals are ignored until the files are written
         if done:
             _save(run, done, options)
         path = aborted[0].save(_file(run, len(done))) if aborted else None
@@ -263,19 +251,14 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
 
 
 def _rate(options: Plan, episode: Trajectory) -> float | None:
-    """The plans per second that set the deadline; None for one per step."""
+    """Plans per second, for the deadline; None for one plan for each step."""
     if options.rate is not None or options.replan_every == 1:
         return options.rate
     return 1 / (options.replan_every * episode.timestep)
 
 
-def _planner_name(planner: MPPI) -> str:
-    update = planner.settings["update"]
-    return {"mppi": "MPPI", "cem": "CEM", "predictive_sampling": "predictive sampling"}.get(update, update)
-
-
 def _left(run: Run, whole: int, aborted: list[Trajectory], path: Path | None) -> str:
-    """The files that an interrupted run leaves, after so many whole episodes."""
+    """Describe the files of a run that was interrupted after some whole episodes."""
     steps = f"after {aborted[0].steps} step{'s' * (aborted[0].steps != 1)}" if aborted else "before its first step"
     if not whole:
         where = f"it is in {path}" if path else f"{run.folder} holds no episode"
@@ -289,7 +272,7 @@ def _file(run: Run, episode: int) -> Path:
 
 
 def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
-    """Write the last episode and the report of all."""
+    """Write the last episode, and the report of all episodes."""
     done[-1].save(_file(run, len(done) - 1))
     control_report(done, rate=_rate(options, done[0])).write(run.folder / "report.json")
 

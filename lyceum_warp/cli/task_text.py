@@ -189,8 +189,8 @@ def literal(text: str) -> str:
 
 _TEXT = '''"""{class_name}: {title}, with a reward that is still to be written.
 
-``lyceum-warp check {file}`` checks this task, ``lyceum-warp train {file}`` trains it, and ``help(lw.Task)`` describes
-what a task may consist of.
+``lyceum-warp check {file}`` checks this task, and ``lyceum-warp train {file}`` trains it.
+``help(lw.Task)`` describes every function of a task.
 """
 
 import warp as wp

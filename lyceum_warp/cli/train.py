@@ -1,4 +1,4 @@
-"""lyceum-warp train."""
+"""Train a policy: lyceum-warp train."""
 
 import contextlib
 import dataclasses
@@ -16,7 +16,7 @@ from lyceum_warp.algos.learner import Learner
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.cli.algorithms import Hyperparameters
-from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, Physics, Repeated, given, optional_flags, parameters
+from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, ParamWords, Physics, given, optional_flags, parameters
 from lyceum_warp.cli.display import Display, curve_table, make_console, note, policy_video, tried
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import read_checkpoint
@@ -30,25 +30,24 @@ from lyceum_warp.viewer.follow import RunViewer
 from lyceum_warp.viz.cameras import parsed_camera
 from lyceum_warp.viz.learning_curve import learning_curve
 from lyceum_warp.viz.long_work import LongWork
-from lyceum_warp.viz.tensorboard import TensorBoard
 
 _FINAL_EPISODES = 32
 
 _SETTINGS: dict[str, Any] = {
     "iterations": 100, "target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0,
 }  # fmt: skip
-"""Settings that a run may change when it is continued, and their defaults."""
+"""Settings that may change when a run is resumed, and their defaults."""
 
 _KEPT = {
     "from_run": "--from", "task": "TASK", "algorithm": "--algorithm", "seed": "--seed", "threads": "--threads",
     "out": "--out",
 }  # fmt: skip
-"""Flags that do not go with --resume."""
+"""Flags that are refused with --resume."""
 
 
 @optional_flags(EnvOptions, omit=NO_FLAGS, default="")
 class EnvFlags:
-    """Where the worlds run, and how their episodes go."""
+    """Where the worlds run, and the length of their episodes."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto (the default): warp on a CUDA device and mujoco on the CPU."""
@@ -61,7 +60,7 @@ class Train:
     """Train a policy on a task, with the natural policy gradient or with PPO.
 
     The run's folder then holds config.json, versions.json, metrics.csv (one row for each iteration), policy.pt,
-    best.pt, checkpoint.pt, curve.png and video.mp4. Ctrl-C ends the run after the current iteration, and saves it; a
+    best.pt, checkpoint.pt, curve.png and video.mp4. Ctrl-C ends the run after the current iteration and saves it; a
     second Ctrl-C ends it at once.
 
     $ lyceum-warp train hopper --iterations 100 --seed 1
@@ -73,11 +72,10 @@ class Train:
     $ lyceum-warp train hopper --algorithm ppo --iterations 300 --learning-rate 3e-4
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
-    Processes that torchrun starts share the worlds, also on several machines. With --device cuda each process takes the
-    GPU of its number. Their number changes only the rounding
-    of the results, and a run may continue with another number. The first process writes files and messages. After
-    Ctrl-C or SIGTERM, to torchrun or to any process, all processes finish the iteration and end together; torchrun
-    waits for them for 30 s, or for its --shutdown-timeout.
+    Processes of torchrun share the worlds, also on several machines. With --device cuda each process uses the GPU of
+    its local rank. Their number changes only the rounding of the results, and may differ when a run is resumed.
+    Rank 0 writes files and messages. After Ctrl-C or SIGTERM to torchrun or to any process, all processes finish the
+    iteration and end together; torchrun waits 30 s for them, or its --shutdown-timeout.
     """
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
@@ -91,49 +89,41 @@ class Train:
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """The run's folder, new or empty; runs/TASK-DATE by default."""
     resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Continue the run in this folder, exactly and with all its settings, up to --iterations."""
+    """Continue the run in this folder exactly, with its settings, up to --iterations."""
     from_run: Annotated[Path | None, tyro.conf.arg(name="from", metavar="RUN")] = None
-    """Begin a new run with the policy, the value function and the normaliser of this one. Settings that are not given
-    are those of that run; with another TASK, its parameters are not, and with another --algorithm, its hyperparameters
-    are not."""
+    """Begin a new run with the policy, the value function and the normaliser of this run. Settings that are not given
+    come from that run, except its parameters with another TASK, and its hyperparameters with another --algorithm."""
     which: str = "last"
     """Which policy of --from: last, best, or the number of an iteration that was kept."""
     target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """End the run once the mean policy's return, or without --mean-every the mean return, is at least this."""
+    """End the run once the return of the mean policy reaches this number; without --mean-every the mean return."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Iterations between two policies that are kept under their numbers, 0 for none. The last and the best one are
-    always kept."""
+    """Iterations between two numbered policies, 0 for none. The last and the best policy are always kept."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Iterations between two saves of the policy and the complete state, from which a run that was killed continues;
-    0 for every 30 s, or more often while that takes at most 1 % of the time."""
+    """Iterations between two saves of the policy and the complete state, from which a killed run continues; 0 for every
+    30 s, or more often while saving takes at most 1 % of the time."""
     tensorboard: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
-    """Whether to write the metrics for TensorBoard, too, into the run's folder."""
+    """Whether to also write the metrics for TensorBoard, into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Worlds of all processes together; by default 64, or 4096 for each GPU. Of npg, each makes samples / nworld steps
-    in an iteration: whole episodes where those fit (as in the paper: 10 worlds for 10,000 samples and episodes of 1,000
-    steps), otherwise segments of episodes."""
+    """Worlds of all processes together; by default 64, or 4096 for each GPU. With npg, each world makes
+    samples / nworld steps per iteration: whole episodes if they fit (as in the paper, with 10 worlds, 10,000 samples
+    and episodes of 1,000 steps), otherwise segments of episodes."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 1)")] = None
     """Threads of torch on the CPU. Small networks gain little from more. Runs are equal to the bit only with the same
-    number. They are not the threads of the mujoco engine, which are --nthread."""
-    param: Repeated = ()
-    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf, a table as NAME=file.npy; may be given several
-    times."""
+    number. --nthread sets the threads of the mujoco engine."""
+    param: ParamWords = ()
     video: bool = True
     """Whether to write a video of one episode of the trained policy at the end."""
     video_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Iterations between two further videos of the mean policy, videos/000100.mp4 and so on in the run's folder, which
-    TensorBoard shows, too; 0 for none."""
+    """Iterations between two videos of the mean policy, videos/000100.mp4 and so on in the run's folder; 0 for none."""
     camera: CameraWords = ()
-    """Camera of the videos: a name or an index of the model's, "free" for MuJoCo's default free camera, or a part of a
-    free camera's pose, as azimuth=90, elevation=-20, distance=3, lookat=0,0,1 or track=BODY; may be given several
-    times."""
     view: bool = False
-    """Whether to show the newest policy while the run trains, in a viewer with worlds of its own: lyceum-warp view
-    FOLDER --follow, which another shell may run as well."""
+    """Whether to show the newest policy while the run trains, as lyceum-warp view FOLDER --follow does in another
+    shell."""
     plot: bool = True
     """Whether to draw the learning curve at the end."""
     require_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """Exit with code 1 unless the trained mean policy's return exceeds this."""
+    """Exit with code 1 unless the return of the trained mean policy exceeds this number."""
     env: tyro.conf.OmitArgPrefixes[EnvFlags] = dataclasses.field(default_factory=EnvFlags)
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
     hyperparameters: tyro.conf.OmitArgPrefixes[Hyperparameters] = dataclasses.field(default_factory=Hyperparameters)
@@ -161,10 +151,31 @@ class Train:
         with join(self.env.device or saved.get("device", "cpu")) as team:
             with team.together():  # every mistake in the options is found before the folder is made
                 learner, folder, entries = self._learner(source, team)
-            return self._train(learner, folder, settings, entries)
+            console, leads, total = make_console(), learner.team.leads, settings["iterations"]
+            try:
+                with RunViewer(folder) if self.view and leads else contextlib.nullcontext():
+                    run = train(
+                        learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
+                        entries=entries, display=Display(console), **settings,
+                    )  # fmt: skip
+            except Interrupted as signalled:
+                if leads and (path := folder / "policy.pt").exists():
+                    done = read_checkpoint(path, parts=("iteration",))["iteration"]
+                    text = f"interrupted by {signal.Signals(signalled.number).name} after {done} of {total} iterations"
+                    if done < total:
+                        text += f"; continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
+                    console.print(text, soft_wrap=True, markup=False)
+                return 128 + signalled.number
+            if not leads:
+                return 0
+            reached = run.config.get("reached", {})
+            if reached.get("iteration") == learner.iteration < total:
+                text = f"the target return is reached: {reached['return']:.6g} in iteration {learner.iteration}"
+                console.print(text, soft_wrap=True, markup=False)
+            return self._report(run, learner, console)
 
     def configuration(self, source: Run | None, team: Team) -> Configuration:
-        """What is trained: what the flags say, on top of the configuration of another run, or of the defaults."""
+        """The configuration of another run, or the defaults, with the given flags."""
         words = given(self.env) | self.physics.given()
         for name, value in (("nworld", self.nworld), ("seed", self.seed)):
             if value is not None:
@@ -182,7 +193,7 @@ class Train:
         algorithm = self.algorithm or base.algorithm
         if source is not None and self.algorithm is None and algorithm not in ALGORITHMS:
             raise ValueError(
-                f"the run in {source.folder} was trained by {algorithm!r}, a learner of a program: go on there, by "
+                f"the run in {source.folder} was trained by {algorithm!r}, a learner of a program: resume it there, by "
                 "lw.train(..., resume=True)"
             )
         if source is not None and self.resume is not None and (old := source.config["algorithm"]) != algorithm:
@@ -200,7 +211,7 @@ class Train:
         )  # fmt: skip
 
     def _learner(self, source: Run | None, team: Team) -> tuple[Learner, Path, dict[str, Any]]:
-        """The learner, the run's folder, and further entries of its config.json."""
+        """Make the learner; returns it with the run's folder and further entries of its config.json."""
         configuration = self.configuration(source, team)
         if self.out is not None and team.leads:
             Run.check_free(self.out)
@@ -211,7 +222,7 @@ class Train:
             if self.resume is None:
                 entries["from"] = {"run": str(source.folder.resolve()), "which": self.which, "iteration": iteration}
         says = note if team.leads else _silent
-        own = source if self.task is None else None  # a task that is named is used as it is now
+        own = source if self.task is None else None  # a given task is used as it is now
         learner = configuration.learner(team, run=own, networks=(policy, value), note=says)
         if policy is not None:
             fitted = type(learner.config)(**learner.settings())
@@ -225,31 +236,6 @@ class Train:
             note_changes(own, learner.env, note=says)
         name = f"{learner.env.task.name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         return learner, self.resume or self.out or Path("runs", name), entries
-
-    def _train(self, learner: Learner, folder: Path, settings: dict[str, Any], entries: dict[str, Any]) -> int:
-        """Train; the process that leads writes files and messages."""
-        console, leads, total = make_console(), learner.team.leads, settings["iterations"]
-        try:
-            with RunViewer(folder) if self.view and leads else contextlib.nullcontext():
-                run = train(
-                    learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
-                    entries=entries, display=Display(console), **settings,
-                )  # fmt: skip
-        except Interrupted as signalled:
-            if leads and (path := folder / "policy.pt").exists():
-                done = read_checkpoint(path, parts=("iteration",))["iteration"]
-                text = f"interrupted by {signal.Signals(signalled.number).name} after {done} of {total} iterations"
-                if done < total:
-                    text += f"; continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
-                console.print(text, soft_wrap=True, markup=False)
-            return 128 + signalled.number
-        if not leads:
-            return 0
-        reached = run.config.get("reached", {})
-        if reached.get("iteration") == learner.iteration < total:
-            text = f"the target return is reached: {reached['return']:.6g} in iteration {learner.iteration}"
-            console.print(text, soft_wrap=True, markup=False)
-        return self._report(run, learner, console)
 
     def _report(self, run: Run, learner: Learner, console: Console) -> int:
         """Print the table, evaluate the policy, draw the curve and the video; returns the exit code."""
@@ -272,10 +258,6 @@ class Train:
         if self.video:
             camera, path = parsed_camera(self.camera), run.folder / "video.mp4"
             paths["video"] = tried(policy_video, env, policy, path, evaluation_seed(seed), camera=camera)
-            if run.config["tensorboard"] and path.is_file():
-                shown = tried(_show_video, run, path, learner.samples)
-                if shown.startswith("none: "):
-                    note(f"TensorBoard does not show the video ({shown.removeprefix('none: ')})")
         for name, place in paths.items():
             console.print(f"{name + ':':<12}{place}", soft_wrap=True, markup=False)
         if self.require_return is not None and not final > self.require_return:
@@ -284,11 +266,5 @@ class Train:
         return 0
 
 
-def _show_video(run: Run, video: Path, samples: int) -> None:
-    """Add a video to a run's TensorBoard."""
-    with TensorBoard(run.folder, run.config) as board:
-        board.video(video, samples)
-
-
 def _silent(line: str) -> None:
-    """Print nothing, in processes that do not write."""
+    """Print nothing, on all ranks but 0."""

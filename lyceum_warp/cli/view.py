@@ -1,4 +1,4 @@
-"""lyceum-warp view."""
+"""Show a task, a policy, a planner or episodes: lyceum-warp view."""
 
 import dataclasses
 from pathlib import Path
@@ -9,19 +9,16 @@ import tyro
 
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.planner import MPPI
-from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.cli.arguments import NO_FLAGS, Repeated, given, optional_flags, parameters
+from lyceum_warp.cli.arguments import NO_FLAGS, ParamWords, given, optional_flags, parameters
 from lyceum_warp.cli.display import note
+from lyceum_warp.cli.evaluate import run_worlds
 from lyceum_warp.cli.plan import Settings
 from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
 from lyceum_warp.controllers.trajectory import Trajectory
-from lyceum_warp.engines.placement import options_for_few_worlds
 from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import check_sizes
-from lyceum_warp.runs.configuration import Configuration
 from lyceum_warp.runs.folder import Run, load
-from lyceum_warp.runs.task_copy import note_changes, run_env
 from lyceum_warp.support.interrupts import Interrupted, signals
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.viewer.follow import Follower, Parent, wait_for_run
@@ -36,23 +33,23 @@ _LONG = 1e9
 
 @optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)")
 class Place:
-    """Where the worlds run; with --mppi, the planner's."""
+    """Where the worlds run, with --mppi the planner's worlds."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu, or a CUDA device such as cuda:0. Without this flag a run whose engine is auto is shown on the CPU."""
+    """cpu, or a CUDA device such as cuda:0. Without this flag a run with the engine auto is shown on the CPU."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View:
     """Show a task, a policy, a planner or episodes, in a browser or in a window.
 
-    Give a task to look at its worlds, to push its bodies with the mouse, and, with --mppi, to see a planner control it
-    in real time; a run to see its policy, with --follow the newest one while the run trains; or files of episodes, as
-    lyceum-warp plan writes them, or the folder of such a run, to play them back.
+    With a task the viewer shows its worlds, lets you push bodies with the mouse, and with --mppi runs a planner in real
+    time. With a run it shows the run's policy, and with --follow the newest policy while the run trains. Files of
+    episodes, or a folder of lyceum-warp plan, are played back.
 
-    The viewer is a page for browsers. It prints the address, which holds a secret, and over ssh the command that
+    The viewer is a web page. The command prints its address, which contains a secret, and over ssh the command that
     forwards the port. With --gfx native it is a window, on a machine with a display.
 
     $ lyceum-warp view hopper
@@ -65,36 +62,34 @@ class View:
     what: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TASK|RUN|FILE...")]
     """A task's name or a file with one, a run's folder, or files of episodes."""
     mppi: bool = False
-    """Control the shown world by planning: MPPI, or with --update another planner."""
+    """Control the shown world with a planner: MPPI, or another one with --update."""
     follow: bool = False
-    """Take the newest policy of a run while it trains."""
+    """Show the newest policy of a run while it trains."""
     which: str = "last"
     """Which policy of a run: last, best, or the number of an iteration that was kept."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """The task of a run or of episodes where it is not found: a name or a file."""
+    """The task of a run or of episodes, a name or a file, if it is not found."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of worlds: by default 16 for a run, 1 otherwise."""
     world: int = 0
-    """Number of the world that is shown first."""
+    """Number of the first shown world."""
     seed: int = 0
     """Seed of the initial states."""
     paused: bool = False
     """Whether to start paused."""
     trace: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """The site or body whose path is drawn for the planner's samples; by default the task's choice."""
+    """The site or body whose path is drawn for each of the planner's samples; by default the task's choice."""
     gfx: Annotated[str, tyro.conf.arg(metavar="web|native")] = "web"
-    """web for a page in a browser, native for a window of this machine's own screen."""
+    """web for a page in a browser, native for a window on this machine's screen."""
     host: str = "127.0.0.1"
-    """Address on which the page is served. Other machines reach it only under another one than the default."""
+    """Address on which the page is served. Other machines can reach the page only with another address than this."""
     port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Port of the page; by default the first free one from 8080 on."""
+    """Port of the page; by default the first free port from 8080 on."""
     browser: bool = False
     """Whether to open the page in this machine's browser."""
-    param: Repeated = ()
-    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf, a table as NAME=file.npy; may be given several
-    times."""
+    param: ParamWords = ()
     fps: float = 30.0
-    """The most frames per second."""
+    """Maximal number of frames per second."""
     place: tyro.conf.OmitArgPrefixes[Place] = dataclasses.field(default_factory=Place)
     planner: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
 
@@ -103,10 +98,10 @@ class View:
         return self.show()
 
     def show(self, parent: Parent | None = None) -> int:
-        """Show it, until the viewer is closed; returns the exit code.
+        """Show it until the viewer is closed; returns the exit code.
 
         Args:
-            parent: The program that started this one, and ends it.
+            parent: The program that started this one. The viewer ends with it.
         """
         chosen_graphics(self.gfx)
         _check(self)
@@ -148,7 +143,7 @@ class View:
 
 
 def _check(options: View) -> None:
-    """Refuse numbers that cannot be meant, and flags without an effect, before worlds are made."""
+    """Refuse numbers out of range, and flags without an effect, before worlds are made."""
     whole_number("seed", options.seed, low=0)
     if options.nworld is not None:
         whole_number("nworld", options.nworld, low=1)
@@ -160,7 +155,7 @@ def _check(options: View) -> None:
 
 
 def _kind(what: tuple[str, ...]) -> str:
-    """What the words name: "task", "run" or "episodes"."""
+    """The kind of the arguments: "task", "run" or "episodes"."""
     first = Path(what[0])
     if first.suffix == ".npz":
         return "episodes"
@@ -176,18 +171,12 @@ def _kind(what: tuple[str, ...]) -> str:
     return kind
 
 
-# episodes
-
-
 def _episodes_env(options: View, episodes: dict[Path, Trajectory]) -> Env:
-    """A world of the task of some episodes."""
+    """A world for the playback of episodes."""
     if options.nworld is not None and options.nworld > 1:
         raise ValueError(f"--nworld {options.nworld} has no effect for episodes: leave it out")
     check_world(options.world, 1)
     return episode_env(episodes, task=options.task, **parameters(options.param, options))
-
-
-# worlds
 
 
 def _task_worlds(options: View) -> Env:
@@ -200,7 +189,7 @@ def _task_worlds(options: View) -> Env:
 
 
 def _planner(options: View, env: Env) -> MPPI:
-    """The planner, where the flags place it."""
+    """The planner, on the engine and device of the flags."""
     config = options.planner.on_top_of(task_config(env.task.task, None))
     words = given(options.place) | ({} if env.options.model is None else {"model": env.options.model})
     return MPPI(env.task.task, config, seed=options.seed, params=env.given_params, **words)
@@ -218,24 +207,9 @@ def _run(options: View, parent: Parent | None) -> Run:
 
 
 def _run_worlds(options: View, run: Run) -> Env:
-    """Worlds of a run's task, in the run's own physics; on the CPU unless a device is given."""
-    saved = Configuration.of(run)
-    known, params = saved.options.changed({"seed": 0}), dict(saved.params)
     nworld = options.nworld or _RUN_WORLDS
     check_world(options.world, nworld)
-    if options.task is not None and task_name(find_task(options.task)) != run.task_name:
-        known, params = EnvOptions(engine=known.engine, device=known.device), {}
-    params |= parameters(options.param, options)
-    known = known.changed({"nworld": nworld} | given(options.place))
-    if options.place.device is None:
-        known = known.changed(options_for_few_worlds(known.engine, known.device))
-    env = run_env(run, known, params, note=note, task=options.task)
-    if options.task is None:
-        note_changes(run, env, note=note)
-    return env
-
-
-# a viewer that another program started
+    return run_worlds(run, options.place, parameters(options.param, options), nworld=nworld, task=options.task)
 
 
 class _Ends:
@@ -251,7 +225,7 @@ class _Ends:
 
 
 def attached() -> None:
-    """The program of ``lw.RunViewer``: reads its job from the standard input, and ends with the program behind it."""
+    """Run the subprocess of ``lw.RunViewer``, which reads its job from stdin and ends with its parent."""
     parent = Parent()
     job = parent.job
     try:

@@ -1,15 +1,14 @@
-"""lyceum-warp warmup."""
+"""Compile kernels ahead of time: lyceum-warp warmup."""
 
 import dataclasses
 import time
-from typing import Annotated
 
 import tyro
 
 from lyceum_warp.algos.npg import NPG
 from lyceum_warp.algos.npg_config import NPGConfig
 from lyceum_warp.algos.planner import MPPI
-from lyceum_warp.cli.arguments import Physics, Placement, Repeated, parameters
+from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, TaskWord, parameters
 from lyceum_warp.cli.display import make_console
 from lyceum_warp.engines.memory import most_worlds
 from lyceum_warp.env import Env
@@ -18,28 +17,24 @@ from lyceum_warp.graphs.compile_ahead import cached
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Warmup:
-    """Compile a task's kernels ahead of time, so that no later run waits for them, and print the memory of a world.
+    """Compile a task's kernels ahead of time, so that later runs start at once, and print the memory of a world.
 
-    Warp caches compiled kernels for each kind of device. Some kernels contain sizes of the model's arrays, none
-    contains the number of worlds. The options of physics (--integrator, --solver, ...) also select kernels: give those
-    of the later run.
+    Warp caches compiled kernels for each kind of device. Kernels depend on the model and on the options of physics
+    (--integrator, --solver, ...), so give the options of the later run. They do not depend on the number of worlds.
 
     $ lyceum-warp warmup hopper --device cuda:0 --nworld 4096 --npg
     $ lyceum-warp warmup reach --device cuda:0 --plan
     $ lyceum-warp warmup humanoid --device cuda:0 --integrator euler --solver ls_iterations=10
     """
 
-    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
-    """A task's name (see lyceum-warp tasks), or a file with one: path/to/file.py, or path/to/file.py:Class."""
+    task: TaskWord
     nworld: int = 64
     """Number of worlds."""
     plan: bool = False
-    """Whether to compile MPPI's kernels, too."""
+    """Whether to also compile MPPI's kernels."""
     npg: bool = False
-    """Whether to compile NPG's kernels, too."""
-    param: Repeated = ()
-    """A parameter of the task as NAME=VALUE, a vector as NAME=0.7,inf, a table as NAME=file.npy; may be given several
-    times."""
+    """Whether to also compile NPG's kernels."""
+    param: ParamWords = ()
     env: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
@@ -54,7 +49,7 @@ class Warmup:
             next(NPG(env, config=NPGConfig(samples=2 * env.nworld, mean_every=0)))
             env.replicate_few(1).step()  # evaluations of the mean policy
         if self.plan:
-            # auto would depend on the number of samples, which is not known here
+            # auto depends on the number of samples, which is unknown here
             placement = vars(self.env) | {"engine": env.engine.name}
             plan = MPPI(self.task, **placement, **more)
             for _ in range(3):

@@ -99,8 +99,10 @@ def control_async(
     check_plant(env, reset=reset, on_step=on_step, on_abort=on_abort)
     check_kind("clock", clock, Clock | None, "which has now, wait_until and wait_for")
     period = positive_number("period", env.timestep if period is None else period, "seconds")
+    if period > threading.TIMEOUT_MAX:
+        raise ValueError(f"period must be at most {threading.TIMEOUT_MAX:g} seconds, not {period!r}")
     if seconds is not None:
-        ticks = min(2**31 - 1, max(1, math.ceil(positive_number("seconds", seconds, "seconds") / period - 1e-9)))
+        ticks = max(1, math.ceil(min(2**31 - 1, positive_number("seconds", seconds, "seconds") / period - 1e-9)))
         steps = ticks if steps is None else min(whole_number("steps", steps, low=1), ticks)
     limit = step_limit(env, steps)
     checked = CheckedController(controller, env)

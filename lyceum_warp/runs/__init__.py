@@ -1,1 +1,1 @@
-"""A run: the files in its folder, its copy of the task, and when it is saved."""
+"""Write and read the folder of a run: its files, its copy of the task, its checkpoints."""

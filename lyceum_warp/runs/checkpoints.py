@@ -1,4 +1,4 @@
-"""Read and write the content of checkpoints and of saved policies."""
+"""Read and write checkpoints and saved policies."""
 
 import io
 import pydoc
@@ -15,24 +15,24 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.files import newer_format, replaced
 
 FORMAT = 1
-"""Format of a run's folder and of its files. It is raised when an older release could no longer read them."""
+"""Format of a run's folder and its files. It increases when older releases can no longer read them."""
 
 _FIX = "restore the file from a copy, or train again into another folder"
 
 PolicyContent = dict[str, Any]
-"""A policy and a value function as they are saved: ``iteration``, ``policy``, and ``value`` if there is one."""
+"""A saved policy and value function: ``iteration``, ``policy``, and ``value`` if there is one."""
 
 _CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": ValueFunction}
-"""The classes of networks whose files name none."""
+"""The classes of networks, if their files name no other ones."""
 
 
 def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> PolicyContent:
-    """A copy of a policy and of a value function on the CPU.
+    """Copy a policy and a value function to the CPU, for a file.
 
     Args:
         iteration: Number of complete iterations.
         policy: The policy.
-        value: The value function.
+        value: The value function, if there is one.
     """
     content: PolicyContent = {"lyceum_warp": FORMAT, "iteration": iteration}
     for name, module in (("policy", policy), ("value", value)):
@@ -47,42 +47,43 @@ def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = 
     return content
 
 
-def serialized(content: Mapping[str, Any]) -> memoryview:
-    """The bytes of a file. Written by Python they raise OSError on a full disk, where torch has errors of its own."""
-    buffer = io.BytesIO()
+def write_content(path: Path, content: Mapping[str, Any], **options: Any) -> None:
+    """Replace a file of a policy, or a checkpoint.
+
+    Args:
+        path: The file.
+        content: Its content.
+        options: Further arguments of ``replaced``.
+    """
+    buffer = io.BytesIO()  # Python's write raises OSError on a full disk; torch raises other errors
     torch.save(content, buffer)
-    return buffer.getbuffer()
-
-
-def write_content(path: Path, content: PolicyContent) -> None:
-    """Replace a file of a policy."""
-    with replaced(path) as temporary:
-        temporary.write_bytes(serialized(content))
+    with replaced(path, **options) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
 
 
 def policy_of(content: PolicyContent, path: Path, given: nn.Module | None = None) -> nn.Module:
-    """The policy of a file.
+    """The policy in a file.
 
     Args:
         content: The file's content.
         path: The file, for messages.
-        given: A policy that takes the weights; a new one by default.
+        given: A policy into which the weights are loaded; by default a new one.
 
     Raises:
-        ValueError: The file holds something else, or another policy than the given one.
+        ValueError: The file holds no policy, or its parameters do not fit the given one.
     """
     return _filled(content, path, "policy", given)
 
 
 def value_of(content: PolicyContent, path: Path) -> nn.Module:
-    """The value function of a file.
+    """The value function in a file.
 
     Args:
         content: The file's content.
         path: The file, for messages.
 
     Raises:
-        ValueError: The file holds none.
+        ValueError: The file holds no value function.
     """
     if "value" not in content:
         raise ValueError(f"{path} holds no value function: the run's algorithm has none")
@@ -90,7 +91,7 @@ def value_of(content: PolicyContent, path: Path) -> nn.Module:
 
 
 def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | None) -> nn.Module:
-    """A network with the weights of a file."""
+    """Load the weights of a file into a network."""
     try:
         saved = content[name]
         module = given if given is not None else _made(name, saved)
@@ -104,7 +105,7 @@ def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | No
 
 
 def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
-    """A new network of the class and the shape that a file names. Only classes of the package are made."""
+    """Make a network of the class and shape in a file, which must be a class of the package."""
     kind: Any = _CLASSES[name]
     own = saved.get("class")
     if own is not None:
@@ -116,12 +117,12 @@ def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
 
 
 def check_sizes(policy: Any, env: Env, path: Path) -> None:
-    """Refuse a policy that was trained on observations or actions of other sizes.
+    """Check that a policy fits the sizes of an environment's observations and actions.
 
     Args:
         policy: The policy.
-        env: The environment that it is to act in.
-        path: Where it is from, for the message.
+        env: The environment.
+        path: The policy's file, for the message.
 
     Raises:
         ValueError: The sizes differ.
@@ -135,7 +136,7 @@ def check_sizes(policy: Any, env: Env, path: Path) -> None:
 
 
 def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
-    """The first difference between a module's weights and saved ones; empty where there is none."""
+    """The first difference between the shapes of a module's weights and saved ones; "" without one."""
     own, saved = ({name: tuple(part.shape) for name, part in s.items()} for s in (module.state_dict(), state))
     saved = {name: own[name] for name in getattr(module, "LATER", ())} | saved
     for name in {**own, **saved}:
@@ -148,12 +149,12 @@ def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
 def read_checkpoint(
     path: Path, device: str | torch.device = "cpu", *, parts: tuple[str, ...] = ("iteration", "policy", "state")
 ) -> dict[str, Any]:
-    """Read the content of a checkpoint, or of a saved policy. No code in the file is executed.
+    """Read a checkpoint or a saved policy. No code in the file is executed.
 
     Args:
         path: The file.
         device: Device for its tensors.
-        parts: What it must hold.
+        parts: Names of entries that it must hold.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -163,7 +164,7 @@ def read_checkpoint(
         raise FileNotFoundError(f"there is no checkpoint {path}: train the run first")
     try:
         content = torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:  # of many types, from torch
+    except Exception as error:  # torch raises errors of many types
         raise ValueError(
             f"the checkpoint {path} is cut off, or was not written by lyceum_warp ({_first_sentence(error)}): {_FIX}"
         ) from error
@@ -176,14 +177,14 @@ def read_checkpoint(
 
 
 def check_format(path: Path, number: Any) -> None:
-    """Refuse a file of another program, or of a newer release.
+    """Check that this release can read a file.
 
     Args:
         path: The file.
         number: Its format.
 
     Raises:
-        ValueError: The format is not known.
+        ValueError: The format is unknown.
     """
     if not isinstance(number, int) or number < 1:
         raise ValueError(f"{path} was not written by lyceum_warp: its format is {number!r}")
@@ -192,6 +193,6 @@ def check_format(path: Path, number: Any) -> None:
 
 
 def _first_sentence(error: BaseException) -> str:
-    """The first sentence of an error's message; torch's messages fill a page."""
+    """The first sentence of an error's message, because torch's messages fill a page."""
     text = str(error).strip() or type(error).__name__
     return text.splitlines()[0].split(". ")[0][:200]

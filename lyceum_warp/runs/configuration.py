@@ -1,4 +1,4 @@
-"""Write a learner as the config.json of its run, and make the learner of one."""
+"""Convert a learner to the config.json of its run, and back."""
 
 import dataclasses
 import logging
@@ -21,27 +21,25 @@ from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import policy_of, read_checkpoint, value_of
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.task_copy import given_params, run_env
+from lyceum_warp.runs.task_copy import json_value, run_env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.machine import cpu_cores
 
 log = logging.getLogger(__name__)
 
 ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig)}
-"""The algorithms that the command line and config.json know by name: the class of the learner, and of its
-hyperparameters."""
-
+"""The algorithms of the command line and config.json, by name: the classes of the learner and its hyperparameters."""
 
 _RSL_RL = {
     "num_steps_per_env": "num_steps", "num_learning_epochs": "epochs", "num_mini_batches": "minibatches",
     "clip_param": "clip", "use_clipped_value_loss": "clip_value_loss", "value_loss_coef": "value_coef",
     "normalize_advantage_per_mini_batch": "whiten_minibatches", "random_start": "stagger",
 }  # fmt: skip
-"""Hyperparameters of the former algorithm rsl-rl that ppo calls otherwise."""
+"""New names of hyperparameters of the former algorithm rsl-rl."""
 
 
 def algorithm_of(name: str) -> tuple[Any, Any]:
-    """The class of an algorithm, and of its hyperparameters.
+    """The classes of an algorithm and its hyperparameters.
 
     Raises:
         ValueError: There is no such algorithm.
@@ -52,10 +50,10 @@ def algorithm_of(name: str) -> tuple[Any, Any]:
 
 
 def describe(learner: Learner) -> dict[str, Any]:
-    """The configuration of a run as config.json holds it, from which ``Configuration`` makes the same learner."""
+    """The content of config.json, from which ``Configuration`` makes the same learner."""
     env, options = learner.env, learner.env.options
     others = options.given()
-    if learner.team.neighbours > 1:  # several processes of a machine share its cores, a later one has them all
+    if learner.team.neighbours > 1:  # another number of processes may continue the run
         others.pop("nthread", None)
     for name in others.keys() - {"nthread", "horizon", "graphs", "fields", "dynamics"}:
         del others[name]
@@ -65,7 +63,7 @@ def describe(learner: Learner) -> dict[str, Any]:
     return {
         "algorithm": learner.algorithm,
         "task": spelled_task(env.task.task),
-        "params": given_params(env),
+        "params": {name: json_value(name, value) for name, value in env.given_params.items()},
         "physics": options.physics.given(),
         "engine": options.engine if isinstance(options.engine, str) else env.engine.name,
         "device": options.device or "cpu",
@@ -81,7 +79,7 @@ def describe(learner: Learner) -> dict[str, Any]:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Configuration:
-    """What a run trains: a task in an environment, and an algorithm with its hyperparameters."""
+    """The configuration of a run: a task, options of its environment, and an algorithm with its hyperparameters."""
 
     task: str | None
     """The task's name or file; None if it was defined in a notebook."""
@@ -100,7 +98,7 @@ class Configuration:
 
     @classmethod
     def of(cls, run: Run) -> "Configuration":
-        """Read the configuration of a run. A run of the former algorithm rsl-rl is read as one of ppo.
+        """Read the configuration of a run. The former algorithm rsl-rl becomes ppo.
 
         Raises:
             ValueError: A value is missing or not valid.
@@ -140,10 +138,10 @@ class Configuration:
         """Make the learner.
 
         Args:
-            team: The processes that learn together.
-            run: The run whose task it is; its copies stand in for files that have moved or changed.
-            networks: The policy and the value function that it begins with; None for new ones.
-            note: Called with lines about the task's files.
+            team: The processes of the training.
+            run: The run of the task. Its copies replace files that have moved or changed.
+            networks: The initial policy and value function; None for new ones.
+            note: Called with messages about the task's files.
 
         Raises:
             ValueError: A value is not valid.
@@ -168,16 +166,16 @@ class Configuration:
 
 
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
-    """The policy and the value function with which a learner begins, and the number of their iteration.
+    """The initial policy and value function of a learner, and the number of their iteration.
 
     Args:
-        run: The run that has them.
-        which: Which policy of the run; None if the run is continued. Its networks are None then, unless they are others
-            than those that its hyperparameters make: a run that began with another one's, or a policy with a limit.
+        run: The run of the networks.
+        which: Which policy of the run; None if the run is resumed. The networks are then None, unless they differ from
+            the networks of the hyperparameters: in a run that began with another run's, or with a ``limit``.
 
     Raises:
         FileNotFoundError: The run has no such policy.
-        ValueError: The file cannot be read, or the policy is of a class of its own.
+        ValueError: The file cannot be read, or the policy has a class outside this package.
     """
     path = run.policy_file("last" if which is None else which)
     content = read_checkpoint(path, parts=("iteration", "policy"))

@@ -16,7 +16,6 @@ from lyceum_warp.runs.checkpoints import (
     check_format,
     policy_of,
     read_checkpoint,
-    serialized,
     value_of,
     write_content,
 )
@@ -41,10 +40,10 @@ class Run:
     ``metrics.csv``     one row per iteration
     ``policy.pt``       the last policy, and its value function
     ``best.pt``         the policy with the best return
-    ``policies/``       the policies of every n-th iteration, if asked for
+    ``policies/``       the policies of every n-th iteration, with ``keep_every``
     ``checkpoint.pt``   the complete state from which a run continues exactly, of the same iteration as ``policy.pt``
     ``previous.pt``     the checkpoint before it
-    ``task/``           the task's file with modules beside it, and its model, where they are not the package's
+    ``task/``           copies of the task's file, its modules and its model, if they are not the package's
     =================== ======================================================================================
 
     Args:
@@ -53,7 +52,7 @@ class Run:
     """
 
     metrics: Path
-    """Path of the table of iterations."""
+    """Path of the table of metrics."""
     checkpoint: Path
     """Path of the checkpoint."""
     previous: Path
@@ -63,7 +62,7 @@ class Run:
     best: Path
     """Path of the best policy."""
     task_folder: Path
-    """Path of the folder with the task's file and its model."""
+    """Path of the folder with the copies of the task's file and model."""
 
     def __init__(self, folder: Path, config: dict[str, Any]) -> None:
         self.folder, self.config = folder, config
@@ -104,7 +103,7 @@ class Run:
         device: str = "cpu",
         files: Mapping[str, Path | bytes] | None = None,
     ) -> "Run":
-        """Begin a run: make its folder, with the versions, the copy of the task, and the configuration.
+        """Make the folder of a run, with the versions, the copy of the task, and the configuration.
 
         If this fails, nothing is left in the folder.
 
@@ -112,7 +111,7 @@ class Run:
             folder: A new or empty folder.
             config: The configuration, of values that JSON can hold.
             device: Device of the run; see ``versions``.
-            files: What the folder ``task`` holds, by path: files to copy, or their contents.
+            files: Files of the folder ``task`` by path: files to copy, or their contents.
 
         Raises:
             ValueError: The folder is not empty, or is a file.
@@ -120,7 +119,7 @@ class Run:
         folder = Path(folder)
         cls.check_free(folder)
         run = cls(folder, {"format": FORMAT, **config})
-        text = json.dumps(run.config, indent=2)  # before the folder is made, because it may fail
+        text = json.dumps(run.config, indent=2)  # may fail, so it comes before the folder is made
         try:
             folder.mkdir(parents=True, exist_ok=True)
             (folder / _VERSIONS).write_text(json.dumps(versions(device), indent=2))
@@ -155,19 +154,19 @@ class Run:
         return cls(folder, config)
 
     def amend(self, **changes: Any) -> None:
-        """Change entries of the configuration, here and in the file."""
+        """Change entries of the configuration, in memory and in the file."""
         self.config = {**self.config, **changes}
         with replaced(self.folder / _CONFIG) as temporary:
             temporary.write_text(json.dumps(self.config, indent=2))
 
     def changed(self, now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-        """Compare versions with those that the run began with, and note the changes in ``versions.json``.
+        """Compare versions with those at the start of the run, and add changes to ``versions.json``.
 
         Args:
             now: The present versions, as ``versions()`` returns them.
 
         Returns:
-            The changed entries, as (then, now). They are noted under "resumed".
+            The changed entries, as (then, now). The file lists them under "resumed".
         """
         path = self.folder / _VERSIONS
         try:
@@ -208,11 +207,11 @@ class Run:
             which: "last", "best", or the number of an iteration.
 
         Raises:
-            FileNotFoundError: The run has no such policy; the message lists those that it has.
+            FileNotFoundError: The run has no such policy; the message lists its policies.
             ValueError: ``which`` is something else.
         """
         if which == "last":
-            # earlier releases kept the policy in the checkpoint alone
+            # earlier releases wrote the policy into the checkpoint alone
             return self.policy if self.policy.is_file() else self.checkpoint
         if which == "best":
             path = self.best
@@ -244,26 +243,24 @@ class Run:
     # the checkpoint
 
     def save(self, content: PolicyContent, state: Mapping[str, Any]) -> None:
-        """Replace the last policy, and the checkpoint; the old checkpoint is kept as the previous one.
-
-        A reader finds the old files or the whole new ones.
+        """Replace the last policy and the checkpoint atomically. The old checkpoint becomes the previous one.
 
         Args:
             content: The policy and the value function.
             state: The state of the algorithm: tensors, numbers, strings and containers of them.
         """
         write_content(self.policy, content)
-        with replaced(self.checkpoint, durable=True, previous=self.previous) as temporary:
-            temporary.write_bytes(serialized({**content, "state": dict(state)}))
+        checkpoint = {**content, "state": dict(state)}
+        write_content(self.checkpoint, checkpoint, durable=True, previous=self.previous)
 
     def read(self, device: str | torch.device = "cpu", *, note: Callable[[str], None] = log.warning) -> dict[str, Any]:
         """Read the checkpoint: ``iteration``, ``policy``, ``state``, and ``value`` if there is one.
 
-        If it is broken or missing, and the one before it is whole, that one is read.
+        If it is broken or missing, the previous checkpoint is read.
 
         Args:
             device: Device for its tensors.
-            note: Called with a line that says that the one before it is read.
+            note: Called with a message if the previous checkpoint is read.
 
         Raises:
             FileNotFoundError: The run has no checkpoint.
@@ -296,15 +293,14 @@ def load(
 
     Args:
         run: A run's folder, or a file of it with a policy.
-        which: "last", "best" (see ``train``), or the number of an iteration that the run kept.
-        policy: A policy that takes the run's weights and is returned; necessary if its class or its network is your
-            own.
+        which: "last", "best" (see ``train``), or the number of a kept iteration.
+        policy: A policy into which the weights are loaded; required for policies or networks of your own classes.
         device: Device for its parameters.
 
     Raises:
         FileNotFoundError: There is no run, or it has no such policy.
-        ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release; or the
-            policy in it is of a class of its own and ``policy`` is not given, or does not fit.
+        ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release; or
+            ``policy`` is required, or does not fit.
     """
     check_kind("policy", policy, torch.nn.Module | None, "as lw.GaussianPolicy(nobs, nact, network=...)")
     content, path = _content(run, which, device)

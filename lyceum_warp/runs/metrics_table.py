@@ -1,4 +1,4 @@
-"""The table of a run's iterations, metrics.csv: rows are appended, read and cut off."""
+"""Append to, read and truncate the table of a run's iterations, metrics.csv."""
 
 import contextlib
 import csv
@@ -10,11 +10,11 @@ from lyceum_warp.support.files import replaced
 
 
 def append_row(path: Path, row: Mapping[str, Any]) -> None:
-    """Append a row. A column that is new, as after an update of the task, is empty in earlier rows.
+    """Append a row. A new column, for example after an update of the task, is empty in earlier rows.
 
     Args:
         path: The table, which need not exist.
-        row: Values by the names of their columns. None becomes an empty cell; floats keep all their digits.
+        row: Values by column. None becomes an empty cell; floats keep all digits.
     """
     lines: list[list[str]] = []
     if path.exists():
@@ -53,7 +53,7 @@ def read_metrics(path: Path) -> list[dict[str, float | None]]:
 
 
 def cut_rows(path: Path, iteration: int) -> None:
-    """Drop the rows after an iteration, and an incomplete last row.
+    """Drop rows after an iteration, and an incomplete last row.
 
     Args:
         path: The table, which need not exist.
@@ -66,7 +66,7 @@ def cut_rows(path: Path, iteration: int) -> None:
     column = header.index("iteration") if "iteration" in header else None
     kept = []
     for i, line in enumerate(lines):
-        number: float = i  # of the row, if its cells do not say it; read_metrics reports a broken line
+        number: float = i  # of the row, if the cell is broken; read_metrics reports broken lines
         with contextlib.suppress(ValueError, IndexError, csv.Error):
             number = float(next(csv.reader([line]))[column]) if i and column is not None else i
         if line.endswith("\n") and (i == 0 or number <= iteration):

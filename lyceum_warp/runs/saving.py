@@ -1,4 +1,4 @@
-"""Decide what is saved of a run and when, and write it."""
+"""Decide when a run is saved, and save it."""
 
 import math
 import time
@@ -12,26 +12,26 @@ SAVE_SECONDS = 30.0
 """Seconds after which a run is saved."""
 
 SHARE = 100
-"""A run is saved earlier if it has trained this many times as long as the last save took."""
+"""A run is saved earlier once it has trained this many times as long as the last save took."""
 
 
 class Saver:
     """Writes a run's files.
 
-    The row of an iteration is written at once, and so are a new best policy and the numbered ones. The last policy and
-    the complete state are saved together: at the start, at the end, and after each iteration that ends 30 s or more
-    after the last save, or as soon as training has taken 100 times as long as that save. So a save of 20 ms happens
-    every 2 s and takes 1 % of the time, one of 1 s happens every 30 s and takes 3 %. After ``kill -9`` a run loses
-    that many seconds, and the iteration in which it was killed.
+    The row of an iteration, a new best policy and numbered policies are written at once. The last policy and the
+    complete state are saved together: at the start, at the end, and after each iteration that ends 30 s after the last
+    save, or earlier, once training has taken 100 times as long as that save. A save of 20 ms thus happens every 2 s and
+    takes 1 % of the time; a save of 1 s happens every 30 s and takes 3 %. After ``kill -9`` the run continues from the
+    last save.
 
-    All processes have a saver and make the same calls; one of them writes.
+    All ranks have a saver and make the same calls; rank 0 writes.
 
     Args:
-        run: The run; None in processes that do not write.
+        run: The run; None on ranks that do not write.
         learner: The algorithm.
         keep_every: Iterations between two numbered policies; 0 for none.
         save_every: Iterations between two saves; 0 for the rule above.
-        saved: Number of the iteration whose state the run holds already; -1 for none.
+        saved: Number of the iteration whose state is saved; -1 for none.
     """
 
     saved: int
@@ -48,10 +48,10 @@ class Saver:
         self._seconds, self._when = 0.0, time.perf_counter()
 
     def write(self, iteration: Iteration) -> float | None:
-        """Write the row of an iteration, and its policy if it is the best one or is kept under its number.
+        """Write the row of an iteration, and its policy if it is the best one or is numbered.
 
         Returns:
-            The return by which policies are compared; None if the iteration has none.
+            The return that selects the best policy; None if the iteration has none.
         """
         assert self.run is not None
         append_row(self.run.metrics, iteration.row())
@@ -60,7 +60,7 @@ class Saver:
         score = None if score is None or math.isnan(score) else score
         better = score is not None and score > self._best
         numbered = self.keep_every > 0 and learner.iteration % self.keep_every == 0
-        # the iteration's own episodes were sampled with the policy before its step
+        # the episodes of an iteration are sampled by the policy before its step
         sampled = name == "return_mean"
         before = self._before
         if better or numbered or sampled:
@@ -85,7 +85,7 @@ class Saver:
         """Save the last policy and the complete state."""
         start = time.perf_counter()
         learner = self.learner
-        state = learner.state_dict()  # the worlds of several processes are brought together
+        state = learner.state_dict()  # gathers the worlds of all ranks
         with learner.team.together():
             if self.run is not None:
                 self.run.save(policy_content(learner.iteration, learner.policy, learner.value), state)

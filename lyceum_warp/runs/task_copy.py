@@ -1,4 +1,4 @@
-"""Copy a run's task into its folder, and decide whether a later command uses the copy."""
+"""Copy a run's task into its folder, and decide whether later commands use the copy."""
 
 import hashlib
 import io
@@ -26,24 +26,22 @@ log = logging.getLogger(__name__)
 Note = Callable[[str], None]
 
 Files = dict[Path, Path | bytes]
-"""Files with their contents, or with the paths to copy."""
+"""Files with their contents, or paths to copy from."""
 
 _MODEL, _TABLES = "model", "tables"
 _APART = 2
-"""A task's file lies at most this many folders below the common one of it and its model."""
+"""A task's file is at most this many folders below the common folder of it and its model."""
 _LARGEST = 512 * 2**20
-"""Models with larger files than this, in bytes, are not copied."""
+"""Models with larger files, in bytes, are not copied."""
 _MOST_MODULES, _LARGEST_MODULES = 100, 8 * 2**20
-"""Modules that a task imports from its folder are not copied if they are more, or larger in bytes."""
+"""Modules that a task imports from its folder are not copied if there are more, or if they have more bytes."""
 
 
 def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
-    """What a run's folder keeps of an environment's task.
-
-    The file and the model of a task of the package are not copied: the release, which versions.json holds, has them.
+    """Copy an environment's task for a run's folder, except a task of the package.
 
     Returns:
-        The entry ``kept`` of config.json; and what the folder ``task`` will hold, by path.
+        The entry ``kept`` of config.json; and the files of the folder ``task`` by path.
     """
     task, given = env.task.task, env.options.model is not None
     loaded, own = source_files(task), not task.__module__.startswith("lyceum_warp.")
@@ -69,12 +67,8 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
     return kept, files
 
 
-def given_params(env: Env) -> dict[str, Any]:
-    """The parameters that an environment was made with, as config.json holds them."""
-    return {name: _plain(name, value) for name, value in env.given_params.items()}
-
-
-def _plain(name: str, value: Any) -> Any:
+def json_value(name: str, value: Any) -> Any:
+    """A parameter of a task as a value of JSON, for config.json."""
     if (table := _table(value)) is not None:
         return str(value) if isinstance(value, str | Path) else f"{name}.npy" if table.size else []
     if isinstance(value, bool | int | float | str):
@@ -83,7 +77,7 @@ def _plain(name: str, value: Any) -> Any:
 
 
 def _table(value: Any) -> Any:
-    """The file or the array of a table, and None for other parameters."""
+    """The file or the array of a table; None for other parameters."""
     if isinstance(value, str | Path) and str(value).endswith(".npy"):
         return Path(value)
     array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
@@ -91,14 +85,14 @@ def _table(value: Any) -> Any:
 
 
 def _npy(array: np.ndarray) -> bytes:
-    """The content of a file with an array."""
+    """The content of a .npy file."""
     buffer = io.BytesIO()
     np.save(buffer, array)
     return buffer.getvalue()
 
 
 def _sources(file: Path, loaded: Mapping[Path, bytes]) -> dict[Path, bytes]:
-    """A task's file and the modules beside it, without the modules if they are too many or too large to copy."""
+    """A task's file and the modules that it imports from its folder, unless they are too many or too large."""
     size = sum(map(len, loaded.values())) - len(loaded[file])
     if len(loaded) - 1 <= _MOST_MODULES and size <= _LARGEST_MODULES:
         return dict(loaded)
@@ -106,23 +100,20 @@ def _sources(file: Path, loaded: Mapping[Path, bytes]) -> dict[Path, bytes]:
     return {file: loaded[file]}
 
 
-# what a later command uses
-
-
 def run_env(
     run: Run, options: EnvOptions, params: Mapping[str, Any], *, note: Note = log.warning, task: str | None = None
 ) -> Env:
     """Make an environment of a run's task.
 
-    A file or a model that has moved or changed since the run began is replaced by the run's own copy, and ``note`` gets
-    a line that says so. A task of the package is taken as it is now.
+    If a file or a model has moved or changed since the run began, the run's own copy is used, and ``note`` gets a
+    message. A task of the package is used as it is now.
 
     Args:
         run: The run.
         options: Options of the environment.
         params: Parameters of the task.
-        note: Called with each line.
-        task: Another task, which is taken as it is.
+        note: Called with each message.
+        task: Another task, which is used as it is.
 
     Raises:
         ValueError: The task does not fit.
@@ -160,12 +151,12 @@ def run_env(
 
 
 def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, bytes] | None = None) -> list[str]:
-    """What has happened to a task's file, and to the modules beside it, since the run began.
+    """List changes of a task's file and its modules since the run began.
 
     Args:
         file: The task's file.
-        kept: What config.json says about it.
-        loaded: The files as they were loaded; by default, and for others, as they are now.
+        kept: The entry ``kept`` of config.json.
+        loaded: Contents of loaded files; other files are read.
     """
     changes = []
     for name, hashed in {file.name: kept.get("source_hash"), **kept.get("modules", {})}.items():
@@ -179,12 +170,12 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
 
 
 def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
-    """Note if an environment's task or its model is another than the run's; both are used as they are.
+    """Report that an environment's task or model differs from the run's. Both are used as they are.
 
     Args:
         run: The run.
         env: The environment.
-        note: Called with each line.
+        note: Called with each message.
     """
     kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
     file = next(iter(loaded), None)
@@ -196,7 +187,7 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning) -> None:
 
 
 def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters of a run's task; a table that is not where it was is the run's own copy."""
+    """The parameters of a run's task, with the run's own copies of missing tables."""
     found = dict(params)
     for name, value in params.items():
         copy = run.task_folder / _TABLES / f"{name}.npy"
@@ -206,7 +197,7 @@ def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _model_changed(run: Run, env: Env) -> bool:
-    """Whether the model differs from the one that the run began with; False where MuJoCo is another version."""
+    """Whether the model has changed since the run began; False with another version of MuJoCo."""
     try:
         version = json.loads((run.folder / "versions.json").read_text())["mujoco"]
     except (OSError, ValueError, KeyError):
@@ -215,15 +206,12 @@ def _model_changed(run: Run, env: Env) -> bool:
     return version == mujoco.__version__ and known not in (None, _model_hash(env))
 
 
-# copies
-
-
 def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()[:16]
 
 
 def _model_hash(env: Env) -> str:
-    """A hash of the compiled model, the same in every process and wherever its files lie."""
+    """A hash of the compiled model, independent of the process and of paths."""
     found = hashlib.sha256()
     for owner in (env.task.model, env.task.model.opt):
         for name in sorted(dir(owner)):
@@ -243,10 +231,10 @@ def _beside(path: Path, file: Path) -> str:
 
 
 def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collection[Path] = ()) -> dict[Path, str]:
-    """The paths in the folder ``task`` of a task's file, of the modules beside it, and of its model's files.
+    """The paths in the folder ``task`` of a task's file, its modules and its model's files.
 
-    The files keep their places relative to each other, so that the copy of the task finds the copy of its model. Where
-    the task's file lies elsewhere than its model, each has a place of its own.
+    Their relative paths stay the same, so that the copied task finds the copied model. If the task's file and its model
+    have distant folders, each gets a separate folder.
     """
     if not paths:
         return {}
@@ -261,7 +249,7 @@ def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collecti
 def _model_files(env: Env) -> tuple[Path | None, Files]:
     """The main file of a task's model, and all its files.
 
-    A model that was made in Python is written as MJCF; the files that it names are copied as they are.
+    A model that was made in Python is written as MJCF; the files that it refers to are copied unchanged.
     """
     task, given = env.task.task, env.options.model
     source = given if given is not None else task.model
@@ -276,7 +264,7 @@ def _model_files(env: Env) -> tuple[Path | None, Files]:
         spec = env.task.spec.copy()
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # they were logged when the environment was made
+                warnings.simplefilter("ignore")  # the environment has logged them
                 spec.compile()
                 text = spec.to_xml()
         except (ValueError, mujoco.FatalError) as error:
@@ -294,7 +282,7 @@ def _model_files(env: Env) -> tuple[Path | None, Files]:
 
 
 def _dependencies(source: Path) -> list[Path]:
-    """The files that a model file names: included files, other models, meshes, textures, height fields."""
+    """The files that a model file refers to: included files, other models, meshes, textures, height fields."""
     if source.suffix.lower() != ".urdf":
         return [path for name in mujoco.mju_getXMLDependencies(str(source)) if (path := Path(name)) != source]
     root = ET.parse(source).getroot()  # MuJoCo lists nothing for a URDF
@@ -308,7 +296,7 @@ def _dependencies(source: Path) -> list[Path]:
 
 
 def _spec_dependencies(spec: mujoco.MjSpec, folder: Path) -> list[Path]:
-    """The files that a model made in Python names."""
+    """The files that a model made in Python refers to."""
     parts = (*spec.meshes, *spec.hfields, *spec.skins)
     names = [Path(spec.meshdir, part.file) for part in parts if part.file]
     for texture in spec.textures:

@@ -43,7 +43,7 @@ class _PerThread(threading.local):
 def separate_captures() -> None:
     """Keep a capture of launches on the CPU to the thread that began it.
 
-    Warp's library records launches for the thread that began a capture, but its Python code takes the capture for one
+    Warp's library captures launches for the thread that began a capture, but its Python code takes the capture for one
     of every thread: loops of other threads would become part of the graph, and their launches would replace the
     arguments of its own.
     """

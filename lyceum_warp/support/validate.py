@@ -2,6 +2,7 @@
 
 import math
 import numbers
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -63,6 +64,27 @@ def check_flag(name: str, value: Any) -> None:
     """
     if not isinstance(value, bool):
         raise ValueError(f"{name} must be True or False, not {value!r}")
+
+
+def check_word(name: str, value: Any, words: Sequence[str], others: str = "") -> None:
+    """Check that a value is one of a few words; ``others`` names what else the caller accepts.
+
+    Raises:
+        ValueError: The value is something else.
+    """
+    if not isinstance(value, str) or value not in words:
+        *first, last = map(repr, words)
+        raise ValueError(f"{name} must be {', '.join(first)} or {last}{others}, not {value!r}")
+
+
+def check_group(group: Any, groups: Iterable[str], task: str) -> None:
+    """Check that a task has a group of observations.
+
+    Raises:
+        ValueError: The task has no such group.
+    """
+    if group not in (known := list(groups)):
+        raise ValueError(f"the task {task!r} has no group {group!r} of observations: it has {', '.join(known)}")
 
 
 def layer_sizes(hidden: Any, name: str = "hidden") -> list[int]:

@@ -1,7 +1,7 @@
 """Follow a training run: show its newest policy in worlds of the viewer's own.
 
-The run is not touched: the viewer reads the files that training writes. So a run has the same numbers with and without
-it, also where both run on different machines that share the folder.
+The viewer only reads the run's files. So the run has the same numbers with and without it, also on another machine that
+shares the folder.
 """
 
 import contextlib
@@ -20,19 +20,19 @@ from lyceum_warp.algos.policy import acting
 from lyceum_warp.runs.checkpoints import read_checkpoint
 from lyceum_warp.runs.folder import Run, load
 
-_NICE = 10  # how much the process of `RunViewer` gives way to the training
+_NICE = 10  # niceness of the process of `RunViewer`
 
 
 class Follower:
-    """A policy that takes the newest weights of a run: ``policy(obs)`` is the mean action.
+    """The newest policy of a run: ``policy(obs)`` is the mean action.
 
     Args:
         run: The run.
-        device: Device of the worlds in which it acts.
+        device: Device of the worlds.
 
     Raises:
         FileNotFoundError: The run has no policy yet.
-        ValueError: The policy cannot be read, or has a network of its own.
+        ValueError: The policy cannot be read, or its network is a class of the user's own.
     """
 
     def __init__(self, run: Run, *, device: str | torch.device = "cpu") -> None:
@@ -46,14 +46,14 @@ class Follower:
         return acting(self.policy)(obs)
 
     def update(self) -> list[str]:
-        """Take new weights if there are some; returns messages about it."""
+        """Load new weights, if any; return messages about it."""
         stamp = self._stamp()
         if stamp is None or stamp == self._seen:
             return []
         try:
             content = self._read()
             self.policy.load_state_dict(content["policy"]["state"])
-        except (FileNotFoundError, ValueError, RuntimeError) as error:  # a file that is just replaced, or a new run
+        except (FileNotFoundError, ValueError, RuntimeError) as error:  # the file is being replaced, or the run is new
             self._seen = stamp
             return [f"the policy of {self.run.folder} was not read: {str(error).splitlines()[0]}"]
         self._seen, self.iteration = stamp, content["iteration"]
@@ -63,7 +63,7 @@ class Follower:
         return read_checkpoint(self.run.policy_file(), self.device, parts=("iteration", "policy"))
 
     def _stamp(self) -> tuple[int, int, int] | None:
-        """What changes when the file is replaced."""
+        """Numbers that change when the file is replaced."""
         try:
             found = os.stat(self.run.policy_file())
         except OSError:
@@ -71,14 +71,12 @@ class Follower:
         return found.st_mtime_ns, found.st_ino, found.st_size
 
     def _return(self) -> str:
-        """The last return in the run's table, in words."""
-        try:
+        """The last return in the run's table, as text."""
+        with contextlib.suppress(FileNotFoundError, ValueError, IndexError):
             row = self.run.rows()[-1]
-        except (FileNotFoundError, ValueError, IndexError):
-            return ""
-        for name in ("mean_return", "return_mean"):
-            if (value := row.get(name)) is not None and value == value:
-                return f", return {value:.6g}"
+            for name in ("mean_return", "return_mean"):
+                if (value := row.get(name)) is not None and value == value:
+                    return f", return {value:.6g}"
         return ""
 
 
@@ -87,8 +85,8 @@ def wait_for_run(folder: Path, *, seconds: float, going_on: Any = lambda: True) 
 
     Args:
         folder: The run's folder.
-        seconds: How long.
-        going_on: Called now and then; the wait ends where it returns False.
+        seconds: Maximum time.
+        going_on: Called now and then; the wait ends if it returns False.
 
     Raises:
         FileNotFoundError: There is no run, or it has no policy.
@@ -108,32 +106,32 @@ def wait_for_run(folder: Path, *, seconds: float, going_on: Any = lambda: True) 
 
 
 class RunViewer:
-    """Shows a run while it trains, in a process of its own: ``lw.train(npg, folder, callback=lw.RunViewer(folder))``.
+    """Shows a run while it trains, in another process: ``lw.train(npg, folder, callback=lw.RunViewer(folder))``.
 
-    The process waits for the folder, follows its newest policy in worlds of its own on the CPU, and gives way to the
-    training where cores are scarce. It ends with ``close``, at the end of a ``with`` block, and with this program. A
-    window that is closed does not end the training.
+    The process waits for the folder, and shows the run's newest policy in worlds of its own on the CPU, at a lower
+    priority than the training. It ends with ``close``, at the end of a ``with`` block, and with this program. Closing
+    its window does not end the training.
 
     Args:
         folder: The run's folder, which need not exist yet.
-        options: Further flags of ``lyceum-warp view`` by their names, as ``gfx="web"``, ``port=8080``, ``nworld=64``.
+        options: Further flags of ``lyceum-warp view`` by name, such as ``gfx="web"``, ``port=8080``, ``nworld=64``.
     """
 
     def __init__(self, folder: str | Path, **options: Any) -> None:
         self.folder = Path(folder)
         job = json.dumps({"folder": str(self.folder.absolute()), "options": options})
-        # not by multiprocessing, which would import the caller's program again
+        # multiprocessing would import the caller's program again
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-c", "from lyceum_warp.cli.view import attached; attached()"],
             stdin=subprocess.PIPE, text=True, process_group=0,
         )  # fmt: skip
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):  # a process that ended at once has printed why
+        with contextlib.suppress(OSError):  # a process that ended at once has printed the reason
             self._process.stdin.write(job + "\n")
             self._process.stdin.flush()
 
     def __call__(self, iteration: Any) -> None:
-        """Nothing: the viewer reads the run's files. It makes the viewer a callback of ``lw.train``."""
+        """Do nothing: as a callback of ``lw.train``, the viewer reads the run's files."""
 
     @property
     def is_open(self) -> bool:
@@ -142,9 +140,9 @@ class RunViewer:
 
     def close(self) -> None:
         """End the process. A second call does nothing."""
-        if self._process.stdin is not None:
-            with contextlib.suppress(OSError):
-                self._process.stdin.close()  # the process ends
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()  # the process ends
         try:
             self._process.wait(10.0)
         except subprocess.TimeoutExpired:
@@ -159,10 +157,7 @@ class RunViewer:
 
 
 class Parent:
-    """The program that started this process, and its end of a pipe.
-
-    It reads the job, and notices when that program closes the pipe or ends.
-    """
+    """The program that started this process: reads the job from its pipe, and notices EOF."""
 
     def __init__(self) -> None:
         with contextlib.suppress(OSError, AttributeError):  # not on Windows

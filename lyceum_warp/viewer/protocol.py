@@ -1,10 +1,10 @@
 """Define the messages between the session process, which owns the worlds, and the window process, which draws them.
 
-Both processes import this module, so it needs NumPy alone. Messages are pickled. Each is written once, by its sender.
+Messages are pickled dataclasses. The window process never loads torch or Warp, so this module imports NumPy only.
 """
 
 import dataclasses
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -13,7 +13,7 @@ Graphics: TypeAlias = Literal["web", "native"]
 Mode: TypeAlias = Literal["passive", "controller", "playback"]
 
 WorldChoice: TypeAlias = int | Literal["next", "previous", "best", "worst", "last_ended"]
-"""A world by its number, or by its return or its place."""
+"""A world's number, or a rule that finds it: by its return so far, or the world whose episode ended last."""
 
 MOST_GHOSTS = 32
 """Maximum number of other worlds, and of other episodes, that are drawn at once."""
@@ -22,7 +22,7 @@ MOST_BURST = 50
 
 TRACE_COLOUR = (0.6, 0.65, 0.75, 0.5)
 BEST_COLOUR = (0.1, 0.75, 0.3, 1.0)
-"""Colours of a planner's samples and of the best one, in the window and in videos."""
+"""Colours of a planner's samples and of the best sample, in the window and in videos."""
 
 MAX_POINTS, MAX_MESSAGES = 20_000, 200
 """Maximum numbers of curve points and of messages that a frame carries over from earlier frames."""
@@ -33,29 +33,25 @@ MAX_POINTS, MAX_MESSAGES = 20_000, 200
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """The part of the display that is constant while a window is open."""
+    """The constant part of the display."""
 
     title: str
-    """The task's name, or what else is shown."""
+    """Title of the window."""
     model: bytes
     """The model, as ``mujoco.mj_saveModel`` writes it."""
     nworld: int
-    """Worlds to choose from."""
-    timestep: float
-    """Simulated seconds of a step of the environment."""
     modes: tuple[Mode, ...]
-    """Modes to choose from, the first one at the start."""
+    """Available modes; the session starts in the first one."""
     controllers: tuple[str, ...]
-    """Names of the controllers."""
     episodes: tuple[str, ...]
-    """Names of the episodes that can be played back."""
+    """Names of the saved episodes."""
     curves: tuple[str, ...]
     """Names of the live curves: "reward", "eval" and the task's metrics."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Pose:
-    """The coordinates that determine the poses of all bodies of one world."""
+    """Positions of all bodies of one world."""
 
     qpos: np.ndarray
     """(nq,) float64."""
@@ -67,11 +63,29 @@ class Pose:
 
 @dataclasses.dataclass(frozen=True)
 class Ghost:
-    """A pose that is drawn translucently beside the world itself."""
+    """A pose that is drawn translucently."""
 
     pose: Pose
     colour: tuple[float, float, float, float]
     """Red, green, blue and opacity, each from 0 to 1."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SetGhosts:
+    """Choose which ghosts are drawn."""
+
+    worlds: tuple[int, ...] = ()
+    """Other worlds, at most ``MOST_GHOSTS``."""
+    episodes: tuple[int, ...] = ()
+    """Other episodes, at the same step, at most ``MOST_GHOSTS``."""
+    burst: int = 0
+    """Number of states along the trajectory, at most ``MOST_BURST``."""
+    fade: float = 1.0
+    """Factor of opacity from each state of the burst to the next."""
+    doppler: bool = False
+    """Whether past states are red and future states blue."""
+    plan: bool = True
+    """Whether the plan's final pose and the samples' traces are drawn."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,54 +95,56 @@ class Status:
     mode: Mode
     controller: str | None
     episode: int | None
-    """Index of the episode that is played back."""
+    """Index of the episode in playback."""
     world: int
     step: int
     """Step within the episode."""
     steps: int
-    """Steps of the episode that is played back; the horizon otherwise, 0 without one."""
+    """Length of the episode in playback; otherwise the horizon, or 0 without a horizon."""
     time: float
-    """Simulated seconds of the episode."""
+    """Simulated seconds since the start of the episode."""
     paused: bool
     speed: float
-    """Wanted simulated seconds per second."""
+    """Target speed, simulated seconds per second."""
     measured_speed: float
-    """Simulated seconds per second, as measured; NaN while paused."""
+    """Measured speed; NaN while paused."""
     plan_ms: float
-    """Milliseconds of the last plan or policy call; NaN without one."""
+    """Milliseconds of the controller's last call; NaN before the first."""
     backwards: bool
-    """Whether a playback runs backwards."""
+    """Whether the playback runs backwards."""
     video: str | None
-    """The video that is being taken."""
+    """Name of the current video; None without one."""
+    ghosts: SetGhosts = SetGhosts()
+    """The ghosts that are drawn."""
     seekable: tuple[int, int] = (0, 0)
-    """First and last step that can be sought in the past of the world; equal where there are no others."""
+    """First and last step of the slider."""
     text: tuple[tuple[str, str], ...] = ()
-    """Further lines of the panel, a name and a value each."""
+    """Further lines of the panel: names and values."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """One moment of the world that is shown."""
+    """The shown world at one moment."""
 
     pose: Pose
     state: np.ndarray
-    """The integration state of this world for ``mujoco.mj_setState`` (``mjSTATE_INTEGRATION``), float64."""
+    """Argument of ``mujoco.mj_setState`` (``mjSTATE_INTEGRATION``), float64."""
     model_fields: dict[str, np.ndarray]
-    """Model fields by MuJoCo's names, where this world's values differ from the model's."""
+    """This world's model fields that differ from the model, by MuJoCo's names."""
     status: Status
     ghosts: tuple[Ghost, ...] = ()
     traces: np.ndarray | None = None
     """Paths of the planner's samples, (samples, points, 3), metres."""
     best: int | None = None
-    """Index of the best of them."""
+    """Index of the best sample."""
     samples: np.ndarray | None = None
-    """New points of the curves, (points, 1 + curves): simulated seconds, then a value for each curve."""
+    """New points of the curves, (points, 1 + curves): simulated seconds, then a value per curve."""
     messages: tuple[str, ...] = ()
-    """New lines: ends of episodes, faults, refused commands."""
+    """New messages: ends of episodes, faults, refused commands."""
 
 
 def latest(older: Frame | None, newer: Frame) -> Frame:
-    """The newer frame, with the curve points and messages of an older one that was not shown."""
+    """Merge the curve points and messages of a skipped frame into the newer frame."""
     if older is None or (older.samples is None and not older.messages):
         return newer
     samples = [part for part in (older.samples, newer.samples) if part is not None]
@@ -144,16 +160,13 @@ def latest(older: Frame | None, newer: Frame) -> Frame:
 
 @dataclasses.dataclass(frozen=True)
 class SetMode:
-    """Change the mode."""
+    """Change the mode, the controller or the episode."""
 
     mode: Mode
-
-
-@dataclasses.dataclass(frozen=True)
-class SetController:
-    """Give control to another controller."""
-
-    name: str
+    controller: str | None = None
+    """Name of the controller; None keeps it."""
+    episode: int | None = None
+    """Index of the episode; None keeps it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,15 +177,8 @@ class SetWorld:
 
 
 @dataclasses.dataclass(frozen=True)
-class SetEpisode:
-    """Play back another episode."""
-
-    episode: int
-
-
-@dataclasses.dataclass(frozen=True)
 class SetPaused:
-    """Pause, or go on."""
+    """Pause, or continue."""
 
     paused: bool
 
@@ -187,96 +193,66 @@ class SetSpeed:
 
 @dataclasses.dataclass(frozen=True)
 class StepBy:
-    """Pause, and move by some steps; negative ones go back."""
+    """Pause, and take ``steps`` steps; negative numbers step back."""
 
     steps: int
 
 
 @dataclasses.dataclass(frozen=True)
 class Seek:
-    """Pause, and show one step of the episode that is played back or of the past of the world."""
+    """Pause, and show a step of the playback or of the world's history."""
 
     step: int
 
 
 @dataclasses.dataclass(frozen=True)
 class SetBackwards:
-    """Change the direction of the playback."""
+    """Set the direction of the playback."""
 
     backwards: bool
 
 
 @dataclasses.dataclass(frozen=True)
 class Reset:
-    """Begin a new episode of the world that is shown."""
+    """Start a new episode of the shown world."""
 
     random: bool
 
 
 @dataclasses.dataclass(frozen=True)
-class SetGhosts:
-    """Which ghosts are drawn."""
-
-    worlds: tuple[int, ...] = ()
-    """Other worlds, at most ``MOST_GHOSTS``."""
-    episodes: tuple[int, ...] = ()
-    """Other episodes, at the same step, at most ``MOST_GHOSTS``."""
-    burst: int = 0
-    """Number of states along the trajectory that are drawn at once, at most ``MOST_BURST``."""
-    fade: float = 1.0
-    """Factor of opacity for each state further away from the present."""
-    doppler: bool = False
-    """Colour states of the past red, states of the future blue."""
-    plan: bool = True
-    """The plan's final pose, and the samples' traces."""
-
-
-@dataclasses.dataclass(frozen=True)
 class Perturb:
-    """Forces on bodies while running; new positions of a free body while paused; of a mocap body at any time.
+    """Push bodies, move a free body while paused, or move a mocap body at any time.
 
-    The forces hold until the next command: one with zeros ends a push.
+    The forces act until the next ``Perturb``; zeros end the push.
     """
 
     forces: np.ndarray
-    """(nbody, 6) float64: force and torque in world coordinates, N and Nm."""
+    """(nbody, 6) float64: force (N) and torque (Nm) in world coordinates."""
     qpos: np.ndarray | None = None
-    """A new (nq,) float64 while paused."""
+    """(nq,) float64; takes effect only while paused."""
     mocap_pos: np.ndarray | None = None
-    """New (nmocap, 3) float64, metres."""
+    """(nmocap, 3) float64, metres."""
     mocap_quat: np.ndarray | None = None
-    """New (nmocap, 4) float64: w, x, y, z."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Camera:
-    """A free camera, as ``mujoco.MjvCamera`` describes it."""
-
-    lookat: tuple[float, float, float]
-    distance: float
-    azimuth: float
-    elevation: float
-    tracked_body: int = -1
-    fixed: int = -1
-    """Index of a camera of the model instead."""
+    """(nmocap, 4) float64: w, x, y, z."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SetVideo:
-    """Begin a video, or end it."""
+    """Start a video, or end it."""
 
     on: bool
-    camera: Camera | None = None
+    camera: dict[str, Any] | None = None
+    """Attributes of the ``mujoco.MjvCamera``; None for the default camera."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Close:
-    """End the session. Closing a page is not reported, because it can be opened again."""
+    """End the session. Closing a page does not end it, because the page can be opened again."""
 
 
 Command: TypeAlias = (
-    SetMode | SetController | SetWorld | SetEpisode | SetPaused | SetSpeed | StepBy | Seek | SetBackwards | Reset
-    | SetGhosts | Perturb | SetVideo | Close
+    SetMode | SetWorld | SetPaused | SetSpeed | StepBy | Seek | SetBackwards | Reset | SetGhosts | Perturb | SetVideo
+    | Close
 )  # fmt: skip
 
 
@@ -290,30 +266,30 @@ class Opening:
     scene: Scene
     graphics: Graphics
     host: str
-    """Address on which the page is served."""
+    """Address that the page is served on."""
     port: int | None
-    """Port of the page; None for the first free one from 8080 on."""
+    """Port of the page; None for the first free port from 8080."""
     browser: bool
-    """Whether to open the page in this machine's browser."""
+    """Whether to open the page in a browser on this machine."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Opened:
-    """The window runs."""
+    """The window is open."""
 
     address: str = ""
-    """The page's address with its token; empty without a page."""
+    """The page's address with its token; empty for a native window."""
     instructions: tuple[str, ...] = ()
     """Lines to print."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Failed:
-    """The window ends because of an error."""
+    """The window ended with an error."""
 
     reason: str
     refused: bool = False
-    """Whether the caller's address or port is the reason."""
+    """Whether the host or port was invalid or in use."""
 
 
 @dataclasses.dataclass(frozen=True)

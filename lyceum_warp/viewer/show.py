@@ -1,4 +1,4 @@
-"""Open a session and its window: ``lw.view``."""
+"""Show worlds, controllers and episodes in a viewer: ``lw.view``."""
 
 import os
 import platform
@@ -9,29 +9,23 @@ from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import Graphics, Scene
 from lyceum_warp.viewer.session.clock import Session, Watcher
-from lyceum_warp.viewer.session.window_process import Window
-
-
-def has_display() -> bool:
-    """Whether a window can be opened on this machine's own screen."""
-    if platform.system() == "Linux":
-        return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    return not os.environ.get("SSH_CONNECTION")
+from lyceum_warp.viewer.session.window_process import NoWindowError, Window
 
 
 def chosen_graphics(gfx: str | None) -> Graphics:
-    """The kind of window: a page in a browser, unless a native window is asked for.
+    """Check the kind of window; None means "web".
 
     Raises:
-        ValueError: The word is not known, or there is no display for a native window.
+        ValueError: ``gfx`` is unknown, or there is no display for a native window.
     """
-    if gfx is None:
+    if gfx is None or gfx == "web":
         return "web"
-    if gfx not in ("web", "native"):
+    if gfx != "native":
         raise ValueError(f"gfx must be 'web' or 'native', not {gfx!r}")
-    if gfx == "native" and not has_display():
+    displays = map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))
+    if not any(displays) if platform.system() == "Linux" else "SSH_CONNECTION" in os.environ:
         raise ValueError("there is no display for a native window: use gfx 'web', which serves a page for browsers")
-    return gfx  # type: ignore[return-value]
+    return "native"
 
 
 def view(
@@ -58,37 +52,37 @@ def view(
     controllers to switch between; ``lw.view(env, episodes=[trajectory, "episode-000.npz"])`` adds episodes to play
     back. The panel and its keys choose the mode, the world, the speed, ghosts and the camera.
 
-    The worlds of ``env`` are stepped, and stay in the state in which the window is closed. A policy acts in all of
-    them. A controller of one world controls a copy of the world that is shown, in real time as under
-    ``lw.control_async``, while the others wait; the shown world goes on where the copy stopped. Where ``env`` is one
-    world on the CPU without automatic resets, it is the plant itself.
+    The viewer steps the worlds of ``env``, and leaves them in their last state. A policy acts in all worlds. A
+    controller of one world acts in a copy of the shown world, in real time as with ``lw.control_async``, while the
+    other worlds wait; afterwards the shown world takes over the state of the copy. If ``env`` is one world on the CPU
+    without automatic resets, no copy is made.
 
     Args:
         env: The worlds, on any engine and device.
-        controllers: Controllers by their names. One that is called with observations, (nworld, nobs), and returns
-            actions, (nworld, nact), is a policy, as ``lw.load`` returns it. One that is called with a state and an
-            observation is a controller of one world; see ``lw.Controller``.
-        episodes: Episodes to play back: trajectories, their files, or states, (steps + 1, state_space.size), as rows of
-            ``env.get_state()``; one, a sequence, or a mapping from names to them.
-        world: Number of the world that is shown first.
-        seed: Seed of a random reset at the start; by default the worlds stay as they are.
+        controllers: Controllers by name. A policy maps observations, (nworld, nobs), to actions, (nworld, nact), as
+            ``lw.load`` returns it. A controller of one world is called with a state and an observation; see
+            ``lw.Controller``.
+        episodes: Episodes to play back: trajectories, files of trajectories, or states, (steps + 1, state_space.size),
+            as rows of ``env.get_state()``; one of these, a sequence, or a mapping from names to them.
+        world: Index of the world that is shown first.
+        seed: Seed of a random reset at the start; by default there is no reset.
         paused: Whether to start paused.
-        trace: Name of the site or body whose path is drawn for a planner's samples; by default ``Task.trace``, or else
-            the centre of mass of a robot whose base moves freely, or the end of an arm.
-        fps: The most frames per second.
-        title: What the window is called; by default the task's name.
-        gfx: "web" for a page in a browser, the default; "native" for a window, on a machine with a display.
-        host: Address on which the page is served. Other machines reach it only under another one than the default.
-        port: Port of the page; by default the first free one from 8080 on.
-        browser: Whether to open the page in this machine's browser.
-        watchers: Functions that are called about twice a second and return new messages, a sequence of texts.
-        on_trajectory: Called with a ``Trajectory`` of what a controller of one world did in real time, after each
-            episode and after each command that interrupts one, as ``lambda episode: episode.save("episode.npz")``.
+        trace: Name of the site or body whose path is drawn for a planner's samples; by default ``Task.trace``. Without
+            either, it is the centre of mass of a robot with an unactuated base, or the end of an arm.
+        fps: Maximum number of frames per second.
+        title: Title of the window; by default the task's name.
+        gfx: "web" (the default) for a page in a browser; "native" for a window, on a machine with a display.
+        host: Address to serve the page on. The default is the loopback address, which other machines cannot reach.
+        port: Port of the page; by default the first free port from 8080.
+        browser: Whether to open the page in a browser on this machine.
+        watchers: Functions that are called about twice a second and return new messages, a sequence of strings.
+        on_trajectory: Called with a ``Trajectory`` of each real-time run of a controller of one world. A run ends with
+            its episode or with a command that interrupts it. Example: ``lambda episode: episode.save("episode.npz")``.
 
     Raises:
-        ValueError: An argument does not fit, or the port is in use; the message says how to fix it.
+        ValueError: An argument is invalid, or the port is in use.
         FileNotFoundError: An episode's file is missing.
-        NoWindowError: The window cannot be opened, or ended because of an error.
+        NoWindowError: The window cannot be opened, or ended with an error.
     """
     graphics = chosen_graphics(gfx)
     session = Session(
@@ -99,26 +93,14 @@ def view(
         window = opened(session.stage.scene, graphics, host=host, port=port, browser=browser)
         session.run(window)
     finally:
-        session.close()
+        session.stage.close()
     if window.error is not None:
         raise NoWindowError(f"the viewer's window ended: {window.error}")
 
 
-class NoWindowError(OSError):
-    """The window cannot be opened, or ended because of an error. The message holds the reason."""
-
-
-def opened(scene: Scene, graphics: Graphics, *, host: str, port: int | None, browser: bool) -> Window:
-    """Open a window, and print where its page is.
-
-    Raises:
-        ValueError: The port is in use, or the address is not one of this machine.
-        NoWindowError: The window cannot be opened.
-    """
-    try:
-        window = Window(scene, gfx=graphics, host=host, port=port, browser=browser)
-    except RuntimeError as error:
-        raise NoWindowError(str(error)) from error
+def opened(scene: Scene, graphics: Graphics, **place: Any) -> Window:
+    """Open a window, and print where its page is. See ``Window``."""
+    window = Window(scene, graphics, **place)
     for line in window.instructions:
         print(line, flush=True)
     return window

@@ -1,4 +1,4 @@
-"""The camera of a video: one of the model's, by name or index, or a free one, by its pose."""
+"""Find the camera of a video: a camera of the model by name or index, or a free camera by its pose."""
 
 import dataclasses
 import difflib
@@ -17,10 +17,10 @@ from lyceum_warp.support.validate import positive_number
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FreeCamera:
-    """A camera that looks at a point, or follows a body. What is not given is as in MuJoCo's default free camera."""
+    """A camera that looks at a point or follows a body. Defaults come from MuJoCo's default free camera."""
 
     lookat: tuple[float, float, float] | None = None
-    """Point to look at, metres. A camera that follows a body looks at the centre of mass of its subtree instead."""
+    """Point to look at, metres. A camera that follows a body looks at the centre of mass of the body's subtree."""
     distance: float | None = None
     """Distance from that point, metres."""
     azimuth: float | None = None
@@ -32,15 +32,15 @@ class FreeCamera:
 
 
 CameraChoice: TypeAlias = str | int | FreeCamera | mujoco.MjvCamera | None
-"""A camera of the model by its name or index, a free camera ("free" and -1 stand for MuJoCo's default), or None for the
-default of a video: the model's first tracking camera, else its first one fixed to the world, else one that follows the
+"""A camera of the model by name or index, a free camera ("free" or -1 for MuJoCo's default), or None for the default
+of a video: the model's first tracking camera, else its first camera fixed to the world, else a camera that follows the
 first body."""
 
 FREE = "free"
 
 
 def find_camera(model: mujoco.MjModel, camera: CameraChoice = None) -> mujoco.MjvCamera:
-    """The camera that a choice stands for, as MuJoCo describes it.
+    """The chosen camera as an ``MjvCamera``.
 
     Raises:
         ValueError: The model has no such camera or body, or a number is not valid.
@@ -63,14 +63,14 @@ def find_camera(model: mujoco.MjModel, camera: CameraChoice = None) -> mujoco.Mj
 
 
 def parsed_camera(words: Iterable[str]) -> str | FreeCamera | None:
-    """The camera that words of a shell describe: a name or an index, or parts of a pose such as ``azimuth=90``.
+    """Parse a camera from words of a shell.
 
     Args:
-        words: One word, or several as NAME=VALUE: lookat=X,Y,Z, distance, azimuth, elevation, track. None of them
-            stands for the default.
+        words: A name or an index; or parts of a pose as NAME=VALUE: lookat=X,Y,Z, distance, azimuth, elevation, track.
+            Without words the result is None.
 
     Raises:
-        ValueError: The words are written in another way.
+        ValueError: The words have another form.
     """
     words = list(words)
     if not words or (len(words) == 1 and "=" not in words[0]):
@@ -95,7 +95,7 @@ def parsed_camera(words: Iterable[str]) -> str | FreeCamera | None:
 
 
 def camera_names(model: mujoco.MjModel) -> list[str]:
-    """Names of the model's cameras, in order; "" for one without a name."""
+    """Names of the model's cameras, in order; "" for a camera without a name."""
     return [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_CAMERA, i) or "" for i in range(model.ncam)]
 
 
@@ -109,7 +109,7 @@ def camera_values(camera: mujoco.MjvCamera) -> tuple[float, ...]:
 
 def tracking_camera(model: mujoco.MjModel) -> int | None:
     """Index of the model's first camera that follows a body, ``model.cam_bodyid``; None without one."""
-    # as numbers, because MuJoCo's enums do not equal NumPy's integers
+    # as int, because MuJoCo's enums do not equal NumPy's integers
     tracking = (int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
     return next((i for i, mode in enumerate(model.cam_mode) if int(mode) in tracking), None)
 

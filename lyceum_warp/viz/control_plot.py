@@ -1,4 +1,4 @@
-"""Plots of a controller's episodes."""
+"""Plot episodes of a controller."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_png
 
 
-def control_plot(trajectories: Trajectory | Sequence[Trajectory], out: str | Path, *, title: str | None = None) -> Path:
+def control_plot(episodes: Sequence[Trajectory], out: str | Path, *, title: str | None = None) -> Path:
     """Draw episodes of a controller as PNG.
 
     The left side shows reward and evaluation metric against simulated time. The right side shows planning times and
@@ -18,7 +18,7 @@ def control_plot(trajectories: Trajectory | Sequence[Trajectory], out: str | Pat
     deadline.
 
     Args:
-        trajectories: Episodes of one task. The deadline is the period of the first one.
+        episodes: Episodes of one task, at least one. The deadline is the period of the first one.
         out: The PNG file.
         title: Title of the plot; by default task, engine and mode.
 
@@ -26,22 +26,18 @@ def control_plot(trajectories: Trajectory | Sequence[Trajectory], out: str | Pat
         The file's path.
 
     Raises:
-        ValueError: There is no trajectory.
         ImportError: matplotlib is not installed.
     """
     figure = new_figure("a controller's episodes", 10.0, 6.5)
     from matplotlib.ticker import LogFormatter
 
-    episodes = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
-    if not episodes:
-        raise ValueError("a plot needs at least one trajectory")
     grid = figure.add_gridspec(6, 2)
     reward, evaluation = (figure.add_subplot(grid[rows, 0]) for rows in (slice(0, 3), slice(3, 6)))
     planning, age, histogram = (figure.add_subplot(grid[rows, 1]) for rows in (slice(0, 2), slice(2, 4), slice(4, 6)))
     _draw_outcomes(reward, evaluation, episodes)
     _draw_times(planning, age, episodes)
     _draw_histogram(histogram, episodes)
-    histogram.xaxis.set_major_formatter(LogFormatter())  # writes 10 where the default writes a power of ten
+    histogram.xaxis.set_major_formatter(LogFormatter())  # plain numbers instead of powers of ten
     histogram.xaxis.set_minor_formatter(LogFormatter())
     finish_axes((reward, evaluation, planning, age, histogram))
     first = episodes[0]

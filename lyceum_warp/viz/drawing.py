@@ -1,4 +1,4 @@
-"""The process that draws a video or pictures, seen from this one."""
+"""Control the subprocess that draws a video or pictures."""
 
 import contextlib
 import importlib.util
@@ -18,15 +18,11 @@ import numpy as np
 
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import positive_number
-from lyceum_warp.viz import EXTRA
+from lyceum_warp.viz import EXTRA, NoVideoError
 from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
 from lyceum_warp.viz.render import CANNOT_DRAW, VIDEO, Shot
 
-_PATIENCE = 10.0  # seconds that the process gets to end
-
-
-class NoVideoError(RuntimeError):
-    """The machine cannot draw, or lacks a package for videos. The message names it and the fix."""
+_PATIENCE = 10.0  # seconds until the process is killed
 
 
 def check_video() -> None:
@@ -40,28 +36,28 @@ def check_video() -> None:
 
 
 def libraries() -> list[str]:
-    """Values of MUJOCO_GL to try, in order; "" stands for MuJoCo's default."""
+    """Values of MUJOCO_GL to try, in order; "" is MuJoCo's default."""
     given = os.environ.get("MUJOCO_GL", "")
     others = ["egl", "osmesa"] if sys.platform.startswith("linux") else [""]
     return list(dict.fromkeys([given, *others] if given else others))
 
 
 class DrawingProcess:
-    """A process that draws poses, with the first graphics library that works; a context.
+    """A subprocess that draws poses, with the first graphics library that works; a context manager.
 
     Args:
         model: The model.
         camera: The camera.
         size: Width and height in pixels.
         fps: Frames per second of a video; None for pictures.
-        background: Whether the process gives way to others on a busy machine.
+        background: Whether the process has a low priority.
 
     Raises:
         ValueError: The model has no such camera, or the size is out of range.
     """
 
     product = "the drawing"
-    """What it makes, for error messages."""
+    """Name of the result in error messages."""
 
     def __init__(
         self, model: mujoco.MjModel, *, camera: CameraChoice, size: tuple[int, int], fps: float | None,
@@ -92,7 +88,7 @@ class DrawingProcess:
                 raise
             self._stop()
             failures.append(f"{library or 'OpenGL'}: {reason}")
-            if code > 0 and code != CANNOT_DRAW:  # another graphics library would fail, too
+            if code > 0 and code != CANNOT_DRAW:  # another graphics library would also fail
                 raise NoVideoError(f"{self.product} could not be written ({reason})")
         raise NoVideoError(
             f"this machine cannot draw off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
@@ -102,10 +98,19 @@ class DrawingProcess:
     def __exit__(self, *exception: object) -> None:
         self._stop()
 
-    def abandon(self) -> None:
-        """Kill the process, and start no other one; may be called from another thread, which does not wait.
+    def draw(self, shot: Shot) -> None:
+        """Draw a pose.
 
-        The thread that draws then gets a ``NoVideoError``.
+        Raises:
+            NoVideoError: The process has ended.
+        """
+        if not self._send(shot) or self._answer() != "frame":
+            raise NoVideoError(f"{self.product} could not be written ({self._ended()[1]})")
+
+    def abandon(self) -> None:
+        """Kill the process, and start no other one. Other threads may call this; it does not wait.
+
+        The drawing thread then gets a ``NoVideoError``.
         """
         with self._lock:
             self._abandoned = True
@@ -121,19 +126,19 @@ class DrawingProcess:
         mujoco.mj_saveModel(self._model, str(Path(self._folder, "model.mjb")), None)
         self._errors = tempfile.TemporaryFile("w+", errors="replace")  # noqa: SIM115
         self._ends.enter_context(self._errors)
-        # -P keeps the folder of render.py off the path, where its other modules could shadow packages
+        # with -P, modules beside render.py do not shadow packages
         command = [sys.executable, "-P", str(Path(__file__).with_name("render.py")), self._folder]
         with self._lock:
             if self._abandoned:
                 raise NoVideoError(f"{self.product} was cancelled")
             self._process = subprocess.Popen(
                 command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
-                start_new_session=True,  # Ctrl-C in the shell is for this process alone, which ends the other one
+                start_new_session=True,  # Ctrl-C in the shell must reach only the parent
             )  # fmt: skip
         self._send(self._job)
 
     def _send(self, message: Any) -> bool:
-        """Send a message; returns False where the process has ended."""
+        """Send a message; returns False if the process has ended."""
         assert self._process is not None and self._process.stdin is not None
         try:
             pickle.dump(message, self._process.stdin, protocol=pickle.HIGHEST_PROTOCOL)
@@ -143,10 +148,10 @@ class DrawingProcess:
         return True
 
     def _answer(self) -> str:
-        """The next line of the process; empty where it has ended."""
+        """The next answer of the process, or "" if it has ended."""
         assert self._process is not None and self._process.stdout is not None
         for line in self._process.stdout:
-            if line in (b"ready\n", b"frame\n"):  # drivers may print lines of their own
+            if line in (b"ready\n", b"frame\n"):  # drivers may print other lines
                 return line.decode().strip()
         return ""
 
@@ -159,7 +164,7 @@ class DrawingProcess:
         return code, lines[-1].strip()[:160] if lines else f"it ended with code {code}"
 
     def _stop(self) -> None:
-        """End the process, if it runs, and delete its files."""
+        """End the process if it runs, and delete its files."""
         with self._lock:
             process, self._process = self._process, None
         if process is None:
@@ -181,20 +186,7 @@ class DrawingProcess:
 
 
 class Drawing(DrawingProcess):
-    """A process that draws poses into a file, with the first graphics library that works; a context.
-
-    Args:
-        model: The model.
-        out: The file.
-        camera: The camera.
-        size: Width and height in pixels.
-        fps: Frames per second.
-        background: Whether the process gives way to others on a busy machine.
-
-    Raises:
-        ValueError: The model has no such camera, or an argument is out of range.
-        NoVideoError: A package for videos is not installed.
-    """
+    """A subprocess that draws poses into a video file; the arguments and errors are as for ``write_video``."""
 
     product = "the video"
 
@@ -211,17 +203,12 @@ class Drawing(DrawingProcess):
         self._frames = 0
 
     def draw(self, shot: Shot) -> None:
-        """Draw a pose, and write its frames.
-
-        Raises:
-            NoVideoError: The process has ended.
-        """
-        if not self._send(shot) or self._answer() != "frame":
-            raise NoVideoError(f"the video could not be written ({self._ended()[1]})")
+        """Draw a pose, and write its frames."""
+        super().draw(shot)
         self._frames += 1
 
     def finish(self) -> Path:
-        """Complete the video, and put it in its place.
+        """Complete the video, and move it to its path.
 
         Raises:
             NoVideoError: There is no frame, or the video cannot be completed.
@@ -242,7 +229,7 @@ class Drawing(DrawingProcess):
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process and those that it started, such as ffmpeg."""
+    """Kill a process and its children, such as ffmpeg."""
     if process.poll() is not None:
         return
     with contextlib.suppress(ProcessLookupError):

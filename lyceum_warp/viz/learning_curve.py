@@ -1,4 +1,4 @@
-"""Learning curves."""
+"""Plot the learning curve of a run."""
 
 import math
 from collections.abc import Sequence
@@ -7,19 +7,17 @@ from typing import Any
 
 from lyceum_warp.algos.learner import METRIC_COLUMN
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.metrics_table import read_metrics
 from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_png
 
 
-def learning_curve(run: str | Path | Run, out: str | Path | None = None, *, title: str | None = None) -> Path:
+def learning_curve(run: str | Path | Run, out: str | Path | None = None) -> Path:
     """Draw a run's learning curve as PNG: returns, the evaluation metric and the task's own metrics against samples.
 
-    Where no episode ended, and the mean policy was not evaluated, rewards of a step stand for returns.
+    Without any ended episode or evaluation, the mean reward of a step is drawn instead of returns.
 
     Args:
-        run: A run, its folder, or a table of metrics.
-        out: The PNG file; by default ``curve.png`` beside the table.
-        title: Title of the plot; by default the task and the seed.
+        run: A run, or its folder.
+        out: The PNG file; by default ``curve.png`` in the folder.
 
     Returns:
         The file's path.
@@ -33,14 +31,10 @@ def learning_curve(run: str | Path | Run, out: str | Path | None = None, *, titl
     from matplotlib import colormaps
     from matplotlib.ticker import EngFormatter
 
-    if isinstance(run, Run) or Path(run).is_dir():
-        run = run if isinstance(run, Run) else Run.open(run)
-        rows, folder = run.rows(), run.folder
-        title = title or f"{run.config['task']}, seed {run.config['seed']}"
-    else:
-        rows, folder = read_metrics(Path(run)), Path(run).parent
+    run = run if isinstance(run, Run) else Run.open(run)
+    rows = run.rows()
     if not rows:
-        raise ValueError(f"{folder} has no complete iteration to draw: train it first")
+        raise ValueError(f"{run.folder} has no complete iteration to draw: train it first")
 
     metrics = [name for name in rows[0] if name.startswith(METRIC_COLUMN)]
     figure.set_figheight(8.0 if metrics else 6.0)
@@ -71,9 +65,8 @@ def learning_curve(run: str | Path | Run, out: str | Path | None = None, *, titl
     panels[-1].set_xlabel("samples")
     panels[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
     finish_axes(panels)
-    if title:
-        top.set_title(title, loc="left")
-    return save_png(figure, out if out is not None else folder / "curve.png")
+    top.set_title(f"{run.config['task']}, seed {run.config['seed']}", loc="left")
+    return save_png(figure, out if out is not None else run.folder / "curve.png")
 
 
 def _column(rows: Sequence[dict[str, float | None]], name: str) -> list[float]:

@@ -1,4 +1,4 @@
-"""Progress of work that may take long: a passing bar on a terminal, lines elsewhere."""
+"""Show the progress of long work: a transient bar on a terminal, otherwise lines."""
 
 import time
 
@@ -7,14 +7,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 class LongWork:
-    """Progress of work that may take long: a passing bar on a terminal, now and then a line elsewhere.
-
-    Work that takes less than three seconds shows nothing where there is no terminal.
+    """Progress of long work: a transient bar on a terminal, otherwise a line every 10 s, the first after 3 s.
 
     Args:
-        text: What is done.
-        unit: What is counted, as "frames".
-        console: Where it is shown; by default on stderr.
+        text: Name of the work.
+        unit: Name of the counted units, such as "frames".
+        console: The output; by default stderr.
     """
 
     def __init__(self, text: str, unit: str, console: Console | None = None) -> None:
@@ -34,7 +32,7 @@ class LongWork:
         self.progress.stop()
 
     def __call__(self, done: int, total: int) -> None:
-        """Show that a part of the work is done."""
+        """Show the number of units done, and their total number."""
         self.progress.update(self.bar, completed=done, total=total)
         seconds = time.monotonic() - self.start
         if not self.console.is_terminal and seconds >= self.next and done < total:

@@ -1,4 +1,4 @@
-"""Pictures of an environment's worlds, as arrays."""
+"""Draw an environment's worlds as arrays."""
 
 from pathlib import Path
 
@@ -6,33 +6,13 @@ import numpy as np
 
 from lyceum_warp.env import Env
 from lyceum_warp.viz.cameras import CameraChoice
-from lyceum_warp.viz.drawing import DrawingProcess, NoVideoError
-from lyceum_warp.viz.render import PICTURE, Shot
+from lyceum_warp.viz.drawing import DrawingProcess
+from lyceum_warp.viz.render import PICTURE
 from lyceum_warp.viz.video import shots
 
 
-class Pictures(DrawingProcess):
-    """A process that draws poses as arrays, with the first graphics library that works; a context.
-
-    The arguments and errors are those of ``DrawingProcess``, without ``fps``.
-    """
-
-    product = "the picture"
-
-    def draw(self, shot: Shot) -> np.ndarray:
-        """Draw a pose, (height, width, 3) uint8.
-
-        Raises:
-            NoVideoError: The process has ended.
-        """
-        if not self._send(shot) or self._answer() != "frame":
-            raise NoVideoError(f"{self.product} could not be drawn ({self._ended()[1]})")
-        width, height = self.size
-        return np.fromfile(Path(self._folder, PICTURE), dtype=np.uint8).reshape(height, width, 3)
-
-
-class WorldPictures:
-    """Draws the worlds of an environment as they are now.
+class WorldPictures(DrawingProcess):
+    """Draws the current state of an environment's worlds.
 
     Args:
         env: The environment.
@@ -43,10 +23,11 @@ class WorldPictures:
         ValueError: The model has no such camera, or the size is odd.
     """
 
+    product = "the picture"
+
     def __init__(self, env: Env, *, camera: CameraChoice = None, size: tuple[int, int] = (480, 480)) -> None:
+        super().__init__(env.model, camera=camera, size=size, fps=None)
         self.env = env
-        self._drawing = Pictures(env.model, camera=camera, size=size, fps=None)
-        self._open = False
 
     def __call__(self) -> list[np.ndarray]:
         """A picture of each world, (height, width, 3) uint8; the first call starts the process.
@@ -54,13 +35,15 @@ class WorldPictures:
         Raises:
             NoVideoError: The machine cannot draw.
         """
-        if not self._open:
-            self._drawing.__enter__()
-            self._open = True
-        return [self._drawing.draw(shot) for shot in shots(self.env, self.env.get_state().cpu())]
+        if self._process is None:
+            self.__enter__()
+        pictures = []
+        for shot in shots(self.env, self.env.get_state().cpu()):
+            self.draw(shot)
+            pixels = np.fromfile(Path(self._folder, PICTURE), dtype=np.uint8)
+            pictures.append(pixels.reshape(self.size[1], self.size[0], 3))
+        return pictures
 
     def close(self) -> None:
         """End the process; a later call starts another one."""
-        if self._open:
-            self._open = False
-            self._drawing.__exit__()
+        self._stop()

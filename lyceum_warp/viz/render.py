@@ -1,16 +1,17 @@
-"""A program that draws poses into a video, or as single pictures: ``python render.py folder``.
+"""Draw poses into a video, or as single pictures: ``python render.py folder``.
 
-``drawing.py`` runs it in a process of its own and writes pickled objects to its standard input: first a dictionary with
-``size``, ``fps``, ``camera`` and ``background``, then one dictionary for each picture (``Shot``), then None. The folder
-holds the model, ``model.mjb``; the program writes ``video.mp4`` beside it, or, where ``fps`` is None, each picture over
-the last one into ``picture.raw``. It prints "ready" once it can draw, and a line for each picture. If its input ends
-without None, the process that runs it has died: it deletes the folder.
+``drawing.py`` runs this program as a subprocess and writes pickled objects to its stdin: first a dict with ``size``,
+``fps``, ``camera`` and ``background``, then a ``Shot`` for each picture, then None. The folder holds the model,
+``model.mjb``. The program writes ``video.mp4``, or if ``fps`` is None each picture into ``picture.raw``. It prints
+"ready" once it can draw, and "frame" after each picture. EOF without None means that its parent has died; it then
+deletes the folder.
 
-MuJoCo chooses its graphics library once, when it is imported, and a driver that fails may end the process. Therefore
-``drawing.py`` runs this file in a process for each library that it tries. The file imports nothing of the package. Exit
-code 3 means that this machine cannot draw with this library; the last line on stderr holds the reason.
+MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. ``drawing.py``
+therefore starts a process for each library that it tries. This file imports nothing of the package. Exit code 3 means
+that this machine cannot draw with this library; the last line on stderr holds the reason.
 """
 
+import contextlib
 import itertools
 import os
 import pickle
@@ -25,31 +26,31 @@ CANNOT_DRAW = 3
 ABANDONED = 4
 
 VIDEO, PICTURE = "video.mp4", "picture.raw"
-"""The files that the program writes; a picture is (height, width, 3) uint8."""
+"""Names of the output files. A picture is (height, width, 3) uint8."""
 
 
 class Shot(TypedDict):
-    """What one frame, or several in succession, show."""
+    """The content of one or more successive frames."""
 
     pose: tuple[np.ndarray, np.ndarray, np.ndarray]
     """qpos, mocap_pos and mocap_quat."""
     model_fields: dict[str, np.ndarray]
-    """Values of model fields by their names. Fields that are not there have the model's values."""
+    """Values of model fields by name. Other fields have the model's values."""
     camera: tuple[float, ...] | None
-    """The camera from this frame on; None for the last one."""
+    """The camera from this frame on; None keeps the last one."""
     ghosts: list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[float, ...]]]
-    """Further poses of the same model, each with its colour."""
+    """Further poses of the model, each with a colour."""
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]
-    """Points of lines, (points, 3), each with its colour and its width in pixels."""
+    """Points of lines, (points, 3), each with a colour and a width in pixels."""
     frames: int
-    """Frames of the video that show it."""
+    """Number of frames."""
 
 
 class Painter:
     """Draws poses of a model.
 
     Args:
-        mujoco: The module, which chooses a graphics library when it is imported.
+        mujoco: The module.
         model: The model. Its fields are changed.
         size: Width and height in pixels.
         camera: The camera's values.
@@ -60,7 +61,7 @@ class Painter:
         width, height = size
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
         model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-        # a finer shadow map shows no more, and takes half of the time of a frame that is drawn without a GPU
+        # without a GPU, a finer shadow map takes half of the time of a frame and shows no more
         model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, 2 * max(size))
         self.renderer = mujoco.Renderer(model, height, width)
         self.data, self.ghost = mujoco.MjData(model), mujoco.MjData(model)
@@ -117,7 +118,7 @@ class Painter:
 
 
 def set_camera(view: Any, values: tuple[float, ...]) -> None:
-    """Give a camera the values that ``cameras.camera_values`` returned."""
+    """Set the values of a camera, as ``cameras.camera_values`` returns them."""
     view.type, view.fixedcamid, view.trackbodyid = (int(value) for value in values[:3])
     view.lookat[:] = values[3:6]
     view.distance, view.azimuth, view.elevation = values[6:9]
@@ -125,7 +126,7 @@ def set_camera(view: Any, values: tuple[float, ...]) -> None:
 
 
 def change_model(mujoco: Any, model: Any, rows: dict[str, Any]) -> None:
-    """Set fields of a model by their names, and compute what follows from them, such as the poses of cameras."""
+    """Set fields of a model by name, and recompute derived constants, such as the poses of cameras."""
     for name, row in rows.items():
         owner = _owner(model, name)
         value = getattr(owner, name)
@@ -141,7 +142,7 @@ def _owner(model: Any, name: str) -> Any:
 
 
 def main(folder: str) -> int:
-    """Draw one frame for each pose of the input."""
+    """Draw a frame for each pose of the input."""
     source = sys.stdin.buffer
     try:
         import mujoco
@@ -157,12 +158,15 @@ def main(folder: str) -> int:
         print(str(error).strip() or type(error).__name__, file=sys.stderr)
         return CANNOT_DRAW
     try:
-        with _LastPicture(Path(folder, PICTURE)) if job["fps"] is None else _video(Path(folder, VIDEO), job) as writer:
+        with contextlib.nullcontext() if job["fps"] is None else _video(Path(folder, VIDEO), job) as writer:
             print("ready", flush=True)
             while (shot := pickle.load(source)) is not None:
                 image = painter.draw(shot)
-                for _ in range(shot["frames"]):
-                    writer.append_data(image)
+                if writer is None:
+                    Path(folder, PICTURE).write_bytes(image.tobytes())
+                else:
+                    for _ in range(shot["frames"]):
+                        writer.append_data(image)
                 print("frame", flush=True)
     except (EOFError, pickle.UnpicklingError):
         shutil.rmtree(folder, ignore_errors=True)
@@ -176,23 +180,6 @@ def _video(path: Path, job: dict[str, Any]) -> Any:
 
     options: Any = dict(fps=float(job["fps"]), codec="libx264", pixelformat="yuv420p", quality=8, macro_block_size=2)
     return imageio.get_writer(str(path), format="FFMPEG", **options)
-
-
-class _LastPicture:
-    """A file with the picture that was drawn last, with the methods of a video."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> "_LastPicture":
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        pass
-
-    def append_data(self, image: np.ndarray) -> None:
-        """Replace the picture."""
-        self.path.write_bytes(image.tobytes())
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The common style of all plots: figure, colours, axes, file."""
+"""Define the common style of all plots: figure, colours, axes, file."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,7 +10,7 @@ LINE, ACCENT, GRID = "#7a8ba3", "#c8502d", "#e4e7eb"
 
 
 def new_figure(purpose: str, width: float, height: float) -> Any:
-    """Make a figure, without pyplot: it needs no display, and shares no state with a user's own figures.
+    """Make a figure without pyplot, so that it needs no display and shares no state with the user's figures.
 
     Args:
         purpose: Name of the drawing, for the error message.

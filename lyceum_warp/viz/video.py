@@ -1,11 +1,11 @@
-"""Videos, drawn off-screen by a process of their own."""
+"""Write videos of states, drawn off-screen by a subprocess."""
 
 import contextlib
 import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -17,15 +17,16 @@ from numpy.typing import ArrayLike
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import positive_number, whole_number
+from lyceum_warp.viz import NoVideoError
 from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
-from lyceum_warp.viz.drawing import Drawing, NoVideoError, check_video
+from lyceum_warp.viz.drawing import Drawing, check_video
 from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.render import Shot
 
 __all__ = ["GhostPose", "Line", "NoVideoError", "Progress", "Recorder", "check_video", "episode", "write_video"]
 
 Progress: TypeAlias = Callable[[int, int], object]
-"""Called with how much is done, and how much there is in all."""
+"""Called with the number of units done, and their total number."""
 
 GhostPose: TypeAlias = tuple[ArrayLike, ArrayLike | None, ArrayLike | None, ArrayLike]
 """qpos, mocap_pos, mocap_quat and colour of a ghost."""
@@ -36,7 +37,7 @@ Line: TypeAlias = tuple[ArrayLike, ArrayLike]
 _LINE_WIDTH = 2.0  # pixels
 _MAX_RATE = 60  # frames per second; screens rarely show more
 _POSES = ("qpos", "mocap_pos", "mocap_quat")
-_KILLED = 5.0  # seconds that the thread gets to end after its process was killed
+_KILLED = 5.0  # seconds to wait for the thread after its process was killed
 
 
 @torch.no_grad()
@@ -50,10 +51,10 @@ def episode(
     """Run one episode under a policy, and return all its states, (steps + 1, state_space.size), on the CPU.
 
     Args:
-        env: An environment of one world, made with ``autoreset=False`` so that the last state is kept.
-        policy: Its ``act``, or else the policy itself, maps observations, (1, nobs), to actions, (1, nact).
+        env: An environment of one world, made with ``autoreset=False``.
+        policy: Maps observations, (1, nobs), to actions, (1, nact), by ``act`` or when it is called.
         seed: Seed of the initial state.
-        progress: Called now and then with the number of steps so far and the horizon.
+        progress: Called regularly with the number of steps so far and the horizon.
 
     Raises:
         ValueError: The environment has several worlds or automatic resets, or its episodes may never end.
@@ -86,22 +87,22 @@ def write_video(
     speed: float = 1.0,
     progress: Progress | bool = True,
 ) -> Path:
-    """Draw states into an mp4 file, each with the model fields that belong to it.
+    """Draw states into an mp4 file, each with its own model fields.
 
-    The video has at most 60 frames per second: with a shorter time step, states are left out. It is drawn by a process
-    of its own, without a display.
+    The video has at most 60 frames per second; with a shorter time step, states are left out. A subprocess draws it,
+    without a display.
 
     Args:
-        env: Environment that the states come from.
+        env: Environment of the states.
         states: States of one world, one row per step, (steps, state_space.size).
-        out: The file. It is replaced once the video is complete.
+        out: The file. It is replaced when the video is complete.
         camera: A camera of the model by its name or index, a ``FreeCamera`` or ``mujoco.MjvCamera``, or "free" for
-            MuJoCo's default free camera. By default the model's first tracking camera, else its first camera that is
-            fixed to the world, else a camera that follows the first body.
+            MuJoCo's default free camera. By default the model's first tracking camera, else its first camera fixed to
+            the world, else a camera that follows the first body.
         size: Width and height in pixels, even numbers.
         speed: Simulated seconds per second of the video.
         progress: Called after each frame with the number of frames so far and in all. True shows a bar on a terminal,
-            and elsewhere now and then a line on stderr; False shows nothing.
+            otherwise lines on stderr; False shows nothing.
 
     Returns:
         The file's path.
@@ -128,18 +129,21 @@ def write_video(
 
 
 def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
-    """What pictures of states show, each state with the model fields that belong to it.
+    """Yield a shot of each state, with its own model fields.
 
     Args:
-        env: Environment that the states come from.
+        env: Environment of the states.
         states: The states, (number of states, state_space.size), on the CPU.
     """
     parts = env.state_space.parts
-    poses = [states[:, parts[name]].numpy() if name in parts else _nothing(len(states)) for name in _POSES]
+    poses = [states[:, parts.get(name, slice(0))].numpy() for name in _POSES]
     fields = {field.name: states[:, parts[field.name]].numpy() for field in env.task.dynamics}
     for i in range(len(states)):
-        shown = {name: values[i] for name, values in fields.items()}
-        yield _shot((poses[0][i], poses[1][i].reshape(-1, 3), poses[2][i].reshape(-1, 4)), shown)
+        yield Shot(
+            pose=(poses[0][i], poses[1][i].reshape(-1, 3), poses[2][i].reshape(-1, 4)),
+            model_fields={name: values[i] for name, values in fields.items()},
+            camera=None, ghosts=[], lines=[], frames=1,
+        )  # fmt: skip
 
 
 def _shown_progress(progress: Progress | bool) -> contextlib.AbstractContextManager[Progress | None]:
@@ -148,19 +152,14 @@ def _shown_progress(progress: Progress | bool) -> contextlib.AbstractContextMana
     return contextlib.nullcontext(progress or None)
 
 
-def _nothing(rows: int) -> np.ndarray:
-    return np.zeros((rows, 0))
-
-
 class Recorder:
-    """A video of poses that come one by one, as from a viewer.
+    """A video of poses that are added one by one, for example by a viewer.
 
-    A process of its own draws them, at a low priority, and ``add`` never waits for it. Where it is slower than the
-    poses come, as without a GPU, they wait in memory, and ``close`` waits until the last one is drawn. With
-    ``most_waiting`` no more than these wait: further poses are dropped, and the last one that waits is shown in their
-    place, so that the video keeps its duration. The file is there once the video is complete, never before: after
-    ``cancel``, after an error within a ``with`` block, or where the program is killed, an older file of this name stays
-    as it is.
+    A subprocess draws them at a low priority, and ``add`` never waits for it. Poses wait in a queue, and ``close``
+    waits until the last one is drawn. ``most_waiting`` limits the queue: if it is full, further poses are dropped, and
+    the last pose in the queue is shown longer, so that the video keeps its duration. The file is written when the video
+    is complete. After ``cancel``, after an error within a ``with`` block, or if the program is killed, an older file of
+    this name is unchanged.
 
     >>> with Recorder(env.model, "video.mp4", camera="side", fps=1 / env.timestep) as mp4:
     ...     for _ in range(100):
@@ -173,7 +172,7 @@ class Recorder:
         camera: The camera, as in ``write_video``.
         size: Width and height in pixels, even numbers.
         fps: Frames per second of the video.
-        most_waiting: The most poses that wait for the process; by default all that come.
+        most_waiting: Maximal number of poses in the queue; unlimited by default.
 
     Raises:
         ValueError: The model has no such camera, or an argument is out of range.
@@ -193,7 +192,6 @@ class Recorder:
         self.model, self.out = model, Path(out)
         bodies = np.argsort(model.body_mocapid)[model.nbody - model.nmocap :]  # in the order of their mocap poses
         self._mocap = model.body_pos[bodies].copy(), model.body_quat[bodies].copy()
-        self._sizes = model.nq, model.nmocap
         self._drawing = Drawing(model, out, camera=camera, size=size, fps=fps, background=True)
         self._most = math.inf if most_waiting is None else whole_number("most_waiting", most_waiting, low=1)
         self._poses: deque[Shot] = deque()
@@ -220,17 +218,17 @@ class Recorder:
 
     @property
     def drawn(self) -> int:
-        """Number of frames that are drawn."""
+        """Number of drawn frames."""
         return self._drawn
 
     @property
     def dropped(self) -> int:
-        """Number of frames without their poses: those that came while too many waited, and those that ``end`` drops."""
+        """Number of frames whose poses were dropped, by a full queue or by ``end``."""
         return self._dropped
 
     @property
     def finished(self) -> bool:
-        """Whether the drawing has ended: the file is there, or ``close`` raises the error."""
+        """Whether the drawing has ended, with the file or with an error that ``close`` raises."""
         return not self._thread.is_alive()
 
     def add(
@@ -245,18 +243,18 @@ class Recorder:
         lines: Iterable[Line] = (),
         frames: int = 1,
     ) -> None:
-        """Add a pose, which is copied.
+        """Add a copy of a pose.
 
         Args:
             qpos: Positions, (nq,).
             mocap_pos: Positions of the mocap bodies, (nmocap, 3) metres; by default the model's.
-            mocap_quat: Their orientations, (nmocap, 4), w, x, y, z; by default the model's.
-            model_fields: Model fields by MuJoCo's names where this pose's values differ from the model's.
-            camera: Another camera from this pose on.
-            ghosts: Further poses, which are drawn over it: (qpos, mocap_pos, mocap_quat, colour), where mocap_pos and
-                mocap_quat may be None, and the colour is red, green, blue and opacity, from 0 to 1.
+            mocap_quat: Orientations of the mocap bodies, (nmocap, 4), w, x, y, z; by default the model's.
+            model_fields: Model fields by MuJoCo's names, if they differ from the model's in this pose.
+            camera: The camera from this pose on.
+            ghosts: Further poses to draw: (qpos, mocap_pos, mocap_quat, colour). mocap_pos and mocap_quat may be None;
+                the colour is red, green, blue and opacity, from 0 to 1.
             lines: Lines through points: (points, colour), points (n, 3) in metres.
-            frames: Number of frames that show it.
+            frames: Number of frames that show the pose.
 
         Raises:
             ValueError: A shape is wrong, the model has no such camera or field, or the video is closed.
@@ -265,13 +263,13 @@ class Recorder:
         self._check()
         if self._ended:
             raise ValueError(f"the video {self.out} is closed")
-        shot = _shot(
-            self._pose(qpos, mocap_pos, mocap_quat),
-            {name: self._field(name, value) for name, value in (model_fields or {}).items()},
-            None if camera is None else camera_values(find_camera(self.model, camera)),
-            [(self._pose(*ghost[:3]), _colour(ghost[3])) for ghost in ghosts],
-            [(_array("points of a line", points, (-1, 3)), _colour(colour), _LINE_WIDTH) for points, colour in lines],
-            whole_number("frames", frames, low=1),
+        shot = Shot(
+            pose=self._pose(qpos, mocap_pos, mocap_quat),
+            model_fields={name: self._field(name, value) for name, value in (model_fields or {}).items()},
+            camera=None if camera is None else camera_values(find_camera(self.model, camera)),
+            ghosts=[(self._pose(*ghost[:3]), _colour(ghost[3])) for ghost in ghosts],
+            lines=[(_array("points of a line", points, (-1, 3)), _colour(rgba), _LINE_WIDTH) for points, rgba in lines],
+            frames=whole_number("frames", frames, low=1),
         )
         with self._changed:
             self._added += frames
@@ -283,10 +281,10 @@ class Recorder:
             self._changed.notify_all()
 
     def end(self, *, drop: bool = False) -> None:
-        """Take no further poses, and finish the video in the background.
+        """Accept no further poses, and finish the video in the background.
 
         Args:
-            drop: Drop the poses that wait: the video ends with those that are drawn.
+            drop: Whether to drop the poses in the queue.
         """
         with self._changed:
             self._ended = True
@@ -296,25 +294,31 @@ class Recorder:
             self._changed.notify_all()
 
     def wait(self, seconds: float = math.inf, *, progress: Progress | bool = True) -> bool:
-        """Wait until the drawing has ended, for a time; returns whether it has.
+        """Wait until the drawing has ended; returns whether it has.
 
         Args:
-            seconds: How long.
+            seconds: Timeout.
             progress: As in ``close``.
         """
-        if not self.finished and seconds > 0:
-            with _shown_progress(progress) as report:
-                self._wait(report, time.monotonic() + seconds)
+        shown, until = 0, time.monotonic() + seconds
+        with contextlib.nullcontext() if self.finished or seconds <= 0 else _shown_progress(progress) as report:
+            while (not self.finished or self._drawn > shown) and (left := until - time.monotonic()) > 0:
+                with self._changed:
+                    self._changed.wait(min(left, 0.1))
+                if self._drawn > shown:
+                    shown = self._drawn
+                    if report is not None:
+                        report(shown, self._added)
         return self.finished
 
     def close(self, *, progress: Progress | bool = True) -> Path:
-        """Take no further poses, and wait until all are drawn and the file is complete.
+        """Accept no further poses, and wait until the file is complete.
 
-        An exception while it waits, such as Ctrl-C, cancels the video.
+        An exception meanwhile, such as Ctrl-C, cancels the video.
 
         Args:
-            progress: Called now and then with the number of frames that are drawn and of those that were added. True
-                and False are as in ``write_video``.
+            progress: Called regularly with the numbers of drawn and of added frames. True and False are as in
+                ``write_video``.
 
         Returns:
             The file's path.
@@ -337,30 +341,19 @@ class Recorder:
         return self.out
 
     def cancel(self) -> None:
-        """Give up the video at once, and write no file. Nothing happens where it is complete."""
+        """Cancel the video at once, and write no file, unless it is complete."""
         if self._thread.is_alive():
             self._cancelled = True
             self.end(drop=True)
             self._drawing.abandon()
             self._thread.join(_KILLED)
 
-    def _wait(self, report: Progress | None, until: float) -> None:
-        """Wait until the drawing has ended, or until a time of ``time.monotonic``."""
-        shown = 0
-        while (not self.finished or self._drawn > shown) and (left := until - time.monotonic()) > 0:
-            with self._changed:
-                self._changed.wait(min(left, 0.1))
-            if self._drawn > shown:
-                shown = self._drawn
-                if report is not None:
-                    report(shown, self._added)
-
     def _check(self) -> None:
         if self._error is not None:
             raise self._error
 
     def _draw(self) -> None:
-        """Draw poses as they come, in a thread."""
+        """Draw poses from the queue, in a thread."""
         try:
             with self._drawing as drawing:
                 while (shot := self._next()) is not None:
@@ -372,7 +365,7 @@ class Recorder:
                     drawing.finish()
         except (NoVideoError, OSError) as error:
             self._error = None if self._cancelled else error
-        except Exception as error:  # the thread has no caller that would see it
+        except Exception as error:  # the thread has no caller
             self._error = NoVideoError(f"the video could not be written ({' '.join(str(error).split())})")
 
     def _next(self) -> Shot | None:
@@ -384,9 +377,9 @@ class Recorder:
     def _pose(
         self, qpos: ArrayLike, mocap_pos: ArrayLike | None, mocap_quat: ArrayLike | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        nq, nmocap = self._sizes
+        nmocap = self.model.nmocap
         return (
-            _array("qpos", qpos, (nq,)),
+            _array("qpos", qpos, (self.model.nq,)),
             _array("mocap_pos", self._mocap[0] if mocap_pos is None else mocap_pos, (nmocap, 3)),
             _array("mocap_quat", self._mocap[1] if mocap_quat is None else mocap_quat, (nmocap, 4)),
         )
@@ -400,11 +393,7 @@ class Recorder:
 
 
 def _array(name: str, value: Any, shape: tuple[int, ...], *, flat: bool = False) -> np.ndarray:
-    """A copy of an array, float64, of a given shape.
-
-    Raises:
-        ValueError: It has another shape.
-    """
+    """Copy an array as float64, and check its shape."""
     try:
         array = np.array(value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value, dtype=float)
     except (TypeError, ValueError):
@@ -418,17 +407,3 @@ def _array(name: str, value: Any, shape: tuple[int, ...], *, flat: bool = False)
 
 def _colour(value: ArrayLike) -> tuple[float, ...]:
     return tuple(_array("a colour", value, (4,)).tolist())
-
-
-def _shot(
-    pose: tuple[np.ndarray, np.ndarray, np.ndarray],
-    model_fields: dict[str, np.ndarray],
-    camera: tuple[float, ...] | None = None,
-    ghosts: Sequence[Any] = (),
-    lines: Sequence[Any] = (),
-    frames: int = 1,
-) -> Shot:
-    return {
-        "pose": pose, "model_fields": model_fields, "camera": camera, "ghosts": list(ghosts), "lines": list(lines),
-        "frames": frames,
-    }  # fmt: skip

@@ -1,4 +1,4 @@
-"""What the adapters say where a library is missing, or of another version."""
+"""Errors of the adapters if a library is missing or has another version."""
 
 import importlib
 import sys
@@ -37,7 +37,7 @@ def test_a_version_must_lie_in_the_range(
 @pytest.mark.parametrize(
     "package, module, install_hint",
     [
-        ("gymnasium", "gymnasium_library", "gymnasium>=1.1,<2"),
+        ("gymnasium", "gymnasium_spaces", "gymnasium>=1.1,<2"),
         ("stable-baselines3", "stable_baselines3", r"lyceum-warp\[stable-baselines3\]"),
     ],
 )

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 
-import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos import distributed
 from lyceum_warp.algos.distributed import Team
@@ -219,17 +218,6 @@ def test_an_error_in_one_process_ends_all_and_two_processes_continue_the_run_of_
     assert_equal_runs(run, other, tolerance=2e-3)
 
 
-def test_first_world_selects_the_random_streams_of_the_worlds() -> None:
-    whole, part = lw.make("hopper", nworld=5), lw.make("hopper", nworld=2, first_world=3)
-    assert torch.equal(part.obs, whole.obs[3:])
-    for env in (whole, part):
-        env.rand_reset(4)
-        env.rand_reset()
-    assert torch.equal(part.obs, whole.obs[3:])
-    assert part.first_world == 3
-    assert part.replicate(nworld=1).first_world == 0
-
-
 def test_locate_finds_samples_among_those_of_a_processs_own_worlds() -> None:
     """Of 4 steps of 6 worlds, shared by 3 processes."""
     index = torch.arange(24)
@@ -246,8 +234,6 @@ def test_worlds_that_cannot_be_shared_evenly_are_refused() -> None:
     assert Team(0, 3).share(9) == 3
     with pytest.raises(ValueError, match="3 processes cannot share 8 worlds evenly: use a multiple of 3"):
         Team(0, 3).share(8)
-    with pytest.raises(ValueError, match="needs an environment with first_world=4, not 0"):
-        lw.NPG(lw.make("point_mass", nworld=4), team=Team(1, 2))
 
 
 def test_fewer_gpus_than_processes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -282,16 +268,3 @@ def test_graphs_are_reset_before_the_process_group_is_destroyed(fails: bool, mon
         if fails:
             raise KeyError
     assert order == (["graph"] if fails else ["graph", "group"])
-
-
-def test_a_team_of_one_process_does_not_communicate() -> None:
-    with distributed.join("cpu") as team:
-        numbers = torch.arange(3.0)
-        assert team.leads and team.captures
-        assert team.sum(numbers) is numbers and team.gather(numbers) is numbers
-        team.copy_leader([numbers])
-        with team.together():
-            pass
-        with pytest.raises(KeyError), team.together():
-            raise KeyError
-    assert not torch.distributed.is_initialized()

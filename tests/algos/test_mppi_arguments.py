@@ -48,25 +48,16 @@ def arguments(task: Any, config: MPPIConfig | None = None, value: Any = None, pa
     return planner_arguments(find_task(task), config, words, params, value)
 
 
-def test_planning_gives_settings_options_and_parameters() -> None:
+def test_planning_gives_settings_options_and_parameters_and_words_replace_them() -> None:
     plan = MPPI("hopper", horizon=2, samples=2)
     assert plan.config == MPPIConfig(horizon=2, samples=2, noise=0.1).completed()
     assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     assert plan.env.task.params["healthy_reward"] == 2.0 and plan.env.task.params["forward_reward_weight"] == 0.2
-    assert lw.make("hopper").task.params["healthy_reward"] == 1.0
-
-
-def test_words_replace_parts_of_planning() -> None:
+    assert plan.settings["healthy_reward"] == 2.0 and lw.make("hopper").task.params["healthy_reward"] == 1.0
     plan = MPPI("hopper", horizon=2, samples=2, healthy_reward=1.0, integrator="rk4")
     assert plan.config.horizon == 2 and plan.config.noise == 0.1
     assert plan.env.task.params["healthy_reward"] == 1.0 and plan.env.task.params["forward_reward_weight"] == 0.2
     assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-
-
-def test_a_task_without_planning_has_the_defaults() -> None:
-    assert MPPI("point_mass").config == MPPIConfig().completed()
-    assert task_config(find_task("point_mass")) == MPPIConfig()
-    assert task_config(find_task("reach")) == MPPIConfig(horizon=16, samples=30, temperature=0.2, noise=1.0)
 
 
 @pytest.mark.parametrize(
@@ -77,17 +68,13 @@ def test_a_task_without_planning_has_the_defaults() -> None:
         (Planning(settings={"horizont": 3}), "'horizont' in planning.settings of the task 'planned' is unknown: "
                                              r"did you mean horizon\?"),
         (Planning(settings={"integrator": "rk4"}), "'integrator' in planning.settings .*: it belongs to options"),
-        (Planning(settings={"limit": 1.0}), "'limit' in planning.settings .*: it belongs to params"),
         (Planning(options={"integratr": "rk4"}), "'integratr' in planning.options .*: did you mean integrator"),
         (Planning(options={"samples": 3}), "'samples' in planning.options .*: it belongs to settings"),
         (Planning(params={"limt": 3.0}), "'limt' in planning.params of the task 'planned' .*: did you mean limit"),
         (Planning(params={"qqq": 3.0}), "'qqq' in planning.params .*: there are limit, wrong"),
-        (Planning(params={"dt": 3.0}), "'dt' in planning.params of the task 'planned' is unknown"),
         (Planning(settings={"horizon": 0}), "planning.settings of the task 'planned': horizon must be .* not 0"),
         (Planning(options={"integrator": "rk5"}), "planning.options of the task 'planned': there is no integrator"),
         (Planning(options={"nworld": 3}), "planning.options of the task 'planned': a planner takes no option nworld"),
-        (Planning(options={"horizon": 3}), "planning.options .*: a planner takes no option horizon"),
-        (Planning(options={"seed": 3}), "planning.options .*: a planner takes no option seed"),
     ],
 )  # fmt: skip
 def test_planning_that_is_not_valid_is_refused_by_task_and_part(planning: Any, message: str) -> None:
@@ -96,33 +83,31 @@ def test_planning_that_is_not_valid_is_refused_by_task_and_part(planning: Any, m
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("part", ["settings", "options", "params"])
-def test_a_part_of_planning_must_be_a_dict(part: str) -> None:
-    with pytest.raises(ValueError, match=rf"{part} of lw.Planning must be a dict, not \['horizon'\]"):
-        Planning(**{part: ["horizon"]})
+def test_a_part_of_planning_must_be_a_dict() -> None:
+    with pytest.raises(ValueError, match=r"settings of lw.Planning must be a dict, not \['horizon'\]"):
+        Planning(settings=["horizon"])  # type: ignore[arg-type]
 
 
 # the words of a call
 
-
-def test_a_configuration_replaces_the_settings_of_the_task() -> None:
-    config, options, params = arguments("hopper", MPPIConfig(horizon=3))
-    assert config == MPPIConfig(horizon=3).completed()
-    assert options.physics.integrator == "euler" and params["healthy_reward"] == 2.0
+REACH = task_config(find_task("reach"))
 
 
-def test_flat_settings_replace_single_ones() -> None:
-    assert (
-        arguments("reach", samples=7)[0] == dataclasses.replace(task_config(find_task("reach")), samples=7).completed()
-    )
-    assert (
-        arguments("reach", MPPIConfig(horizon=3, samples=8), samples=7)[0]
-        == MPPIConfig(horizon=3, samples=7).completed()
-    )
-
-
-def test_a_flat_setting_of_none_is_not_given() -> None:
-    assert arguments("reach", samples=None, discount=None)[0] == arguments("reach")[0]
+@pytest.mark.parametrize(
+    ("task", "config", "words", "expected"),
+    [
+        ("point_mass", None, {}, MPPIConfig()),
+        ("reach", None, {}, MPPIConfig(horizon=16, samples=30, temperature=0.2, noise=1.0)),
+        ("reach", None, {"samples": 7}, dataclasses.replace(REACH, samples=7)),
+        ("reach", None, {"samples": None, "discount": None}, REACH),
+        ("hopper", MPPIConfig(horizon=3), {}, MPPIConfig(horizon=3)),
+        ("reach", MPPIConfig(horizon=3, samples=8), {"samples": 7}, MPPIConfig(horizon=3, samples=7)),
+    ],
+)
+def test_flat_settings_replace_the_configuration_which_replaces_planning(
+    task: str, config: MPPIConfig | None, words: dict[str, Any], expected: MPPIConfig
+) -> None:
+    assert arguments(task, config, **words)[0] == expected.completed()
 
 
 def test_words_are_sorted_into_settings_options_and_parameters() -> None:
@@ -131,24 +116,17 @@ def test_words_are_sorted_into_settings_options_and_parameters() -> None:
     assert config == MPPIConfig(noise=0.2, samples=3).completed()
     assert options.given() == {"integrator": "rk4", "cone": "elliptic", "nthread": 2}
     assert params == {"limit": 2.0, "wrong": 5.0}
-
-
-def test_physics_in_one_piece_replace_those_of_planning() -> None:
     physics = lw.make("point_mass", integrator="implicit").options.physics
-    task = planned(options={"integrator": "euler", "cone": "elliptic"})
     assert arguments(task, physics=physics)[1].physics == physics
 
 
-def test_a_word_that_is_a_setting_and_a_parameter_is_refused() -> None:
+def test_a_word_that_is_a_setting_and_a_parameter_must_be_given_explicitly() -> None:
     message = (
         r"'noise' is a setting of MPPI and a parameter of the task 'noisy': give the setting as "
         r"config=lw.MPPIConfig\(noise=...\), or the parameter as params=\{'noise': ...\}"
     )
     with pytest.raises(ValueError, match=message):
         MPPI(Noisy, noise=0.3)
-
-
-def test_params_and_config_say_an_ambiguous_word_explicitly() -> None:
     plan = MPPI(Noisy, MPPIConfig(horizon=2, samples=2, noise=0.25), params={"noise": 3.0}, size=4.0)
     assert plan.config.noise == 0.25
     assert (plan.env.task.params["noise"], plan.env.task.params["size"]) == (3.0, 4.0)
@@ -159,8 +137,6 @@ def test_params_and_config_say_an_ambiguous_word_explicitly() -> None:
     ("words", "message"),
     [
         ({"sample": 3}, "the task 'reach' has no parameter 'sample': did you mean samples"),
-        ({"temprature": 1.0}, "no parameter 'temprature': did you mean temperature"),
-        ({"horizont": 1.0}, r"no parameter 'horizont': did you mean horizon\?"),
         ({"sucess_distance": 1.0}, "no parameter 'sucess_distance': did you mean success_distance"),
         ({"integratr": "rk4"}, "no parameter 'integratr': did you mean integrator"),
         ({"record": False}, "no parameter 'record': did you mean graphs"),
@@ -168,18 +144,20 @@ def test_params_and_config_say_an_ambiguous_word_explicitly() -> None:
         ({"dt": 3}, "no parameter 'dt'"),
         ({"params": {"samples": 3}}, "no parameter 'samples': it is a setting of MPPI: give it outside params"),
         ({"params": {"nthread": 3}}, "no parameter 'nthread': it is an option of its worlds: give it outside params"),
-        ({"params": [3]}, r"params must be a dict of parameters of the task, not list \[3\]"),
-        ({"config": {"samples": 3}}, r"config must be a lw.MPPIConfig, as .*, not dict \{'samples': 3\}"),
+        ({"params": [3]}, r"params must be .* a dict of parameters of the task, not list \[3\]"),
+        ({"config": {"samples": 3}}, r"config must be .* MPPIConfig.*, as .*, not dict \{'samples': 3\}"),
         ({"nworld": 1}, "a planner takes no option nworld: samples is the number of its worlds"),
-        ({"autoreset": True}, "a planner takes no option autoreset"),
         ({"nthread": -1}, "nthread must be a whole number"),
-        ({"nthread": "a"}, "nthread must be a whole number"),
         ({"integrator": "rk5"}, "no integrator 'rk5'"),
-        ({"solver": 4}, "solver must be a dict of limits"),
         ({"horizon": 0}, "horizon must be a whole number from 1"),
+        ({"elites": 4}, "elites=4 is a setting of update='cem', not of 'mppi'"),
+        ({"update": "predictive_sampling", "min_noise": 0.1}, "min_noise=0.1 is a setting of update='cem', not of"),
+        ({"update": "cem", "noise": np.eye(7)}, "noise of update='cem' must be standard deviations, not a covariance"),
+        ({"update": "cem", "min_noise": [0.1, 0.1]}, "min_noise must be a standard deviation or 7 of them, not"),
+        ({"models": 4}, "models=4 needs a task that draws model fields, and 'reach' draws none: write them in its"),
     ],
 )  # fmt: skip
-def test_words_that_do_not_fit_are_refused_with_a_suggestion(words: dict[str, Any], message: str) -> None:
+def test_words_that_do_not_fit_are_refused_in_one_line(words: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message) as raised:
         MPPI("reach", **words)
     assert "\n" not in str(raised.value)
@@ -229,22 +207,6 @@ def test_settings_that_are_left_out_follow_from_the_update() -> None:
     assert [chosen(update="cem", samples=n)[1] for n in (1, 2, 19, 40)] == [1, 2, 2, 4]
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ({"elites": 4}, "elites=4 is a setting of update='cem', not of 'mppi'"),
-        ({"update": "predictive_sampling", "min_noise": 0.1}, "min_noise=0.1 is a setting of update='cem', not of"),
-        ({"update": "cem", "noise": np.eye(7)}, "noise of update='cem' must be standard deviations, not a covariance"),
-        ({"update": "cem", "min_noise": [0.1, 0.1]}, "min_noise must be a standard deviation or 7 of them, not"),
-        ({"models": 4}, "models=4 needs a task that draws model fields, and 'reach' draws none: write them in its"),
-    ],
-)
-def test_settings_that_do_not_fit_the_update_or_the_task_are_refused(words: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message) as raised:
-        MPPI("reach", **words)
-    assert "\n" not in str(raised.value)
-
-
 @pytest.mark.parametrize("planner, update", [(lw.CEM, "cem"), (lw.PredictiveSampling, "predictive_sampling")])
 def test_cem_and_predictive_sampling_are_mppi_with_another_update(planner: type[MPPI], update: Any) -> None:
     config = MPPIConfig(horizon=3, samples=6)
@@ -255,14 +217,6 @@ def test_cem_and_predictive_sampling_are_mppi_with_another_update(planner: type[
         planner("reach", update="mppi")
 
 
-def test_models_multiply_the_samples_that_are_placed(monkeypatch: pytest.MonkeyPatch) -> None:
-    cuda = types.SimpleNamespace(is_cuda=True), types.SimpleNamespace(is_cuda=False)
-    monkeypatch.setattr(placement, "find_device", lambda name: cuda[not str(name).startswith("cuda")])
-    for models, engine in ((1, "mujoco"), (4, "warp")):
-        options = arguments("reach", samples=40, models=models, device="cuda:0", nthread=2)[1]
-        assert options.engine == engine
-
-
 # where samples are rolled out
 
 
@@ -271,17 +225,16 @@ def test_models_multiply_the_samples_that_are_placed(monkeypatch: pytest.MonkeyP
     [
         ("reach", dict(samples=79), ("mujoco", "cpu")),
         ("reach", dict(samples=80), ("warp", "cuda:0")),
+        ("reach", dict(samples=20, models=4), ("warp", "cuda:0")),
         ("reach", dict(samples=79, nthread=1), ("warp", "cuda:0")),
         ("reach", dict(samples=639, nthread=128), ("mujoco", "cpu")),
         ("reach", dict(samples=640, nthread=128), ("warp", "cuda:0")),  # more than 16 cores were not measured
         ("reach", dict(samples=79, nconmax=16), ("mujoco", "cpu")),
         ("reach", dict(samples=1, engine="warp"), ("warp", "cuda:0")),
         ("reach", dict(samples=4096, device="cpu"), ("auto", "cpu")),
-        ("reach", dict(samples=4096, device=None), ("auto", None)),
         ("reach", dict(samples=100, solver={"noslip_iterations": 3}), ("mujoco", "cpu")),
         # the hand's noslip solver is slow on a GPU, unless it is turned off
         ("adroit_pen", dict(samples=160), ("mujoco", "cpu")),
-        ("adroit_pen", dict(samples=479, solver={"iterations": 4}), ("mujoco", "cpu")),
         ("adroit_pen", dict(samples=480), ("warp", "cuda:0")),
         ("adroit_pen", dict(samples=160, solver={"noslip_iterations": 0}), ("warp", "cuda:0")),
     ],
@@ -312,4 +265,3 @@ def test_settings_are_what_json_can_hold() -> None:
         "solver": {"iterations": 3},
         "model": "MjSpec 'MuJoCo Model'", "limit": [1.0, 2.0], "wrong": 3.0, "fields": ["xpos"],
     }  # fmt: skip
-    assert MPPI("hopper", horizon=2, samples=2).settings["healthy_reward"] == 2.0

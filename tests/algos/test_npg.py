@@ -98,13 +98,11 @@ def test_one_extreme_reward_is_bounded_and_counted(env: lw.Env) -> None:
     assert disturbed[-1].explained_variance > 0.6 * plain[-1].explained_variance > 0.3
     assert disturbed[-1].step_norm > 0.1 * plain[-1].step_norm
 
-
-def test_an_extreme_reward_in_the_first_iteration_does_not_set_the_scale(env: lw.Env) -> None:
-    def outlier(reward: torch.Tensor, iteration: int) -> None:
-        if iteration == 1:
+    def first(reward: torch.Tensor, iteration: int) -> None:
+        if iteration == 1:  # it does not set the scale
             reward[5, 2] = 1e10
 
-    assert learned(env, 6, outlier)[-1].explained_variance > 0.5
+    assert learned(env, 6, first)[-1].explained_variance > 0.5
 
 
 def test_a_step_that_the_fisher_information_misjudges_is_shortened(env: lw.Env) -> None:
@@ -161,13 +159,8 @@ def test_the_fisher_information_takes_other_samples_each_time(env: lw.Env) -> No
     env.rand_reset(0)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, fisher_fraction=1 / 16), seed=0)
     next(npg)
-    obs = npg.rollout.obs.flatten(0, 1)
-    means = [npg.fisher(obs).mean.clone() for _ in range(2)]
+    means = [npg.fisher(npg.rollout.obs.flatten(0, 1)).mean.clone() for _ in range(2)]
     assert means[0].shape == (20, 2) and not torch.equal(*means)
-    # of 16 worlds, a stride of 16 would take the same one every time
-    every = npg.policy(obs).detach()
-    worlds = {int((every - mean).abs().sum(1).argmin()) % 16 for mean in means[0].detach()}
-    assert len(worlds) > 5
 
 
 def test_the_value_function_gets_the_group_critic_where_the_task_has_one() -> None:
@@ -178,7 +171,7 @@ def test_the_value_function_gets_the_group_critic_where_the_task_has_one() -> No
     assert npg.value.network[0].in_features == env.obs_spaces["critic"].size != env.obs_space.size
     policy_group = lw.NPG(env, config=dataclasses.replace(SMALL, samples=40, value_group="policy"))
     assert policy_group.value.network[0].in_features == env.obs_space.size
-    with pytest.raises(ValueError, match="has no group 'privileged' of observations .* it has policy, critic"):
+    with pytest.raises(ValueError, match="has no group 'privileged' of observations: it has policy, critic"):
         lw.NPG(env, config=dataclasses.replace(SMALL, value_group="privileged"))
 
 
@@ -188,17 +181,12 @@ def test_a_state_of_another_number_of_worlds_is_refused(env: lw.Env) -> None:
         lw.NPG(lw.make("point_mass", nworld=3), config=SMALL).load_state_dict(npg.state_dict())
 
 
-def test_mini_batches_grow_with_the_samples(env: lw.Env) -> None:
-    def batch(samples: int, given: int | None = None) -> int:
-        return lw.NPG(env, config=dataclasses.replace(SMALL, samples=samples, value_batch=given)).fit.batch
+def test_samples_are_rounded_up_to_whole_steps_and_mini_batches_grow_with_them(env: lw.Env) -> None:
+    def made(samples: int, batch: int | None = None) -> tuple[int, int]:
+        npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=samples, value_batch=batch))
+        return npg.count, npg.fit.batch
 
-    assert [batch(320), batch(16 * 2048)] == [64, 128]
-    assert batch(320, 10) == 10
-
-
-def test_samples_are_rounded_up_to_whole_steps() -> None:
-    counts = [lw.NPG(lw.make("point_mass", nworld=n)).count for n in (10, 64, 1000)]
-    assert counts == [10_000, 10_048, 16_000]
+    assert [made(310), made(16 * 2048), made(320, 10)] == [(320, 64), (16 * 2048, 128), (320, 10)]
 
 
 def test_segments_continue_where_the_last_ones_ended(env: lw.Env) -> None:
@@ -245,13 +233,6 @@ def test_point_mass_learns_to_reach_the_target() -> None:
     assert np.mean(rewards[-3:]) > 0.7, rewards
 
 
-def test_weights_and_noise_have_different_seeds(env: lw.Env) -> None:
-    env.rand_reset(0)
-    npg = lw.NPG(env, config=SMALL, seed=5)
-    same_seed = torch.Generator().manual_seed(5)
-    assert not torch.equal(npg.generator.get_state(), same_seed.get_state())
-
-
 def test_wrong_arguments_are_refused(env: lw.Env) -> None:
     with pytest.raises(ValueError, match=r"env of NPG .* of type Env, as lw.make\(...\) .*, not str 'hopper'"):
         lw.NPG("hopper")  # type: ignore[arg-type]
@@ -261,58 +242,14 @@ def test_wrong_arguments_are_refused(env: lw.Env) -> None:
         lw.NPG(env, value=lw.ValueFunction(7))
     with pytest.raises(ValueError, match=r"value of NPG .* not Linear"):
         lw.NPG(env, value=torch.nn.Linear(6, 1))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="takes the group 'critic' of observations, which the task 'point_mass' lacks"):
+    with pytest.raises(ValueError, match="the task 'point_mass' has no group 'critic' of observations: it has policy"):
         lw.NPG(env, value=lw.ValueFunction(6, group="critic"))
-    broken = lw.ValueFunction(6, scale=math.nan)
+    broken = lw.ValueFunction(6)
+    broken.scale.fill_(math.nan)
     with pytest.raises(ValueError, match="the value function's 'scale' is not finite: leave it out for a new value"):
         lw.NPG(env, value=broken)
     with pytest.raises(ValueError, match="autoreset=True"):
         lw.NPG(lw.make("point_mass", autoreset=False))
-
-
-NAN = """
-import warp as wp
-import lyceum_warp as lw
-from lyceum_warp import Row
-
-@wp.struct
-class World:
-    qpos: Row[float]
-    qvel: Row[float]
-
-@wp.struct
-class Params:
-    dt: float
-    where: int = 0
-
-@wp.func
-def observe(s: World, p: Params, obs: Row[float]):
-    obs[0] = s.qpos[0]
-    obs[1] = s.qpos[1]
-    if p.where == 1:
-        obs[2] = wp.sqrt(s.qpos[1] - 1.2)
-    else:
-        obs[2] = 0.0
-
-@wp.func
-def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    if p.where == 0 and s1.qpos[1] < 1.2:
-        return wp.sqrt(s1.qpos[1] - 1.2)
-    return 0.0
-
-class Fragile(lw.Task):
-    model = "hopper.xml"
-    obs = {"place": 2, "root": 1}
-"""
-
-
-@pytest.mark.parametrize("where, fault", [(0, "reward"), (1, "observation")])
-def test_a_reward_or_observation_that_is_not_finite_is_a_fault(where: int, fault: str, task_file: TaskFile) -> None:
-    env = lw.make(str(task_file("fragile.py", NAN)), nworld=4, where=where, horizon=80)
-    npg = lw.NPG(env, config=dataclasses.replace(SMALL, mean_every=0))
-    iterations = [next(npg) for _ in range(5)]
-    assert sum(it.faults for it in iterations) == env.fault_counts[fault] > 0
-    assert all(math.isfinite(it.kl) and math.isfinite(it.value_error) for it in iterations)
 
 
 WILD = """
@@ -351,6 +288,18 @@ class Wild(lw.Task):
 """
 
 
+@pytest.mark.parametrize("params, fault", [
+    ({"reward_size": math.inf}, "reward"), ({"chance": 0.01, "size": math.inf}, "observation"),
+])  # fmt: skip
+def test_a_reward_or_observation_that_is_not_finite_is_a_fault(
+    params: dict[str, float], fault: str, task_file: TaskFile
+) -> None:
+    npg = wild(task_file, params)
+    iterations = [next(npg) for _ in range(5)]
+    assert sum(it.faults for it in iterations) == npg.env.fault_counts[fault] > 0
+    assert all(math.isfinite(it.kl) and math.isfinite(it.value_error) for it in iterations)
+
+
 def wild(task_file: TaskFile, params: dict[str, float], **changes: object) -> lw.NPG:
     """NPG on a task whose observations or rewards are finite, but too large for float32."""
     env = lw.make(str(task_file("wild.py", WILD)), nworld=4, **params)
@@ -362,7 +311,7 @@ def mean_actions(policy: lw.GaussianPolicy) -> torch.Tensor:
     return policy(torch.linspace(-1.0, 1.0, 10).view(5, 2)).detach()
 
 
-def numbers(npg: lw.NPG) -> torch.Tensor:
+def parameters(npg: lw.NPG) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in (*npg.policy.parameters(), *npg.value.parameters())])
 
 
@@ -385,7 +334,7 @@ def test_updates_that_are_not_finite_are_left_out_and_counted(task_file: TaskFil
         assert torch.equal(mean_actions(npg.policy), before) == bool(spikes)
         skipped.append(it.skipped_updates)
     assert 0 in skipped and 2 in skipped
-    assert numbers(npg).isfinite().all()
+    assert parameters(npg).isfinite().all()
 
 
 def test_many_updates_in_a_row_that_are_not_finite_end_a_run(task_file: TaskFile, tmp_path: Path) -> None:
@@ -407,26 +356,13 @@ def test_many_updates_in_a_row_that_are_not_finite_end_a_run(task_file: TaskFile
 def test_a_value_function_that_became_not_finite_is_restored(task_file: TaskFile) -> None:
     npg = wild(task_file, {})
     next(npg)
-    good = numbers(npg)[-1].item()
+    good = parameters(npg)[-1].item()
     with torch.no_grad():
         npg.value.network[0].weight[0, 0] = math.nan
     it = next(npg)
     assert (it.skipped_updates, it.faults) == (1, 0) and it.kl > 0.01
-    assert numbers(npg).isfinite().all() and numbers(npg)[-1].item() == pytest.approx(good, rel=1e-3)
+    assert parameters(npg).isfinite().all() and parameters(npg)[-1].item() == pytest.approx(good, rel=1e-3)
     assert next(npg).skipped_updates == 0
-
-
-def test_a_checkpoint_whose_value_function_is_not_finite_continues_with_a_new_one(task_file: TaskFile) -> None:
-    """As earlier releases may have written it."""
-    npg = wild(task_file, {})
-    next(npg)
-    state = npg.state_dict()
-    state["value"]["network.2.bias"].fill_(math.nan)
-    state["optimizer"]["state"][0]["exp_avg"].fill_(math.nan)
-    resumed = wild(task_file, {})
-    resumed.load_state_dict(state)
-    assert [next(resumed).skipped_updates for _ in range(3)] == [1, 0, 0]
-    assert numbers(resumed).isfinite().all() and math.isfinite(next(resumed).explained_variance)
 
 
 def test_what_is_not_finite_is_named() -> None:
@@ -500,13 +436,9 @@ def test_written_out_and_parallel_iterations_equal_plain_ones(kl_limit: float, m
                 monkeypatch.setattr(DensePolicy, "of", lambda *args: None)
                 monkeypatch.setattr(DenseValue, "of", lambda *args: None)
                 npg._reads_numbers = False
-            assert (npg.dense_policy() is None) == plain
             it = next(npg)
-            numbers = torch.nn.utils.parameters_to_vector
-            learned.append((it.kl, it.step_fraction, numbers(npg.policy.parameters()), numbers(npg.value.parameters())))
+            learned.append((torch.tensor([it.kl, it.step_fraction]), parameters(npg)))
     finally:
         torch.set_num_threads(threads)
-    (kl, fraction, *networks), (other_kl, other_fraction, *others) = learned
-    assert kl == pytest.approx(other_kl, rel=1e-3) and fraction == pytest.approx(other_fraction, rel=1e-3)
-    for network, other in zip(networks, others, strict=True):
-        torch.testing.assert_close(network, other, rtol=1e-3, atol=1e-5)
+    for part, other in zip(*learned, strict=True):
+        torch.testing.assert_close(part, other, rtol=1e-3, atol=1e-5)

@@ -19,13 +19,11 @@ from lyceum_warp.algos.npg_statistics import (
     summary,
     value_statistics,
 )
-from lyceum_warp.algos.on_policy import (
+from lyceum_warp.algos.rollout_statistics import (
     EpisodeSums,
-    Moments,
     episode_statistics,
     finished,
     finished_metrics,
-    pooled,
 )
 
 NAMES = ("done", "episode_return", "episode_length", "reward", "eval", "success")
@@ -35,14 +33,27 @@ def floats(sums: EpisodeSums) -> EpisodeSums:
     return EpisodeSums(*(number.item() for number in sums))
 
 
-def test_episode_statistics_are_those_of_the_episodes_that_ended() -> None:
-    """In one rollout, and pooled from two parts of its worlds."""
-    env = lw.make("hopper", nworld=6)
-    rollout = lw.Rollout(env, 60)
+@pytest.fixture(scope="module")
+def rollout() -> lw.Rollout:
+    env = lw.make(Metered, nworld=6)
+    rollout = lw.Rollout(env, 150)
     rollout.running_return[0] = math.nan  # an episode that began in its middle does not count
     generator = torch.Generator().manual_seed(1)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, log_std=0.0, generator=generator)
     rollout.collect(policy, torch.randn(rollout.action.shape, generator=torch.Generator().manual_seed(0)))
+    return rollout
+
+
+def part_of(rollout: lw.Rollout, worlds: slice) -> Any:
+    """The samples of some worlds, as of one process."""
+    return SimpleNamespace(
+        **{name: getattr(rollout, name)[:, worlds] for name in NAMES},
+        episode_metrics={name: sums[:, worlds] for name, sums in rollout.episode_metrics.items()},
+    )
+
+
+def test_episode_statistics_are_those_of_the_episodes_that_ended(rollout: lw.Rollout) -> None:
+    """In one rollout, and pooled from two parts of its worlds."""
     ended = rollout.done & ~rollout.episode_return.isnan()
     assert 6 < ended.sum() < rollout.done.sum()
     returns = rollout.episode_return[ended].double()
@@ -54,10 +65,7 @@ def test_episode_statistics_are_those_of_the_episodes_that_ended() -> None:
     }  # fmt: skip
     expected = {name: tensor.item() for name, tensor in tensors.items()}
     assert episode_statistics([floats(finished(rollout))]) == pytest.approx(expected, rel=1e-5)
-    parts = [
-        floats(finished(SimpleNamespace(**{name: getattr(rollout, name)[:, part] for name in NAMES})))  # type: ignore[arg-type]
-        for part in (slice(0, 1), slice(1, None))
-    ]
+    parts = [floats(finished(part_of(rollout, worlds))) for worlds in (slice(0, 1), slice(1, None))]
     assert parts[0].episodes < parts[1].episodes
     assert episode_statistics(parts) == pytest.approx(expected, rel=1e-5)
 
@@ -78,46 +86,20 @@ def test_value_statistics_of_two_processes_equal_those_of_all_samples() -> None:
     )
 
 
-def test_pooled_moments_equal_those_of_all_numbers() -> None:
-    numbers = torch.randn(30, dtype=torch.float64)
-    parts = [
-        Moments(len(part), part.mean().item(), (part - part.mean()).square().sum().item())
-        for part in numbers.split([4, 20, 6])
-    ]
-    square = (numbers - numbers.mean()).square().sum().item()
-    assert pooled(parts) == pytest.approx(Moments(30, numbers.mean().item(), square))
-    assert pooled([Moments(0, 0.0, 0.0)]) == Moments(0, 0.0, 0.0)
-
-
-def test_metric_means_are_those_of_the_episodes_that_ended() -> None:
-    """In one rollout, and pooled from two parts of its worlds; nan where none ended."""
-    env = lw.make(Metered, nworld=6)
-    rollout = lw.Rollout(env, 150)
-    rollout.running_return[0] = math.nan  # an episode that began in its middle does not count
-    generator = torch.Generator().manual_seed(1)
-    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, log_std=0.0, generator=generator)
-    rollout.collect(policy, torch.randn(rollout.action.shape, generator=torch.Generator().manual_seed(0)))
+def test_metric_means_are_those_of_the_episodes_that_ended(rollout: lw.Rollout) -> None:
+    """In one rollout, and pooled from two parts of its worlds; nan if none ended."""
     ended = rollout.done & ~rollout.episode_return.isnan()
-    assert 6 < ended.sum() < rollout.done.sum()
     expected = {name: sums[ended].mean().item() for name, sums in rollout.episode_metrics.items()}
     assert list(expected) == ["forward", "effort"] and expected["effort"] > 0.1
-    returns = rollout.episode_return[ended].mean().item()
-    assert returns == pytest.approx(expected["forward"] - 0.1 * expected["effort"], abs=1e-5)
 
     def numbers(worlds: slice) -> ProcessNumbers:
-        part: Any = SimpleNamespace(
-            **{name: getattr(rollout, name)[:, worlds] for name in NAMES},
-            episode_metrics={name: sums[:, worlds] for name, sums in rollout.episode_metrics.items()},
-        )
+        part = part_of(rollout, worlds)
         sums = process(1.0, 0)._replace(episodes=finished(part), metrics=finished_metrics(part))
         return ProcessNumbers.unpack(sums.pack().tolist())
 
-    whole = summary([numbers(slice(None))], 10, list(expected))
-    assert whole["metrics"] == pytest.approx(expected, rel=1e-5)
     parts = [numbers(slice(0, 1)), numbers(slice(1, None))]
-    assert parts[0].episodes.episodes < parts[1].episodes.episodes
-    both = summary(parts, 10, list(expected))
-    assert both["metrics"] == pytest.approx(expected, rel=1e-5)
+    for processes in ([numbers(slice(None))], parts):
+        assert summary(processes, 10, list(expected))["metrics"] == pytest.approx(expected, rel=1e-5)
     none = [part._replace(episodes=EpisodeSums(*[0.0] * 9), metrics=(0.0, 0.0)) for part in parts]
     assert all(math.isnan(mean) for mean in summary(none, 10, list(expected))["metrics"].values())
 
@@ -158,15 +140,10 @@ def test_summary_sums_faults_and_outliers_and_sets_attributes_of_an_iteration() 
     assert both.keys() == {name for name in names if not name.startswith(("time_", "mean_"))}
 
 
-def test_help_describes_every_attribute_of_an_iteration() -> None:
-    assert all(f"    {field.name}: " in (NPGIteration.__doc__ or "") for field in dataclasses.fields(NPGIteration))
-
-
-def test_the_mean_reward_covers_all_samples_also_where_no_episode_ended() -> None:
+def test_the_mean_reward_covers_all_samples_also_if_no_episode_ended() -> None:
     env = lw.make("point_mass", nworld=4, horizon=1000)
     npg = lw.NPG(env, config=lw.NPGConfig(samples=40, rollout="segments", hidden=(4,), value_hidden=(4,)))
-    iteration = next(npg)
-    assert iteration.reward_mean == pytest.approx(npg.rollout.reward.mean().item())
+    assert next(npg).reward_mean == pytest.approx(npg.rollout.reward.mean().item())
 
 
 def test_a_task_without_a_success_has_no_share_of_successes() -> None:

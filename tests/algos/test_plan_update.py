@@ -79,13 +79,6 @@ def compare(one: lw.Planner, other: lw.Planner, calls: int = 4) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_elite_mean_of_a_user_gives_the_first_plan_of_cem(engine: str) -> None:
-    """Before CEM adapts its noise; noise of 1 is the same number before and after smoothing."""
-    own = lw.Planner(engine=engine, update=EliteMean(3), include_plan=False, **POINT)
-    compare(own, lw.CEM(engine=engine, elites=3, **POINT), calls=1)
-
-
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("more", [{}, {"knots": 3}, {"plants": 2, "iterations": 2}, {"graphs": False}])
 def test_cem_that_a_user_writes_in_torch_gives_the_plans_of_cem(more: dict[str, Any], engine: str) -> None:
     smoothing = lw.MPPIConfig(knots=more.get("knots")).noise_smoothing
@@ -125,9 +118,8 @@ def test_a_plan_stays_where_all_samples_of_a_users_update_fail() -> None:
 
 def test_planners_with_one_update_object_do_not_share_buffers() -> None:
     update = CrossEntropy(3, 0.05, (1.0, 0.0, 0.0))
-    one, other = (lw.Planner(update=update, smoothing=(1, 0, 0), **POINT) for _ in range(2))
+    compare(*(lw.Planner(update=update, smoothing=(1, 0, 0), **POINT) for _ in range(2)))
     assert vars(update).keys() == {"elites", "min_noise", "smoothing"}
-    compare(one, other)
 
 
 def test_settings_show_a_users_update_with_its_attributes() -> None:

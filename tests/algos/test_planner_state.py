@@ -25,10 +25,6 @@ def reset_state(task: str) -> tuple[torch.Tensor, dict[str, slice]]:
     return plant.get_state()[0], dict(plant.state_space.parts)
 
 
-def test_state_of_without_parts_is_the_fixed_reset(reach: lw.MPPI) -> None:
-    assert torch.equal(reach.state_of(), reset_state("reach")[0])
-
-
 def test_state_of_sets_the_given_parts_and_keeps_the_rest(reach: lw.MPPI) -> None:
     qpos = np.linspace(-0.5, -0.1, 7)
     state = reach.state_of(qpos=qpos, qvel=[0.1] * 7, time=0.3, mocap_pos=torch.tensor([[0.1, 0.2, 0.3]]), step=15)

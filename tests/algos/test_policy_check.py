@@ -56,12 +56,6 @@ def frozen(module: nn.Module) -> nn.Module:
     return module.requires_grad_(False)
 
 
-def with_log_std(value: torch.Tensor | None) -> lw.GaussianPolicy:
-    policy = lw.GaussianPolicy(6, 2)
-    policy.log_std = None if value is None else nn.Parameter(value)
-    return policy
-
-
 @pytest.mark.parametrize(
     ("network", "message"),
     [
@@ -72,10 +66,8 @@ def with_log_std(value: torch.Tensor | None) -> lw.GaussianPolicy:
         (Net(lambda mean: mean.detach()), "depend on no parameter: leave out detach"),
         (Net(lambda mean: mean + torch.ones(3)), r"fails for observations of shape \(4, 6\) \(RuntimeError: The size"),
         (Net(Once.apply), r"cannot be differentiated twice, which NPG needs .*\): use other layers"),
-        (nn.Linear(5, 2), r"fails for observations of shape \(4, 6\) \(RuntimeError: mat1 and mat2"),
         (frozen(Net()), r"no parameter to learn: unfreeze it with policy.requires_grad_\(True\)"),
-        (nn.Flatten(), "no parameter to learn"),
-        (Net().double(), "parameter 'network.first.weight' must be float32, not a float64 tensor"),
+        (Net().double(), r"fails for observations of shape \(4, 6\) \(RuntimeError: .*dtype"),
         (Unused(), "do not depend on its parameter 'network.spare.weight': use it"),
         (Counting(), "two different mean actions for the same observations"),
         (nn.Sequential(nn.Linear(6, 2), nn.Dropout(0.5)), "two different mean actions .*dropout"),
@@ -98,11 +90,7 @@ def test_npg_refuses_a_network_in_one_line(shared_env: SharedEnv, network: nn.Mo
     ("policy", "message"),
     [
         (Net(), r"policy must be a GaussianPolicy, not Net: lw.GaussianPolicy\(nobs, nact, network=net\) makes one"),
-        (lw.GaussianPolicy, "policy must be a GaussianPolicy, not GaussianPolicy"),
-        ("policy.pt", "policy must be a GaussianPolicy, not str"),
         (lw.GaussianPolicy(5, 2), "takes 5 observations and gives 2 actions, but the task 'point_mass' has 6 and 2"),
-        (with_log_std(None), r"log_std must be an nn.Parameter of shape \(2,\), not NoneType None"),
-        (with_log_std(torch.full((2,), torch.nan)), "parameter 'log_std' is not finite: initialise it"),
     ],
 )
 def test_npg_refuses_a_policy_in_one_line(shared_env: SharedEnv, policy: object, message: str) -> None:
@@ -126,13 +114,12 @@ def test_the_check_accepts_usual_layers_and_changes_nothing(shared_env: SharedEn
     assert all(parameter.grad is None for parameter in policy.parameters())
 
 
-@pytest.mark.parametrize("normalize", [False, True])
-def test_npg_learns_a_network_of_the_users_own_as_its_own(normalize: bool) -> None:
-    config = lw.NPGConfig(samples=200, hidden=(8,), normalize=normalize)
+def test_npg_learns_a_network_of_the_users_own_as_its_own() -> None:
+    config = lw.NPGConfig(samples=200, hidden=(8,))
     own = mlp([6, 8, 2], last_scale=1e-2, generator=torch.Generator().manual_seed(3))
     policies = (
-        lw.GaussianPolicy(6, 2, network=own, normalize=normalize),
-        lw.GaussianPolicy(6, 2, (8,), normalize=normalize, generator=torch.Generator().manual_seed(3)),
+        lw.GaussianPolicy(6, 2, network=own, normalize=True),
+        lw.GaussianPolicy(6, 2, (8,), normalize=True, generator=torch.Generator().manual_seed(3)),
     )
     iterations = []
     for policy in policies:

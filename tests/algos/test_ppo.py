@@ -241,13 +241,7 @@ def test_a_run_has_the_files_of_every_run_and_continues(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("words, message", [
     ({"num_steps": 0}, "num_steps must be a whole number from 1 "),
-    ({"gamma": 1.5}, "gamma must be a finite number from 0 to 1, not 1.5"),
-    ({"learning_rate": float("nan")}, "learning_rate must be a finite number"),
-    ({"hidden": (8, 0)}, "hidden must be the widths of the hidden layers"),
-    ({"activation": "sine"}, "activation must be one of 'tanh'"),
     ({"schedule": "linear"}, "schedule must be 'adaptive' or 'fixed', not 'linear'"),
-    ({"std_type": "none"}, "std_type must be 'scalar' or 'log', not 'none'"),
-    ({"normalize": 1}, "normalize must be True or False, not 1"),
     ({"final_entropy_coef": -1.0}, "final_entropy_coef must be a finite number of at least 0, not -1.0"),
     ({"entropy_decay": 7}, r"entropy_decay must be two numbers of iterations, as in \(150, 200\), not 7"),
     ({"entropy_decay": (5, 5)}, r"entropy_decay must end after it begins, not \(5, 5\)"),
@@ -261,12 +255,8 @@ def test_hyperparameters_that_are_not_valid_are_refused(words: dict[str, Any], m
 def test_arguments_that_do_not_fit_are_refused(env: lw.Env) -> None:
     with pytest.raises(ValueError, match="200 mini-batches are more than the 48 samples: give more worlds, or make"):
         made(env, minibatches=200)
-    with pytest.raises(ValueError, match="'metered' has no group 'actor' of observations .* it has policy, critic"):
+    with pytest.raises(ValueError, match="'metered' has no group 'actor' of observations: it has policy, critic"):
         made(env, value_group="actor")
-    with pytest.raises(ValueError, match="policy takes 2 observations and gives 1 actions, but the task 'metered' has"):
-        lw.PPO(env, lw.GaussianPolicy(2, 1))
-    with pytest.raises(ValueError, match="the value function takes 2 observations, but the group 'policy' .* has 1"):
-        lw.PPO(env, value=lw.ValueFunction(2))
     with pytest.raises(ValueError, match="seed must be a whole number from 0 to 2147483647, not -1"):
         made(env, seed=-1)
 

@@ -9,59 +9,38 @@ from metered_task import Metered
 import lyceum_warp as lw
 
 
-def test_collect_stores_inputs_and_results_of_each_step() -> None:
-    """The same with graphs, which are captured in the second step, and without."""
-    stored = []
-    for graphs in (True, False):
-        env, plain = (
-            lw.make("point_mass", nworld=3, horizon=4, seed=2, **options) for options in ({"graphs": graphs}, {})
-        )
-        rollout = lw.Rollout(env, 6)
-        generator = torch.Generator().manual_seed(0)
-        policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, generator=generator)
-        noise = torch.randn(rollout.action.shape, generator=generator)
-        rollout.collect(policy, noise)
-        for t in range(6):
-            assert torch.equal(rollout.obs[t], plain.obs) and torch.equal(rollout.step[t], plain.episode_step.float())
-            policy.sample(plain.obs, noise[t], out=plain.action)
-            assert torch.equal(rollout.action[t], plain.action)
-            plain.step()
-            for name in ("final_obs", "reward", "eval", "terminated", "done", "success"):
-                assert torch.equal(getattr(rollout, name)[t], getattr(plain, name))
-        assert rollout.episode_length[:, 0].tolist() == [1, 2, 3, 4, 1, 2]
-        torch.testing.assert_close(rollout.episode_return[3], rollout.reward[:4].sum(0))
-        torch.testing.assert_close(rollout.running_return, rollout.reward[4:].sum(0))
-        stored.append(rollout.obs)
-    assert torch.equal(*stored)
-
-
-def test_collect_stores_groups_and_metrics_of_each_step() -> None:
-    """The same with graphs and without; groups that are not asked for are not stored."""
-    for graphs in (True, False):
-        env, plain = (lw.make(Metered, nworld=3, horizon=4, graphs=g) for g in (graphs, True))
-        rollout = lw.Rollout(env, 6, groups=("critic",))
-        policy = lw.GaussianPolicy(1, 1, generator=torch.Generator().manual_seed(0))
-        noise = torch.randn(rollout.action.shape, generator=torch.Generator().manual_seed(0))
-        rollout.collect(policy, noise)
-        assert list(rollout.obs_groups) == list(rollout.final_obs_groups) == ["policy", "critic"]
-        assert rollout.obs_groups["policy"] is rollout.obs
-        assert rollout.final_obs_groups["critic"].shape == (6, 3, 2)
-        for t in range(6):
-            for name, obs in plain.obs_groups.items():
-                assert torch.equal(rollout.obs_groups[name][t], obs)
-            plain.step(rollout.action[t])
-            for name, obs in plain.final_obs_groups.items():
-                assert torch.equal(rollout.final_obs_groups[name][t], obs)
-            for name, sums in plain.episode_metrics.items():
-                assert torch.equal(rollout.episode_metrics[name][t], sums)
-        effort = rollout.action.square().sum(-1)
-        torch.testing.assert_close(rollout.episode_metrics["effort"][3], effort[:4].sum(0))
-        torch.testing.assert_close(rollout.episode_metrics["effort"][5], effort[4:].sum(0))
-    assert list(lw.Rollout(env, 2).obs_groups) == ["policy"]
+@pytest.mark.parametrize("graphs", [True, False])  # graphs are captured in the second step
+def test_collect_stores_inputs_and_results_of_each_step(graphs: bool) -> None:
+    """Groups that are not asked for are not stored."""
+    env, plain = (lw.make(Metered, nworld=3, horizon=4, seed=2, graphs=g) for g in (graphs, True))
+    rollout = lw.Rollout(env, 6, groups=("critic",))
+    policy = lw.GaussianPolicy(1, 1, generator=torch.Generator().manual_seed(0))
+    noise = torch.randn(rollout.action.shape, generator=torch.Generator().manual_seed(0))
+    rollout.collect(policy, noise)
+    assert list(rollout.obs_groups) == list(rollout.final_obs_groups) == ["policy", "critic"]
+    assert rollout.obs_groups["policy"] is rollout.obs and list(lw.Rollout(env, 2).obs_groups) == ["policy"]
+    assert rollout.final_obs_groups["critic"].shape == (6, 3, 2)
+    for t in range(6):
+        assert torch.equal(rollout.step[t], plain.episode_step.float())
+        for name, obs in plain.obs_groups.items():
+            assert torch.equal(rollout.obs_groups[name][t], obs)
+        policy.sample(plain.obs, noise[t], out=plain.action)
+        assert torch.equal(rollout.action[t], plain.action)
+        plain.step()
+        for name in ("final_obs", "reward", "eval", "terminated", "done", "success"):
+            assert torch.equal(getattr(rollout, name)[t], getattr(plain, name))
+        for name, obs in plain.final_obs_groups.items():
+            assert torch.equal(rollout.final_obs_groups[name][t], obs)
+        for name, sums in plain.episode_metrics.items():
+            assert torch.equal(rollout.episode_metrics[name][t], sums)
+    assert rollout.episode_length[:, 0].tolist() == [1, 2, 3, 4, 1, 2]
+    torch.testing.assert_close(rollout.episode_return[3], rollout.reward[:4].sum(0))
+    torch.testing.assert_close(rollout.running_return, rollout.reward[4:].sum(0))
+    torch.testing.assert_close(rollout.episode_metrics["effort"][5], rollout.action.square().sum(-1)[4:].sum(0))
 
 
 def test_an_unknown_group_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"'metered' has no group 'actor' of observations: it has \['policy', 'crit"):
+    with pytest.raises(ValueError, match=r"'metered' has no group 'actor' of observations: it has policy, critic"):
         lw.Rollout(lw.make(Metered), 2, groups=("actor",))
 
 

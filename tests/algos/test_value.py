@@ -19,9 +19,9 @@ def test_a_value_function_has_the_discount_of_the_returns_that_it_was_fitted_to(
     run = Run.create(tmp_path, {}, device="cpu")
     run.save(policy_content(0, npg.policy, value), {})
     assert lw.load_value(run).discount == 0.9
-    content = torch.load(run.checkpoint)
+    content = torch.load(run.policy)
     del content["value"]["shape"]["discount"]  # as older releases saved it
-    torch.save(content, run.checkpoint)
+    torch.save(content, run.policy)
     assert lw.load_value(run).discount is None
 
 

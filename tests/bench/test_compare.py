@@ -1,6 +1,5 @@
 """The comparison of two checkouts: with itself there is no difference, and a changed line is found where it counts."""
 
-import importlib.util
 import json
 import os
 import shutil
@@ -8,23 +7,14 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
+import compare
 import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = ROOT / "bench" / "compare.py"
-
-
-@pytest.fixture(scope="module")
-def compare() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("compare", PROGRAM)
-    assert spec is not None and spec.loader is not None
-    module = sys.modules["compare"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def copied(folder: Path, changes: dict[str, tuple[str, str]]) -> Path:
@@ -42,7 +32,7 @@ QUICK: dict[str, Any] = {"engines": ("mujoco",), "parts": ("env",), "steps": 3}
 
 
 @pytest.fixture(scope="module")
-def report(compare: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The report on a copy in which a task ends the process, another one raises an error, and point_mass has another
     reward."""
     changes = {
@@ -86,22 +76,20 @@ def test_a_failure_of_one_checkout_is_reported(task: str, text: str, report: dic
     assert (failure["kind"], failure["text"]) == ("failure", f"new failed: {text}")
 
 
-def test_a_working_tree_equals_itself(compare: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_working_tree_equals_itself(capsys: pytest.CaptureFixture[str]) -> None:
     options = compare.Options(str(ROOT), tasks=("point_mass",), **(QUICK | {"parts": ("env", "plans")}))
     assert compare.run(options) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1].startswith("no difference: ") and " arrays in 2 units" in lines[-1]
 
 
-def test_a_package_that_cannot_be_imported_is_reported(
-    compare: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    copy = copied(tmp_path, {"__init__.py": ("import warp as _wp\n", "raise RuntimeError('no package')\n")})
+def test_a_package_that_cannot_be_imported_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    copy = copied(tmp_path, {"__init__.py": ("import importlib\n", "raise RuntimeError('no package')\n")})
     assert compare.run(compare.Options(str(ROOT), str(copy), tasks=("point_mass",), **QUICK)) == 1
     assert "    package: new failed: RuntimeError: no package" in capsys.readouterr().out.splitlines()
 
 
-def test_a_name_of_neither_folder_nor_revision_is_refused(compare: ModuleType) -> None:
+def test_a_name_of_neither_folder_nor_revision_is_refused() -> None:
     with pytest.raises(ValueError, match="'no_such_revision' is neither a folder with lyceum_warp/ nor a revision"):
         compare.run(compare.Options("no_such_revision", str(ROOT)))
 
@@ -122,21 +110,21 @@ OTHER_NAN = np.array([0x7FC00001], np.uint32).view(np.float32)[0]
     ],
 )
 def test_numbers_differ_in_any_bit(
-    compare: ModuleType, old: list, new: list, first: dict[str, int], largest: float | None, count: int
+    old: list, new: list, first: dict[str, int], largest: float | None, count: int
 ) -> None:
     found = compare.difference("a", np.array(old, np.float32), np.array(new, np.float32), ["step"])
     assert (found.kind, found.first, found.largest, found.count) == ("numbers", first, largest, count)
     assert compare.difference("a", np.array(old, np.float32), np.array(old, np.float32)) is None
 
 
-def test_form_and_text_are_compared(compare: ModuleType) -> None:
+def test_form_and_text_are_compared() -> None:
     assert compare.difference("a", np.zeros(2), np.zeros(3)).text == "float64 (2,) -> float64 (3,)"
     assert compare.difference("a", np.zeros(2), np.zeros(2, np.float32)).kind == "form"
     assert compare.difference("a", np.array("ab"), np.array("abc")).text == "ab -> abc"
     assert compare.difference("a", np.array("ab"), np.array("ab")) is None
 
 
-def test_names_of_one_checkout_alone_are_added_or_removed(compare: ModuleType) -> None:
+def test_names_of_one_checkout_alone_are_added_or_removed() -> None:
     zero = np.zeros(1)
     found = compare.differences("u", {"both": zero, "gone": zero}, {"new": zero, "both": zero}, {})
     assert [(each.name, each.kind) for each in found] == [("u/gone", "removed"), ("u/new", "added")]
@@ -158,7 +146,7 @@ class Saved:
         return {"whole/return": np.array([1.0, 2.0]), "resumed/return": np.array([1.0, 3.0])}
 
 
-def test_a_resumed_run_that_differs_is_reported_in_both_checkouts(compare: ModuleType) -> None:
+def test_a_resumed_run_that_differs_is_reported_in_both_checkouts() -> None:
     report = compare.Report(())
     unit = compare.Unit("commands", "point_mass", "mujoco", {})
     compare.compare_unit(unit, [Saved("old"), Saved("new")], "cpu", report)

@@ -1,25 +1,18 @@
-"""What the experiments share."""
+"""Test the runner of experiments."""
 
-import copy
 import dataclasses
 import json
+import os
 import sys
-import time
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
+import experiment
+import plot
 import pytest
-
-BENCH = Path(__file__).parents[2] / "bench"
-
-
-@pytest.fixture
-def experiment(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(BENCH))
-    import experiment
-
-    return experiment
+import tables
+import venvs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +26,7 @@ RATES = {"ours": 3.0, "theirs": 2.0}
 
 
 @pytest.fixture
-def toy(experiment: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Any:
+def toy(monkeypatch: pytest.MonkeyPatch) -> Any:
     """An experiment whose measurements are known; ``toy.measured`` lists what was measured."""
     measured: list[Case] = []
 
@@ -80,7 +73,7 @@ def test_results_carry_their_case_and_provenance(toy: Any, tmp_path: Path, capsy
     assert rows[0]["case"] == {"task": "hop", "repeat": 0, "contestant": "ours"} and rows[0]["result"] == {"rate": 3.0}
     assert {"cpu", "cores", "mujoco", "python", "date"} <= rows[0]["provenance"].keys() and len(rows) == 8
     out = capsys.readouterr().out
-    assert out.startswith("toy: 0 of 12 cases are there; the rest takes about 12 min\n")
+    assert out.startswith("toy: 0 of 12 cases are stored; the rest takes about 12 min\n")
     assert out.count("a_missing_peer is not installed: pip install a-missing-peer==1.0") == 1
     assert "| ours | 1.50 (1.50 to 1.50) |\n| theirs | 1.00 (1.00 to 1.00) |" in out
 
@@ -91,19 +84,19 @@ def test_stopped_run_continues_without_measuring_again(
     path = tmp_path / "toy.jsonl"
     assert toy.main("--out", path, "--contestants", "ours", "--seeds", 13) == 130
     assert "stopped; the same command continues" in capsys.readouterr().err
-    path.write_bytes(path.read_bytes()[:-9])  # the second line was torn off
+    path.write_bytes(path.read_bytes()[:-9])  # as a stop leaves it
     toy.measured.clear()
     assert toy.main("--out", path, "--contestants", "ours") == 0
     assert [(case.task, case.repeat) for case in toy.measured] == [("hop", 1), ("walk", 0), ("walk", 1)]
     captured = capsys.readouterr()
-    assert "1 of 4 cases are there" in captured.out and "line 2 was torn off" in captured.err
+    assert "1 of 4 cases are stored" in captured.out and "line 2 is incomplete" in captured.err
     assert len(lines(path)) == 4
     toy.measured.clear()
     assert toy.main("--out", path, "--contestants", "ours") == 0 and not toy.measured
 
 
 def test_results_of_other_machines_and_versions_do_not_count(
-    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], experiment: ModuleType
+    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, options = tmp_path / "toy.jsonl", ("--contestants", "ours", "--tasks", "hop", "--repeats", 1)
     toy.main("--out", path, *options)
@@ -114,30 +107,8 @@ def test_results_of_other_machines_and_versions_do_not_count(
         toy.measured.clear()
         toy.main("--out", path, *options)
         assert len(toy.measured) == 1
-        rows = experiment.read(path)
-        assert [len(same) for same in experiment.by_machine(rows).values()] == [1] * len(
-            {r.provenance["cores"] for r in rows}
-        )
+        assert [len(same) for same in experiment.by_machine(experiment.read(path)).values()] == [1, 1]
         row = lines(path)[-1]
-
-
-def test_a_missing_peer_separates_no_results(toy: Any, tmp_path: Path, experiment: ModuleType) -> None:
-    path, options = tmp_path / "toy.jsonl", ("--contestants", "ours", "--tasks", "hop", "--repeats", 1)
-    toy.main("--out", path, *options)
-    row = lines(path)[0]
-    for installed, kept in (({}, 2), ({"other": "2"}, 2), ({"peer": "1", "other": "2"}, 2), ({"peer": "2"}, 1)):
-        first, second = copy.deepcopy(row), copy.deepcopy(row)
-        first["provenance"]["peers"], second["provenance"]["peers"] = {"peer": "1"}, installed
-        second["case"]["repeat"] = 1
-        path.write_text("".join(json.dumps(line) + "\n" for line in (first, second)))
-        (same,) = experiment.by_machine(experiment.read(path)).values()
-        assert len(same) == kept
-    numbered = [copy.deepcopy(row) for _ in range(3)]
-    for number, (line, installed) in enumerate(zip(numbered, ({"peer": "1"}, {"peer": "2"}, {}), strict=True)):
-        line["provenance"]["peers"], line["case"]["repeat"] = installed, number
-    path.write_text("".join(json.dumps(line) + "\n" for line in numbered))
-    (same,) = experiment.by_machine(experiment.read(path)).values()
-    assert [found.case["repeat"] for found in same] == [1, 2]
 
 
 def test_failing_case_leaves_the_others(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -154,68 +125,116 @@ def test_dry_run_prints_cases_and_measures_nothing(
     assert not toy.measured and not (tmp_path / "toy.jsonl").exists()
 
 
-def test_bad_input_gets_one_line(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert toy.main("--tasks", "hopp") == 2
-    assert capsys.readouterr().err == "toy: there is no task 'hopp': did you mean hop?\n"
+def test_a_file_without_results_is_refused(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "toy.jsonl").write_text("{}\n")
     assert toy.main("--out", tmp_path / "toy.jsonl") == 2
     assert capsys.readouterr().err.endswith("toy.jsonl: line 1 is not a result of an experiment\n")
 
 
-def test_figures_and_tables_come_from_results_alone(
-    toy: Any, tmp_path: Path, experiment: ModuleType, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("name", "words", "message"),
+    [
+        ("throughput", "--tasks hoper", "there is no task 'hoper': did you mean hopper?"),
+        ("throughput", "--contestants gym", "there is no contestant 'gym': there are native, c, warp, "),
+        ("throughput", "--parts one", "there is no part 'one': there are sampling, single, cores, worlds, kept"),
+        ("throughput", "--device cuda:99", "there is no GPU for --device cuda:99"),
+        ("mppi", "--jobs 2", "plans and a GPU are timed alone: give --jobs 1, or --parts episodes"),
+        ("mppi", "--block 0", "episodes, block and repeats must be at least 1"),
+        ("npg", "--contestants npg_gpu", "npg_gpu needs a GPU: give --device cuda"),
+        ("npg", "--jobs 1000", "1000 jobs with 2 threads need 2000 cores"),
+        ("fidelity", "--nworld 0", "--nworld"),
+    ],
+)
+def test_bad_input_of_an_experiment_gets_one_line(
+    name: str, words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import plot
-    import tables
+    options = ["--short", "--out", str(tmp_path / "out.jsonl"), *words.split()]
+    assert experiment.main(experiment.load(name), options) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"{name}: ") and message in error and error.count("\n") == 1
 
+
+def test_figures_and_tables_come_from_results_alone(
+    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     toy.main("--out", tmp_path / "toy.jsonl")
     toy.measured.clear()
     assert plot.main(plot.Options(("toy",), tmp_path)) == 0
-    drawn = {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.*")}
-    assert plot.main(plot.Options(("toy",), tmp_path)) == 0
-    assert drawn == {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.*")}
-    assert sorted(path.suffix for path in tmp_path.glob("toy-*-cores.*")) == [".png", ".svg"]
-    document = tmp_path / "README.md"
-    document.write_text("# Before\n\n<!-- table toy -->\nold\n<!-- end -->\n\nAfter\n")
-    for _ in range(2):  # the second run replaces the tables of the first
-        assert tables.main(tables.Options(("toy",), tmp_path, document)) == 0
-        text = document.read_text()
-        assert text.startswith("# Before\n\n<!-- table toy -->\n") and text.endswith("\n<!-- end -->\n\nAfter\n")
-        assert "old" not in text and text.count("| ours | 1.50 (1.50 to 1.50) |") == 1
+    drawn = {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.png")}
+    assert len(drawn) == 1
+    for _ in range(2):  # the second run replaces the page of the first
+        assert plot.main(plot.Options(("toy",), tmp_path)) == tables.main(tables.Options((), tmp_path)) == 0
+        text = (tmp_path / "toy.md").read_text()
+        assert text.startswith("# toy\n") and text.count("| ours | 1.50 (1.50 to 1.50) |") == 1
+    assert drawn == {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.png")}
     assert not toy.measured
     with pytest.raises(FileNotFoundError, match="run an experiment first"):
         plot.main(plot.Options((), tmp_path / "empty"))
-    document.write_text("no place")
-    with pytest.raises(ValueError, match="add <!-- table toy --> and <!-- end -->"):
-        tables.main(tables.Options(("toy",), tmp_path, document))
 
 
 def test_peer_has_an_environment_of_its_own(
-    experiment: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import peers
-
-    monkeypatch.setattr(peers, "FOLDER", tmp_path)
+    monkeypatch.setattr(venvs, "FOLDER", tmp_path)
     monkeypatch.setenv("LYCEUM_WARP_PEERS", str(tmp_path / "cache"))
     (tmp_path / "echo").mkdir()
     (tmp_path / "echo" / "requirements.txt").write_text("")
-    worker = "import json, sys\nprint('noise')\nprint(json.dumps({'prefix': sys.prefix} | json.load(sys.stdin)))\n"
-    (tmp_path / "echo" / "worker.py").write_text(worker)
-    answer = peers.peer("echo").run(samples=3)
+    worker = tmp_path / "worker.py"
+    worker.write_text(
+        "import json, sys\nprint('noise')\nprint(json.dumps({'prefix': sys.prefix} | json.load(sys.stdin)))\n"
+    )
+    python = venvs.python_of("echo")
+    answer = venvs.run(python, worker, samples=3)
     assert answer["samples"] == 3 and Path(answer["prefix"]).parent == tmp_path / "cache"
-    began = time.perf_counter()
-    peers.peer.cache_clear()
-    peers._failure.cache_clear()
-    assert peers.peer("echo") and time.perf_counter() - began < 1.0  # it is there
-    (tmp_path / "echo" / "worker.py").write_text("raise ValueError('no')")
+    venvs._made.cache_clear()
+    assert venvs.python_of("echo") == python
+    assert capsys.readouterr().out.count("making a virtual environment for echo") == 1
+    worker.write_text("raise ValueError('no')")
     with pytest.raises(RuntimeError, match="ValueError: no"):
-        peers.peer("echo").run()
-    (tmp_path / "echo" / "worker.py").write_text("import a_missing_package")
-    with pytest.raises(experiment.Skipped, match="echo needs the package a_missing_package"):
-        peers.peer("echo").run()
+        venvs.run(python, worker)
+    worker.write_text("import a_missing_package")
+    with pytest.raises(experiment.Skipped, match="worker.py needs the package a_missing_package"):
+        venvs.run(python, worker)
     (tmp_path / "lost").mkdir()
     (tmp_path / "lost" / "requirements.txt").write_text(f"{tmp_path}/no_package.whl\n")
     for _ in range(2):
         with pytest.raises(experiment.Skipped, match="lost cannot be installed: .*no_package"):
-            peers.peer("lost")
+            venvs.python_of("lost")
     assert capsys.readouterr().out.count("making a virtual environment for lost") == 1
+
+
+TOY = """
+import dataclasses
+import os
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    number: int
+
+
+def measure(case, options):
+    if case.number == 2:
+        raise RuntimeError("it broke")
+    return {"cores": sorted(os.sched_getaffinity(0)), "process": os.getpid()}
+"""
+
+
+def test_cases_apart_are_processes_on_cores_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "apart_toy.py").write_text(TOY)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    import apart_toy
+
+    made = experiment.Experiment(
+        "toy", "A toy.", lambda options: [apart_toy.Case(i) for i in range(3)], lambda case: 60.0, apart_toy.measure,
+        lambda rows: [], None, apart=True,
+    )  # fmt: skip
+    out, before = tmp_path / "toy.jsonl", os.sched_getaffinity(0)
+    jobs = min(2, len(before))
+    assert experiment.main(made, ["--out", str(out), "--threads", "1", "--jobs", str(jobs)]) == 1
+    assert "RuntimeError: it broke" in capsys.readouterr().err and os.sched_getaffinity(0) == before
+    results = [found.result for found in experiment.read(out)]
+    assert len(results) == 2 and len({result["process"] for result in results} | {os.getpid()}) == 3
+    assert all(len(result["cores"]) == 1 for result in results)

@@ -150,7 +150,7 @@ def uses_rows(s: Uses, p: Params):
     row_of(s)[0] = 1.0
     a, _b = s.unpacked, 1.0
     a[0] = 1.0
-    c = s.chosen if p.gain > 0.0 else s.chosen
+    c = s.chosen if p.gain > 0.0 else s.chosen  # noqa: RUF034
     c[0] = 1.0
     wp.where(p.gain > 0.0, s.by_where, s.by_where)[0] = 1.0
     row = s.before

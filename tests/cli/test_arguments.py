@@ -1,7 +1,6 @@
 """Flags made from options, and values as NAME=VALUE."""
 
 import dataclasses
-from pathlib import Path
 from typing import Annotated
 
 import pytest
@@ -46,12 +45,6 @@ def test_a_parameter_written_in_another_way_is_refused(text: str, message: str) 
         parameter(text)
 
 
-def test_a_file_with_a_table_gets_its_whole_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    name, path = parameter("motion=here/walk.npy")
-    assert (name, path) == ("motion", str(tmp_path / "here/walk.npy"))
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Options:
     size: int = 3
@@ -77,28 +70,6 @@ def test_flags_are_the_fields_of_the_options_and_none_unless_given() -> None:
     argv = ["--size", "5", "--name", "a", "--fast", "--no-safe", "--limits", "1", "--limits", "2"]
     found = tyro.cli(Flags, args=argv)
     assert given(found) == {"size": 5, "name": "a", "fast": True, "safe": False, "limits": ("1", "2")}
-
-
-@optional_flags(Options, omit=["limits"])
-class FlagsWithDefaults:
-    pass
-
-
-@optional_flags(Options)
-class MoreFlags(FlagsWithDefaults):
-    pass
-
-
-def test_flags_without_a_text_for_their_default_have_those_of_the_options(capsys: pytest.CaptureFixture[str]) -> None:
-    assert vars(FlagsWithDefaults()) == {"size": 3, "name": None, "fast": False, "safe": True}
-    assert tyro.cli(FlagsWithDefaults, args=["--size", "4", "--name", "a"]) == dataclasses.replace(
-        FlagsWithDefaults(), size=4, name="a"  # type: ignore[call-arg]
-    )  # fmt: skip
-    with pytest.raises(SystemExit):
-        tyro.cli(FlagsWithDefaults, args=["--help"])
-    out = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "--size INT Size of it, in metres. (default: 3)" in out and "(default: None)" not in out
-    assert vars(MoreFlags()) == vars(FlagsWithDefaults()) | {"limits": (1.0,)}
 
 
 def test_help_texts_of_flags_are_the_docstrings_of_the_options(capsys: pytest.CaptureFixture[str]) -> None:

@@ -58,8 +58,3 @@ def test_a_broken_rule_is_named_and_the_exit_code_is_1(task_file: TaskFile, caps
     assert cli.main(["check", str(task_file("alike.py", ALIKE)), "--rule", "spaces", "--rule", "rand_reset"]) == 1
     out = capsys.readouterr().out
     assert out == "alike on the mujoco engine breaks the rule 'rand_reset': two consecutive draws are the same\n"
-
-
-def test_a_wrong_number_of_worlds_is_refused_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["check", "point_mass", "--nworld", "1"]) == 2
-    refused(capsys, "nworld must be at least 2")

@@ -32,22 +32,22 @@ def first(npg: lw.NPG) -> lw.Iteration:
 def shown_on(console: Console, npg: lw.NPG, total: int = 10) -> Iterator[display.Display]:
     """The display of a run, after its first line."""
     shown = display.Display(console)
-    shown.begin(Run(Path("run"), {}), npg, total)
-    console.file.truncate(0)
-    console.file.seek(0)
-    yield shown
-    shown.end()
+    with shown.training(Run(Path("run"), {}), npg, total):
+        console.file.truncate(0)
+        console.file.seek(0)
+        yield shown
 
 
 def test_the_first_line_names_the_task_the_worlds_the_algorithm_and_the_folder(npg: lw.NPG) -> None:
     console = Console(file=io.StringIO(), width=120, highlight=False)
-    display.Display(console).begin(Run(Path("run"), {}), npg, 10)
+    with display.Display(console).training(Run(Path("run"), {}), npg, 10):
+        pass
     expected = "half_cheetah: 17 observations, 6 actions; 4 worlds, mujoco engine on cpu, npg; run in run\n"
     assert console.file.getvalue() == expected
 
 
 def line(npg: lw.NPG, iteration: lw.Iteration, **changes: object) -> str:
-    """What is shown of an iteration where there is no terminal."""
+    """The line of an iteration without a terminal."""
     console = Console(file=io.StringIO(), width=120, highlight=False)
     with shown_on(console, npg) as shown:
         shown(dataclasses.replace(iteration, samples_per_second=29_412.0, **changes))
@@ -87,13 +87,13 @@ def table(rows: list[dict[str, float | None]]) -> str:
 
 
 def test_the_table_of_a_run_has_at_most_15_rows_with_evaluations_first() -> None:
-    rows = [{"iteration": float(i), "mean_return": None} for i in range(1, 101)]
-    shown = display._spread(rows)
-    assert len(shown) == 15
-    assert (shown[0], shown[-1]) == (rows[0], rows[-1])
+    rows: list[dict[str, float | None]] = [{"iteration": float(i), "mean_return": None} for i in range(1, 101)]
+    shown = [int(line) for line in table(rows).split()[2:]]
+    assert len(shown) == 15 and (shown[0], shown[-1]) == (1, 100)
     for i in range(9, 100, 10):
         rows[i]["mean_return"] = 1.0
-    assert [row["iteration"] for row in display._spread(rows)] == [1, *range(10, 101, 10)]
+    lines = [line.split() for line in table(rows).splitlines()]
+    assert [line[0] for line in lines if line and line[0].isdigit()] == list(map(str, [1, *range(10, 101, 10)]))
 
 
 def test_the_table_leaves_out_what_the_task_does_not_have(first: lw.Iteration) -> None:
@@ -110,19 +110,3 @@ def test_the_table_counts_faults_and_outliers_of_all_iterations(first: lw.Iterat
     row = first.row() | {"faults": 1.0, "outliers": 3.0}
     assert "2 faults and 6 outliers in all 2 iterations" in " ".join(table([row, row]).split())
     assert "fault" not in table([first.row(), {"iteration": 2.0}])  # a row of an earlier release
-
-
-def test_other_work_is_shown_between_iterations(npg: lw.NPG) -> None:
-    console = Console(file=io.StringIO(), width=120, highlight=False)
-    with shown_on(console, npg) as shown:
-        shown.work("drawing the video", "frames", 1, 80)
-        assert shown.other is not None
-        shown.other.start -= 4.0
-        for done in (20, 30, 80):
-            shown.work("drawing the video", "frames", done, 80)
-        assert shown.other is None
-    assert console.file.getvalue() == "drawing the video: 20 of 80 frames, 4 s\n"
-    console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system=None)
-    with shown_on(console, npg) as shown:
-        shown.work("drawing the video", "frames", 20, 80)
-    assert "drawing the video: 20/80 frames" in console.file.getvalue()

@@ -111,7 +111,9 @@ def test_a_value_function_of_a_run_changes_plans(tmp_path: Path, capsys: pytest.
     assert not (tmp_path / "none").exists()
     assert plan(tmp_path / "none", "--value", str(run), task="reach") == 2
     refused(capsys, f"--value {run} is a run of the task 'point_mass', not of 'reach'")
-    with pytest.raises(ValueError, match="value takes 6 observations, and the task 'reach' has 20"):
+    with pytest.raises(
+        ValueError, match="value function takes 6 observations, but the group 'policy' of the task 'reach' has 20"
+    ):
         lw.MPPI("reach", value=lw.load_value(run))
 
 

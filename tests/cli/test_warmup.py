@@ -31,14 +31,3 @@ def test_warmup_applies_the_options_of_physics(made_envs: list[lw.Env], capsys: 
     capsys.readouterr()
     assert main([*warmup, "--integrator", "rk5"]) == 2
     assert "there is no integrator 'rk5'" in capsys.readouterr().err
-
-
-def test_warmup_passes_threads_and_refuses_options_among_the_parameters(
-    made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["warmup", "point_mass", "--nworld", "4", "--nthread", "1", "--plan"]) == 0
-    assert [env.options.nthread for env in made_envs] == [1, 1]
-    capsys.readouterr()
-    assert main(["warmup", "point_mass", "--param", "nworld=3"]) == 2
-    error = capsys.readouterr().err
-    assert error == "lyceum-warp: nworld is an option, not a parameter of the task: use --nworld\n"

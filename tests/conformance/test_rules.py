@@ -7,6 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+import warp as wp
 from form_tasks import Gifted, Practiced, Weighed
 from full_task import Full, Settled
 
@@ -15,6 +16,7 @@ import lyceum_warp.env
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.testing import CHECKS, Report, check_task
+from lyceum_warp.world_arrays import WorldArrays
 from lyceum_warp.worlds import Worlds
 
 Function = Callable[..., Any]
@@ -88,9 +90,9 @@ def clear_all_but(kept: str) -> Callable[[Function], Function]:
 
 
 def in_every_world(method: Function) -> Function:
-    def event(self: Worlds) -> None:
+    def event(self: Worlds, kernel: wp.Kernel) -> None:
         self.restarting.zero_()
-        method(self)
+        method(self, kernel)
 
     return event
 
@@ -135,11 +137,11 @@ def another_critic(env: lw.Env) -> None:
 Break = tuple[str, Any, str, Callable[[Function], Function]]
 
 BREAKS: list[Break] = [
-    ("spaces", Worlds, "_allocate", then(lambda worlds: worlds.obs_spaces.update(policy=worlds.action_space))),
+    ("spaces", WorldArrays, "__init__", then(lambda worlds: worlds.obs_spaces.update(policy=worlds.action_space))),
     ("addresses", lw.Env, "step", then(lambda env: env.__dict__.update(obs=env.obs.clone()))),
     ("getters", lyceum_warp.env, "_copied", lambda function: lambda values, out: values),
     ("time", lw.Env, "__init__", then(lambda env: setattr(env, "timestep", 1.5 * env.timestep))),
-    ("round_trip", Worlds, "_restore_counters", nothing),
+    ("round_trip", Worlds, "unpack_state", nothing),
     ("restoring", MujocoEngine, "_set_integration", nothing),
     ("masked_restoring", lw.Env, "set_state", lambda method: lambda self, state, mask=None: method(self, state)),
     ("masked_getting", lw.Env, "get_state", lambda method: lambda self, out=None, mask=None: method(self, out)),
@@ -150,14 +152,14 @@ BREAKS: list[Break] = [
     ("masked_reset", lw.Env, "reset", lambda method: lambda self, mask=None: method(self)),
     ("rand_reset", lw.Env, "rand_reset", lambda method: lambda self, seed=None, mask=None: method(self, None, mask)),
     ("world_count", lw.Env, "rand_reset", then(lambda env: env.obs.add_(env.nworld))),
-    ("saved_stream", Worlds, "_restore_counters", nothing),
+    ("saved_stream", Worlds, "unpack_state", nothing),
     ("truncation", lw.Env, "step", then(lambda env: env.final_obs.copy_(env.obs))),
     ("truncation", lw.Env, "step", then(lambda env: env.terminated.copy_(env.done))),
     ("no_autoreset", lw.Env, "step", then(lambda env: env.done.zero_())),
     ("graphs", Graphs, "sequence", skip_some_replays),
     ("memory", lw.Env, "step", then(lambda env: leak.append(float(env.nworld)))),  # 32 bytes
     ("memory", lw.Env, "get_state", then(lambda env: env.__dict__.setdefault("kept", []).append(env.obs.clone()))),
-    ("bounds", Worlds, "_allocate", then(narrow_positions)),
+    ("bounds", lw.Env, "__init__", then(lambda env: narrow_positions(env.worlds))),
     ("bad_state", MujocoEngine, "find_faults", nothing),
     ("bad_action", Worlds, "_judge", without_action_faults),
     ("bad_warmstart", MujocoEngine, "__init__", then(keep_warm_start)),
@@ -169,9 +171,9 @@ FULL_BREAKS: list[Break] = [
     ("groups", lw.Env, "step", then(another_critic)),
     ("noise", Worlds, "_judge_state", count_steps_as_none),
     ("metrics", Worlds, "_clear", clear_all_but("metric_sums")),
-    ("metrics", Worlds, "_restore_counters", nothing),
+    ("metrics", Worlds, "unpack_state", nothing),
     ("success_steps", Worlds, "_clear", clear_all_but("success_counts")),
-    ("success_steps", Worlds, "_restore_counters", nothing),
+    ("success_steps", Worlds, "unpack_state", nothing),
     ("success_steps", Worlds, "_hold_success", nothing),
     ("events", Worlds, "_event", in_every_world),
     ("events", Worlds, "_mark_changes", unmarked),

@@ -215,7 +215,7 @@ def test_step_of_the_engines_calls_mujoco_directly(task: str, monkeypatch: pytes
     warp = lw.make(task, engine="warp", nworld=2).engine
     monkeypatch.setattr(solver, "solve", watched(solver.solve, "warp_engine"))
     warp.step(2)
-    assert len(seen) > 2 and all(frames == ["substep.step", "warp_engine.step"] for frames in seen[1:])
+    assert len(seen) > 2 and all(frames == ["forward.step", "warp_engine.step"] for frames in seen[1:])
 
 
 def test_a_reset_leaves_the_faults_of_other_worlds_unchanged() -> None:

@@ -54,10 +54,10 @@ FIRST = {
     "train --resume good": "",
     "train --from good": "",
 }
-"""What follows a command's name; a task by default."""
+"""First arguments of commands; a task by default."""
 
-_OMIT = ("--help", "--video", "--video-every", "--view")
-"""Flags that start other processes, and one that prints."""
+_OMIT = ("--help", "--video", "--video-every", "--view", "--frame-skip")
+"""Flags that start other processes, one that prints, and one that can ask for hours within one native call."""
 
 
 @functools.cache

@@ -87,13 +87,13 @@ SIZES = "--samples 16 --nworld 2 --hidden 4 --value-hidden 4 --mean-every 2 --me
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A kind of file: where a case finds it, how it is damaged, and the ways in which it is read."""
+    """A kind of file: its path, its mutation, and its readers."""
 
     file: str
     mutate: Callable[[bytes, Random], bytes]
     readers: tuple[str, ...]
     names: tuple[str, ...] = ()
-    """What an error may name instead of the file."""
+    """Names that an error may contain instead of the file's name."""
 
 
 def _checkpoint(data: bytes, random: Random) -> bytes:
@@ -191,7 +191,7 @@ READERS: dict[str, Callable[[], object]] = {
     "table": lambda: _step(lw.make(SLIDE_PY, motion=CASE / "table.npy")),
 }  # fmt: skip
 WITHOUT = {"load alone": "run/policy.pt", "resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}
-"""Files that are missing where a reader is to read another one."""
+"""Files to remove, so that a reader falls back to another file."""
 SLIDE_PY = str(BASE / "slide.py")
 _NEW = ("--out", "case/new", "--iterations", "1", "--no-video", "--no-plot")
 

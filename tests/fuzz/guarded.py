@@ -34,7 +34,7 @@ class HangError(BaseException):
 
 @dataclasses.dataclass
 class Outcome:
-    """What a case did: "refused", "worked", "interrupted", or a problem in one line."""
+    """The outcome of a case: "refused", "worked", "interrupted", or a problem in one line."""
 
     case: str
     did: str
@@ -43,7 +43,7 @@ class Outcome:
 
 
 Attack = Callable[[str], str]
-"""Runs a case; returns what it did, and raises ProblemError where that breaks a rule."""
+"""Runs a case, and returns its outcome. Raises ProblemError if it breaks a rule."""
 
 
 class ProblemError(Exception):

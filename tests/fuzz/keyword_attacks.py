@@ -148,6 +148,9 @@ def call(name: str, words: dict[str, Any]) -> str:
         raise ProblemError(f"{shown} takes too much memory", refusal)
     text = str(refusal)
     named = [*words, *(word.replace("_", " ").removesuffix("s") for word in words), *map(_shown, words.values())]
+    named += [repr(part) for value in words.values() if isinstance(value, (dict, tuple)) for part in value]
+    if "resume" in words:
+        named.append("there is no run in run")
     if not any(part in text for part in (*named, *(str(v) for v in words.values() if len(str(v)) > 3))):
         raise ProblemError(f"{shown}: the message has neither the argument's name nor its value", refusal)
     return "refused"

@@ -33,16 +33,15 @@ CLASSES = {
     "F3": ("a bad value in a saved episode is refused without the file's name", r"^episode\.npz, .* does not name the"),
     "F4": (
         "networks of sizes that memory cannot hold are refused by torch",
-        r"^(GaussianPolicy|ValueFunction|NPG)\(.*(RuntimeError at networks\.py|too much memory)",
+        r"^(GaussianPolicy|ValueFunction|NPG)\(.*(RuntimeError at (networks|value)\.py|too much memory)",
     ),
     "R8 fields": ("fields and dynamics that are tensors are a traceback", r"\b(fields|dynamics)=.* at options\.py"),
     "R8 physics": ("physics of another type with options is a traceback", r"physics=.* at options\.py"),
     "R8 iterations": ("iterations of 1e9 are a traceback", r"^(MPPI|CEM)\(.*iterations=.* at mppi\.py"),
     "R8 steps": ("check --steps -5 is a traceback", r"^lyceum-warp check .* at "),
-    "R8 markup": ("a folder whose name has markup is a traceback", r"MarkupError"),
     "N8": ("evaluate passes on torch's error about a policy of other sizes", r"^evaluate\(.*policy="),
 }
-"""What is known, and how the line of a failure of each class looks."""
+"""Known failures, and the pattern of their lines, by class."""
 
 
 def reason(name: str) -> str:
@@ -128,12 +127,12 @@ def _header(data: bytes) -> bytes:
 FILES = {
     "config.json whose task is a number": File("config.json", "eval", _json(task=3), "R7 config"),
     "config.json whose kept is a list": File("config.json", "open", _json(kept=[]), "R7 config"),
-    "config.json without params": File("config.json", "eval", _json(params=None), "R7 config"),
+    "config.json without params": File("config.json", "eval", _json(params=None)),
     "config.json nested too deep": File("config.json", "open", lambda data: b"[" * 100_000, "R7 config"),
     "config.json whose kept file is a number": File(
         "kept config.json", "eval kept", _json(kept={"file": 3, "name": "slide"}), "R7 config"
     ),
-    "config.json whose algorithm is a list": File("config.json", "resume", _json(algorithm=[1]), "R7 config"),
+    "config.json whose algorithm is a list": File("config.json", "resume", _json(algorithm=[1])),
     "versions.json that is a list": File("versions.json", "eval", lambda data: b"[]", "R7 versions"),
     "metrics.csv with a word for a number": File(
         "metrics.csv", "resume", lambda data: data.replace(b"\n1,", b"\none,", 1), "R7 metrics"
@@ -155,11 +154,11 @@ FILES = {
         "checkpoint.pt", "resume alone", _saved(lambda c: c.update(iteration=[1])), "R7 policy"
     ),
     "checkpoint.pt whose policy is a list": File(
-        "checkpoint.pt", "resume alone", _saved(lambda c: c.update(policy=[])), "R7 policy"
+        "checkpoint.pt", "resume alone", _saved(lambda c: c.update(policy=[]))
     ),
     "config.json of another device": File("config.json", "eval", _json(device="x"), "F1"),
     "config.json with a text for a number": File("config.json", "resume", _json(keep_every="x"), "F1"),
-    "config.json with a seed of 2^63": File("config.json", "from", _json(seed=2**63), "F1"),
+    "config.json with a seed of 2^63": File("config.json", "from", _json(seed=2**63)),
     "an episode whose state_parts have numbers": File(
         "episode.npz", "episodes", _info(state_parts={"time": 3}), "R7 episode"
     ),
@@ -178,6 +177,11 @@ KEYWORDS = {
     "a policy of 2^31 actions": Keywords("GaussianPolicy", {"nact": 2**31 - 1}, "F4"),
     "a policy that is not a function": Keywords("evaluate", {"policy": 3}),
     "an environment that is a text": Keywords("control_async", {"env": "hopper"}),
+    "a time feature of 10^9 powers": Keywords("ValueFunction", {"time_orders": 10**9}, "F4"),
+    "10^9 plants": Keywords("CEM", {"plants": 10**9}),
+    "10^9 episodes": Keywords("evaluate", {"episodes": 10**9}),
+    "a horizon of 10^9 steps": Keywords("OpenLoop", {"horizon": 10**9}),
+    "a period of 2^63 seconds": Keywords("control_async", {"period": 2**63}),
     "a rollout of 10^9 steps": Keywords("Rollout", {"steps": 10**9}),
     "a run that is a list": Keywords("load", {"run": []}),
     "resume that is a number": Keywords("train", {"resume": 7}),
@@ -187,7 +191,7 @@ COMMANDS = {
     "a negative number of steps": Command(("check", "point_mass", "--steps", "-5"), "R8 steps"),
     "a folder with markup": Command(
         ("train", "point_mass", "--out", "[/bold]x", "--iterations", "1", "--samples", "8", "--nworld", "2",
-         "--horizon", "4", "--no-video", "--no-plot"), "R8 markup",
+         "--horizon", "4", "--no-video", "--no-plot"),
     ),
 }  # fmt: skip
 

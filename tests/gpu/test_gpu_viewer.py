@@ -6,7 +6,7 @@ import torch
 from test_gpu import nothing_waits
 
 import lyceum_warp as lw
-from lyceum_warp.viewer.protocol import SetController, SetGhosts, SetPaused, SetWorld, StepBy
+from lyceum_warp.viewer.protocol import SetGhosts, SetMode, SetPaused, SetWorld, StepBy
 from lyceum_warp.viewer.session.clock import Session
 
 pytestmark = pytest.mark.gpu
@@ -32,7 +32,7 @@ def test_steps_and_frames_are_asked_for_without_waiting() -> None:
 def test_any_world_is_shown_a_frame_later() -> None:
     env = lw.make("hopper", nworld=4096, device="cuda")
     session = Session(env, controllers={"policy": pushing}, world=3000, seed=0)
-    assert session.stage.live.past.bytes <= 256 * 2**20
+    assert session.stage.live.past.states.nbytes <= 256 * 2**20
     session.stage.frame()
     session.stage.advance(5)
     session.stage.frame()
@@ -74,11 +74,11 @@ def test_a_planner_controls_a_copy_of_a_world_on_a_gpu() -> None:
                       world=100, paused=True, seed=0)  # fmt: skip
     session.stage.advance(3)
     before = env.get_state()
-    session.obey(SetController("mppi"))
+    session.obey(SetMode("controller", "mppi"))
     assert session.stage.live.env.obs.device.type == "cpu"
     qpos = env.state_space.parts["qpos"]
     np.testing.assert_allclose(session.stage.frame().pose.qpos, before[100, qpos].cpu().numpy(), atol=1e-6)
     session.stage.advance(3)
-    session.obey(SetController("policy"))
+    session.obey(SetMode("controller", "policy"))
     after = env.get_state()
     assert torch.equal(after[99], before[99]) and not torch.equal(after[100, qpos], before[100, qpos])

@@ -2,6 +2,7 @@
 
 import gc
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -123,7 +124,7 @@ def test_a_graph_holds_the_launches_of_its_own_thread_alone() -> None:
         thread.start()
         thread.join()
 
-    # the lock keeps captures of the package apart, so that this one has to be Warp's own
+    # the lock keeps captures of the package apart, so that this one must be Warp's own
     mine.phase(1).run()
     with wp.ScopedCapture(device=cpu) as capture:
         mine.phase(1).run()
@@ -161,11 +162,9 @@ def test_kernels_with_tiles_have_their_own_tiles_in_every_thread() -> None:
             call()
             wrong.extend(sums.numpy()[sums.numpy() != 6400 * number])
 
-    threads = [threading.Thread(target=work, args=(i + 1,), kwargs={"enabled": i < 2}) for i in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(4) as pool:
+        for result in [pool.submit(work, i + 1, enabled=i < 2) for i in range(4)]:
+            result.result()
     assert not wrong
 
 

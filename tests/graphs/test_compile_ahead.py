@@ -16,6 +16,9 @@ import lyceum_warp as lw
 SCRIPT = """
 import warp as wp
 from lyceum_warp.graphs.compile_ahead import compile_ahead
+from lyceum_warp.support.warp_log import start_warp
+
+start_warp()
 
 @wp.kernel(module="unique", enable_backward=False)
 def one(a: wp.array[float]):

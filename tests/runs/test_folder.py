@@ -20,10 +20,6 @@ def run(tmp_path: Path) -> Run:
     return run
 
 
-def test_open_returns_the_configuration(run: Run) -> None:
-    assert Run.open(run.folder).config == {"format": FORMAT, "task": "hopper", "seed": 0, "scale": float("inf")}
-
-
 def test_create_writes_the_versions(run: Run) -> None:
     versions = json.loads((run.folder / "versions.json").read_text())
     assert versions["torch"] == torch.__version__
@@ -60,12 +56,6 @@ def test_create_leaves_no_folder_when_the_configuration_is_bad(tmp_path: Path) -
     assert not (tmp_path / "run").exists()
 
 
-def test_create_leaves_nothing_when_a_file_of_the_task_cannot_be_copied(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
-        Run.create(tmp_path / "run", {}, files={"task.py": b"x = 1", "robot.xml": tmp_path / "gone.xml"})
-    assert not (tmp_path / "run").exists()
-
-
 def test_open_of_an_empty_folder_finds_no_run(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"there is no run in .*: it has no config\.json"):
         Run.open(tmp_path)
@@ -85,11 +75,6 @@ def test_open_refuses_a_run_of_a_newer_release(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(json.dumps({"format": FORMAT + 1}))
     with pytest.raises(ValueError, match=r"newer lyceum_warp \(format 2, this one reads up to 1\): pip install --up"):
         Run.open(tmp_path)
-
-
-def test_rows_before_the_first_iteration_are_missing(run: Run) -> None:
-    with pytest.raises(FileNotFoundError, match="the run has no complete iteration"):
-        run.rows()
 
 
 def test_load_returns_the_same_policy(run: Run) -> None:

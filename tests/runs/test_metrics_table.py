@@ -38,13 +38,6 @@ def test_rows_come_back_with_every_digit(table: Path) -> None:
     assert [row["mean"] for row in read] == [None, 1e-30, None]
 
 
-def test_cut_counts_iterations_and_not_rows(table: Path) -> None:
-    for i in (4, 5, 6):
-        append_row(table, {"value": 0.5, "iteration": i})
-    cut_rows(table, 5)
-    assert [row["iteration"] for row in read_metrics(table)] == [4, 5]
-
-
 def test_cut_drops_rows_without_a_checkpoint(table: Path) -> None:
     cut_rows(table, 2)  # without a table
     for i in (1, 2, 3):

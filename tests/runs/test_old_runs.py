@@ -87,13 +87,6 @@ def test_a_run_of_0_1_resumes_and_another_begins_with_it(run: Path, tmp_path: Pa
     assert config["npg"] == before.config["npg"] and config["from"]["iteration"] == 4
 
 
-def test_a_run_of_0_1_resumes_in_python(tmp_path: Path) -> None:
-    run = Path(shutil.copytree(DATA / "runs_0_1" / "command", tmp_path / "run"))
-    config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=2, mean_episodes=2)
-    npg = lw.NPG(lw.make("point_mass", nworld=2, success_distance=0.1), config=config)
-    assert [row["iteration"] for row in lw.train(npg, run, iterations=3, resume=True).rows()] == [1, 2, 3]
-
-
 @pytest.fixture
 def rsl_rl_run(tmp_path: Path) -> Path:
     """A run of the former algorithm rsl-rl, by rsl_rl's PPO."""

@@ -39,15 +39,6 @@ def test_saves_take_a_small_share_of_the_time(seconds: float, wait: float, npg: 
     assert saver.due()
 
 
-def test_a_run_is_saved_after_each_so_many_iterations(npg: lw.NPG, tmp_path: Path) -> None:
-    saver = Saver(Run.create(tmp_path / "run", {}), npg, save_every=2)
-    due = []
-    for _ in range(4):
-        next(npg)
-        due.append(saver.due())
-    assert due == [False, True, False, True]
-
-
 # folders that cannot be written
 
 

@@ -217,15 +217,6 @@ def test_modules_that_a_task_imports_are_kept_with_it(folder: Path, capsys: pyte
         shutil.rmtree(folder / "moved")
 
 
-def test_too_many_modules_are_not_copied(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (folder / "mine" / "slide_goal.py").write_text("GOAL = 0.1\n")
-    (folder / "mine" / "slide.py").write_text(f"import slide_goal\n{SOURCE}")
-    env = lw.make(str(folder / "mine" / "slide.py"), nworld=1)
-    assert "slide_goal.py" in task_copy(env)[1]
-    monkeypatch.setattr("lyceum_warp.runs.task_copy._LARGEST_MODULES", 5)
-    assert "slide.py" in task_copy(env)[1] and "slide_goal.py" not in task_copy(env)[1]
-
-
 def test_an_edited_model_is_named_and_the_runs_own_copy_used(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = trained(folder)
     before = returns(capsys, str(out))
@@ -328,7 +319,7 @@ EDITS = [
     lambda text: "",
     None,
 ]
-"""What happens to a task's files while it trains; None is that they are deleted."""
+"""Edits of a task's files during training; None deletes them."""
 
 
 def test_a_run_keeps_to_the_source_that_it_was_started_with(folder: Path) -> None:

@@ -1,7 +1,6 @@
 """Plots of learning curves."""
 
 import math
-import sys
 from pathlib import Path
 
 import pytest
@@ -33,11 +32,6 @@ def test_a_run_is_drawn_into_its_folder(run: Run) -> None:
     assert is_png(run.folder / "curve.png")
 
 
-def test_a_table_is_drawn_into_a_given_file(run: Run, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    assert is_png(learning_curve(run.metrics, tmp_path / "new" / "other.png", title="by table"))
-
-
 def test_a_run_with_metrics_gets_a_panel_for_them(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     sizes = []
@@ -54,12 +48,6 @@ def test_a_run_without_rows_is_refused(run: Run) -> None:
     pytest.importorskip("matplotlib")
     cut_rows(run.metrics, 0)
     with pytest.raises(ValueError, match="has no complete iteration to draw: train it first"):
-        learning_curve(run)
-
-
-def test_a_missing_matplotlib_is_reported_with_the_extra(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(ImportError, match=r"needs matplotlib: pip install 'lyceum-warp\[viz\]'"):
         learning_curve(run)
 
 

@@ -19,10 +19,3 @@ def test_long_work_prints_a_line_now_and_then() -> None:
     assert console.file.getvalue().splitlines() == [
         "drawing the video: 80 of 500 frames, 4 s", "drawing the video: 300 of 500 frames, 15 s",
     ]  # fmt: skip
-
-
-def test_long_work_is_a_passing_bar_on_a_terminal() -> None:
-    console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system=None)
-    with LongWork("evaluating", "episodes", console) as work:
-        work(3, 32)
-    assert "3/32" in console.file.getvalue() and "episodes" in console.file.getvalue()

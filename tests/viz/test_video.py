@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 import video_frames
-from conftest import SharedEnv
 from varied_task import Varied, ball
 
 import lyceum_warp as lw
@@ -57,11 +56,6 @@ def test_episode_returns_all_states(env: lw.Env) -> None:
     assert torch.equal(states[0, env.state_space.parts["step"]], torch.zeros(1, dtype=torch.float64))
     assert states[-1, env.state_space.parts["time"]].item() == pytest.approx(20 * env.timestep)
     assert torch.equal(states, video.episode(env, still, seed=4))
-
-
-def test_episode_refuses_automatic_resets(shared_env: SharedEnv) -> None:
-    with pytest.raises(ValueError, match="one world without automatic resets"):
-        video.episode(shared_env("point_mass"), still)
 
 
 def test_write_video_writes_a_frame_for_each_state(env: lw.Env, tmp_path: Path) -> None:
@@ -122,28 +116,6 @@ def test_a_machine_that_cannot_draw_is_reported_with_a_fix(
     with pytest.raises(video.NoVideoError, match=message):
         mp4.add(env.field("qpos")[0])
     assert mp4.finished and not list(tmp_path.iterdir())
-
-
-def test_the_library_in_mujoco_gl_is_tried_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "platform", "linux")
-    monkeypatch.setitem(os.environ, "MUJOCO_GL", "osmesa")
-    assert drawing.libraries() == ["osmesa", "egl"]
-    monkeypatch.delitem(os.environ, "MUJOCO_GL")
-    assert drawing.libraries() == ["egl", "osmesa"]
-
-
-def test_a_missing_imageio_is_reported_with_the_extra(
-    env: lw.Env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(drawing.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(video.NoVideoError, match=r"videos need imageio and imageio_ffmpeg: pip install 'lyceum-warp\["):
-        video.write_video(env, env.get_state(), tmp_path / "video.mp4")
-
-
-def test_states_of_another_shape_are_refused(env: lw.Env, tmp_path: Path) -> None:
-    size = env.state_space.size
-    with pytest.raises(ValueError, match=rf"must have the shape \(steps, {size}\), not \(3, {size - 1}\)"):
-        video.write_video(env, torch.zeros(3, size - 1), tmp_path / "video.mp4")
 
 
 @pytest.mark.parametrize("options, message", [
@@ -227,19 +199,6 @@ def test_poses_that_come_too_fast_are_dropped_and_the_video_keeps_its_length(
     assert result["frames"] == 10
     columns = result["columns"]
     assert columns[1] > columns[0] + 0.5 and columns[-1] == pytest.approx(columns[-2], abs=0.3)
-
-
-def test_a_pose_can_last_several_frames(model: mujoco.MjModel, tmp_path: Path) -> None:
-    def write() -> Path:
-        with video.Recorder(model, tmp_path / "video.mp4", size=SMALL) as mp4:
-            mp4.add([0.0], frames=4)
-            mp4.add([1.0])
-            with pytest.raises(ValueError, match="frames must be"):
-                mp4.add([0.0], frames=0)
-        return mp4.out
-
-    columns = video_frames.read(drawable(write))["columns"]
-    assert len(columns) == 5 and np.ptp(columns[:4]) < 0.3 and columns[4] > columns[3] + 5
 
 
 def test_a_video_can_end_with_what_is_drawn(

@@ -1,7 +1,7 @@
-"""Tasks for Gymnasium and for dm_control: the formulas that lyceum_warp's tasks have, on the same models.
+"""Define tasks for Gymnasium and for dm_control, with the formulas and the models of lyceum_warp's tasks.
 
-Gymnasium has all tasks but cartpole and herb_reach, dm_control has cartpole. The others are written here as the
-library's users write them, with NumPy. This file runs in peers' environments, too: it does not import lyceum_warp.
+Gymnasium has all tasks but cartpole and herb_reach, dm_control has cartpole. The others are written here
+with NumPy, as the library's users write them. This file runs in environments of peers and does not import lyceum_warp.
 """
 
 from pathlib import Path

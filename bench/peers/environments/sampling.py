@@ -1,7 +1,7 @@
-"""Environment steps per second of other libraries' environments: a worker of bench/peers.py.
+"""Measure environment steps per second of other libraries, as a worker of bench/venvs.py.
 
 It reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints one. Actions are uniform in
-their bounds, drawn before the clock starts; an episode that ends restarts within the step where the library can do so.
+their bounds, drawn before the clock starts; an episode restarts within its last step if the library can do so.
 """
 
 import json
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 KEPT_ACTIONS = 4096
-"""Actions that are drawn before the clock starts, of all environments together; at least those of 16 steps."""
+"""Actions of all environments that are drawn before the clock starts; at least those of 16 steps."""
 
 ENVPOOL = {
     "hopper": "Hopper-v5",
@@ -35,24 +35,21 @@ ENVPOOL = {
 
 
 def draw(low: np.ndarray, high: np.ndarray, envs: int, seed: int) -> np.ndarray:
-    """Actions of some steps, which are then repeated, (steps, envs, nact)."""
+    """Draw actions of some steps, which are then repeated, (steps, envs, nact)."""
     return np.random.default_rng(seed).uniform(low, high, (max(16, KEPT_ACTIONS // envs), envs, *low.shape))
 
 
 class Gymnasium:
-    """Gymnasium's vector environments, or a single one: as it is, or with Newton's solver, which ours has."""
+    """Gymnasium's vector environments, or a single environment."""
 
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
         import gymnasium
-        import mujoco
         from python_tasks import GYMNASIUM
 
         name = GYMNASIUM[task]
-        self.single = contestant in ("gymnasium", "gymnasium-newton")
+        self.single = contestant == "gymnasium"
         if self.single:
             self.env: Any = gymnasium.make(name)
-            if contestant == "gymnasium-newton":
-                self.env.unwrapped.model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
             space = self.env.action_space
         else:
             kind = {"gym-sync": gymnasium.vector.SyncVectorEnv, "gym-async": gymnasium.vector.AsyncVectorEnv}
@@ -120,7 +117,7 @@ class DmControl:
 
 
 def shared(context: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """An array that forked processes share."""
+    """Make an array that forked processes share."""
     memory = context.RawArray("d", int(np.prod(shape)))
     return np.frombuffer(memory).reshape(shape)
 
@@ -167,11 +164,11 @@ class EnvPool:
         self.env.reset()
 
     def step(self, t: int) -> np.ndarray:
-        """Number of each environment's step in its episode."""
+        """Return the number of each environment's step in its episode."""
         return self.env.step(self.actions[t])[-1]["elapsed_step"]
 
     def transition_share(self) -> float:
-        """Share of environment steps that are transitions, in 200 further steps.
+        """Return the share of environment steps that are transitions, in 200 further steps.
 
         The step after the end of an episode ignores its action and returns the first observation of a new one.
         """
@@ -184,7 +181,6 @@ class EnvPool:
 
 CONTESTANTS: dict[str, Callable[..., Any]] = {
     "gymnasium": Gymnasium,
-    "gymnasium-newton": Gymnasium,
     "gym-sync": Gymnasium,
     "gym-async": Gymnasium,
     "dm_control": DmControl,
@@ -195,14 +191,14 @@ CONTESTANTS: dict[str, Callable[..., Any]] = {
 def timed(
     step: Callable[[int], None], period: int, warm: int, seconds: float, wait: Callable[[], None] = lambda: None
 ) -> tuple[int, float]:
-    """Number of steps, and the seconds that they took.
+    """Return the number of steps, and their seconds.
 
     Args:
         step: Makes a step with the actions of a number below the period.
         period: After how many steps the actions are repeated.
         warm: Steps before the clock starts.
-        seconds: How long to step.
-        wait: Waits for the steps to end, where they run behind.
+        seconds: Duration of the measurement.
+        wait: Waits for the end of asynchronous steps.
     """
     for t in range(warm):
         step(t % period)
@@ -216,7 +212,7 @@ def timed(
             count += 1
         wait()
         now = time.perf_counter()
-        if now - began < 0.01:  # reading the clock must not count
+        if now - began < 0.01:  # else reading the clock would count
             block *= 2
     return count, now - start
 

@@ -58,29 +58,29 @@ def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
     them only later: it finds the last forward pass's, of another state, or, after a fault, not-a-number. Here they
     follow the positions, in every stage of a Runge-Kutta step.
     """
-    own = forward_functions()
-    smooth = types.SimpleNamespace(**vars(own["smooth"]) | {part.__name__: _nothing for part in done})
-    positions = _copy(own["fwd_kinematics"], smooth=smooth)
+    own_smooth = vars(forward_functions()["smooth"])
+    smooth = types.SimpleNamespace(**own_smooth | {part.__name__: _nothing for part in done})
+    positions = _copy("fwd_kinematics", smooth=smooth)
 
     def fwd_kinematics(model: mjw.Model, data: mjw.Data) -> None:
         positions(model, data)
         if model.eq_connect_adr.size or model.eq_wld_adr.size:
             mjw.com_vel(model, data)
 
-    fwd_position = _copy(own["fwd_position"], fwd_kinematics=fwd_kinematics)
-    whole = _copy(own["_forward"], fwd_position=fwd_position)
-    forward = _copy(own["forward"], _forward=whole)
+    fwd_position = _copy("fwd_position", fwd_kinematics=fwd_kinematics)
+    whole = _copy("_forward", fwd_position=fwd_position)
+    forward = _copy("forward", _forward=whole)
     stage = _without(frozenset())["_forward"] if done else whole
-    step = _copy(own["step"], forward=forward, rungekutta4=_copy(own["rungekutta4"], _forward=stage))
+    step = _copy("step", forward=forward, rungekutta4=_copy("rungekutta4", _forward=stage))
     return {"_forward": whole, "forward": forward, "step": step}
 
 
-def _copy(function: Callable[..., Any], **names: Any) -> Callable[..., Any]:
+def _copy(function: str, **names: Any) -> Callable[..., Any]:
     """A copy of a function of MuJoCo Warp's, in which some of its global names stand for other objects."""
-    inner: Any = inspect.unwrap(function)
+    inner: Any = inspect.unwrap(forward_functions()[function])
     if unknown := names.keys() - set(inner.__code__.co_names):
-        raise ImportError(f"{inner.__name__} of this mujoco_warp uses no {min(unknown)}: use mujoco-warp 4.0")
-    return types.FunctionType(inner.__code__, inner.__globals__ | names, inner.__name__, inner.__defaults__)
+        raise ImportError(f"{function} of this mujoco_warp uses no {min(unknown)}: use mujoco-warp 4.0")
+    return types.FunctionType(inner.__code__, inner.__globals__ | names, function, inner.__defaults__)
 
 
 def _nothing(model: mjw.Model, data: mjw.Data) -> None:

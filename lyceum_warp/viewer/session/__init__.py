@@ -1,1 +1,1 @@
-"""The session, in this process: torch, Warp and the worlds."""
+"""Run the worlds, with torch and Warp."""

@@ -5,8 +5,8 @@ import sys
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 
@@ -14,56 +14,37 @@ from lyceum_warp.controllers.episode_collector import ControlProgress
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import positive_number
-from lyceum_warp.viewer.protocol import Close, Command, Frame, Perturb, SetController, SetGhosts, SetMode, SetVideo
+from lyceum_warp.viewer.protocol import Close, Command, Perturb, SetGhosts, SetMode, SetVideo
 from lyceum_warp.viewer.session.commands import obey
 from lyceum_warp.viewer.session.drivers import ControllerError, WorldControl
 from lyceum_warp.viewer.session.plant import POLL, InterruptedByCommand, run_plant
 from lyceum_warp.viewer.session.stage import Stage
-from lyceum_warp.viz.drawing import NoVideoError
+from lyceum_warp.viewer.session.window_process import Window
+from lyceum_warp.viz import NoVideoError
 
-_LAG = 0.25  # maximum delay of the worlds behind the clock, in seconds; beyond it the clock waits
+_LAG = 0.25  # maximum seconds that the worlds may be behind the clock; beyond it the clock is moved
 _IDLE = 0.5  # seconds between two frames while nothing changes
 _CHECK = 0.5  # seconds between two calls of a watcher
-
-
-class SessionWindow(Protocol):
-    """What a session needs of a window."""
-
-    def show(self, frame: Frame, /) -> None:
-        """Show a frame; never waits."""
-
-    def commands(self) -> Iterable[Command]:
-        """The commands since the last call; never waits."""
-
-    def is_open(self) -> bool:
-        """Whether the window is there."""
-
-    def close(self) -> None:
-        """Close the window."""
-
-    # ``wants_frame``, a property, is optional: False while the frame before is on its way
-
 
 Watcher = Callable[[], Sequence[str]]
 """Called about twice a second; returns new messages."""
 
 
 class Session:
-    """Shows a stage in a window.
+    """Show worlds in a window.
 
-    Policies act in all worlds, which the session steps by the clock. A controller of one world, such as a planner,
-    controls a plant as ``lw.control_async`` does; the session works only while the plant waits for its next step.
+    Policies act in all worlds, which the session steps by the clock. A controller of one world acts in a plant, as
+    with ``lw.control_async``; the session works only while the plant waits for its next step.
 
     Args:
         env: The worlds.
         fps: Maximum number of frames per second.
-        watchers: Called about twice a second.
-        on_trajectory: Called with what a controller of one world did in real time, after each episode and after each
-            command that interrupts one.
+        watchers: Called about twice a second; they return messages.
+        on_trajectory: Called with the trajectory of each real-time run of a controller of one world.
         shown: Further arguments of ``Stage``.
 
     Raises:
-        ValueError: An argument does not fit.
+        ValueError: An argument is invalid.
     """
 
     def __init__(
@@ -78,7 +59,7 @@ class Session:
         self.fps = positive_number("fps", fps, "frames per second")
         self.stage = Stage(env, **shown)
         self._watchers, self._on_trajectory = watchers, on_trajectory
-        self._window: SessionWindow | None = None
+        self._window: Window | None = None
         self._closed = self._in_run = False
         self._waiting: deque[Command] = deque()
         self._next_step = self._next_frame = self._next_check = self._last_frame = self._last_work = 0.0
@@ -86,19 +67,15 @@ class Session:
     # the loop
 
     @torch.no_grad()
-    def run(self, window: SessionWindow) -> None:
-        """Show the session until its window is closed.
-
-        Args:
-            window: The window. It is closed at the end, also after an exception, and the session with it.
-        """
+    def run(self, window: Window) -> None:
+        """Run until the window is closed; close the window and the session, also after an exception."""
         self._window = window
         now = time.perf_counter()
         self._next_frame = self._next_check = now
         self._next_step = now + self.stage.env.timestep / self.stage.speed
         with contextlib.ExitStack() as ends:  # in reverse order
             ends.enter_context(self.stage.videos.finishing(print))
-            ends.callback(self.close)
+            ends.callback(self.stage.close)
             ends.callback(window.close)
             while True:
                 self._poll()
@@ -112,12 +89,8 @@ class Session:
                 except ControllerError as error:
                     self._give_up_control(error)
 
-    def close(self) -> None:
-        """End the threads of the session. A second call does nothing."""
-        self.stage.close()
-
     def _tick(self) -> None:
-        """Step what is due, show a frame, and wait."""
+        """Make the steps that are due, show a frame, and wait."""
         stage, now = self.stage, time.perf_counter()
         if stage.paused:
             self._next_step = now
@@ -139,7 +112,7 @@ class Session:
             time.sleep(min(wake - now, POLL))
 
     def _poll(self) -> None:
-        """Obey the window's commands, and call the watchers now and then."""
+        """Obey the window's commands, and call the watchers when due."""
         assert self._window is not None
         if not self._window.is_open():
             self._waiting.append(Close())
@@ -151,17 +124,16 @@ class Session:
             self._next_check = now + _CHECK
             for watch in (*self._watchers, self.stage.videos.completed):
                 for message in watch():
-                    self.stage.say(message)
+                    self.stage.frames.say(message)
 
     def _show_when_due(self, now: float) -> None:
-        """Show a frame if it is time for one, and if something has changed or the last one is long ago."""
+        """Show a frame if one is due, and if something has changed or the last frame is old."""
         assert self._window is not None
         stage, videos = self.stage, self.stage.videos
-        wanted = videos.due or getattr(self._window, "wants_frame", True)
-        if now < self._next_frame or not wanted:
+        if now < self._next_frame or not (videos.due or self._window.wants_frame):
             return
         self._next_frame = max(self._next_frame + 1 / self.fps, now)
-        changed = stage.changed or stage.frames.has_messages or videos.due
+        changed = stage.changed or bool(stage.frames.messages) or videos.due
         if stage.paused and not changed and now - self._last_frame < _IDLE:
             return
         frame = stage.frame()
@@ -169,19 +141,19 @@ class Session:
         self._last_frame, stage.changed = now, False
         try:
             videos.add(frame)
-        except (NoVideoError, OSError, ValueError) as error:
+        except (NoVideoError, OSError) as error:
             videos.give_up()
-            stage.say(str(error))
+            stage.frames.say(str(error))
 
-    # a plant that keeps its rate
+    # a plant in real time
 
     def _by_the_clock(self) -> bool:
-        """Whether a controller of one world controls its plant in real time."""
+        """Whether a controller of one world acts in its plant in real time."""
         stage = self.stage
         return isinstance(stage.control, WorldControl) and not stage.paused and not stage.live.past.ahead
 
     def _run_plant(self) -> None:
-        """Control the plant until its episode ends, or a command needs its state."""
+        """Run the plant until its episode ends, or a command needs its state."""
         stage, control = self.stage, self.stage.control
         assert isinstance(control, WorldControl)
         stage.begin_due_episode()
@@ -196,14 +168,14 @@ class Session:
         self._next_step = time.perf_counter()
 
     def _stepped(self, progress: ControlProgress) -> None:
-        """The plant made a step."""
+        """Account for a step of the plant."""
         self.stage.live.stepped()
-        self.stage.count_step()
-        if time.perf_counter() - self._last_work > 1 / self.fps:  # the plant is late or fast, and never waits
+        self.stage.steps += 1
+        if time.perf_counter() - self._last_work > 1 / self.fps:  # a plant that is late or fast never waits
             self._work()
 
     def _work(self) -> None:
-        """Obey commands and show a frame, once."""
+        """Obey commands, and show a frame."""
         self._last_work = time.perf_counter()
         self._poll()
         self._show_when_due(self._last_work)
@@ -211,9 +183,9 @@ class Session:
     # commands
 
     def obey(self, command: Command) -> None:
-        """Obey a command. One that cannot be obeyed becomes a message.
+        """Carry out a command. An error becomes a message.
 
-        While a plant keeps its rate, a command that needs its state is left for later, and the run is interrupted.
+        While a plant runs in real time, a command that needs its state interrupts the run.
         """
         push = isinstance(command, Perturb) and command.qpos is None
         if self._in_run and not push and not isinstance(command, SetVideo | SetGhosts):
@@ -223,12 +195,12 @@ class Session:
         stage.changed = True
         if isinstance(command, Close):
             self._closed = True
-        if isinstance(command, SetMode | SetController) and not self._calls_have_ended():
+        if isinstance(command, SetMode) and not self._calls_have_ended():
             return
         try:
             obey(stage, command)
         except (ValueError, OSError, NoVideoError) as error:
-            stage.say(str(error))
+            stage.frames.say(str(error))
         except ControllerError as error:
             self._give_up_control(error)
         stage.end_old_push()
@@ -236,9 +208,9 @@ class Session:
             stage.live.expect_steps()
 
     def _calls_have_ended(self) -> bool:
-        """Show frames until no call of a controller is running; returns whether the window is still open.
+        """Show frames until no controller is being called; return whether the window is still open.
 
-        The first calls of another controller may capture graphs, which must not happen beside them.
+        The first calls of another controller may capture graphs, which must not happen during other calls.
         """
         while any(isinstance(each, WorldControl) and each.busy for each in self.stage.controllers.values()):
             if (window := self._window) is not None:
@@ -251,10 +223,10 @@ class Session:
         return True
 
     def _give_up_control(self, error: ControllerError) -> None:
-        """Pause, and take the control from a controller that raised an exception."""
+        """Pause, and deselect a controller that raised an exception."""
         stage = self.stage
         print("".join(traceback.format_exception(error.__cause__)), end="", file=sys.stderr, flush=True)
         stage.paused = stage.changed = True
         if stage.mode == "controller":
             stage.select("passive", stage.controller)
-        stage.say(f"{error}; the viewer is paused, without a controller")
+        stage.frames.say(f"{error}; the viewer is paused, without a controller")

@@ -1,12 +1,11 @@
-"""Step the worlds of a session, keep their past, and copy the few rows that a frame shows to the host.
+"""Step the worlds of a session, keep their history, and copy the rows of a frame to the host.
 
-Everything that happens in a step stays on the worlds' device: the past, the returns so far, the points of the curves. A
-frame copies the rows that it shows to the host, on a GPU without waiting for them.
+All work of a step stays on the worlds' device: the history, the returns and the points of the curves. On a GPU no step
+waits for the device, and a frame copies its rows to the host asynchronously.
 """
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,64 +15,55 @@ from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import Pose
 
 HISTORY_BYTES = 240 * 2**20
-"""Memory of the past of all worlds, in bytes."""
+"""Memory of the history of all worlds, in bytes."""
 PLANT_HISTORY_BYTES = 16 * 2**20
-"""Memory of the past of a plant, in bytes."""
+"""Memory of the history of a plant, in bytes."""
 HISTORY_STEPS = 2000
-"""The most steps of the past that are kept."""
+"""Maximum number of steps in the history."""
 
-_CURVE_ROWS = 512  # points of the curves between two frames; older ones are overwritten
-_END, _FAULT = 4, 4  # numbers about the last end of an episode, and about the last fault
+_CURVE_ROWS = 512  # curve points between two frames; older points are overwritten
 
 
 class Past:
-    """The last steps of all worlds: the state before each step and its action, in buffers of fixed size.
+    """Ring buffer with the states of all worlds before each of the last steps.
 
-    Position p is the state before step p. Steps before the present can be taken back, and repeated with the same
-    actions. Where the memory does not suffice for two states of all worlds, nothing is kept.
+    Without memory for two states of all worlds, it stays empty.
 
     Args:
         env: The worlds.
         limit: Memory in bytes.
-        steps: The most steps.
     """
 
-    def __init__(self, env: Env, limit: int = HISTORY_BYTES, steps: int = HISTORY_STEPS) -> None:
-        sizes = env.state_space.size, env.action_space.size
-        row = env.nworld * (8 * sizes[0] + 4 * sizes[1] + 8)
-        places = min(steps, limit // row)
-        self.length = places if places > 1 else 0
-        """Places for states; 0 where nothing is kept."""
-        self.bytes = self.length * row
-        device = env.obs.device
-        self.states = torch.empty(self.length, env.nworld, sizes[0], dtype=torch.float64, device=device)
-        self.actions = torch.empty(self.length, env.nworld, sizes[1], device=device)
-        self.returns = torch.empty(self.length, env.nworld, dtype=torch.float64, device=device)
-        self.edited: list[bool] = [False] * self.length
-        """Whether the state was changed from outside, so that the step before does not lead to it."""
+    def __init__(self, env: Env, limit: int) -> None:
+        n, size, device = env.nworld, env.state_space.size, env.obs.device
+        length = min(HISTORY_STEPS, limit // (n * 8 * (size + 1)))
+        self.length = length if length > 1 else 0
+        """Capacity in states."""
+        self.states = torch.empty(self.length, n, size, dtype=torch.float64, device=device)
+        self.returns = torch.empty(self.length, n, dtype=torch.float64, device=device)
         self.pushed: list[int | None] = [None] * self.length
-        """The world in whose state a person's push is."""
+        """The world that the user was pushing."""
         self.now = self.newest = self.oldest = 0
+        """Numbers of the present step, of the newest step and of the oldest step."""
 
     @property
     def behind(self) -> int:
-        """Steps that can be taken back."""
-        # the present takes the place of the oldest state as soon as one of them is taken back
+        """Number of steps that can be taken back."""
+        # once a step is taken back, the present state takes the place of the oldest state
         return min(self.now - self.oldest, max(self.length - 1, 0))
 
     @property
     def ahead(self) -> int:
-        """Steps that were taken back, and can be repeated."""
+        """Number of steps that were taken back."""
         return self.newest - self.now
 
-    def put(self, state: torch.Tensor, returns: torch.Tensor, *, edited: bool, pushed: int | None) -> int:
-        """Keep the present state; returns its place."""
-        place = self.now % self.length
-        self.states[place].copy_(state)
-        self.returns[place].copy_(returns)
-        self.edited[place], self.pushed[place] = edited, pushed
+    def put(self, state: torch.Tensor, returns: torch.Tensor, pushed: int | None) -> None:
+        """Keep the present state."""
+        index = self.now % self.length
+        self.states[index].copy_(state)
+        self.returns[index].copy_(returns)
+        self.pushed[index] = pushed
         self.oldest = max(self.oldest, self.now - self.length + 1)
-        return place
 
     def drop_ahead(self) -> None:
         """Forget the steps that were taken back."""
@@ -82,65 +72,59 @@ class Past:
 
 @dataclasses.dataclass(frozen=True)
 class Rows:
-    """What a frame shows of some worlds, on the host."""
+    """Rows of a frame, on the host."""
 
     worlds: tuple[int, ...]
-    """Their numbers, the shown one first."""
+    """Indices of the worlds; the shown world comes first."""
     states: np.ndarray
     """(worlds, state_space.size) float64."""
     back: np.ndarray
-    """Earlier states of the shown world, (burst, state_space.size) float64."""
-    back_steps: tuple[int, ...]
-    """How many steps each of them lies in the past."""
+    """Earlier states of the shown world, the latest first, (burst, state_space.size) float64."""
     episode_return: float
     """Return of the shown world's episode so far."""
-    end: tuple[float, float, float, float]
-    """The number of the step after which the shown world's last episode ended, the bits of ``Done``, its return and its
-    length."""
-    fault: tuple[float, float, float, float]
-    """The same number of the last fault in any world, the bits, the world, and the number of faults so far."""
+    end: tuple[float, ...]
+    """Last end of an episode of the shown world: number of the step, bits of ``Done``, return, length."""
+    fault: tuple[float, ...]
+    """Last fault in any world: number of the step, bits of ``Done``, world, number of faults so far."""
     points: np.ndarray
     """New points of the curves, (points, 1 + curves) float64."""
-    clock: int
-    """Steps since the session began."""
 
 
 class Live:
     """Worlds that are stepped.
 
     Args:
-        env: The worlds. They stay in the state in which they are.
-        limit: Memory of the past in bytes.
+        env: The worlds, which keep their present state.
+        limit: Memory of the history in bytes.
     """
 
     def __init__(self, env: Env, *, limit: int = HISTORY_BYTES) -> None:
         self.env, self.past = env, Past(env, limit)
-        self.clock = 0
-        """Steps since the session began, without those that were taken back."""
         self.made = 0
-        """Steps since the session began, those that were taken back included."""
+        """Number of steps since the session began."""
         self.world = 0
         self.pushed: int | None = None
-        """The world in whose state a person's push is."""
+        """The world that the user is pushing."""
         device, n = env.obs.device, env.nworld
         self.asynchronous = device.type != "cpu"
         """Whether rows are copied to the host asynchronously."""
         self.returns = torch.zeros(n, dtype=torch.float64, device=device)
         """Return of each world's episode so far, (nworld,)."""
-        self._ends = torch.zeros(n, _END, dtype=torch.float64, device=device)
-        self._fault = torch.zeros(_FAULT, dtype=torch.float64, device=device)
+        self._clock = 0  # steps since the session began, minus those taken back
+        self._ends = torch.zeros(n, 4, dtype=torch.float64, device=device)
+        self._fault = torch.zeros(4, dtype=torch.float64, device=device)
         self._ended, self._reward = torch.zeros(n, dtype=torch.bool, device=device), torch.zeros_like(env.reward)
         self._curves = torch.zeros(_CURVE_ROWS, 2 + len(env.metrics), dtype=torch.float64, device=device)
         self._times: list[float] = []
         self._state = env.get_state()
-        self._edited = True
-        self._reading: _Reading | None = None
-        # of the state before the step that is made
+        self._reading: tuple[tuple[int, ...], list[float], list[torch.Tensor]] | None = None  # worlds, times, rows
+        self._event = torch.cuda.Event() if device.type == "cuda" else None
+        # before the current step
         self._length, self._over = env.episode_step.clone(), env.done.clone()
         self._number = torch.arange(n, device=device)
 
     def warm_up(self) -> None:
-        """Make every call a few times, so that their graphs are captured, and restore the state."""
+        """Capture the graphs of all calls, and restore the state."""
         env = self.env
         before = env.get_state()
         mask = torch.zeros(env.nworld, dtype=torch.bool, device=env.obs.device)
@@ -154,36 +138,28 @@ class Live:
     # steps
 
     def step(self, act: Callable[[], None]) -> None:
-        """Make a step, or repeat one that was taken back.
+        """Make a step, or restore the state after a step that was taken back.
 
         Args:
-            act: Writes the actions of all worlds into ``env.action``. It is not called for a step that is repeated.
+            act: Writes the actions of all worlds into ``env.action``. It is not called if the state is restored.
         """
-        env, past = self.env, self.past
-        if past.ahead:
-            env.action.copy_(past.actions[past.now % past.length])
-            self._before_step()
-            env.step()
-            past.now += 1
-            self._after_step()
-            self._edited = False
-            if past.edited[place := past.now % past.length]:  # after that step the state was changed from outside
-                self._restore(place)
+        if self.past.ahead:
+            self._move(1)
             return
         act()
         self._before_step()
-        self._keep(env.get_state(out=self._state))
-        env.step()
+        self._keep(self.env.get_state(out=self._state))
+        self.env.step()
         self._after_step()
 
     def expect_steps(self) -> None:
-        """Prepare for steps that are made elsewhere, each followed by ``stepped``."""
+        """Prepare for steps that other code makes; call ``stepped`` after each."""
         self.past.drop_ahead()
         self.env.get_state(out=self._state)
         self._before_step()
 
     def stepped(self) -> None:
-        """A step was made elsewhere, under the actions in ``env.action``."""
+        """Account for a step that other code made."""
         self._keep(self._state)
         self._after_step()
         self.env.get_state(out=self._state)
@@ -195,24 +171,21 @@ class Live:
 
     def _keep(self, state: torch.Tensor) -> None:
         past = self.past
-        if not past.length:
-            return
-        place = past.put(state, self.returns, edited=self._edited, pushed=self.pushed)
-        past.actions[place].copy_(self.env.action)
-        past.now += 1
-        past.newest = past.now
-        self._edited = False
+        if past.length:
+            past.put(state, self.returns, self.pushed)
+            past.now += 1
+            past.newest = past.now
 
     def _after_step(self) -> None:
         env = self.env
-        self.clock += 1
+        self._clock += 1
         self.made += 1
         ended, reward = self._ended.copy_(env.done), self._reward.copy_(env.reward)
-        if not env.autoreset:  # an end stays set, and the return is that of the episode
+        if not env.autoreset:  # done stays set, and the return stays the episode's
             ended.logical_and_(~self._over)
             reward.masked_fill_(self._over, 0.0)
         self.returns.add_(reward)
-        # on the CPU it costs nothing to look whether an episode has ended; a GPU would be waited for
+        # on a GPU, reading the mask would wait for the device
         if self.asynchronous or ended.any():
             self._note_ends(ended)
         values = [
@@ -221,10 +194,10 @@ class Live:
             *(metric[self.world] for metric in env.metrics.values()),
         ]
         self._curves[len(self._times) % _CURVE_ROWS].copy_(torch.stack(values))
-        self._times.append(self.clock * env.timestep)
+        self._times.append(self._clock * env.timestep)
 
     def _note_ends(self, ended: torch.Tensor) -> None:
-        """Note which episodes ended and which worlds had faults, without waiting for the device."""
+        """Save ends of episodes and faults, without waiting for the device."""
         env, reason = self.env, self.env.done_reason
         made = torch.full_like(self.returns, self.made)
         end = torch.stack([made, reason.double(), self.returns, self._length + 1.0], dim=1)
@@ -232,42 +205,48 @@ class Live:
         if env.autoreset:
             self.returns.masked_fill_(ended, 0.0)
         fault = ended & ((reason & int(FAULTS)) != 0)
-        # a tensor as the index of an element would be waited for
+        # indexing with a tensor would wait for the device
         first = torch.argmax(fault.to(torch.int8)).view(1)
         count = self._fault[3:] + fault.sum()
         now = torch.cat([made[:1], reason.gather(0, first).double(), first.double(), count])
         torch.where(fault.any(), now, self._fault, out=self._fault)
 
-    # the past
+    # the history
 
     def back(self, steps: int) -> int:
-        """Take steps back; all worlds are then in the states that they were in.
+        """Restore all worlds to an earlier state.
 
         Returns:
-            The number of steps that were taken back: at most those that are kept.
+            Number of steps that were taken back, at most ``past.behind``.
         """
         past = self.past
+        if not past.ahead and past.behind:  # the present state has no place yet
+            past.put(self.env.get_state(out=self._state), self.returns, self.pushed)
         steps = min(steps, past.behind)
-        if steps <= 0:
-            return 0
-        if not past.ahead:  # the present has no place yet
-            past.put(self.env.get_state(out=self._state), self.returns, edited=self._edited, pushed=self.pushed)
-            steps = min(steps, past.behind)
-        past.now -= steps
-        self.clock -= steps
-        self._restore(past.now % past.length)
-        self._times.clear()
+        if steps > 0:
+            self._move(-steps)
         return steps
 
-    def _restore(self, place: int) -> None:
-        self.env.set_state(self.past.states[place], check=False)
-        self.returns.copy_(self.past.returns[place])
-        self._edited, self.pushed = self.past.edited[place], self.past.pushed[place]
+    def forward(self, steps: int) -> None:
+        """Restore all worlds to a state that was taken back."""
+        if steps := min(steps, self.past.ahead):
+            self._move(steps)
+
+    def _move(self, steps: int) -> None:
+        past = self.past
+        past.now += steps
+        self._clock += steps
+        index = past.now % past.length
+        self.env.set_state(past.states[index], check=False)
+        self.returns.copy_(past.returns[index])
+        self.pushed = past.pushed[index]
+        if steps < 0:
+            self._times.clear()
 
     # changes from outside
 
     def reset(self, *, random: bool) -> None:
-        """Begin a new episode of the shown world."""
+        """Start a new episode of the shown world."""
         mask = self._number == self.world
         self.past.drop_ahead()
         if random:
@@ -275,17 +254,16 @@ class Live:
         else:
             self.env.reset(mask=mask)
         self.returns.masked_fill_(mask, 0.0)
-        self._edited = True
-        if self.pushed == self.world:  # the new state holds no push
+        if self.pushed == self.world:
             self.pushed = None
 
     def set_row(self, state: torch.Tensor, *, new_episode: bool = False, world: int | None = None) -> None:
-        """Put a world into a state.
+        """Set the state of one world.
 
         Args:
             state: (state_space.size,) float64, on any device.
             new_episode: Whether its return starts from 0.
-            world: Its number; by default that of the shown world.
+            world: Its index; by default the shown world.
         """
         world = self.world if world is None else world
         mask = self._number == world
@@ -295,13 +273,12 @@ class Live:
         self.env.set_state(states, mask, check=False)
         if new_episode:
             self.returns.masked_fill_(mask, 0.0)
-        self._edited = True
 
     def push(self, forces: np.ndarray) -> None:
-        """Push bodies of the shown world until another push, or until ``end_push``.
+        """Push bodies of the shown world, until ``end_push``.
 
         Args:
-            forces: (nbody, 6): force and torque in world coordinates, N and Nm.
+            forces: (nbody, 6): force (N) and torque (Nm) in world coordinates.
         """
         if self.pushed != self.world:
             self.end_push()
@@ -309,7 +286,7 @@ class Live:
         self.pushed = self.world
 
     def end_push(self) -> None:
-        """End a push, in the world where it is."""
+        """Clear the force of a push."""
         if (world := self.pushed) is not None:
             self.pushed = None
             state = self.env.get_state()[world]
@@ -331,104 +308,79 @@ class Live:
     # worlds to show
 
     def choose(self, choice: int | str) -> int | None:
-        """The number of a world; None where the choice names none.
+        """Find the index of a world; None if no episode has ended yet. "best" and later ones wait for the device.
 
         Args:
-            choice: A number, or "next", "previous", "best" and "worst" by the return of the episode so far, or
-                "last_ended", the world whose episode ended last. The last three wait for the device.
+            choice: An index; "next" or "previous"; "best" or "worst" by the return of the episode so far; or
+                "last_ended", the world whose episode ended last.
         """
-        n = self.env.nworld
+        if isinstance(choice, int):
+            return choice
         if choice in ("next", "previous"):
-            return (self.world + (1 if choice == "next" else -1)) % n
-        if choice == "best":
-            return int(self.returns.argmax())
-        if choice == "worst":
-            return int(self.returns.argmin())
-        if choice == "last_ended":
-            world = int(self._ends[:, 0].argmax())
-            return world if self._ends[world, 0] > 0 else None
-        return int(choice) if isinstance(choice, int) and 0 <= choice < n else None
+            return (self.world + (1 if choice == "next" else -1)) % self.env.nworld
+        if choice in ("best", "worst"):
+            return int(self.returns.argmax() if choice == "best" else self.returns.argmin())
+        world = int(self._ends[:, 0].argmax())
+        return world if self._ends[world, 0] > 0 else None
 
     # rows for the window
 
     def request(self, worlds: Sequence[int] = (), burst: int = 0) -> None:
-        """Begin to copy what a frame shows, unless a copy is on its way.
+        """Start copying the rows of a frame to the host, unless a copy is already in progress.
 
         Args:
             worlds: Further worlds.
-            burst: The number of earlier states of the shown world.
+            burst: Number of earlier states of the shown world.
         """
         if self._reading is not None:
             return
         past, device = self.past, self.env.obs.device
         shown = (self.world, *worlds)
         states = self.env.get_state(out=self._state)[_index(shown, device)]
-        steps = _spread(past.behind, burst)
-        places = _index([(past.now - k) % past.length for k in steps], device)
-        points = len(self._times)
+        count = min(burst, past.behind)
+        steps = [past.behind * i // count for i in range(1, count + 1)]
+        earlier = _index([(past.now - k) % past.length for k in steps], device)
         parts = [
-            states, past.states[places, self.world], self.returns[self.world : self.world + 1],
+            states, past.states[earlier, self.world], self.returns[self.world : self.world + 1],
             self._ends[self.world], self._fault, self._curves,
         ]  # fmt: skip
-        self._reading = _Reading([_to_host(part) for part in parts], shown, steps, self._times[:points], self.clock)
-        self._times = []
-        if device.type == "cuda":
-            self._reading.event = torch.cuda.Event()
-            self._reading.event.record()
+        self._reading, self._times = (shown, self._times, [_to_host(part) for part in parts]), []
+        if self._event is not None:
+            self._event.record()
 
     def take(self) -> Rows | None:
-        """The rows that were requested; None without a request. Waits until they are on the host."""
-        reading, self._reading = self._reading, None
-        return None if reading is None else reading.rows()
-
-
-@dataclasses.dataclass
-class _Reading:
-    """A copy to the host that is on its way."""
-
-    parts: list[torch.Tensor]
-    worlds: tuple[int, ...]
-    back_steps: tuple[int, ...]
-    times: list[float]
-    clock: int
-    event: Any = None
-
-    def rows(self) -> Rows:
-        if self.event is not None:
-            self.event.synchronize()
-        states, back, returned, end, fault, curves = (part.numpy() for part in self.parts)
-        times = self.times[-len(curves) :]
-        places = np.arange(len(self.times) - len(times), len(self.times)) % len(curves)
-        points = np.column_stack([np.array(times, dtype=float).reshape(-1, 1), curves[places]])
-        ends, faults = tuple(end.tolist()), tuple(fault.tolist())
-        return Rows(self.worlds, states, back, self.back_steps, float(returned[0]), ends, faults, points, self.clock)
+        """Wait for the requested rows, and return them; None without a request."""
+        if self._reading is None:
+            return None
+        (worlds, times, parts), self._reading = self._reading, None
+        if self._event is not None:
+            self._event.synchronize()
+        states, back, returned, end, fault, curves = (part.numpy() for part in parts)
+        numbers = np.arange(len(times))[-len(curves) :]
+        points = np.column_stack([np.array(times, dtype=float)[numbers], curves[numbers % len(curves)]])
+        return Rows(worlds, states, back, float(returned[0]), tuple(end.tolist()), tuple(fault.tolist()), points)
 
 
 def _index(numbers: Sequence[int], device: torch.device) -> torch.Tensor:
-    """Indices on a device, without waiting for it."""
+    """Copy indices to a device, without waiting for it."""
     index = torch.tensor(numbers, dtype=torch.long)
     return index if device.type == "cpu" else index.pin_memory().to(device, non_blocking=True)
 
 
 def _to_host(part: torch.Tensor) -> torch.Tensor:
-    """A copy on the host, which on a GPU is complete only after its event."""
+    """Copy to the host, asynchronously from a GPU."""
     if part.device.type == "cpu":
         return part.clone()
     host = torch.empty(part.shape, dtype=part.dtype, pin_memory=True)
     return host.copy_(part, non_blocking=True)
 
 
-def _spread(length: int, count: int) -> tuple[int, ...]:
-    """At most ``count`` different numbers from 1 to ``length``, at equal distances."""
-    return tuple(sorted({round(i * length / count) for i in range(1, count + 1)} - {0})) if count and length else ()
-
-
 def pose(state: np.ndarray, parts: Mapping[str, slice], nmocap: int) -> Pose:
-    """The pose in a state.
+    """Extract the pose from a state.
 
     Args:
         state: (state_space.size,).
-        parts: The places of its parts.
+        parts: Slices of the state by name.
         nmocap: Number of mocap bodies.
     """
     none = slice(0, 0)

@@ -1,4 +1,4 @@
-"""Run the plant, the copy of the shown world that a controller of one world controls in real time."""
+"""Run a controller of one world in real time, in a copy of the shown world."""
 
 import threading
 import time
@@ -12,19 +12,19 @@ from lyceum_warp.viewer.session.drivers import ControllerError, WorldControl
 from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
 
 POLL = 0.005
-"""Seconds between two looks at the window's commands."""
+"""Seconds between two polls of the window's commands."""
 
-_RESERVE = 0.0015  # seconds before a plant's step in which the session does not begin any work
-_PART = 10_000  # steps of a plant in one run of the loop, which keeps all of their states
-_WARM_UP = 3  # calls of a controller in which it may capture graphs, which must not happen beside other work
+_RESERVE = 0.0015  # seconds before a plant's step in which the session starts no work
+_PART = 10_000  # maximum steps of a run, whose states are all kept
+_WARM_UP = 3  # first calls of a controller, which may capture graphs; no other work may run meanwhile
 
 
 class InterruptedByCommand(BaseException):
-    """Ends a run of the plant, because a command needs its state."""
+    """Raised to end a run of the plant, because a command needs its state."""
 
 
 def make_plant(main: Live) -> Live:
-    """One world for controllers of one world, on the CPU, where its steps do not wait for a planner's GPU."""
+    """Make the plant: one world on the CPU, whose steps do not wait for a planner's GPU."""
     env, plant = main.env, main
     if env.nworld > 1 or env.autoreset or env.device.is_cuda:
         options = options_for_plant(env.options.engine, env.device)
@@ -45,18 +45,18 @@ def run_plant(
     on_step: Callable[[ControlProgress], None],
     on_trajectory: Callable[[Trajectory], object] | None,
 ) -> None:
-    """Control the plant by the clock until its episode ends.
+    """Run the plant by the clock until its episode ends.
 
     Args:
         live: The plant.
         control: Its controller.
         speed: Simulated seconds per second.
-        work: Called while the plant waits for its next step. It ends the run with ``InterruptedByCommand``.
+        work: Called while the plant waits for its next step; it may raise ``InterruptedByCommand`` to end the run.
         on_step: Called after each step.
-        on_trajectory: Called with the steps of the run, also of one that is interrupted.
+        on_trajectory: Called with the trajectory of the run, also after an interruption.
 
     Raises:
-        ControllerError: The controller raised an exception, or its actions do not fit.
+        ControllerError: The controller raised an exception, or its actions are invalid.
     """
     live.expect_steps()
     try:
@@ -68,18 +68,18 @@ def run_plant(
             on_trajectory(trajectory)
     except InterruptedByCommand:
         pass
-    except ValueError as error:  # of actions that do not fit
+    except ValueError as error:  # from invalid actions
         raise ControllerError(control.name, error) from error
     finally:
-        control.end_run()
+        control.new_run()  # calls that are left of this run fail
 
 
 class _WorkingClock(Clock):
-    """The wall clock; while a plant waits for its next step, its session works.
+    """A wall clock that works while the plant waits.
 
     Args:
-        work: The work of the session.
-        warm: Whether to work while the plant waits for the first plan, too.
+        work: Called while the plant waits for its next step.
+        warm: Whether to work before the first plan, too.
     """
 
     def __init__(self, work: Callable[[], None], *, warm: bool) -> None:

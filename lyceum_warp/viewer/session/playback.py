@@ -1,7 +1,6 @@
-"""Play back episodes: states one after another, with their rewards if these are known."""
+"""Play back episodes: states in order, with rewards if these are known."""
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,39 +23,33 @@ class Episode:
     states: np.ndarray
     """(steps + 1, state_space.size) float64."""
     rewards: np.ndarray
-    """(steps,), NaN where unknown."""
+    """(steps,), NaN if unknown."""
     evals: np.ndarray
-    """(steps,), NaN where unknown."""
+    """(steps,), NaN if unknown."""
     done_reason: int = 0
-    """Bits of ``Done``: why it ended; 0 where it did not, or where this is unknown."""
+    """Bits of ``Done``; 0 if the episode did not end, or if this is unknown."""
 
     @property
     def steps(self) -> int:
         """Number of steps."""
         return len(self.states) - 1
 
-    @property
-    def end(self) -> str:
-        """Why it ended, in words; empty where it did not."""
-        return reasons(self.done_reason)
-
 
 def reasons(bits: int) -> str:
-    """The names of the bits of ``Done``, in lower case."""
+    """Format the bits of ``Done`` as text."""
     return ", ".join(str(bit.name).lower().replace("_", " ") for bit in Done if bits & bit)
 
 
 def episodes_of(given: Any, env: Env) -> list[Episode]:
-    """The episodes to play back.
+    """Load the episodes to play back.
 
     Args:
-        given: Trajectories, files of them, tensors of states, (steps + 1, state_space.size), as rows of
-            ``env.get_state()``; one, a sequence, or a mapping from names to them.
+        given: The episodes; see ``lw.view``.
         env: An environment of their task.
 
     Raises:
         FileNotFoundError: A file is missing.
-        ValueError: One of them is of another task or of another form.
+        ValueError: An episode belongs to another task, or is not an episode.
     """
     if isinstance(given, Mapping):
         return [_episode(name, each, env) for name, each in given.items()]
@@ -78,7 +71,7 @@ def _episode(name: str | None, given: Any, env: Env, number: int = 0) -> Episode
             f"an episode of {env.task.name!r} must be a Trajectory, a file of one, or states of shape (steps, {size}) "
             f"as env.get_state() returns them, not {described(given)}"
         )
-    unknown = np.full(len(given) - 1, math.nan)
+    unknown = np.full(len(given) - 1, np.nan)
     states = given.detach().to("cpu", torch.float64).numpy().copy()
     return Episode(name or f"episode {number}", states, unknown, unknown)
 
@@ -90,11 +83,7 @@ def _of_trajectory(name: str, trajectory: Trajectory, env: Env) -> Episode:
 
 
 class Playback:
-    """The episode that is played back, and the moment in it.
-
-    Args:
-        episodes: The episodes.
-    """
+    """The episodes, and the shown step of one of them."""
 
     def __init__(self, episodes: Sequence[Episode]) -> None:
         self.episodes = list(episodes)
@@ -102,42 +91,40 @@ class Playback:
 
     @property
     def episode(self) -> Episode:
-        """The episode that is played back."""
+        """The shown episode."""
         return self.episodes[self.index]
 
     @property
     def state(self) -> np.ndarray:
-        """The state that is shown, (state_space.size,) float64."""
+        """The shown state, (state_space.size,) float64."""
         return self.episode.states[self.step]
 
+    @property
+    def next_step(self) -> int:
+        """The next step in the direction of the playback, which repeats the episode."""
+        return (self.step + (-1 if self.backwards else 1)) % (self.episode.steps + 1)
+
+    def check(self, index: int) -> None:
+        """Raise ValueError if there is no such episode."""
+        if not 0 <= index < len(self.episodes):
+            raise ValueError(f"there is no episode {index}: there are {len(self.episodes)}, from 0")
+
     def choose(self, index: int) -> None:
-        """Show another episode, at the same step where it has one.
+        """Show another episode, at the same step or its last one.
 
         Raises:
             ValueError: There is no such episode.
         """
-        if not 0 <= index < len(self.episodes):
-            raise ValueError(f"there is no episode {index}: there are {len(self.episodes)}, from 0")
+        self.check(index)
         self.index = index
         self.seek(self.step)
 
     def seek(self, step: int) -> None:
-        """Show a step; the first or the last one for a number beyond them."""
+        """Show a step, clipped to the episode."""
         self.step = min(max(step, 0), self.episode.steps)
 
-    def advance(self) -> bool:
-        """Show the next step in the direction of the playback; after the last one the first.
-
-        Returns:
-            Whether the playback started over.
-        """
-        step, last = self.step + (-1 if self.backwards else 1), self.episode.steps
-        over = not 0 <= step <= last
-        self.step = (last if self.backwards else 0) if over else step
-        return over
-
     def around(self, count: int) -> list[int]:
-        """At most ``count`` steps at equal distances over the episode, without the one that is shown."""
+        """At most ``count`` evenly spaced steps of the episode, without the shown step."""
         last = self.episode.steps
         steps = {round(i * last / max(count - 1, 1)) for i in range(count)}
         return sorted(steps - {self.step})

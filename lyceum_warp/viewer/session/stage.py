@@ -1,4 +1,4 @@
-"""Hold what is shown: the mode, the controller, the worlds or the episode, and the frames that show them."""
+"""Hold the state of a session: mode, controller, worlds and episode."""
 
 import math
 import time
@@ -17,30 +17,20 @@ from lyceum_warp.viewer.session.frames import FrameMaker, model_bytes, past_text
 from lyceum_warp.viewer.session.live import Live
 from lyceum_warp.viewer.session.plant import make_plant
 from lyceum_warp.viewer.session.playback import Playback, episodes_of
-from lyceum_warp.viewer.session.traces import Traces, TraceThread, rollouts_for, trace_point
+from lyceum_warp.viewer.session.traces import TraceRollouts, Traces, TraceThread, trace_point
 from lyceum_warp.viewer.session.videos import VideoTaker
 
-_OLD = 1.0  # seconds after which paths of samples are no longer shown
+_OLD = 1.0  # seconds after which traces are no longer shown
 
 
 class Stage:
-    """The worlds, controllers and episodes of a session, and which of them are shown.
+    """The worlds, controllers and episodes of a session.
 
     Policies act in all worlds. A controller of one world, such as a planner, acts in the plant, a copy of the shown
-    world, while the others wait.
-
-    Args:
-        env: The worlds.
-        controllers: Controllers by their names; see ``lw.view``.
-        episodes: Episodes to play back.
-        world: The world that is shown first.
-        seed: Seed of a random reset at the start; by default the worlds stay as they are.
-        paused: Whether the session starts paused.
-        trace: The site or body whose path is drawn for a planner's samples.
-        title: The title of the window; by default the task's name.
+    world, while the other worlds wait. The arguments are explained in ``lw.view``.
 
     Raises:
-        ValueError: An argument does not fit.
+        ValueError: An argument is invalid.
     """
 
     def __init__(
@@ -69,27 +59,29 @@ class Stage:
         planned = any(isinstance(each, WorldControl) for each in self.controllers.values())
         self._plant = make_plant(self.main) if planned else None
         self._trace = trace
-        self._threads: dict[str, TraceThread | None] = {}
+        self._threads: dict[str, TraceThread] = {}
         self.mode: Mode = "passive"
         self.controller: str | None = None
         self.paused, self.speed = bool(paused), 1.0
         self.dragging = False
-        """Whether a person pushes a body."""
+        """Whether the user is pushing a body."""
         self.changed = False
-        """Whether something has changed since the last frame."""
+        """Whether anything has changed since the last frame."""
         modes: list[Mode] = ["playback"] if self.playback.episodes else []
         modes += ["controller"] if self.controllers else []
         modes.append("passive")
         self.scene = Scene(
-            title=title or env.task.name, model=model_bytes(env.task.model), nworld=env.nworld, timestep=env.timestep,
+            title=title or env.task.name, model=model_bytes(env.task.model), nworld=env.nworld,
             modes=tuple(modes), controllers=tuple(self.controllers),
             episodes=tuple(episode.name for episode in self.playback.episodes),
             curves=("reward", "eval", *env.metrics),
         )  # fmt: skip
         self.videos = VideoTaker(env.task.model, self.scene.title)
         self.frames = FrameMaker(env, len(self.scene.curves))
-        self._progress: deque[tuple[float, int]] = deque(maxlen=64)
-        self._steps = 0
+        self.steps = 0
+        """Steps since the session began, for the measured speed."""
+        self.progress: deque[tuple[float, int]] = deque(maxlen=64)
+        """Times of the last frames, with the number of steps by then."""
         self.select(modes[0], next(iter(self.controllers), None))
 
     @property
@@ -99,19 +91,13 @@ class Stage:
 
     @property
     def control(self) -> Control | None:
-        """The controller that acts."""
+        """The controller in use."""
         return self.controllers[self.controller] if self.mode == "controller" and self.controller else None
-
-    def say(self, message: str) -> None:
-        """Show a message in the next frame."""
-        self.frames.say(message)
 
     def close(self) -> None:
         """End the threads. A second call does nothing."""
-        threads, self._threads = self._threads, {}
-        for thread in threads.values():
-            if thread is not None:
-                thread.close()
+        while self._threads:
+            self._threads.popitem()[1].close()
 
     # steps
 
@@ -123,10 +109,9 @@ class Stage:
         """
         self.changed = True
         for _ in range(steps):
-            self.count_step()
+            self.steps += 1
             if self.mode == "playback":
-                self.playback.advance()
-                self.frames.add_point(self.playback)
+                self.seek_episode(self.playback.next_step)
                 continue
             if isinstance(self.control, WorldControl) and not self.live.past.ahead:
                 self._step_plant(self.control)
@@ -134,43 +119,35 @@ class Stage:
                 self.live.step(self.act)
             self.end_old_push()
 
-    def count_step(self) -> None:
-        """Count a step for the measured speed."""
-        self._steps += 1
-
-    def restart_measurement(self) -> None:
-        """Measure the speed from now on."""
-        self._progress.clear()
-
     def act(self) -> None:
-        """Write the actions of the next step of all worlds."""
+        """Write the actions of all worlds."""
         if isinstance(self.control, PolicyControl):
             self.control.act()
         else:
             self.live.env.action.zero_()
 
     def _step_plant(self, current: WorldControl) -> None:
-        """One step of a plant that waits for its controller."""
+        """Make one step of a plant that waits for its controller."""
         self.begin_due_episode()
         self.live.expect_steps()
         try:
             control(self.live.env, current.new_run(), steps=1, reset=False)
-        except ValueError as error:  # of actions that do not fit
+        except ValueError as error:  # from invalid actions
             raise ControllerError(current.name, error) from error
         self.live.stepped()
 
     def begin_due_episode(self) -> None:
-        """Begin a new episode of the plant, and of its controller, if the last one is over."""
+        """Start a new episode of the plant and its controller if the last episode is over."""
         if self.live.env.done.item():
             self.reset(random=True)
 
     def reset(self, *, random: bool) -> None:
-        """Begin a new episode of the shown world, and of its controller."""
+        """Start a new episode of the shown world and its controller."""
         self.live.reset(random=random)
         self.reset_controller()
 
     def reset_controller(self) -> None:
-        """Call the controller's ``reset``, and drop the traces of its plans."""
+        """Reset the controller, and drop its traces."""
         if isinstance(current := self.control, WorldControl):
             current.reset()
         if (thread := self._threads.get(str(self.controller))) is not None:
@@ -180,19 +157,18 @@ class Stage:
         """Take steps back."""
         done = self.live.back(steps)
         if done < steps:
-            self.say(f"the past ends here: {past_text(self.live)}")
+            self.frames.say(f"the past ends here: {past_text(self.live)}")
 
     def seek_episode(self, step: int) -> None:
-        """Show a step of the episode that is played back."""
+        """Show a step of the playback."""
         self.playback.seek(step)
         self.frames.add_point(self.playback)
 
     def end_old_push(self) -> None:
-        """End a push that steps through the past have put back, once the worlds go on from there."""
+        """End a push that was restored with a past state, once the worlds continue from there."""
         live = self.live
         if live.pushed is not None and not self.dragging and not live.past.ahead:
             live.end_push()
-        # a planner does not know of the push
         pushed = self.env.state_space.parts["xfrc_applied"] if live.pushed is not None else None
         for each in self.controllers.values():
             if isinstance(each, WorldControl):
@@ -201,25 +177,27 @@ class Stage:
     # which worlds
 
     def select(self, mode: Mode, controller: str | None) -> None:
-        """Change the mode and the controller; the shown world goes on in the worlds of the new one."""
+        """Change the mode and the controller. The shown world keeps its state."""
         before, chosen = self.live, (self.mode, self.controller)
         self.mode, self.controller = mode, controller
         if self.live is not before:
             self._transfer(before, self.live)
             before.end_push()
         for thread in self._threads.values():
-            if thread is not None:
-                thread.forget()
+            thread.forget()
         if chosen != (mode, controller):
             self.live.past.drop_ahead()
             self.reset_controller()
-            self.restart_measurement()
+            self.progress.clear()
         self.frames.forget_seen(self.live)
-        if isinstance(current := self.control, WorldControl) and current.name not in self._threads:
-            self._threads[current.name] = self._trace_thread(current)
+        current = self.control
+        if isinstance(current, WorldControl) and current.plans and current.name not in self._threads:
+            rollouts = TraceRollouts(current.controller, self.live.env, self._trace)
+            self.frames.text["trace"] = rollouts.point.name
+            self._threads[current.name] = TraceThread(rollouts)
 
     def show_world(self, world: int) -> None:
-        """Show another world; a push ends."""
+        """Show another world, and end a push."""
         before = self.live
         before.end_push()
         self.dragging = False
@@ -232,7 +210,7 @@ class Stage:
         self.frames.forget_seen(self.live)
 
     def go_on_from(self, state: torch.Tensor, live: Live, *, new_episode: bool = False) -> None:
-        """Put the shown world of ``live`` into a state, as one whose episode goes on."""
+        """Set the state of the shown world, and let its episode continue."""
         state = state.clone()
         state[self.env.state_space.parts["done_reason"]] = 0.0
         live.set_row(state, new_episode=new_episode)
@@ -244,33 +222,22 @@ class Stage:
             after.pushed = after.world
         after.returns[after.world] = before.returns[before.world].item()
 
-    def _trace_thread(self, current: WorldControl) -> TraceThread | None:
-        """The thread for a planner's traces; None for a controller without plans."""
-        if not hasattr(current.controller, "actions"):
-            return None
-        rollouts = rollouts_for(current.controller, self.live.env, self._trace)
-        self.frames.text["trace"] = rollouts.point.name
-        return TraceThread(rollouts)
-
     # frames
 
     def frame(self) -> Frame:
-        """What is shown now."""
+        """Make a frame of the present state."""
         if self.mode == "playback":
             return self.frames.of_playback(self.playback, self._status)
-        plan_ms = 1000 * self.control.seconds if self.control else math.nan
-        return self.frames.of_worlds(
-            self.live, self.main, self._traces(), self._status, plan_ms=plan_ms, paused=self.paused
-        )
+        return self.frames.of_worlds(self.live, self.main, self._traces(), self._status, paused=self.paused)
 
     def _traces(self) -> Traces | None:
-        """The newest paths of a planner's samples, if they are to be shown; asks for others."""
+        """The newest traces, if they are shown; requests new ones."""
         thread, current = self._threads.get(str(self.controller)), self.control
         if not self.frames.ghosts.plan or thread is None or not isinstance(current, WorldControl):
             return None
         if thread.error is not None:
-            self.say(f"no paths of samples: {thread.error}")
-            self._threads[current.name] = None
+            self.frames.say(f"no paths of samples: {thread.error}")
+            thread.error = None
         if (view := current.look()) is not None:
             thread.give(view)
         seen = thread.newest()
@@ -278,24 +245,21 @@ class Stage:
 
     def _status(self, **rest: Any) -> Status:
         now = time.perf_counter()
-        self._progress.append((now, self._steps))
-        begun, steps = self._progress[0]
+        self.progress.append((now, self.steps))
+        begun, steps = self.progress[0]
         measured = math.nan
         if not self.paused and now - begun > 0.1:
-            measured = (self._steps - steps) * self.env.timestep / (now - begun)
+            measured = (self.steps - steps) * self.env.timestep / (now - begun)
         return Status(
             mode=self.mode, controller=self.controller if self.mode == "controller" else None,
             episode=self.playback.index if self.mode == "playback" else None, paused=self.paused, speed=self.speed,
-            measured_speed=measured, backwards=self.playback.backwards, video=self.videos.name, **rest,
+            measured_speed=measured, backwards=self.playback.backwards, video=self.videos.name,
+            ghosts=self.frames.ghosts, plan_ms=1000 * self.control.seconds if self.control else math.nan, **rest,
         )  # fmt: skip
 
 
 def check_world(world: Any, nworld: int) -> int:
-    """Check the number of a world.
-
-    Raises:
-        ValueError: There is no such world.
-    """
+    """Check the index of a world; raise ValueError if there is no such world."""
     if not isinstance(world, int) or isinstance(world, bool) or not 0 <= world < nworld:
         known = "is 1 world, number 0" if nworld == 1 else f"are {nworld} worlds, 0 to {nworld - 1}"
         raise ValueError(f"there is no world {world!r}: there {known}")

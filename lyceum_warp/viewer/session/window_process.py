@@ -14,26 +14,15 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.viewer.protocol import (
-    Close,
-    Command,
-    Failed,
-    Frame,
-    Graphics,
-    Opened,
-    Opening,
-    Reply,
-    Scene,
-    Taken,
-    latest,
-)
+from lyceum_warp.viewer import protocol
+from lyceum_warp.viewer.protocol import Command, Failed, Frame, Graphics, Opened, Scene
 
 FRAME_TIME = 1 / 60
-"""Seconds between two frames at least."""
+"""Minimum seconds between two frames."""
 OPENING_TIME = 60.0
-"""Seconds in which the process must report that the window runs."""
+"""Seconds in which the process must report that the window is open."""
 CLOSING_TIME = 5.0
-"""Seconds in which it must end."""
+"""Seconds in which the process must end."""
 
 _PROGRAM = """
 import sys
@@ -43,22 +32,23 @@ main(int(sys.argv[1]))
 """
 
 
-class Window:
-    """Shows frames, and takes the commands of the person who looks at them.
+class NoWindowError(OSError):
+    """The window cannot be opened, or ended with an error. The message gives the reason."""
 
-    The window's process is not a fork and does not import the caller's program, so no guard of ``__main__`` is needed.
-    It ends with this process, however this one ends; Ctrl-C does not reach it.
+
+class Window:
+    """Show frames in a window process, and collect the user's commands.
+
+    The window process is not a fork and does not import the caller's program, so the caller needs no ``__main__``
+    guard. It ends when this process ends, even by SIGKILL. Ctrl-C does not reach it.
 
     Args:
-        scene: What is shown.
-        gfx: "web" serves a page for browsers, which needs no display; "native" opens a window.
-        host: Address on which the page is served. Other machines reach it only under another one than the default.
-        port: Port of the page; by default the first free one from 8080 on.
-        browser: Whether to open the page in this machine's browser.
+        scene: The constant part of the display.
+        gfx: "web" or "native". This and the further arguments are explained in ``lw.view``.
 
     Raises:
-        ValueError: The port is out of range or in use, or the address is not one of this machine.
-        RuntimeError: The window cannot be opened; the message holds the reason.
+        ValueError: The port is out of range or in use, or the address is not an address of this machine.
+        NoWindowError: The window cannot be opened.
     """
 
     def __init__(
@@ -70,8 +60,6 @@ class Window:
         port: int | None = None,
         browser: bool = False,
     ) -> None:
-        if gfx not in ("web", "native"):
-            raise ValueError(f"gfx must be 'web' or 'native', not {gfx!r}")
         self._pending: Frame | None = None
         self._lock = threading.Lock()
         self._wake = threading.Event()
@@ -94,13 +82,9 @@ class Window:
                 process_group=0,  # the terminal sends Ctrl-C to its own group only
             )
         self.error: str | None = None
-        """Why the window ended, where that was an error."""
-        self.address = ""
-        """The page's address, which holds its secret; empty without a page."""
-        self.instructions: tuple[str, ...] = ()
-        """Lines to print: where the page is, and how another machine reaches it."""
+        """The error that ended the window, if there was one."""
         try:
-            self._connection.send(Opening(scene, gfx, host, port, browser))
+            self._connection.send(protocol.Opening(scene, gfx, host, port, browser))
             reply = self._connection.recv() if self._connection.poll(OPENING_TIME) else None
         except (EOFError, OSError):
             self._process.wait()
@@ -113,27 +97,29 @@ class Window:
             if isinstance(reply, Failed) and reply.refused:
                 raise ValueError(reply.reason)
             reason = reply.reason if isinstance(reply, Failed) else f"its process did not start in {OPENING_TIME:.0f} s"
-            raise RuntimeError(f"the viewer's window cannot be opened: {reason}")
-        self.address, self.instructions = reply.address, reply.instructions
+            raise NoWindowError(f"the viewer's window cannot be opened: {reason}")
+        self.address = reply.address
+        """The page's address with its token; empty for a native window."""
+        self.instructions = reply.instructions
+        """Lines to print: the page's address, and the ssh command for other machines."""
         for target in (self._send, self._receive):
             self._threads.append(threading.Thread(target=target, daemon=True, name="lyceum-viewer"))
             self._threads[-1].start()
 
     def show(self, frame: Frame) -> None:
-        """Show a frame instead of the one before. The call does not wait for the window.
+        """Send a frame, without waiting for the window.
 
-        Where frames come faster than they are drawn, only the latest one is drawn, with the curves' points and the
-        messages of all.
+        If the previous frame has not been sent yet, it is skipped; its curve points and messages are kept.
         """
         with self._lock:
-            self._pending = latest(self._pending, frame)
+            self._pending = protocol.latest(self._pending, frame)
         self._wake.set()
 
     @property
     def wants_frame(self) -> bool:
-        """Whether the frame before is on its way: the caller may save the work of making frames until then.
+        """Whether the window can draw another frame now; until then the caller need not make one.
 
-        True about 60 times a second while a person looks, and four times a second otherwise.
+        The window draws about 60 frames a second while a page is open, and takes four a second otherwise.
         """
         return self._pending is None and time.monotonic() >= self._next and not self._ended
 
@@ -142,11 +128,11 @@ class Window:
         return [self._commands.popleft() for _ in range(len(self._commands))]
 
     def is_open(self) -> bool:
-        """Whether the window's process runs."""
+        """Whether the window process runs."""
         return not self._ended
 
     def close(self) -> None:
-        """End the window's process. A second call does nothing."""
+        """End the window process. A second call does nothing."""
         self._end()
         with contextlib.suppress(OSError):  # wakes both threads and the process
             self._socket.shutdown(socket.SHUT_RDWR)
@@ -156,7 +142,7 @@ class Window:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        for thread in self._threads:  # its end of the connection must not be closed while a thread reads from it
+        for thread in self._threads:  # a thread must not read from a closed connection
             thread.join(CLOSING_TIME)
         self._connection.close()
         self._log.close()
@@ -173,18 +159,18 @@ class Window:
         self._taken.release()
 
     def _last_words(self) -> str:
-        """How the process ended: the signal that ended it, or what it printed last."""
+        """The signal that ended the process, or its last line of output."""
         code = self._process.returncode
         if code is None:
             return "its process closed the connection"
         if code < 0:
             return f"its process was ended by {signal.Signals(-code).name}"
         self._log.seek(0)
-        lines = [line.strip() for line in self._log.read().decode(errors="replace").splitlines() if line.strip()]
-        return lines[-1] if lines else f"its process ended with code {code}"
+        lines = self._log.read().decode(errors="replace").strip().splitlines()
+        return lines[-1].strip() if lines else f"its process ended with code {code}"
 
     def _send(self) -> None:
-        """The thread that sends frames."""
+        """Send frames, in a thread."""
         while True:
             self._wake.wait()
             if self._ended:
@@ -198,23 +184,23 @@ class Window:
             try:
                 self._connection.send(frame)
             except (OSError, ValueError):
-                return  # the thread that takes replies finds out why
+                return  # the receiving thread reports the reason
             self._taken.acquire()
             self._next = time.monotonic()
             time.sleep(FRAME_TIME)
 
     def _receive(self) -> None:
-        """The thread that takes replies."""
+        """Receive replies, in a thread."""
         closed = False
         try:
             while not self._ended:
-                reply: Reply = self._connection.recv()
-                if isinstance(reply, Taken):
+                reply: protocol.Reply = self._connection.recv()
+                if isinstance(reply, protocol.Taken):
                     self._taken.release()
                 elif isinstance(reply, Failed):
                     self.error = reply.reason
                 elif not isinstance(reply, Opened):
-                    closed = closed or isinstance(reply, Close)
+                    closed = closed or isinstance(reply, protocol.Close)
                     self._commands.append(reply)
         except (EOFError, OSError):
             if not self._ended and not closed and self.error is None:

@@ -1,1 +1,1 @@
-"""The window, in a process of its own: mujoco, NumPy and studio, never torch or Warp."""
+"""Draw frames and handle input, with mujoco, NumPy and studio, but without torch or Warp."""

@@ -1,4 +1,4 @@
-"""Turn keys and buttons into commands: what a person can do, and the table of keys."""
+"""Turn keys and buttons into commands."""
 
 import dataclasses
 from collections import deque
@@ -14,14 +14,7 @@ from lyceum_warp.viewer.window.scene import ViewCameras
 from lyceum_warp.viewer.window.studio import imgui, inputs, ux
 
 SPEEDS = tuple(2.0**power for power in range(-4, 5))
-"""Wanted speeds to choose from, simulated seconds per second."""
-PLAIN_WITHOUT = (
-    mujoco.mjtRndFlag.mjRND_SHADOW,
-    mujoco.mjtRndFlag.mjRND_REFLECTION,
-    mujoco.mjtRndFlag.mjRND_SKYBOX,
-    mujoco.mjtRndFlag.mjRND_HAZE,
-    mujoco.mjtRndFlag.mjRND_POST_PROCESSING,
-)
+"""Available speeds, simulated seconds per second."""
 MANY_STEPS = 50
 """Steps of the arrow keys with Shift."""
 
@@ -33,37 +26,36 @@ KEY_NAMES = {
 
 
 class Actions:
-    """The choices of a person, and the commands that follow from them.
+    """The user's choices, and the commands that they cause.
 
     Args:
-        scene: What is shown.
+        scene: The constant part of the display.
         do: Sends a command to the session.
     """
 
     def __init__(self, scene: Scene, do: Callable[[Command], None]) -> None:
         self.scene, self.do = scene, do
         self.frame: Frame | None = None
-        """The frame that is shown; None before the first one."""
+        """The shown frame; None before the first one."""
         self.viewer: Any
-        """Studio's viewer, from the start of the window on."""
+        """Studio's viewer; set when the window starts."""
         self.cameras: ViewCameras
-        """The same."""
-        self.ghosts = protocol.SetGhosts()
+        """Set when the window starts."""
         self.windows = {"messages", *(["curves"] if scene.curves else [])}
-        """Names of the open windows."""
+        """Titles of the open windows."""
         self.folded = False
-        """Whether the first window is folded."""
+        """Whether the main window is folded."""
         self.fold: bool | None = None
-        """Whether to fold it, or to unfold it, in the next drawing."""
+        """Whether the main window is folded in the next drawing; None keeps it."""
         self.messages: deque[str] = deque(maxlen=200)
         self.scroll_down = False
-        """Whether the newest message has not been drawn yet."""
+        """Whether there is a message that has not been drawn yet."""
         self._slow = SPEEDS[0] * 2
         self._keys = key_table()
 
     @property
     def status(self) -> Status:
-        """The session's status; there is one from the first frame on."""
+        """The session's status, from the first frame on."""
         assert self.frame is not None
         return self.frame.status
 
@@ -73,7 +65,7 @@ class Actions:
         self.scroll_down = True
 
     def press_keys(self) -> None:
-        """Act on the keys that were pressed."""
+        """Handle pressed keys."""
         io = imgui.GetIO()
         if io.WantCaptureKeyboard:
             return
@@ -88,32 +80,32 @@ class Actions:
             _, viewer.cam_speed = ux.move_camera_with_keys(viewer.model, viewer.camera, viewer.cam_speed)
 
     def change_mode(self, by: int) -> None:
-        """Go to the next mode, or to one before."""
+        """Change to the next or the previous mode."""
         modes = self.scene.modes
         self.do(protocol.SetMode(modes[(modes.index(self.status.mode) + by) % len(modes)]))
 
     def change_controller(self, by: int) -> None:
-        """Go to the next controller, or to one before."""
+        """Change to the next or the previous controller."""
         names = self.scene.controllers
         if names:
             now = names.index(self.status.controller) if self.status.controller in names else -by
-            self.do(protocol.SetController(names[(now + by) % len(names)]))
+            self.do(protocol.SetMode("controller", controller=names[(now + by) % len(names)]))
 
     def change_shown(self, by: int) -> None:
-        """Go to the next world or episode, or to one before."""
+        """Show the next or the previous world or episode."""
         if self.status.mode == "playback":
-            if self.scene.episodes:
-                self.do(protocol.SetEpisode(((self.status.episode or 0) + by) % len(self.scene.episodes)))
+            episode = ((self.status.episode or 0) + by) % len(self.scene.episodes)
+            self.do(protocol.SetMode("playback", episode=episode))
         else:
             self.do(protocol.SetWorld("next" if by > 0 else "previous"))
 
     def change_speed(self, by: int) -> None:
-        """Double the speed, or halve it."""
+        """Double or halve the speed."""
         now = int(np.argmin(np.abs(np.log2(SPEEDS) - np.log2(max(self.status.speed, 1e-3)))))
         self.do(protocol.SetSpeed(SPEEDS[min(max(now + by, 0), len(SPEEDS) - 1)]))
 
     def toggle_slow(self) -> None:
-        """Change between real time and the slower or faster speed before."""
+        """Toggle between real time and the previous speed."""
         if self.status.speed == 1:
             self.do(protocol.SetSpeed(self._slow))
         else:
@@ -122,65 +114,47 @@ class Actions:
 
     def set_ghosts(self, **changes: Any) -> None:
         """Change which ghosts are drawn."""
-        ghosts = dataclasses.replace(self.ghosts, **changes)
-        if ghosts != self.ghosts:
-            self.ghosts = ghosts
-            self.do(ghosts)
-
-    def toggle_burst(self) -> None:
-        """Draw many states along the trajectory at once, or only the present one."""
-        self.set_ghosts(burst=0 if self.ghosts.burst else MOST_BURST // 2)
+        self.do(dataclasses.replace(self.status.ghosts, **changes))
 
     def toggle_video(self) -> None:
-        """Begin a video from the camera of the view, or end it."""
+        """Start a video from the view's camera, or end it."""
         on = self.status.video is None
         self.do(protocol.SetVideo(on, self.cameras.view() if on else None))
 
-    def toggle_fold(self) -> None:
-        """Fold the first window, or unfold it."""
-        self.fold = not self.folded
-
     def toggle_window(self, title: str) -> None:
-        """Open a window of the panel, or close it."""
+        """Open or close a window of the panel."""
         self.windows ^= {title}
-
-    def draw_plainly(self) -> None:
-        """Leave out what a browser without a graphics card draws slowly."""
-        flags = list(self.viewer.render_flags.flags)
-        for flag in PLAIN_WITHOUT:
-            flags[int(flag)] = 0
-        self.viewer.render_flags.flags = flags
 
 
 @dataclasses.dataclass(frozen=True)
 class Key:
-    """A key with what it does."""
+    """A key and its action."""
 
     name: str
     what: str
     action: Callable[["Actions"], None]
     repeat: bool = False
-    """Whether holding it repeats it."""
+    """Whether the key repeats while it is held."""
 
     @property
     def code(self) -> Any:
-        """Studio's name of the key, without Ctrl and Shift."""
+        """Studio's code of the key, without Ctrl and Shift."""
         last = self.name.rpartition("+")[2]
         return getattr(imgui.Key, KEY_NAMES.get(last, last))
 
     @property
     def ctrl(self) -> bool:
-        """Whether it is pressed with Ctrl."""
+        """Whether it needs Ctrl."""
         return "Ctrl+" in self.name
 
     @property
     def shift(self) -> bool:
-        """Whether it is pressed with Shift."""
+        """Whether it needs Shift."""
         return "Shift+" in self.name
 
 
 def key_table() -> list[Key]:
-    """The keys of the panel: Lyceum's, where a browser leaves them to the page."""
+    """The keys of the panel. A browser passes all of them to the page."""
     frames, labels = int(mujoco.mjtFrame.mjNFRAME), int(mujoco.mjtLabel.mjNLABEL)
 
     def turn(panel: "Actions", option: str, by: int, number: int) -> None:
@@ -191,36 +165,37 @@ def key_table() -> list[Key]:
         Key("F1", "show or hide this table", lambda p: p.toggle_window("keys")),
         Key("F2", "messages", lambda p: p.toggle_window("messages")),
         Key("F3", "curves", lambda p: p.toggle_window("curves")),
-        Key("F4", "plain drawing, for slow browsers", lambda p: p.draw_plainly()),
-        Key("Tab", "fold or unfold the panel", lambda p: p.toggle_fold()),
-        Key("Space", "pause or go on", lambda p: p.do(protocol.SetPaused(not p.status.paused))),
+        Key("Tab", "fold or unfold the panel", lambda p: setattr(p, "fold", not p.folded)),
+        Key("Space", "pause or continue", lambda p: p.do(protocol.SetPaused(not p.status.paused))),
         Key("Right", "a step", lambda p: p.do(protocol.StepBy(1)), repeat=True),
         Key("Left", "a step back", lambda p: p.do(protocol.StepBy(-1)), repeat=True),
         Key("Shift+Right", f"{MANY_STEPS} steps", lambda p: p.do(protocol.StepBy(MANY_STEPS)), repeat=True),
         Key("Shift+Left", f"{MANY_STEPS} steps back", lambda p: p.do(protocol.StepBy(-MANY_STEPS)), repeat=True),
         Key("Ctrl+Right", "next mode", lambda p: p.change_mode(1)),
-        Key("Ctrl+Left", "mode before", lambda p: p.change_mode(-1)),
+        Key("Ctrl+Left", "previous mode", lambda p: p.change_mode(-1)),
         Key("Ctrl+Down", "next controller", lambda p: p.change_controller(1)),
-        Key("Ctrl+Up", "controller before", lambda p: p.change_controller(-1)),
+        Key("Ctrl+Up", "previous controller", lambda p: p.change_controller(-1)),
         Key("Down", "next world, or next episode of a playback", lambda p: p.change_shown(1), repeat=True),
-        Key("Up", "world or episode before", lambda p: p.change_shown(-1), repeat=True),
+        Key("Up", "previous world or episode", lambda p: p.change_shown(-1), repeat=True),
         Key("Shift+Up", "double the speed", lambda p: p.change_speed(1)),
         Key("Shift+Down", "halve the speed", lambda p: p.change_speed(-1)),
-        Key("Enter", "real time, or the speed before", lambda p: p.toggle_slow()),
+        Key("Enter", "real time, or the previous speed", lambda p: p.toggle_slow()),
         Key("Backspace", "reset", lambda p: p.do(protocol.Reset(random=False))),
         Key("Shift+Backspace", "random reset", lambda p: p.do(protocol.Reset(random=True))),
         Key("Ctrl+R", "reverse the playback", lambda p: p.do(protocol.SetBackwards(not p.status.backwards))),
-        Key("Ctrl+B", "burst: many states at once", lambda p: p.toggle_burst()),
-        Key("Ctrl+D", "burst in colours: past red, future blue", lambda p: p.set_ghosts(doppler=not p.ghosts.doppler)),
-        Key("Ctrl+V", "begin or end a video", lambda p: p.toggle_video()),
+        Key("Ctrl+B", "burst: many states at once",
+            lambda p: p.set_ghosts(burst=0 if p.status.ghosts.burst else MOST_BURST // 2)),
+        Key("Ctrl+D", "burst in colours: past red, future blue",
+            lambda p: p.set_ghosts(doppler=not p.status.ghosts.doppler)),
+        Key("Ctrl+V", "start or end a video", lambda p: p.toggle_video()),
         Key("Ctrl+A", "look at everything", lambda p: p.cameras.reset()),
         Key("Escape", "free camera", lambda p: p.cameras.choose(ux.TUMBLE_CAMERA_IDX)),
         Key("PageDown", "next camera", lambda p: p.cameras.change(1)),
-        Key("PageUp", "camera before", lambda p: p.cameras.change(-1)),
+        Key("PageUp", "previous camera", lambda p: p.cameras.change(-1)),
         Key("[", "frames of the next kind", lambda p: turn(p, "frame", 1, frames)),
-        Key("]", "frames of the kind before", lambda p: turn(p, "frame", -1, frames)),
+        Key("]", "frames of the previous kind", lambda p: turn(p, "frame", -1, frames)),
         Key("-", "labels of the next kind", lambda p: turn(p, "label", 1, labels)),
-        Key("=", "labels of the kind before", lambda p: turn(p, "label", -1, labels)),
+        Key("=", "labels of the previous kind", lambda p: turn(p, "label", -1, labels)),
     ]  # fmt: skip
 
 
@@ -232,4 +207,4 @@ OTHER_KEYS = (
     ("Ctrl + drag right, left", "push or twist that body; while paused, place it"),
     ("double-click right", "look at a point, with Ctrl follow the body"),
 )
-"""What studio does itself."""
+"""Keys and mouse actions that studio handles."""

@@ -1,7 +1,7 @@
-"""Run the window process, which ``session/window_process.py`` starts.
+"""Run the window process: receive frames, draw them with studio, and send commands.
 
-The process draws; it neither steps nor plans. It imports mujoco and NumPy, and of this package only ``viewer/window``
-and ``viewer/protocol.py``: torch and Warp would cost seconds and hundreds of megabytes.
+It imports mujoco and NumPy, and of this package only ``viewer/window`` and ``viewer/protocol.py``: torch and Warp would
+cost seconds and hundreds of megabytes.
 """
 
 import contextlib
@@ -18,18 +18,15 @@ from lyceum_warp.viewer.window import studio
 from lyceum_warp.viewer.window.panel import Panel
 
 IDLE_TIME = 0.25
-"""Seconds between two frames while no person looks."""
+"""Seconds between two frames while no page is open."""
 NICE = 5
-"""How much drawing gives way to the session, whose planner or training may need every core."""
+"""Niceness of the process: drawing gives way to the session, whose planner may need every core."""
 END_TIME = 3.0
 """Seconds in which studio must end."""
 
 
 class WindowEnd:
-    """The window's end of the connection.
-
-    One thread receives frames, and the thread that draws takes the latest one. Both may send.
-    """
+    """The window's end of the connection. One thread receives frames, and the drawing thread takes the latest one."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -38,18 +35,13 @@ class WindowEnd:
         self._looked = 0.0
         self._parent = os.getppid()
 
-    def first(self) -> Opening:
-        """Wait for the first message."""
-        opening: Opening = self._connection.recv()
-        return opening
-
     def send(self, reply: Reply) -> None:
-        """Send to the session; without effect after its end."""
+        """Send to the session; no effect after it has ended."""
         with self._lock, contextlib.suppress(OSError):
             self._connection.send(reply)
 
     def take(self) -> Frame | None:
-        """The latest frame that was not taken yet, for a person who looks."""
+        """The latest frame that was not taken yet."""
         self._looked = time.monotonic()
         with self._lock:
             frame, self._frame = self._frame, None
@@ -74,17 +66,14 @@ class WindowEnd:
 
 
 def main(descriptor: int) -> None:
-    """Open the window, and draw until the session or the person ends it.
-
-    Args:
-        descriptor: File descriptor of the connection to the session.
-    """
+    """Draw until the session or the user ends it; ``descriptor`` is the connection to the session."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session handles Ctrl-C, and ends the window
     if hasattr(os, "nice"):  # not on Windows
         os.nice(NICE)
-    end = WindowEnd(Connection(descriptor))
+    connection = Connection(descriptor)
+    end = WindowEnd(connection)
     try:
-        run(end)
+        run(connection.recv(), end)
         end.send(Close())
     except Exception as error:
         kind = "" if isinstance(error, RuntimeError) else f"{type(error).__name__}: "
@@ -92,12 +81,11 @@ def main(descriptor: int) -> None:
         raise
 
 
-def run(end: WindowEnd) -> None:
+def run(opening: Opening, end: WindowEnd) -> None:
     """Run studio with the panel."""
-    opening = end.first()
     with contextlib.ExitStack() as ends:
         proxy = sock = None
-        opened = Opened()
+        opened, limit = Opened(), studio.NATIVE_GEOMS
         if opening.graphics == "web":
             from lyceum_warp.viewer.window.proxy import Proxy  # loads aiohttp
             from lyceum_warp.viewer.window.sockets import private_socket
@@ -107,11 +95,10 @@ def run(end: WindowEnd) -> None:
             except ValueError as error:
                 return end.send(Failed(str(error), refused=True))
             sock = private_socket()
-            opened = Opened(proxy.address, tuple(proxy.instructions))
+            opened, limit = Opened(proxy.address, tuple(proxy.instructions)), studio.MAX_GEOMS
         model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": opening.scene.model})
         screen = studio.Screen()
-        limit = studio.MAX_GEOMS if opening.graphics == "web" else studio.NATIVE_GEOMS
-        panel = Panel(opening.scene, model, end, screen, opened, limit)
+        panel = Panel(opening.scene, model, end.send, end.take, screen, opened, limit)
 
         def follow() -> None:
             end.receive()
@@ -125,4 +112,4 @@ def run(end: WindowEnd) -> None:
             proxy.start(sock.getsockname(), on_quiet=panel.mouse.let_go)
             if opening.browser:
                 proxy.open_in_browser()
-        screen.run(panel, gfx=opening.graphics, title=opening.scene.title, sock=sock)
+        screen.run(panel, title=opening.scene.title, sock=sock)

@@ -1,6 +1,5 @@
 """Push the body that the mouse drags, or place it while paused."""
 
-import dataclasses
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +11,7 @@ from lyceum_warp.viewer.protocol import Perturb
 
 
 class Mouse:
-    """Turns a drag of the selected body into commands.
+    """Converts drags of the selected body to commands.
 
     Args:
         do: Sends a command to the session.
@@ -25,7 +24,7 @@ class Mouse:
         self._lock = threading.Lock()
 
     def drag(self, viewer: Any, *, paused: bool) -> None:
-        """Push the selected body while the mouse drags it; while paused, place it.
+        """Push the selected body while it is dragged; while paused, place it.
 
         Args:
             viewer: Studio's viewer.
@@ -37,16 +36,16 @@ class Mouse:
                 viewer.perturb.active = 0
             if viewer.perturb.active and viewer.perturb.select > 0:
                 push = _perturbation(viewer.model, viewer.data, viewer.perturb, paused)
-                if self._pushed is None or not _same(push, self._pushed):
+                if self._pushed is None or _rounded(push) != _rounded(self._pushed):
                     self._pushed = push
                     self._do(push)
             else:
                 self._end()
 
     def let_go(self) -> None:
-        """End a push: the person who drags has left. Any thread may call it."""
+        """End a push, because the browser has gone. Any thread may call this."""
         with self._lock:
-            self._left = True  # studio draws nothing without a browser, and does not see that the button was let go
+            self._left = True  # without a browser, studio does not see that the button is released
             self._end()
 
     def _end(self) -> None:
@@ -57,7 +56,7 @@ class Mouse:
 
 
 def _perturbation(model: mujoco.MjModel, data: mujoco.MjData, perturb: mujoco.MjvPerturb, paused: bool) -> Perturb:
-    """The effect of the drag: a force, or a new position."""
+    """The force or the new position of a drag."""
     data.xfrc_applied[:] = 0
     mujoco.mjv_applyPerturbPose(model, data, perturb, int(paused))
     if not paused:
@@ -71,10 +70,6 @@ def _perturbation(model: mujoco.MjModel, data: mujoco.MjData, perturb: mujoco.Mj
     )
 
 
-def _same(one: Perturb, other: Perturb) -> bool:
-    """Whether two pushes do the same, up to rounding errors."""
-    pairs = [(getattr(one, field.name), getattr(other, field.name)) for field in dataclasses.fields(Perturb)]
-    return all(
-        a is b or (a is not None and b is not None and a.shape == b.shape and np.allclose(a, b, rtol=0, atol=1e-9))
-        for a, b in pairs
-    )
+def _rounded(push: Perturb) -> list[Any]:
+    """The parts of a command without rounding errors."""
+    return [None if part is None else (part.round(9) + 0.0).tolist() for part in vars(push).values()]

@@ -1,8 +1,8 @@
-"""Run in studio as a plugin: show the session's frames, and send back the person's commands."""
+"""Connect studio with the session: show frames, and send the user's commands."""
 
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -16,28 +16,19 @@ from lyceum_warp.viewer.window.studio import inputs, ux
 from lyceum_warp.viewer.window.windows import Windows
 
 SWAP_TIME = 0.5
-"""Seconds between two models that are sent to the browser."""
-
-
-class End(Protocol):
-    """The window's end of the connection to the session."""
-
-    def send(self, reply: Reply) -> None:
-        """Send to the session."""
-
-    def take(self) -> Frame | None:
-        """The latest frame that was not taken yet."""
+"""Minimum seconds between two models that are sent to the browser."""
 
 
 class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
-    """Draws frames with studio, and sends commands.
+    """A plugin of studio that shows frames and sends commands.
 
     Args:
-        scene: What is shown.
+        scene: The constant part of the display.
         model: The scene's model.
-        end: Where frames come from and commands go.
-        screen: The viewer that runs this plugin.
-        opened: Sent to the session when the window runs.
+        send: Sends a message to the session.
+        newest: Returns the latest frame that was not shown yet.
+        screen: The viewer that runs the plugin.
+        opened: Sent to the session when the window is open.
         limit: Maximum number of geoms of ghosts and traces.
     """
 
@@ -45,16 +36,17 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         self,
         scene: Scene,
         model: mujoco.MjModel,
-        end: End,
+        send: Callable[[Reply], None],
+        newest: Callable[[], Frame | None],
         screen: studio.Screen,
         opened: Opened,
         limit: int = studio.MAX_GEOMS,
     ) -> None:
-        self.actions = Actions(scene, end.send)
-        self.mouse = Mouse(end.send)
+        self.actions = Actions(scene, send)
+        self.mouse = Mouse(send)
         self.values = ModelValues(model)
         self.windows = Windows(self.actions, self.values, limit)
-        self._end, self._screen, self._opened, self._limit = end, screen, opened, limit
+        self._send, self._newest, self._screen, self._opened, self._limit = send, newest, screen, opened, limit
         self._geoms = ExtraGeoms(model, limit)
         self._swapped = -SWAP_TIME
         self._model_due = False
@@ -63,33 +55,29 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
 
     @studio.handler
     def on_start(self, event: studio.Started) -> None:
-        """The window runs."""
+        """Start the window."""
         ux.setup_theme(ux.GuiTheme.LIGHT)
         self.actions.viewer, self.actions.cameras = self.viewer, ViewCameras(self.viewer, self.values)
         self.actions.cameras.reset()
-        self._end.send(self._opened)
+        self._send(self._opened)
 
     @studio.handler
     def on_update(self, event: studio.Update) -> None:
-        """Before a frame is drawn: take the session's frame, then keys and the mouse."""
-        frame = self._end.take()
+        """Show the newest frame, and handle keys and the mouse."""
+        frame = self._newest()
         if frame is not None:
             self.take(frame)
-        dropped = self.viewer.get_drop_file()  # studio only keeps a file that was dropped on the page or the window
+        dropped = self.viewer.get_drop_file()  # on the page or the window
         if dropped:
             title = self.actions.scene.title
             self.actions.say(f"{Path(dropped).name} was not loaded: this viewer shows {title} only")
         if self.actions.frame is None:
             return
+        viewer = self.viewer
         inputs.handle_mouse_events(
-            self.viewer.model,
-            self.viewer.data,
-            self.viewer.camera,
-            self.viewer.vis_options,
-            self.viewer.perturb,
-            self.actions.cameras.state,
-            move_camera=self.viewer.client_camera is None,
-        )
+            viewer.model, viewer.data, viewer.camera, viewer.vis_options, viewer.perturb, self.actions.cameras.state,
+            move_camera=viewer.client_camera is None,
+        )  # fmt: skip
         self.actions.press_keys()
         self.mouse.drag(self.viewer, paused=self.actions.status.paused)
 
@@ -108,7 +96,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
             self.windows.curves.add(frame.samples)
         if frame.messages:
             self.actions.say(*frame.messages)
-        # the session reports a state that is not finite as a fault; its last good pose stays
+        # the session reports other states as faults; the last good pose stays
         if np.isfinite(frame.state).all():
             mujoco.mj_setState(model, data, frame.state, mujoco.mjtState.mjSTATE_INTEGRATION)
             mujoco.mj_forward(model, data)
@@ -118,12 +106,12 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         self.viewer.extra_geoms[:] = drawn.geoms
 
     def _show_model(self, frame: Frame) -> None:
-        """Set the world's values in the model that is drawn."""
-        if self.values.differ(frame.model_fields):
-            if self.values.set(frame.model_fields):
-                self._model_due = True
-            else:
-                self.values.copy_to(self.viewer.model)
+        """Set the world's values in the drawn model."""
+        changed, visible = self.values.set(frame.model_fields)
+        if visible:
+            self._model_due = True
+        elif changed:
+            self.values.copy_to(self.viewer.model)
         if self._model_due and time.monotonic() > self._swapped + SWAP_TIME:
             self._swapped, self._model_due = time.monotonic(), False
             self._geoms = ExtraGeoms(self.values.model, self._limit)

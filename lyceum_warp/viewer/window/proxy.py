@@ -1,20 +1,18 @@
-"""Serve the page of mujoco.studio to browsers that know the secret: a reverse proxy with access control.
+"""Serve studio's page through a reverse proxy with access control.
 
-Studio's own server has no password. It listens on a private socket (``sockets.py``), which refuses other processes, and
-this proxy stands in front of it, on the loopback address unless asked otherwise. It forwards a request only if
+Studio's own server has no password. It listens on a private socket (``sockets.py``), which refuses other processes. The
+proxy forwards a request only if
 
-- its ``Host`` is an address or a name of this machine, so that DNS rebinding leads nowhere;
-- its ``Origin``, which browsers send with every WebSocket, is the proxy itself, and no other site's page asked for it;
-- it carries the secrets of this viewer: once the token of the printed address, afterwards a cookie and the page's path;
-- it is a GET without a body, or opens one of studio's WebSockets for the screen; other models cannot be loaded.
+- its ``Host`` is an address or a name of this machine (against DNS rebinding);
+- its ``Origin`` and ``Sec-Fetch-*`` headers show that no page of another site sent it;
+- it has the cookie and the secret path, which the token of the printed address is exchanged for;
+- it is a GET without a body, or opens studio's WebSocket ``/ui`` or ``/state`` (not ``/drop``, which loads models).
 
-Browsers send a cookie to every port of its host, and so to servers of other users on the same loopback address. The
-cookie is therefore limited to a random path (``Path=/RANDOM/``), which only the viewer and its browsers know. The proxy
-serves everything below that path. Studio's page asks for some addresses from the root of the host; a script that the
-proxy adds to the page puts the path in front of them.
+Browsers send a cookie to every port of its host, and so to other users' servers on the loopback address. The cookie is
+therefore limited to a random path (``Path=/RANDOM/``), below which the page is served. Studio's page requests addresses
+from the root of the host; a script that the proxy inserts prefixes them with the path.
 
-aiohttp parses requests and bounds their heads (8 KiB a line, 128 lines). It runs in a thread with an event loop of its
-own. What studio receives is built from the checked parts.
+aiohttp parses the requests and limits their heads (8 KiB per line, 128 lines). It runs in a thread.
 """
 
 import asyncio
@@ -30,7 +28,6 @@ import secrets
 import socket
 import tempfile
 import threading
-import time
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
@@ -40,21 +37,18 @@ import aiohttp
 from aiohttp import web
 from yarl import URL
 
-from lyceum_warp.viewer.window.sockets import public_sockets, reachable_address
+from lyceum_warp.viewer.window.sockets import public_sockets
 
 HEAD_SECONDS = 10.0
-"""Time in which the head of a request must arrive, and after which an idle connection is closed."""
+"""Timeout for the head of a request, and for idle connections."""
 WRITE_SECONDS = 60.0
-"""Time in which a client must take some bytes of a response."""
+"""Timeout for a client that does not read."""
 UNCHECKED = 128
-"""Maximum number of connections that have not shown the secret; beyond it the oldest one is closed."""
+"""Maximum number of connections that have not sent the secret; the oldest ones are closed first."""
 MESSAGE_BYTES = 2**20
-"""Maximum size of a WebSocket message of a browser."""
+"""Maximum size of a WebSocket message from a browser."""
 QUIET_SECONDS = 2.0
-"""Time without input after which the browser that controls the viewer counts as gone.
-
-A page sends input for every frame that it draws; a page that is closed, hidden or cut off does not.
-"""
+"""Seconds without input after which the controlling page counts as closed or hidden: it sends input every frame."""
 PROTECTION = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -62,9 +56,9 @@ PROTECTION = {
     "Content-Security-Policy": "frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Embedder-Policy": "require-corp",  # studio's page shares memory between threads
+    "Cross-Origin-Embedder-Policy": "require-corp",  # needed for memory shared between threads
 }
-"""Headers of every response: other sites can neither read nor embed it, and an address is never passed to them."""
+"""Headers of every response: other sites can neither read nor embed it, and never get its address."""
 SCRIPT = """<script>
 (() => {
   const path = location.pathname.slice(0, location.pathname.indexOf("/", 1));
@@ -84,53 +78,51 @@ SCRIPT = """<script>
   };
 })();
 </script>"""
-"""Puts the path of the page in front of the addresses that it asks for from the root of the host."""
+"""Prefixes the addresses that the page requests with its secret path."""
 
 _PATH = re.compile(r"(/[A-Za-z0-9_~!$&'()*+,;=:@\[\]-][A-Za-z0-9._~!$&'()*+,;=:@\[\]-]*)+|/")
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
 _COOKIE = "lyceum-warp"
 _WHERE = "Open the address that was printed where the viewer was started; it ends in ?token=..."
 _ENDED = "The viewer has ended.\n"
-_HEARTBEAT = 30.0  # seconds between pings of a browser, which find out that it is gone, as after a lid was closed
+_HEARTBEAT = 30.0  # seconds between pings, which detect a browser that has gone
 _SocketEnd = web.WebSocketResponse | aiohttp.ClientWebSocketResponse
 
 
 class Proxy:
-    """A server that forwards requests with the right secret to a private server of this process.
+    """A reverse proxy that forwards requests with the secret to studio's server.
 
-    Construction opens the port, ``start`` begins to answer, and ``close`` ends it, as does a ``with`` block.
+    Construction opens the port, ``start`` begins to answer, and ``close`` or the end of a ``with`` block closes it.
 
     Args:
-        host: Address or name to listen on. The default is the loopback address, which other machines cannot reach.
-            Traffic is not encrypted, so forward the port by ssh rather than listen on another address.
-        port: Port to listen on. By default the first free one from 8080 on.
+        host: Address or name to listen on; see ``lw.view``.
+        port: Port to listen on; by default the first free port from 8080.
 
     Raises:
-        ValueError: The port is out of range or in use, or the address is not one of this machine.
+        ValueError: The port is out of range or in use, or the address is not an address of this machine.
     """
 
     def __init__(self, *, host: str = "127.0.0.1", port: int | None = None) -> None:
         self._sockets = public_sockets(host, port)
         addresses = [ipaddress.ip_address(each.getsockname()[0].partition("%")[0]) for each in self._sockets]
         self.port: int = self._sockets[0].getsockname()[1]
-        """The port that browsers connect to."""
+        """The public port."""
         self.local = all(address.is_loopback for address in addresses)
         """Whether only this machine can connect."""
         self._token, self._cookie, self._path = (secrets.token_urlsafe(32) for _ in range(3))
         machine = socket.gethostname().lower()
         self._names = {"localhost", machine, machine.partition(".")[0], host.lower()}
+        ssh = os.environ.get("SSH_CONNECTION", "").split()  # the client's address and port, then this machine's
+        self._ssh = (ssh[2], ssh[3]) if len(ssh) == 4 else (socket.gethostname(), "22")
         everywhere = any(address.is_unspecified for address in addresses)
         self._host = "127.0.0.1" if self.local or everywhere else host
-        families = {int(each.family) for each in self._sockets}
-        self._shown_host = reachable_address(families) or machine if everywhere else self._host
+        self._shown_host = self._ssh[0] if everywhere else self._host
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop
         self._stop: asyncio.Event
         self._server: _Server
         self._client: aiohttp.ClientSession
-        self._upstream = ""
-        self._on_quiet: Callable[[], None] | None = None
-        self._heard: float | None = None
+        self._silence: asyncio.TimerHandle | None = None
         self._folder: tempfile.TemporaryDirectory[str] | None = None
 
     @property
@@ -140,51 +132,41 @@ class Proxy:
 
     @property
     def ssh_line(self) -> str:
-        """The command that forwards the port, with compression, to the machine on which a person sits.
-
-        In a session of ssh it names the address by which that session reached this machine.
-        """
-        connection = os.environ.get("SSH_CONNECTION", "").split()
-        host, ssh_port = (connection[2], connection[3]) if len(connection) == 4 else (socket.gethostname(), "22")
-        target = f"-p {ssh_port} " if ssh_port != "22" else ""
-        try:
-            target += f"{getpass.getuser()}@{host}"
-        except (KeyError, OSError):  # a user without a name, as in some containers
-            target += host
+        """The ssh command that forwards the port to another machine."""
+        host, port = self._ssh
+        with contextlib.suppress(KeyError, OSError):  # a user without a name, as in some containers
+            host = f"{getpass.getuser()}@{host}"
+        target = f"-p {port} {host}" if port != "22" else host
         return f"ssh -C -N -L {self.port}:{_bracketed(self._host)}:{self.port} {target}"
 
     @property
     def instructions(self) -> list[str]:
-        """Lines to print: the address, the command for ssh, and a warning if other machines can connect."""
+        """Lines to print: the address, the ssh command, and a warning if other machines can connect."""
+        lines, ssh = [f"viewer: {self.address}"], f"from another machine: {self.ssh_line}"
         if self.local:
-            return [f"viewer: {self.address}", f"from another machine: {self.ssh_line}"]
-        return [
-            f"viewer: {self.address}",
-            "warning: other machines can connect, and what they send is not encrypted",
-            f"encrypted, from another machine: {self.ssh_line}",
-            f"and open there: {self._address('127.0.0.1')}",
-        ]
+            return [*lines, ssh]
+        lines.append("warning: other machines can connect, and what they send is not encrypted")
+        return [*lines, f"encrypted, {ssh}", f"and open there: {self._address('127.0.0.1')}"]
 
     def _address(self, host: str) -> str:
         return f"http://{_bracketed(host)}:{self.port}/?token={self._token}"
 
     def open_in_browser(self) -> None:
-        """Open the page in this machine's browser, from a private file that leads to the address.
+        """Open the page in a browser on this machine, by a private file that redirects to it.
 
-        Other users can see the command lines of all processes, so the browser's must not contain the token.
+        All users can read the command lines of processes, so the browser's command line must not contain the token.
         """
         self._folder = tempfile.TemporaryDirectory(prefix="lyceum-warp-", ignore_cleanup_errors=True)
-        file = Path(self._folder.name) / "viewer.html"  # a folder of tempfile is for its user only
+        file = Path(self._folder.name) / "viewer.html"  # the folder is readable by this user only
         file.write_text(_page_leading_to(self.address))
         threading.Thread(target=webbrowser.open, args=(file.as_uri(),), kwargs={"new": 2}, daemon=True).start()
 
-    def start(self, upstream: tuple[str, int], on_quiet: Callable[[], None] | None = None) -> None:
+    def start(self, upstream: tuple[str, int], on_quiet: Callable[[], object] = lambda: None) -> None:
         """Begin to answer, in a thread.
 
         Args:
-            upstream: Host and port of the private server.
-            on_quiet: Called in that thread when the browser that controls the viewer has sent nothing for a while, as
-                after its page was closed.
+            upstream: Host and port of studio's server.
+            on_quiet: Called in that thread when the controlling page has been closed or hidden.
         """
         self._upstream, self._on_quiet = "http://{}:{}".format(*upstream), on_quiet
         ready = threading.Event()
@@ -217,19 +199,11 @@ class Proxy:
         runner = web.ServerRunner(self._server, shutdown_timeout=0.2)
         timeout = aiohttp.ClientTimeout(total=None, sock_read=WRITE_SECONDS)
         async with aiohttp.ClientSession(timeout=timeout, auto_decompress=False) as self._client:
-            try:
-                await runner.setup()
-                for each in self._sockets:
-                    await web.SockSite(runner, each).start()
-            finally:
-                ready.set()
-            while not self._stop.is_set():
-                with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(self._stop.wait(), QUIET_SECONDS / 8)
-                if self._heard is not None and time.monotonic() - self._heard > QUIET_SECONDS:
-                    self._heard = None
-                    if self._on_quiet is not None:
-                        self._on_quiet()
+            await runner.setup()
+            for each in self._sockets:
+                await web.SockSite(runner, each).start()
+            ready.set()
+            await self._stop.wait()
             await runner.cleanup()
 
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
@@ -246,21 +220,21 @@ class Proxy:
             raise
 
     def _check_sender(self, request: web.BaseRequest) -> None:
-        """Refuse names that are not this machine's, requests of other sites' pages, and all but a plain GET."""
+        """Refuse foreign hosts, requests from pages of other sites, and requests other than a plain GET."""
         host = request.headers.get("Host", "").lower()
         match = _HOST.fullmatch(host)
         if match is None:
             raise web.HTTPBadRequest(text="the Host header is missing or malformed\n")
         name = match[1].strip("[]")
         try:
-            ipaddress.ip_address(name)  # a page that a browser got from a bare address cannot be rebound
+            ipaddress.ip_address(name)  # an IP address cannot be rebound
         except ValueError:
             if name not in self._names:
                 text = f"{name} is not a name of this machine; use its address instead\n"
                 raise web.HTTPMisdirectedRequest(text=text) from None
         own = (f"http://{host}", f"https://{host}")
         foreign = any(origin.lower() not in own for origin in request.headers.getall("Origin", []))
-        # a link on another page may lead here; its token decides
+        # links on other pages are allowed; they need the token
         modes = request.headers.get("Sec-Fetch-Mode"), request.headers.get("Sec-Fetch-Dest")
         if foreign or (_is_cross_site(request) and modes != ("navigate", "document")):
             raise web.HTTPForbidden(text="a request of another site's page\n")
@@ -270,7 +244,7 @@ class Proxy:
             raise web.HTTPBadRequest(text="a request with a body\n")
 
     def _enter(self, request: web.BaseRequest) -> web.Response:
-        """Exchange the token for the cookie and its path; the page's address has no token."""
+        """Exchange the token for the cookie and its path."""
         tokens = request.query.getall("token")
         if len(tokens) > 1 or not _same(tokens[0], self._token):
             raise web.HTTPForbidden(text=f"This token is not the one of this viewer. {_WHERE}\n")
@@ -284,12 +258,12 @@ class Proxy:
         }
         if not _is_cross_site(request):
             return web.Response(status=303, headers={**headers, "Location": target})
-        # A browser that follows a link of another site does not send the cookie (SameSite=Strict), and neither when
-        # that link's answer redirects it. It sends the cookie when a page of the proxy leads on.
+        # After a link on another site, browsers send the cookie (SameSite=Strict) neither at once nor after a redirect,
+        # but when a page of this site leads on.
         return web.Response(text=_page_leading_to(target), content_type="text/html", headers=headers)
 
     def _checked_target(self, request: web.BaseRequest) -> str:
-        """Compare the path and the cookie; returns the target as the private server knows it."""
+        """Check the path and the cookie; return the target without the secret path."""
         path, question, query = request.raw_path.partition("?")
         first, slash, below = path.removeprefix("/").partition("/")
         wanted = f"{_COOKIE}={self._cookie}"
@@ -304,7 +278,7 @@ class Proxy:
         return f"/{below}{question}{query}"
 
     async def _fetch(self, request: web.BaseRequest, target: str) -> web.StreamResponse:
-        """Answer with the private server's response, of which only type, length, caching and body are kept."""
+        """Forward studio's response: type, length, caching and body."""
         try:
             found = await self._client.get(URL(self._upstream + target, encoded=True), allow_redirects=False)
         except (aiohttp.ClientError, TimeoutError):
@@ -332,7 +306,7 @@ class Proxy:
             return answer
 
     async def _bridge(self, request: web.BaseRequest, target: str) -> web.StreamResponse:
-        """Pass on the messages of a WebSocket in both directions, until one end closes it."""
+        """Forward the messages of a WebSocket in both directions."""
         browser = web.WebSocketResponse(heartbeat=_HEARTBEAT, compress=False, max_msg_size=MESSAGE_BYTES)
         browser.headers.update(PROTECTION)
         await browser.prepare(request)  # refuses malformed handshakes
@@ -347,16 +321,19 @@ class Proxy:
         return browser
 
     def _hear(self) -> None:
-        self._heard = time.monotonic()
+        """Restart the timer of the controlling page."""
+        if self._silence is not None:
+            self._silence.cancel()
+        self._silence = self._loop.call_later(QUIET_SECONDS, self._on_quiet)
 
 
 class _Server(web.Server):
-    """Closes the oldest of too many connections that have not shown the secret, and slow or idle ones."""
+    """Limits the number of connections without the secret, and closes slow or idle connections."""
 
     def __init__(self, handler: Any) -> None:
         super().__init__(
             handler, handler_cancellation=True, keepalive_timeout=HEAD_SECONDS, lingering_time=1.0, access_log=None,
-            logger=logging.Logger("viewer-proxy", logging.CRITICAL),  # malformed requests would fill a file
+            logger=logging.Logger("viewer-proxy", logging.CRITICAL),  # no log of malformed requests
         )  # fmt: skip
         self.unchecked: dict[web.RequestHandler, None] = {}
 
@@ -372,11 +349,11 @@ class _Server(web.Server):
 
 
 async def _relay(source: _SocketEnd, sink: _SocketEnd, heard: Callable[[], None] | None = None) -> None:
-    """Pass on messages until the source is closed, then close the sink in the same way.
+    """Forward messages until the source is closed; then close the sink with the same code.
 
     Args:
-        source: Where messages come from.
-        sink: Where they go.
+        source: The receiving end.
+        sink: The sending end.
         heard: Called for each message.
     """
     code, reason = int(aiohttp.WSCloseCode.GOING_AWAY), ""
@@ -397,7 +374,7 @@ async def _relay(source: _SocketEnd, sink: _SocketEnd, heard: Callable[[], None]
 
 
 def _same(given: str, secret: str) -> bool:
-    """Compare in a time that does not depend on where the two differ."""
+    """Compare in constant time."""
     return hmac.compare_digest(given.encode(errors="replace"), secret.encode())
 
 
@@ -406,10 +383,10 @@ def _is_cross_site(request: web.BaseRequest) -> bool:
 
 
 def _bracketed(host: str) -> str:
-    """A host as it is written in an address: IPv6 in brackets."""
+    """Put an IPv6 address in brackets."""
     return f"[{host}]" if ":" in host else host
 
 
 def _page_leading_to(address: str) -> str:
-    """A page that opens another one at once."""
+    """A page that redirects."""
     return f'<!doctype html><meta http-equiv="refresh" content="0; url={html.escape(address)}">'

@@ -1,7 +1,6 @@
-"""Draw the panel with ImGui: the session, messages, curves, the view and the keys."""
+"""Draw the windows of the panel with ImGui."""
 
 import functools
-import re
 import textwrap
 from collections.abc import Callable
 from typing import Any
@@ -10,29 +9,29 @@ import mujoco
 import numpy as np
 
 from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import MOST_BURST, MOST_GHOSTS
+from lyceum_warp.viewer.protocol import MAX_POINTS, MOST_BURST
 from lyceum_warp.viewer.window.actions import MANY_STEPS, OTHER_KEYS, SPEEDS, Actions, key_table
 from lyceum_warp.viewer.window.scene import Drawn, ModelValues
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS = 200
-"""Points of a plotted curve. All of them are sent to the browser for each frame."""
+"""Maximum number of points of a plotted curve. Each frame sends all of them to the browser."""
 WINDOWS = ("messages", "curves", "view", "keys")
 
 
 class Windows:
-    """Draws the windows of the panel.
+    """The windows of the panel.
 
     Args:
-        actions: The person's choices.
-        values: The model of the world that is shown.
+        actions: The user's choices.
+        values: The model of the shown world.
         limit: Maximum number of geoms of ghosts and traces.
     """
 
     def __init__(self, actions: Actions, values: ModelValues, limit: int) -> None:
         self.curves = Curves(len(actions.scene.curves))
         self.drawn = Drawn([], 0, 0)
-        """The ghosts and traces of the last frame."""
+        """The drawn ghosts and traces."""
         self._actions, self._values, self._limit = actions, values, limit
         self._scene = actions.scene
         self._ghost_worlds = ""
@@ -42,7 +41,7 @@ class Windows:
         """Draw every open window."""
         size = imgui.GetIO().DisplaySize
         width, height = size.x, size.y
-        # a browser's window changes its size: the panel follows, and may be moved until then
+        # the windows may be moved until the browser's window changes its size
         self._size, resized = (width, height), (width, height) != self._size
         cond = int(imgui.Cond.Always if resized else imgui.Cond.FirstUseEver)
         tall = min(len(self._scene.curves) * 128 + 40, height - 50)
@@ -55,12 +54,12 @@ class Windows:
     def _window(
         self, title: str, place: tuple[float, float, float, float], cond: int, content: Callable[[], None]
     ) -> None:
-        """Draw a window, unless it is closed. The first one only folds when it is closed.
+        """Draw a window, unless it is closed. The main window can only be folded.
 
         Args:
             title: Its title.
             place: Left, top, width and height, in pixels.
-            cond: When it is put there, as ``ImGuiCond``.
+            cond: When the place is set, as ``ImGuiCond``.
             content: Draws the inside.
         """
         left, top, width, height = place
@@ -72,18 +71,16 @@ class Windows:
         if first and self._actions.fold is not None:
             imgui.SetNextWindowCollapsed(self._actions.fold)
             self._actions.fold = None
-        unfolded, still_open = imgui.Begin(title, True)
+        unfolded, still_open = imgui.Begin(title, None if first else True)
         if unfolded:
             content()
         imgui.End()
         if first:
             self._actions.folded = not unfolded
-            self._actions.fold = None if still_open else True
         elif not still_open:
             self._actions.windows.discard(title)
 
     def _session(self) -> None:
-        """Modes, worlds, time and ghosts."""
         if self._actions.frame is None:
             imgui.TextDisabled("waiting for the session")
             return
@@ -97,7 +94,6 @@ class Windows:
         self._buttons()
 
     def _modes(self) -> None:
-        """Modes, controllers and episodes."""
         status = self._actions.status
         for i, mode in enumerate(self._scene.modes):
             if i:
@@ -107,17 +103,16 @@ class Windows:
         if status.mode == "controller":
             for name in self._scene.controllers:
                 if imgui.Selectable(name, name == status.controller):
-                    self._actions.do(protocol.SetController(name))
+                    self._actions.do(protocol.SetMode("controller", controller=name))
         if status.mode == "playback":
             chosen = combo("episode", self._scene.episodes, status.episode or 0)
             if chosen is not None:
-                self._actions.do(protocol.SetEpisode(chosen))
+                self._actions.do(protocol.SetMode("playback", episode=chosen))
             changed, backwards = imgui.Checkbox("backwards", status.backwards)
             if changed:
                 self._actions.do(protocol.SetBackwards(backwards))
 
     def _worlds(self) -> None:
-        """The world that is shown."""
         if self._scene.nworld == 1:
             return
         imgui.SeparatorText(f"world, of {self._scene.nworld:,}")
@@ -127,10 +122,7 @@ class Windows:
         )
         imgui.PopItemWidth()
         if entered:
-            if 0 <= world < self._scene.nworld:
-                self._actions.do(protocol.SetWorld(world))
-            else:
-                self._actions.say(f"there is no world {world}: choose 0 to {self._scene.nworld - 1}")
+            self._actions.do(protocol.SetWorld(world))
         choices: tuple[tuple[str, protocol.WorldChoice], ...] = (
             ("\uf053", "previous"), ("\uf054", "next"), ("best", "best"), ("worst", "worst"),
             ("last ended", "last_ended"),
@@ -142,7 +134,6 @@ class Windows:
                 self._actions.do(protocol.SetWorld(choice))
 
     def _time(self) -> None:
-        """Pause, steps, speed, resets and the scrubber."""
         status = self._actions.status
         imgui.SeparatorText("time")
         buttons: tuple[tuple[str, str, protocol.Command], ...] = (
@@ -150,7 +141,7 @@ class Windows:
             ("\uf074", "random reset", protocol.Reset(random=True)),
             ("\uf04a", f"{MANY_STEPS} steps back", protocol.StepBy(-MANY_STEPS)),
             ("\uf048", "a step back", protocol.StepBy(-1)),
-            ("\uf04b" if status.paused else "\uf04c", "go on or pause", protocol.SetPaused(not status.paused)),
+            ("\uf04b" if status.paused else "\uf04c", "continue or pause", protocol.SetPaused(not status.paused)),
             ("\uf051", "a step", protocol.StepBy(1)),
             ("\uf04e", f"{MANY_STEPS} steps", protocol.StepBy(MANY_STEPS)),
         )
@@ -167,8 +158,6 @@ class Windows:
         if chosen is not None:
             self._actions.do(protocol.SetSpeed(SPEEDS[chosen]))
         first, last = status.seekable
-        if first == last and status.mode == "playback":
-            first, last = 0, max(status.steps - 1, 0)
         if first < last:
             imgui.PushItemWidth(-1)
             changed, step = imgui.SliderInt("##scrub", min(max(status.step, first), last), first, last, "step %d")
@@ -177,12 +166,11 @@ class Windows:
                 self._actions.do(protocol.Seek(step))
 
     def _status(self) -> None:
-        """The status as a table."""
         status = self._actions.status
         of = f" of {status.steps:,}" if status.steps else ""
         rows = [("step", f"{status.step:,}{of}"), ("time", f"{status.time:.3f} s")]
         if np.isfinite(status.measured_speed):
-            rows.append(("speed", f"{status.measured_speed:.2f}, wanted {speed_name(status.speed)}"))
+            rows.append(("speed", f"{status.measured_speed:.2f} of {speed_name(status.speed)}"))
         if np.isfinite(status.plan_ms):
             rows.append(("control", f"{status.plan_ms:.1f} ms"))
         rows += [(name, f"{value:.4g}") for name, value in self._last_values()]
@@ -195,13 +183,9 @@ class Windows:
                 imgui.TableNextColumn()
                 imgui.TextWrapped(value)
             imgui.EndTable()
-        values = self._values.differences
-        if values and imgui.CollapsingHeader(f"model of this world ({len(values)})"):
-            for name, value in values:
-                imgui.TextUnformatted(f"{name}  {value}")
 
     def dropped(self) -> list[tuple[str, str]]:
-        """How many ghosts and traces are drawn, where some are left out."""
+        """Ghosts and traces that are left out."""
         frame = self._actions.frame
         if frame is None:
             return []
@@ -213,21 +197,20 @@ class Windows:
         return [(name, f"{drawn} of {given} drawn: {why}") for name, given, drawn in counts if drawn < given]
 
     def _last_values(self) -> list[tuple[str, float]]:
-        """The newest value of each curve."""
+        """The last value of each curve."""
         rows = self.curves.rows
         return list(zip(self._scene.curves, rows[-1, 1:].tolist(), strict=True)) if len(rows) else []
 
     def _ghosts(self) -> None:
-        """Which ghosts are drawn."""
         if not imgui.CollapsingHeader("ghosts"):
             return
-        ghosts = self._actions.ghosts
+        ghosts = self._actions.status.ghosts
         imgui.PushItemWidth(150)
         if self._scene.nworld > 1:
             _, self._ghost_worlds = imgui.InputTextWithHint("worlds", "1 2 5-9", self._ghost_worlds)
             if imgui.IsItemDeactivatedAfterEdit():
                 try:
-                    self._actions.set_ghosts(worlds=numbers(self._ghost_worlds, self._scene.nworld, MOST_GHOSTS))
+                    self._actions.set_ghosts(worlds=numbers(self._ghost_worlds, self._scene.nworld))
                 except ValueError as error:
                     self._actions.say(str(error))
         if len(self._scene.episodes) > 1 and imgui.BeginCombo("episodes", f"{len(ghosts.episodes)} chosen"):
@@ -235,15 +218,12 @@ class Windows:
                 changed, on = imgui.Checkbox(f"{name}##{i}", i in ghosts.episodes)
                 if changed:
                     others = set(ghosts.episodes) - {i}
-                    if on and len(others) == MOST_GHOSTS:
-                        self._actions.say(f"{MOST_GHOSTS} episodes can be drawn at once: leave one out first")
-                    else:
-                        self._actions.set_ghosts(episodes=tuple(sorted(others | {i} if on else others)))
+                    self._actions.set_ghosts(episodes=tuple(sorted(others | {i} if on else others)))
             imgui.EndCombo()
         changed, burst = imgui.SliderInt("burst", ghosts.burst, 0, MOST_BURST)
         if changed:
             self._actions.set_ghosts(burst=burst)
-        imgui.SetItemTooltip("states along the trajectory that are drawn at once (Ctrl+B)")
+        imgui.SetItemTooltip("number of states along the trajectory (Ctrl+B)")
         changed, fade = imgui.SliderFloat("fade", ghosts.fade, 0.5, 1.0)
         if changed:
             self._actions.set_ghosts(fade=fade)
@@ -256,17 +236,12 @@ class Windows:
         imgui.PopItemWidth()
 
     def _camera(self) -> None:
-        """The camera, and the body that it follows."""
         if not imgui.CollapsingHeader("camera"):
             return
         imgui.PushItemWidth(190)
-        cameras = self._actions.cameras
-        indices = cameras.indices()
-        names = [cameras.name(index) for index in indices]
-        chosen = combo("camera", names, indices.index(cameras.state.camera_index))
-        if chosen is not None:
-            cameras.choose(indices[chosen])
-        model, camera = self._values.model, self._actions.viewer.camera
+        cameras, viewer = self._actions.cameras, self._actions.viewer
+        ux.camera_selection_gui(viewer.model, viewer.data, viewer.camera, cameras.state)
+        model, camera = self._values.model, viewer.camera
         names = [model.body(i).name or f"body {i}" for i in range(1, model.nbody)]
         tracking = camera.type == mujoco.mjtCamera.mjCAMERA_TRACKING
         body = combo("follows", ["-", *names], int(camera.trackbodyid) if tracking else 0)
@@ -279,7 +254,6 @@ class Windows:
             cameras.reset()
 
     def _body(self) -> None:
-        """The body that the mouse pushes, for those who cannot double-click it."""
         if not imgui.CollapsingHeader("push a body"):
             return
         model, perturb = self._values.model, self._actions.viewer.perturb
@@ -293,7 +267,6 @@ class Windows:
         imgui.TextDisabled("Ctrl + drag right: push, left: twist")
 
     def _buttons(self) -> None:
-        """Video, help and the end."""
         imgui.Separator()
         making = self._actions.status.video is not None
         if highlighted_button("\uf03d  end the video" if making else "\uf03d  video", making):
@@ -310,7 +283,6 @@ class Windows:
             imgui.TextWrapped(self._actions.status.video)
 
     def _messages(self) -> None:
-        """Ends of episodes, faults and refusals."""
         columns = int(imgui.GetContentRegionAvail().x / imgui.CalcTextSize("n" * 10).x * 10)
         for message in self._actions.messages:
             imgui.TextUnformatted(wrapped(message, max(columns, 10)))
@@ -319,7 +291,6 @@ class Windows:
             self._actions.scroll_down = False
 
     def _curves(self) -> None:
-        """A plot for each curve."""
         rows = self.curves.thinned(PLOT_POINTS)
         flags = int(implot.Flags.NoLegend) | int(implot.Flags.NoMenus) | int(implot.Flags.NoBoxSelect)
         fit = int(implot.AxisFlags.AutoFit)
@@ -330,10 +301,7 @@ class Windows:
                 implot.EndPlot()
 
     def _view(self) -> None:
-        """What studio offers for the drawing."""
         viewer = self._actions.viewer
-        if imgui.Button("plain drawing, for slow browsers (F4)"):
-            self._actions.draw_plainly()
         if imgui.CollapsingHeader("rendering"):
             ux.rendering_gui(viewer.model, viewer.vis_options, viewer.render_flags)
         if imgui.CollapsingHeader("visualization"):
@@ -344,7 +312,6 @@ class Windows:
             ux.sensor_gui(viewer.model, viewer.data)
 
     def _help(self) -> None:
-        """The keys and what the mouse does."""
         if imgui.BeginTable("##keys", 2):
             for keys, what in [*((key.name, key.what) for key in key_table()), *OTHER_KEYS]:
                 imgui.TableNextColumn()
@@ -358,7 +325,7 @@ class Windows:
 
 
 def highlighted_button(label: str, on: bool) -> bool:
-    """A button that shows whether it is on."""
+    """Draw a button that is highlighted while it is on; return whether it was pressed."""
     if on:
         imgui.PushStyleColor(int(imgui.Col.Button), imgui.Vec4(0.2, 0.55, 0.9, 1.0))
     pressed = imgui.Button(label)
@@ -368,70 +335,57 @@ def highlighted_button(label: str, on: bool) -> bool:
 
 
 def combo(label: str, names: Any, now: int) -> int | None:
-    """A choice of several; the index of the newly chosen one."""
+    """Draw a list of choices; return the index of a new choice."""
     changed, chosen = imgui.Combo(label, now, list(names))
     return int(chosen) if changed and chosen != now else None
 
 
 @functools.lru_cache(maxsize=1000)
 def wrapped(text: str, columns: int) -> str:
-    """Break a text between words. ImGui breaks within words, too."""
+    """Wrap a text at spaces, which ImGui does not."""
     return textwrap.fill(text, columns)
 
 
 def speed_name(speed: float) -> str:
-    """A speed as a person writes it, such as 1/4."""
+    """Format a speed, such as 1/4."""
     return f"1/{1 / speed:g}" if 0 < speed < 1 else f"{speed:g}"
 
 
-def numbers(text: str, below: int, most: int) -> tuple[int, ...]:
-    """Read numbers and ranges of worlds, such as "1 2 5-9", each once.
-
-    Args:
-        text: What a person wrote.
-        below: Number of worlds.
-        most: Worlds that may be chosen at once.
+def numbers(text: str, below: int) -> tuple[int, ...]:
+    """Parse numbers and ranges, such as "1 2 5-9". Ranges end at ``below``, so that none is huge.
 
     Raises:
-        ValueError: if the text has another form, or there is no such world, or too many are chosen.
+        ValueError: A word is neither a number nor a range.
     """
     chosen: dict[int, None] = {}
     for word in text.replace(",", " ").split():
-        found = re.fullmatch(r"(\d+)(?:-(\d+))?", word)
-        if found is None:
+        first, _, last = word.partition("-")
+        if not first.isdecimal() or not (last or first).isdecimal() or word.endswith("-"):
             raise ValueError(f"{word!r} is not a number or a range: write for example 1 2 5-9")
-        first, last = int(found[1]), int(found[2] or found[1])
-        if last < first:
-            raise ValueError(f"the range {word} is empty: write {last}-{first}")
-        if last >= below:
-            raise ValueError(f"there is no world {max(first, below)}: choose 0 to {below - 1}")
-        if last - first >= most or len(chosen := chosen | dict.fromkeys(range(first, last + 1))) > most:
-            raise ValueError(f"too many worlds in {text!r}: {most} can be drawn at once")
+        chosen |= dict.fromkeys(range(int(first), min(int(last or first), max(int(first), below)) + 1))
     return tuple(chosen)
 
 
 class Curves:
-    """The newest points of some curves that share their times.
+    """The newest points of curves with common times.
 
     Args:
-        number: How many curves there are.
-        capacity: Points that are kept.
+        number: Number of curves.
     """
 
-    def __init__(self, number: int, capacity: int = 20_000) -> None:
+    def __init__(self, number: int) -> None:
         self.rows = np.empty((0, 1 + number))
-        """(points, 1 + number): times in seconds, then a value for each curve."""
-        self._capacity = capacity
+        """(points, 1 + number): times in seconds, then a value per curve."""
 
     def add(self, rows: np.ndarray) -> None:
-        """Append points. If time goes back, as in a new episode, the points from that time on are dropped."""
+        """Append points. If time goes back, as after steps back, later points are dropped."""
         for part in np.split(rows, np.flatnonzero(np.diff(rows[:, 0]) < 0) + 1):
             if len(part):
                 kept = self.rows[: np.searchsorted(self.rows[:, 0], part[0, 0])]
-                self.rows = np.concatenate([kept, part])[-self._capacity :]
+                self.rows = np.concatenate([kept, part])[-MAX_POINTS:]
 
     def thinned(self, points: int) -> np.ndarray:
-        """At most about ``points`` rows for a plot: the extremes of each curve's equal parts are kept."""
+        """Thin the curves to about ``points`` rows: the minimum and the maximum of each of ``points / 2`` parts."""
         rows = self.rows
         if len(rows) <= points:
             return rows

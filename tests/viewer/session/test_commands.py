@@ -1,4 +1,6 @@
-"""What each command does."""
+"""The effect of each command."""
+
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -8,79 +10,50 @@ from memory_window import pushing
 
 import lyceum_warp as lw
 from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import Perturb, StepBy
+from lyceum_warp.viewer.protocol import Perturb, SetMode, StepBy
 from lyceum_warp.viewer.session.clock import Session
+
+FORCES = np.zeros((5, 6))
+FORCES[1, 0] = 50.0
+PUSH, RELEASE = Perturb(FORCES), Perturb(0 * FORCES)
 
 
 def pushed(env: lw.Env, world: int) -> bool:
     return bool(env.get_state()[world, env.state_space.parts["xfrc_applied"]].any())
 
 
-@pytest.fixture
-def push(shared_env: SharedEnv) -> Perturb:
-    forces = np.zeros((shared_env("hopper", nworld=2).model.nbody, 6))
-    forces[1, 0] = 50.0
-    return Perturb(forces)
-
-
-def released(push: Perturb) -> Perturb:
-    return Perturb(0 * push.forces)
-
-
-def test_a_push_ends_when_another_world_is_shown(shared_env: SharedEnv, push: Perturb) -> None:
+def test_a_push_ends_when_another_world_is_shown(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
-    session.obey(push)
-    assert pushed(env, 0)
-    session.obey(protocol.SetWorld(1))
-    assert not pushed(env, 0)
-    session.obey(push)  # the drag goes on
-    session.obey(released(push))
-    assert not pushed(env, 0) and not pushed(env, 1)
+    for command, pushes in ((PUSH, (True, False)), (protocol.SetWorld(1), (False, False)),
+                            (PUSH, (False, True)), (RELEASE, (False, False))):  # fmt: skip
+        session.obey(command)
+        assert (pushed(env, 0), pushed(env, 1)) == pushes
 
 
-def test_a_push_of_the_past_does_not_stay(shared_env: SharedEnv, push: Perturb) -> None:
+@pytest.mark.parametrize("branch", [Perturb(0 * FORCES, qpos=np.full(6, 0.1)), SetMode("passive"),
+                                    SetMode("controller", "other"), protocol.SetWorld(1), StepBy(3)])  # fmt: skip
+def test_a_push_that_is_restored_ends_when_the_world_goes_on(shared_env: SharedEnv, branch: protocol.Command) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, controllers={"policy": pushing, "other": pushing}, paused=True)
-    qpos = env.model.qpos0 + 0.1
-
-    def past_push() -> None:
-        session.obey(push)
-        session.obey(StepBy(4))
-        session.obey(released(push))
-        session.obey(StepBy(2))
-        session.obey(StepBy(-4))
-        assert pushed(env, 0)
-
-    placed = Perturb(0 * push.forces, qpos=qpos)
-    branches = (placed, protocol.SetMode("passive"), protocol.SetController("other"), protocol.SetWorld(1))
-    for branch in branches:  # each of them drops the steps ahead
-        past_push()
-        session.obey(branch)
-        assert not pushed(env, 0), branch
-        session.obey(protocol.Reset(random=False))
-        session.obey(protocol.SetWorld(0))
-        session.obey(protocol.SetController("policy"))
-    past_push()
-    session.obey(StepBy(3))
+    for command in (PUSH, StepBy(4), RELEASE, StepBy(2), StepBy(-4)):
+        session.obey(command)
+    assert pushed(env, 0)
+    session.obey(branch)
     assert not pushed(env, 0)
 
 
-def test_a_push_that_ends_in_the_past_does_not_stay_in_the_present(shared_env: SharedEnv, push: Perturb) -> None:
+def test_a_push_that_ends_in_the_past_does_not_stay_in_the_present(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
-    session.stage.advance(2)
-    session.obey(push)
-    session.stage.advance(2)
-    session.obey(StepBy(-4))
-    session.obey(released(push))
-    session.obey(StepBy(2))
-    assert pushed(env, 0)  # the push is repeated
+    for command in (StepBy(2), PUSH, StepBy(2), StepBy(-4), RELEASE, StepBy(2)):
+        session.obey(command)
+    assert pushed(env, 0)  # restored
     session.obey(StepBy(2))
     assert not pushed(env, 0) and session.stage.live.past.ahead == 0
 
 
-def test_a_push_goes_on_under_another_controller(push: Perturb) -> None:
+def test_a_planner_does_not_foresee_a_push_and_the_push_goes_on() -> None:
     env = lw.make("hopper", nworld=2)
     seen = []
 
@@ -89,14 +62,16 @@ def test_a_push_goes_on_under_another_controller(push: Perturb) -> None:
         return torch.zeros(3)
 
     session = Session(env, controllers={"look": look}, paused=True)
-    session.obey(protocol.SetMode("passive"))
-    session.obey(push)
-    session.obey(protocol.SetController("look"))
-    assert pushed(session.stage.live.env, 0) and not pushed(env, 0)
+    for command in (SetMode("passive"), PUSH, SetMode("controller", "look")):
+        session.obey(command)
+    plant = session.stage.live.env
+    assert pushed(plant, 0) and not pushed(env, 0)
+    position = plant.get_state()[0, plant.state_space.parts["qpos"]][0].item()
     session.stage.advance(2)
     assert seen == [0.0, 0.0]
-    session.obey(released(push))
-    assert not pushed(session.stage.live.env, 0)
+    assert plant.get_state()[0, plant.state_space.parts["qpos"]][0] > position
+    session.obey(RELEASE)
+    assert not pushed(plant, 0)
 
 
 def test_a_body_is_placed_while_paused(shared_env: SharedEnv) -> None:
@@ -112,29 +87,12 @@ def test_a_body_is_placed_while_paused(shared_env: SharedEnv) -> None:
 
 
 def test_seeking_shows_a_step_of_the_episode(shared_env: SharedEnv) -> None:
-    env = shared_env("hopper", nworld=2)
-    session = Session(env, seed=0)
+    session = Session(shared_env("hopper", nworld=2), seed=0)
     session.stage.advance(8)
-    session.obey(protocol.Seek(3))
-    frame = session.stage.frame()
-    assert frame.status.step == 3 and frame.status.paused and frame.status.seekable == (0, 8)
-    session.obey(protocol.Seek(100))
-    assert session.stage.frame().status.step == 8
-
-
-def test_another_controller_acts_after_steps_back(shared_env: SharedEnv) -> None:
-    env = shared_env("hopper", nworld=2)
-    session = Session(env, controllers={"a": pushing, "b": lambda obs: 0.5 * pushing(obs)}, paused=True, seed=1)
-    session.stage.advance(6)
-    session.obey(StepBy(-4))
-    session.obey(protocol.SetController("b"))
-    assert session.stage.live.past.ahead == 0 and session.stage.live.past.behind == 2
-    session.obey(StepBy(1))
-    assert env.action.abs().max() == 0.25
-    session.obey(StepBy(-1))
-    session.obey(protocol.SetMode("passive"))
-    session.obey(StepBy(1))
-    assert env.action.abs().max() == 0
+    for step, shown in ((3, 3), (100, 8)):
+        session.obey(protocol.Seek(step))
+        status = session.stage.frame().status
+        assert status.step == shown and status.paused and status.seekable == (0, 8)
 
 
 def test_worlds_are_chosen_by_number_and_by_return(shared_env: SharedEnv) -> None:
@@ -164,17 +122,17 @@ def test_worlds_are_chosen_by_number_and_by_return(shared_env: SharedEnv) -> Non
 
 def test_controllers_are_switched_and_passive_worlds_have_no_controls(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
-    session = Session(env, controllers={"push": pushing, "half": lambda obs: 0.5 * pushing(obs)}, paused=True)
-    assert session.stage.scene.modes == ("controller", "passive") and session.stage.frame().status.controller == "push"
-    session.stage.advance()
-    assert env.action.abs().max() == 0.5
-    session.obey(protocol.SetController("half"))
-    session.stage.advance()
-    assert env.action.abs().max() == 0.25 and session.stage.frame().status.controller == "half"
-    session.obey(protocol.SetMode("passive"))
-    session.stage.advance()
-    assert env.action.abs().max() == 0 and session.stage.frame().status.controller is None
-    session.obey(protocol.SetController("none"))
+    half: Callable[[torch.Tensor], torch.Tensor] = lambda obs: 0.5 * pushing(obs)  # noqa: E731
+    session = Session(env, controllers={"push": pushing, "half": half}, paused=True)
+    assert session.stage.scene.modes == ("controller", "passive")
+    for command, name, action in (
+        (SetMode("controller"), "push", 0.5), (SetMode("controller", "half"), "half", 0.25),
+        (SetMode("passive"), None, 0.0),
+    ):  # fmt: skip
+        session.obey(command)
+        session.stage.advance()
+        assert env.action.abs().max() == action and session.stage.frame().status.controller == name
+    session.obey(SetMode("controller", "none"))
     assert session.stage.frame().messages == ("there is no controller 'none': there are push, half",)
-    session.obey(protocol.SetMode("playback"))
+    session.obey(SetMode("playback"))
     assert "there is no mode 'playback' here" in session.stage.frame().messages[0]

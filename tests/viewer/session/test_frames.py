@@ -1,4 +1,4 @@
-"""What frames hold."""
+"""The contents of frames."""
 
 import math
 
@@ -13,7 +13,7 @@ from lyceum_warp.viewer.session.clock import Session
 
 
 def test_rows_that_come_later_are_shown_a_frame_later(shared_env: SharedEnv) -> None:
-    """As those of worlds on a GPU."""
+    """As on a GPU."""
     env = shared_env("hopper", nworld=4)
     session = Session(env, controllers={"policy": pushing}, seed=0)
     session.stage.live.asynchronous = True
@@ -44,15 +44,16 @@ def test_other_worlds_and_the_past_are_shown_as_ghosts(shared_env: SharedEnv) ->
     past = ghosts[2:]
     assert len(past) == 5 and past[0].colour[3] == 2 * past[1].colour[3]
     np.testing.assert_array_equal(past[-1].pose.qpos, session.stage.live.past.states[0, 0, qpos].numpy())
-    session.obey(protocol.SetGhosts(worlds=(9,)))
-    assert "there is no world 9" in session.stage.frame().messages[0]
     for ghosts, text in (
+        (protocol.SetGhosts(worlds=(9,)), "there is no world 9"),
+        (protocol.SetGhosts(episodes=(0,)), "there is no episode 0: there are 0"),
         (protocol.SetGhosts(worlds=(0,) * (protocol.MOST_GHOSTS + 1)), "at most 32 worlds are drawn as ghosts, not 33"),
         (protocol.SetGhosts(burst=protocol.MOST_BURST + 1), "at most 50 states of the burst"),
     ):
         session.obey(ghosts)
         assert text in session.stage.frame().messages[0]
-    assert len(session.stage.frame().ghosts) == 7
+    frame = session.stage.frame()
+    assert len(frame.ghosts) == 7 and frame.status.ghosts.worlds == (1, 3)
 
 
 def test_ends_of_episodes_and_faults_become_messages(shared_env: SharedEnv) -> None:
@@ -70,13 +71,13 @@ def test_ends_of_episodes_and_faults_become_messages(shared_env: SharedEnv) -> N
     steps = session.stage.live.made
     (message,) = session.stage.frame().messages
     assert message.startswith(f"the episode ended after {steps} steps (terminated), return ")
-    session.obey(protocol.SetController("bad"))
+    session.obey(protocol.SetMode("controller", "bad"))
     session.stage.advance()
     assert "fault in world 1: action (1 so far)" in session.stage.frame().messages
 
 
-def test_frames_hold_every_point_of_the_curves() -> None:
-    env = lw.make("hopper", nworld=2)
+def test_frames_hold_every_point_of_the_curves(shared_env: SharedEnv) -> None:
+    env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True, seed=0)
     assert session.stage.scene.curves == ("reward", "eval", *env.metrics)
     rewards = []
@@ -87,6 +88,9 @@ def test_frames_hold_every_point_of_the_curves() -> None:
     assert points.shape == (20, 1 + len(session.stage.scene.curves))
     np.testing.assert_array_equal(points[:, 1], rewards)
     np.testing.assert_allclose(points[:, 0], env.timestep * np.arange(1, 21))
+    session.obey(protocol.StepBy(-5))
+    session.obey(protocol.StepBy(6))  # a step after five that are restored
+    np.testing.assert_allclose(session.stage.frame().samples[:, 0], [env.timestep * 21])
 
 
 def test_model_fields_that_differ_are_in_the_frame() -> None:

@@ -1,6 +1,5 @@
-"""A copy of the shown world under a controller of one world, and controllers that are slow or fail."""
+"""Controllers of one world in real time, and controllers that are slow or fail."""
 
-import atexit
 import threading
 import time
 
@@ -8,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 from conftest import SharedEnv
-from memory_window import run, until
+from memory_window import run
 from toy_controllers import towards
 
 import lyceum_warp as lw
 from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import Command, Frame, Perturb, StepBy
+from lyceum_warp.viewer.protocol import SetMode, StepBy
 from lyceum_warp.viewer.session.clock import Session
 
 PLANNER = dict(horizon=8, samples=6, temperature=0.01, noise=0.3)
@@ -25,43 +24,37 @@ def test_a_planner_keeps_its_rate_and_shows_its_plan() -> None:
     begun = time.monotonic()
     window = run(
         session,
-        until(lambda frame: frame.traces is not None and frame.status.time > 0.4),
-        [protocol.SetPaused(True)],
-        [StepBy(-5)],
-        until(lambda frame: frame.status.paused and frame.status.seekable[1] - frame.status.step == 5),
+        lambda frame: frame.traces is not None and frame.status.time > 0.4,
+        [protocol.SetPaused(True), StepBy(-5)],
+        lambda frame: frame.status.paused and frame.status.seekable[1] - frame.status.step == 5,
         [StepBy(5), protocol.SetPaused(False), protocol.SetSpeed(4.0)],
-        until(lambda frame: frame.status.time > 1.5),
+        lambda frame: frame.status.time > 1.5,
     )
     frame = window.frames[-1]
     assert frame.status.time < 4 * (time.monotonic() - begun)
     assert frame.traces.shape == (7, 9, 3) and frame.best == 0 and len(frame.ghosts) == 1
     assert frame.status.plan_ms > 0 and session.stage.paused is False
-    # the points of the paths begin where the point is
-    np.testing.assert_allclose(np.ptp(frame.traces[:, 0], axis=0), 0.0, atol=1e-12)
-    points = np.concatenate([frame.samples for frame in window.frames])
-    assert np.isfinite(points).all()
+    np.testing.assert_allclose(np.ptp(frame.traces[:, 0], axis=0), 0.0, atol=1e-12)  # the paths begin together
+    assert np.isfinite(np.concatenate([frame.samples for frame in window.frames])).all()
 
 
 def test_a_planner_controls_a_copy_of_the_shown_world(shared_env: SharedEnv) -> None:
     env = shared_env("point_mass", nworld=3)
     mppi = lw.MPPI("point_mass", **PLANNER)
     session = Session(env, controllers={"mppi": mppi, "own": towards}, world=1, paused=True, seed=0)
-    before = env.get_state()
+    before, qpos = env.get_state(), env.state_space.parts["qpos"]
     session.stage.advance(3)
     assert torch.equal(env.get_state(), before)
     moved = session.stage.live.env.get_state()[0]
     assert not torch.equal(moved, before[1])
     session.obey(protocol.SetGhosts(worlds=(0,)))
-    np.testing.assert_array_equal(
-        session.stage.frame().ghosts[0].pose.qpos, before[0, env.state_space.parts["qpos"]].numpy()
-    )
-    session.obey(protocol.SetWorld(2))  # world 1 goes on where the copy stopped
-    qpos = env.state_space.parts["qpos"]
+    np.testing.assert_array_equal(session.stage.frame().ghosts[0].pose.qpos, before[0, qpos].numpy())
+    session.obey(protocol.SetWorld(2))  # world 1 takes over the state of the copy
     assert torch.equal(env.get_state()[1, qpos], moved[qpos])
     assert torch.equal(session.stage.live.env.get_state()[0, qpos], before[2, qpos])
-    session.obey(protocol.SetController("own"))
+    session.obey(SetMode("controller", "own"))
     session.stage.advance()
-    session.obey(protocol.SetMode("passive"))
+    session.obey(SetMode("passive"))
     after = env.get_state()
     assert torch.equal(after[0], before[0]) and not torch.equal(after[2, qpos], before[2, qpos])
     assert session.stage.frame().status.world == 2
@@ -72,30 +65,9 @@ def test_an_episode_of_a_plant_that_ends_is_followed_by_another() -> None:
     done: list[lw.Trajectory] = []
     session = Session(env, controllers={"own": towards}, seed=0, on_trajectory=done.append)
     session.obey(protocol.SetSpeed(8.0))
-    window = run(session, until(lambda frame: session.stage.live.made > 30))
+    window = run(session, lambda frame: session.stage.live.made > 30)
     assert [episode.steps for episode in done[:2]] == [12, 12] and done[0].truncated
     assert any("the episode ended after 12 steps (truncated)" in message for message in window.messages)
-
-
-def test_a_planner_does_not_foresee_a_push() -> None:
-    env = lw.make("point_mass", autoreset=False)
-    seen = []
-
-    def look(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
-        seen.append(state[env.state_space.parts["xfrc_applied"]].abs().max().item())
-        return torch.zeros(2)
-
-    session = Session(env, controllers={"look": look}, paused=True, seed=0)
-    force = np.zeros((env.model.nbody, 6))
-    force[1, 0] = 1.0
-    before = env.get_state()
-    session.obey(Perturb(force))
-    session.stage.advance(5)
-    assert seen == [0.0] * 5
-    qpos = env.state_space.parts["qpos"]
-    assert env.get_state()[0, qpos][0] > before[0, qpos][0]
-    session.obey(Perturb(0 * force))
-    assert env.get_state()[0, env.state_space.parts["xfrc_applied"]].abs().max() == 0
 
 
 class Slow:
@@ -119,18 +91,17 @@ class Slow:
 def test_a_plan_that_takes_long_does_not_hold_up_commands(shared_env: SharedEnv) -> None:
     env, slow = shared_env("point_mass", nworld=3), Slow()
     session = Session(env, controllers={"slow": slow}, seed=0)
-    exits = atexit._ncallbacks()
     run(
         session,
-        until(lambda frame: len(slow.log) > 6 and slow.inside == 1),
+        lambda frame: len(slow.log) > 6 and slow.inside == 1,
         [protocol.Reset(random=True)],
-        until(lambda frame: frame.status.step == 0),
+        lambda frame: frame.status.step == 0,
         [protocol.SetWorld(1)],
-        until(lambda frame: frame.status.world == 1),
+        lambda frame: frame.status.world == 1,
         [protocol.SetPaused(True)],
-        until(lambda frame: frame.status.paused),
+        lambda frame: frame.status.paused,
         [protocol.SetPaused(False), protocol.SetSpeed(2.0)],
-        until(lambda frame: frame.status.speed == 2.0),
+        lambda frame: frame.status.speed == 2.0,
     )
     calls = len(slow.log)
     assert slow.inside == 1  # the same call
@@ -138,57 +109,46 @@ def test_a_plan_that_takes_long_does_not_hold_up_commands(shared_env: SharedEnv)
     while slow.inside:
         time.sleep(0.01)
     time.sleep(0.1)
-    assert len(slow.log) == calls  # calls of runs that are over
+    assert len(slow.log) == calls  # calls of earlier runs fail
     assert "reset within a call" not in slow.log
-    assert atexit._ncallbacks() <= exits + 1
 
 
-def test_a_controller_that_fails_is_shown_and_loses_control(
-    shared_env: SharedEnv, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [("policy", "KeyError: 'no such\\nkey'"), ("planner", "ZeroDivisionError: no time"),
+     ("unfit", "ValueError: a controller must return an action of shape (2,)")],
+)  # fmt: skip
+@pytest.mark.parametrize("paused", [False, True])
+def test_a_controller_that_fails_is_reported_and_loses_control(
+    shared_env: SharedEnv, capsys: pytest.CaptureFixture[str], kind: str, text: str, paused: bool
 ) -> None:
-    env = shared_env("point_mass", nworld=2)
     calls = []
 
     def policy(obs: torch.Tensor) -> torch.Tensor:
         calls.append(0)
-        if len(calls) > 3:
-            raise KeyError("no such\nkey")
-        return torch.zeros(2, 2)
+        return torch.zeros(2, 2) if len(calls) <= 3 else {}["no such\nkey"]
 
     def planner(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         calls.append(0)
-        if len(calls) > 8:
+        if len(calls) > 3:
             raise ZeroDivisionError("no time")
         return torch.zeros(2)
 
     def unfit(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         return torch.zeros(7)
 
-    for name, controller, text in (
-        ("policy", policy, "KeyError: 'no such\\nkey'"), ("planner", planner, "ZeroDivisionError: no time"),
-        ("unfit", unfit, "ValueError: a controller must return an action of shape (2,)"),
-    ):  # fmt: skip
-        calls.clear()
-        session = Session(env, controllers={name: controller}, seed=0)
-        window = run(session, until(lambda frame: frame.status.mode == "passive" and bool(frame.messages)))
-        assert window.messages[0].startswith(f"the controller {name!r} failed: {text}")
-        assert session.stage.paused and window.frames[-1].status.paused
-        assert "Traceback" in capsys.readouterr().err
-    calls.clear()
-    session = Session(env, controllers={"planner": planner}, paused=True)
-    session.obey(StepBy(20))
-    assert session.stage.mode == "passive" and "ZeroDivisionError" in session.stage.frame().messages[0]
+    controller = {"policy": policy, "planner": planner, "unfit": unfit}[kind]
+    session = Session(shared_env("point_mass", nworld=2), controllers={kind: controller}, seed=0, paused=paused)
+    script = [[StepBy(20)]] if paused else []
+    window = run(session, *script, lambda frame: frame.status.mode == "passive" and bool(frame.messages))
+    assert window.messages[0].startswith(f"the controller {kind!r} failed: {text}")
+    assert session.stage.paused and window.frames[-1].status.paused
+    assert "Traceback" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("speed", [4.0, 16.0])
-def test_frames_come_where_a_plant_never_waits(speed: float) -> None:
-    env = lw.make("point_mass", autoreset=False, horizon=0)
+def test_frames_come_from_a_plant_that_never_waits(shared_env: SharedEnv, speed: float) -> None:
+    env = shared_env("point_mass", autoreset=False, horizon=0)
     session = Session(env, controllers={"none": lambda state, obs: torch.zeros(2)}, seed=0, fps=20.0)
     session.obey(protocol.SetSpeed(speed))
-    frames: list[Frame] = []
-
-    def many(frame: Frame) -> list[Command] | None:
-        frames.append(frame)
-        return [] if len(frames) < 20 else None
-
-    run(session, until(lambda frame: session.stage.live.made > 0), many)
+    run(session, lambda frame: session.stage.live.made > 0, *[[]] * 20)

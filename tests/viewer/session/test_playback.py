@@ -1,4 +1,4 @@
-"""Episodes that are played back."""
+"""Playback of episodes."""
 
 import numpy as np
 import pytest
@@ -21,10 +21,8 @@ def trajectories() -> list[lw.Trajectory]:
 def test_a_playback_is_sought_reversed_and_looped(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
     env = shared_env("point_mass")
     session = Session(env, episodes=trajectories, paused=True)
-    assert session.stage.scene.modes == ("playback", "passive") and session.stage.scene.episodes == (
-        "episode 0",
-        "episode 1",
-    )
+    scene = session.stage.scene
+    assert scene.modes == ("playback", "passive") and scene.episodes == ("episode 0", "episode 1")
     qpos = env.state_space.parts["qpos"]
 
     def shown() -> np.ndarray:
@@ -37,7 +35,7 @@ def test_a_playback_is_sought_reversed_and_looped(shared_env: SharedEnv, traject
     session.obey(protocol.SetBackwards(True))
     session.stage.advance(6)
     assert session.stage.frame().status.step == 20  # after the first step the last one
-    session.obey(protocol.SetEpisode(1))
+    session.obey(protocol.SetMode("playback", episode=1))
     frame = session.stage.frame()
     assert frame.status.step == 15 and frame.status.steps == 15 and frame.status.episode == 1
     session.obey(protocol.SetBackwards(False))
@@ -51,7 +49,7 @@ def test_a_playback_is_sought_reversed_and_looped(shared_env: SharedEnv, traject
     np.testing.assert_array_equal(ghosts[0].pose.qpos, trajectories[0].states[3, qpos])
     past = [ghost for ghost in ghosts[1:] if ghost.colour[0] > ghost.colour[2]]
     assert len(past) == 1 and len(ghosts) == 5
-    session.obey(protocol.SetEpisode(5))
+    session.obey(protocol.SetMode("playback", episode=5))
     assert session.stage.frame().messages == ("there is no episode 5: there are 2, from 0",)
 
 
@@ -75,12 +73,13 @@ def test_states_are_played_back_without_rewards(shared_env: SharedEnv) -> None:
 
 
 def test_an_episode_that_does_not_fit_is_refused(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
-    with pytest.raises(ValueError, match="episode 0 is an episode of the task 'point_mass', not of 'hopper'"):
-        Session(shared_env("hopper"), episodes=trajectories)
     env = lw.make("point_mass", dynamics=["body_mass"])
-    with pytest.raises(ValueError, match="episode 0 does not fit the task 'point_mass' as it is now"):
-        Session(env, episodes=trajectories[0])
-    with pytest.raises(ValueError, match="or states of shape"):
-        Session(shared_env("hopper"), episodes=torch.zeros(3, 4))
+    for worlds, episodes, message in (
+        (shared_env("hopper"), trajectories, "episode 0 is an episode of the task 'point_mass', not of 'hopper'"),
+        (env, trajectories[0], "episode 0 does not fit the task 'point_mass' as it is now"),
+        (shared_env("hopper"), torch.zeros(3, 4), "or states of shape"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Session(worlds, episodes=episodes)
     with pytest.raises(FileNotFoundError, match="missing.npz"):
         Session(shared_env("hopper"), episodes=["missing.npz"])

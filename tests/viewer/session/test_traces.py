@@ -1,7 +1,5 @@
 """Paths of a planner's samples."""
 
-import time
-
 import mujoco
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp.viewer.session.drivers import WorldControl
-from lyceum_warp.viewer.session.traces import TraceThread, rollouts_for, trace_point
+from lyceum_warp.viewer.session.traces import TraceRollouts, trace_point
 
 ARM = """<mujoco><worldbody><body name="base"><body name="upper"><joint name="a" axis="0 1 0"/><geom size=".1"/>
 <body name="hand" pos="0 0 1"><joint name="b" axis="0 1 0"/><geom size=".1"/>{site}</body></body></body>
@@ -43,11 +41,6 @@ def test_a_site_a_body_or_the_tasks_choice_is_traced() -> None:
     with pytest.raises(ValueError, match="no site and no body 'nose' to trace: it has tip, base, upper, hand, ball"):
         trace_point(model, "nose")
 
-    class Traced(lw.Task):
-        trace = "thigh"
-
-    assert Traced.trace == "thigh" and lw.Task.trace is None
-
 
 def test_paths_are_those_that_the_samples_take(shared_env: SharedEnv) -> None:
     """Each path is where the plant itself would go under the actions of the sample."""
@@ -62,7 +55,7 @@ def test_paths_are_those_that_the_samples_take(shared_env: SharedEnv) -> None:
     assert view is not None and view.best == 0
     best = int(mppi.returns.argmax())
     assert torch.equal(view.samples[:, 0], mppi.sampled[:, best])
-    traces = rollouts_for(mppi, plant, None)(view)
+    traces = TraceRollouts(mppi, plant, None)(view)
     assert traces.paths.shape == (7, 6, 3)
     for path, actions in zip(
         traces.paths[[0, 3, 6]], (view.samples[:, 0], view.samples[:, 3], view.actions), strict=True
@@ -76,21 +69,3 @@ def test_paths_are_those_that_the_samples_take(shared_env: SharedEnv) -> None:
     qpos = plant.get_state()[0, plant.state_space.parts["qpos"]]
     np.testing.assert_allclose(traces.final.qpos, qpos, atol=1e-6)
     assert control.look() is None  # nothing new
-
-
-def test_the_thread_keeps_the_newest_plan_and_forgets_on_request(shared_env: SharedEnv) -> None:
-    plant = shared_env("point_mass", autoreset=False)
-    control = WorldControl("mppi", lw.MPPI("point_mass", samples=4, horizon=3))
-    control.look()
-    control.new_run()(plant.get_state()[0], plant.obs[0])
-    view = control.look()
-    assert view is not None
-    thread = TraceThread(rollouts_for(control.controller, plant, "agent"), share=0.9)
-    thread.give(view)
-    end = time.monotonic() + 10
-    while (traces := thread.newest()) is None and time.monotonic() < end:
-        time.sleep(0.01)
-    assert traces is not None and thread.error is None
-    thread.forget()
-    assert thread.newest() is None
-    thread.close()

@@ -1,7 +1,8 @@
+"""The window process: what it serves, and how it ends."""
+
 import contextlib
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -32,34 +33,22 @@ def shared_window() -> Iterator[Window]:
         yield window
 
 
-@pytest.fixture
-def window() -> Iterator[Window]:
-    with Window(scene_of(MODEL)) as window:
-        yield window
-
-
 def page(window: Window, path: str = "") -> bytes:
     """What a browser gets that was opened with the address."""
     browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
-    with browser.open(window.address, timeout=10) as response:
+    with browser.open(window.address, timeout=10) as first:
+        address = urllib.parse.urljoin(first.url, path)
+    with browser.open(address, timeout=10) as response:
         content: bytes = response.read()
-        address = response.url
-    if path:
-        with browser.open(urllib.parse.urljoin(address, path), timeout=10) as response:
-            content = response.read()
     return content
-
-
-def port_of(window: Window) -> int:
-    return urllib.parse.urlsplit(window.address).port or 0
 
 
 def process_of(window: Window) -> int:
     return window._process.pid
 
 
-def wait_until(done: object, seconds: float = 60.0) -> bool:
-    end = time.monotonic() + seconds
+def wait_until(done: object) -> bool:
+    end = time.monotonic() + 60.0
     while time.monotonic() < end:
         if done():  # type: ignore[operator]
             return True
@@ -77,11 +66,13 @@ def is_alive(pid: int) -> bool:
 # a window that runs
 
 
-def test_page_and_model_are_served(shared_window: Window) -> None:
+def test_page_and_model_are_served_and_a_second_window_gets_another_port(shared_window: Window) -> None:
     assert shared_window.is_open()
-    assert b"canvas" in page(shared_window)
-    assert SCRIPT.encode() in page(shared_window)
+    assert b"canvas" in page(shared_window) and SCRIPT.encode() in page(shared_window)
     assert wait_until(lambda: len(page(shared_window, "model")) > 1000)
+    port = urllib.parse.urlsplit(shared_window.address).port
+    with pytest.raises(ValueError, match=f"^port {port} is in use.*$"):
+        Window(scene_of(MODEL), port=port)
 
 
 def test_process_listens_on_the_loopback_address_only(shared_window: Window) -> None:
@@ -97,9 +88,7 @@ def test_process_listens_on_the_loopback_address_only(shared_window: Window) -> 
 
 def test_process_does_not_load_torch_or_warp(shared_window: Window) -> None:
     maps = Path(f"/proc/{process_of(shared_window)}/maps").read_text()
-    assert "mujoco" in maps
-    assert "torch" not in maps
-    assert "/warp/" not in maps
+    assert "mujoco" in maps and "torch" not in maps and "/warp/" not in maps
 
 
 def test_frames_are_taken_without_a_browser(shared_window: Window) -> None:
@@ -110,66 +99,65 @@ def test_frames_are_taken_without_a_browser(shared_window: Window) -> None:
     assert wait_until(lambda: shared_window.wants_frame)
 
 
-def test_studio_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
-    with Window(scene_of(MODEL)) as window:
-        assert page(window)
-    assert capfd.readouterr() == ("", "")
+def test_ctrl_c_does_not_end_the_window(shared_window: Window) -> None:
+    os.kill(process_of(shared_window), signal.SIGINT)
+    time.sleep(0.3)
+    assert shared_window.is_open() and page(shared_window)
+    assert os.getpgid(process_of(shared_window)) != os.getpgid(0)  # the terminal's Ctrl-C does not reach it
 
 
-# frames that wait
+# frames
 
 
-def test_show_never_waits_for_a_window_that_hangs(window: Window) -> None:
-    os.kill(process_of(window), signal.SIGSTOP)
+def test_show_never_waits_for_a_window_that_hangs(shared_window: Window) -> None:
+    os.kill(process_of(shared_window), signal.SIGSTOP)
     try:
         frame = frame_of(MODEL, DATA, samples=np.ones((1, 3)), messages=("end",))
         began = time.monotonic()
         for _ in range(2000):
-            window.show(frame)
-        assert time.monotonic() - began < 20  # a pipe that is full would not be emptied
+            shared_window.show(frame)
+        assert time.monotonic() - began < 20  # the pipe is full and stays full
     finally:
-        os.kill(process_of(window), signal.SIGCONT)
+        os.kill(process_of(shared_window), signal.SIGCONT)
 
 
-def test_latest_frame_has_the_points_and_messages_of_those_before() -> None:
-    frames = [
+def test_skipped_frames_keep_their_points_and_messages_up_to_a_limit() -> None:
+    merged = None
+    for frame in (
         frame_of(MODEL, DATA, samples=np.array([[0.0, 1, 2]]), messages=("one",)),
         frame_of(MODEL, DATA),
-        frame_of(MODEL, DATA, samples=np.array([[0.1, 3, 4]]), messages=("two", "three")),
-    ]
-    merged = None
-    for frame in frames:
+        last := frame_of(MODEL, DATA, samples=np.array([[0.1, 3, 4]]), messages=("two", "three")),
+    ):
         merged = latest(merged, frame)
-    assert merged is not None
+    assert merged is not None and merged.samples is not None
     np.testing.assert_array_equal(merged.samples, [[0.0, 1, 2], [0.1, 3, 4]])
-    assert merged.messages == ("one", "two", "three")
-    assert merged.pose is frames[-1].pose
-
-
-def test_frames_that_wait_for_hours_keep_a_limited_number_of_points() -> None:
-    merged = frame_of(MODEL, DATA)
+    assert merged.messages == ("one", "two", "three") and merged.pose is last.pose
     for i in range(30):
         merged = latest(merged, frame_of(MODEL, DATA, samples=np.full((1000, 3), i), messages=("m",) * 10))
-    assert len(merged.samples) == 20_000 and len(merged.messages) == 200
+    assert merged.samples is not None and len(merged.samples) == 20_000 and len(merged.messages) == 200
 
 
 # ends
 
 
-def test_close_ends_the_process_and_may_be_called_twice() -> None:
-    window = Window(scene_of(MODEL))
-    pid = process_of(window)
-    window.close()
-    window.close()
-    assert window._process.returncode != -signal.SIGKILL
-    assert not is_alive(pid)
-    assert not window.is_open()
-    window.show(frame_of(MODEL, DATA))  # without effect
+def test_close_ends_the_process_and_leaves_nothing_open(capfd: pytest.CaptureFixture[str]) -> None:
+    threads, descriptors = threading.active_count(), None
+    for _ in range(2):
+        with Window(scene_of(MODEL)) as window:
+            pid = process_of(window)
+            assert page(window)
+        window.close()
+        assert window._process.returncode != -signal.SIGKILL and not is_alive(pid) and not window.is_open()
+        window.show(frame_of(MODEL, DATA))  # no effect
+        assert threading.active_count() == threads
+        before, descriptors = descriptors, len(os.listdir("/proc/self/fd"))
+        assert before in (None, descriptors)
+    assert capfd.readouterr() == ("", "")  # of studio
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
 def test_process_that_ends_while_it_is_sent_frames_is_an_error(number: signal.Signals) -> None:
-    """The thread that sends notices it first."""
+    """The sending thread notices it first."""
     with Window(scene_of(MODEL)) as window:
         os.kill(process_of(window), signal.SIGSTOP)
         frame = frame_of(MODEL, DATA, samples=np.zeros((20_000, 3)))
@@ -183,42 +171,13 @@ def test_process_that_ends_while_it_is_sent_frames_is_an_error(number: signal.Si
 
 
 def test_killed_window_ends_the_view_with_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = lyceum_warp.Env("point_mass", nworld=1)
-
-    def kill(window: Window) -> None:
-        time.sleep(1.0)
-        os.kill(process_of(window), signal.SIGKILL)
-
     class Killed(Window):
-        def __init__(self, *args: object, **options: object) -> None:
-            super().__init__(*args, **options)  # type: ignore[arg-type]
-            threading.Thread(target=kill, args=(self,), daemon=True).start()
+        def show(self, frame: object) -> None:
+            os.kill(process_of(self), signal.SIGKILL)
 
     monkeypatch.setattr(show, "Window", Killed)
     with pytest.raises(show.NoWindowError, match="ended: its process was ended by SIGKILL"):
-        lyceum_warp.view(env, gfx="web")
-
-
-def test_close_leaves_no_descriptor_open() -> None:
-    def opened() -> int:
-        return len(os.listdir("/proc/self/fd"))
-
-    with Window(scene_of(MODEL)):
-        pass
-    before, threads = opened(), threading.active_count()
-    for _ in range(2):
-        with Window(scene_of(MODEL)):
-            pass
-    assert opened() == before
-    assert threading.active_count() == threads
-
-
-def test_ctrl_c_does_not_end_the_window(window: Window) -> None:
-    os.kill(process_of(window), signal.SIGINT)
-    time.sleep(0.3)
-    assert window.is_open()
-    assert page(window)
-    assert os.getpgid(process_of(window)) != os.getpgid(0)  # the terminal's Ctrl-C does not reach it
+        lyceum_warp.view(lyceum_warp.Env("point_mass", nworld=1))
 
 
 PROGRAM = """
@@ -230,10 +189,9 @@ from lyceum_warp.viewer.session.window_process import Window
 
 window = Window(scene_of(robot()))  # without a guard of __main__
 print(window._process.pid, flush=True)
-if {fork}:
-    if os.fork() == 0:
-        time.sleep(5)
-        os._exit(0)
+if {fork} and os.fork() == 0:
+    time.sleep(5)
+    os._exit(0)
 time.sleep(60)
 """
 
@@ -246,33 +204,5 @@ def test_window_ends_with_the_session(number: int, fork: bool, tmp_path: Path) -
     with subprocess.Popen([sys.executable, str(program)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as session:
         assert session.stdout is not None
         pid = int(session.stdout.readline())
-        assert is_alive(pid)
         session.send_signal(number)
         assert wait_until(lambda: not is_alive(pid))
-
-
-# windows that cannot be opened
-
-
-def test_port_in_use_is_one_line(window: Window) -> None:
-    with pytest.raises(ValueError, match=str(port_of(window))) as caught:
-        Window(scene_of(MODEL), port=port_of(window))
-    assert "\n" not in str(caught.value)
-
-
-def test_windows_that_cannot_be_opened_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(RuntimeError, match="cannot be opened: there is no display"):
-        Window(scene_of(MODEL), gfx="native")
-    with pytest.raises(ValueError, match="'web' or 'native', not 'opengl'"):
-        Window(scene_of(MODEL), gfx="opengl")  # type: ignore[arg-type]
-
-
-def test_given_port_is_taken() -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    with Window(scene_of(MODEL), port=port) as window:
-        assert port_of(window) == port
-        assert page(window)

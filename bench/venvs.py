@@ -1,0 +1,83 @@
+"""Run programs of peers, in virtual environments of their own if they need other versions of our packages.
+
+``peers/NAME/requirements.txt`` pins what a peer needs. Its environment is made at first use, in
+``~/.cache/lyceum_warp/peers`` (or ``$LYCEUM_WARP_PEERS``), one for each set of requirements and each Python.
+"""
+
+import fcntl
+import functools
+import hashlib
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import experiment
+
+FOLDER = experiment.FOLDER / "peers"
+
+
+def run(python: Path, worker: Path, **arguments: Any) -> dict[str, Any]:
+    """Run a worker, which reads a JSON object from stdin and prints one as its last line.
+
+    Raises:
+        experiment.Skipped: A package of the worker is missing.
+        RuntimeError: The worker failed.
+    """
+    # a peer's environment must not find our packages
+    hidden = () if python == Path(sys.executable) else ("PYTHONPATH", "PYTHONHOME")
+    env = {name: value for name, value in os.environ.items() if name not in hidden}
+    command = [str(python), str(worker)]
+    done = subprocess.run(command, input=json.dumps(arguments), env=env, timeout=600, capture_output=True, text=True)
+    if done.returncode != 0:
+        if missing := re.search(r"^ModuleNotFoundError: No module named '(\w+)", done.stderr, re.MULTILINE):
+            raise experiment.Skipped(f"{worker.name} needs the package {missing[1]}, which is not installed")
+        raise RuntimeError(f"{worker} failed with {arguments}:\n{done.stderr[-3000:]}")
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+@functools.cache
+def _made(name: str) -> tuple[Path, str]:
+    """Make a peer's environment if there is none; return its Python, and the reason if that failed."""
+    requirements = FOLDER / name / "requirements.txt"
+    text = "\n".join([requirements.read_text(), sys.version, platform.machine()])
+    root = Path(os.environ.get("LYCEUM_WARP_PEERS") or Path.home() / ".cache" / "lyceum_warp" / "peers")
+    folder = root / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    python, complete = folder / "bin" / "python", folder / "complete"
+    root.mkdir(parents=True, exist_ok=True)
+    with folder.with_name(folder.name + ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if complete.exists():
+            return python, ""
+        print(f"making a virtual environment for {name}: {folder}", flush=True)
+        shutil.rmtree(folder, ignore_errors=True)
+        # this pip installs into it; a copy of pip would take seconds
+        pip = [sys.executable, "-m", "pip", "--python", str(python), "--disable-pip-version-check", "--retries", "1"]
+        for command in (
+            [sys.executable, "-m", "venv", "--without-pip", str(folder)],
+            [*pip, "install", "--timeout", "15", "--quiet", "-r", str(requirements)],
+        ):
+            done = subprocess.run(command, capture_output=True, text=True)
+            if done.returncode != 0:
+                shutil.rmtree(folder, ignore_errors=True)
+                said = [line for line in (done.stderr or done.stdout).splitlines() if line.strip()] or ["no message"]
+                return python, f"{name} cannot be installed: {said[-1].strip()}"
+        complete.touch()  # last: the program may be killed during the installation
+    return python, ""
+
+
+def python_of(name: str) -> Path:
+    """Return the Python of a peer's environment, which is made if there is none yet.
+
+    Raises:
+        experiment.Skipped: The environment cannot be made, for example without a network.
+    """
+    python, reason = _made(name)
+    if reason:
+        raise experiment.Skipped(reason)
+    return python

@@ -1,0 +1,50 @@
+"""Check the fields of a configuration by their annotations and bounds."""
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from lyceum_warp.support.validate import check_flag, check_word, finite_number, layer_sizes, whole_number
+
+LEAST = -math.inf
+"""Lower bound of numbers that may be negative."""
+
+
+def check_fields(config: Any, bounds: Mapping[str, float | tuple[float, float]]) -> None:
+    """Check the fields of a frozen dataclass, and convert numbers to their annotated types.
+
+    Supported annotations are numbers, bool, ``Literal``, widths of hidden layers (``tuple[int, ...]``) and the name of
+    a group of observations (``str | None``). None is valid if the annotation includes it.
+
+    Args:
+        config: The dataclass, in its ``__post_init__``.
+        bounds: Lower bound of each number, or lower and upper bound.
+
+    Raises:
+        ValueError: A value is of the wrong type, out of range or not finite.
+    """
+    for field in dataclasses.fields(config):
+        name, kind, value = field.name, field.type, getattr(config, field.name)
+        arguments = typing.get_args(kind)
+        if value is None and types.NoneType in arguments:
+            continue
+        if kind is bool:
+            check_flag(name, value)
+        elif typing.get_origin(kind) is Literal:
+            check_word(name, value, arguments)
+        elif kind == tuple[int, ...]:
+            value = tuple(layer_sizes(value, name))
+        elif str in arguments:
+            if not isinstance(value, str):
+                raise ValueError(f"{name} must be the name of a group of observations, not {value!r}")
+        elif name in bounds:
+            bound = bounds[name]
+            low, high = bound if isinstance(bound, tuple) else (bound, math.inf)
+            if int in (kind, *arguments):
+                value = whole_number(name, value, low=int(low))
+            else:
+                value = finite_number(name, value, low=low, high=high)
+        object.__setattr__(config, name, value)

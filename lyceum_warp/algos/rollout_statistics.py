@@ -1,0 +1,150 @@
+"""Compute statistics of the episodes that ended in a rollout."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import torch
+
+from lyceum_warp.algos.learner import Iteration
+from lyceum_warp.algos.rollout_buffer import Rollout
+from lyceum_warp.support.docstrings import document_attributes
+
+Scalar: TypeAlias = Any
+"""A scalar tensor on the device or, after the transfer to the host, a float."""
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OnPolicyIteration(Iteration):
+    """Statistics of one iteration of NPG or PPO.
+
+    Numbers about episodes cover the episodes that ended in the iteration; they are nan if none ended.
+    """
+
+    kl: float
+    """KL divergence from the old to the new policy, averaged over the samples."""
+    std_mean: float
+    """Mean standard deviation of the policy's actions."""
+    faults: int
+    """Number of faults of worlds in this iteration."""
+    time_sample: float
+    """Seconds for sampling."""
+    time_mean: float
+    """Seconds for the evaluation of the mean policy."""
+    samples_per_second: float
+    """Samples divided by ``time_sample``."""
+
+    def row(self) -> dict[str, Any]:
+        """Convert to a row of metrics.csv: numbers by column, including None."""
+        names = [field.name for field in dataclasses.fields(self) if field.name not in ("metrics", "numbers")]
+        return {name: getattr(self, name) for name in names} | super().row()
+
+
+class EpisodeSums(NamedTuple):
+    """Sums over the episodes that ended in one process's worlds."""
+
+    episodes: Scalar
+    """Number of episodes."""
+    return_mean: Scalar
+    """Mean of their returns."""
+    return_square: Scalar
+    """Sum of the squared deviations of their returns from their mean."""
+    return_min: Scalar
+    """Smallest return; infinity if no episode ended."""
+    return_max: Scalar
+    """Largest return; minus infinity if no episode ended."""
+    length: Scalar
+    """Sum of their lengths."""
+    terminal_reward: Scalar
+    """Sum of their last rewards."""
+    eval: Scalar
+    """Sum of the evaluation metrics at their ends."""
+    success: Scalar
+    """Number of episodes that ended with the goal met."""
+
+
+class Moments(NamedTuple):
+    """Count, mean and sum of squared deviations from the mean of a set of numbers."""
+
+    n: float
+    mean: float
+    square: float
+
+
+def finished(rollout: Rollout) -> EpisodeSums:
+    """Compute sums over the episodes that ended within a rollout, scalar tensors on its device."""
+    ended = _ended(rollout)
+    returns = rollout.episode_return.double()
+    infinity = torch.inf
+
+    def total(part: torch.Tensor) -> torch.Tensor:
+        return part.double().masked_fill(~ended, 0.0).sum()
+
+    episodes = ended.sum().double()
+    mean = total(returns) / episodes.clamp_min(1.0)
+    return EpisodeSums(
+        episodes=episodes,
+        return_mean=mean,
+        return_square=total((returns - mean).square()),
+        return_min=returns.masked_fill(~ended, infinity).min(),
+        return_max=returns.masked_fill(~ended, -infinity).max(),
+        length=total(rollout.episode_length),
+        terminal_reward=total(rollout.reward),
+        eval=total(rollout.eval),
+        success=total(rollout.success),
+    )
+
+
+def finished_metrics(rollout: Rollout) -> tuple[torch.Tensor, ...]:
+    """Sum the task's metrics over the episodes that ended within a rollout, scalar tensors on its device."""
+    ended = _ended(rollout)
+    return tuple(sums.double().masked_fill(~ended, 0.0).sum() for sums in rollout.episode_metrics.values())
+
+
+def _ended(rollout: Rollout) -> torch.Tensor:
+    """Mask of the last steps of counted episodes, (steps, nworld) bool."""
+    return rollout.done & ~rollout.episode_return.isnan()
+
+
+def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, float]:
+    """Compute means of the task's metrics over the episodes that ended; nan if none ended.
+
+    Args:
+        episodes: Number of episodes of all processes.
+        sums: The sums of each process, in the order of the names.
+        names: Names of the metrics.
+    """
+    totals = (sum(parts) for parts in zip(*sums, strict=True))
+    return {name: total / episodes if episodes else math.nan for name, total in zip(names, totals, strict=True)}
+
+
+def episode_statistics(sums: Sequence[EpisodeSums]) -> dict[str, float]:
+    """Compute statistics of finished episodes from the sums of all processes; nan if none ended."""
+    episodes, mean, square = pooled([Moments(part.episodes, part.return_mean, part.return_square) for part in sums])
+    if not episodes:
+        return dict.fromkeys(_EPISODE_STATISTICS, math.nan)
+    numbers = (
+        mean,
+        math.sqrt(square / episodes),
+        min(part.return_min for part in sums),
+        max(part.return_max for part in sums),
+        sum(part.length for part in sums) / episodes,
+        sum(part.terminal_reward for part in sums) / episodes,
+        sum(part.eval for part in sums) / episodes,
+        sum(part.success for part in sums) / episodes,
+    )
+    return dict(zip(_EPISODE_STATISTICS, numbers, strict=True))
+
+
+_EPISODE_STATISTICS = (
+    "return_mean", "return_std", "return_min", "return_max", "length_mean", "terminal_reward", "eval_mean", "success",
+)  # fmt: skip
+
+
+def pooled(parts: Sequence[Moments]) -> Moments:
+    """Combine the moments of several sets of numbers."""
+    n = sum(part.n for part in parts)
+    mean = sum(part.n * part.mean for part in parts) / n if n else 0.0
+    return Moments(n, mean, sum(part.square + part.n * (part.mean - mean) ** 2 for part in parts))

@@ -1,0 +1,53 @@
+"""Test the experiment on the seconds until a return is reached."""
+
+import itertools
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import experiment
+import learning
+import pytest
+
+
+@pytest.mark.parametrize("algorithm", ["npg", "ppo"])
+def test_a_run_ends_at_its_target(
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.setitem(learning.TARGETS, "hopper", ("npg", 0.0, 8, 64, 1))
+    monkeypatch.setattr(learning, "JUDGED", 2)
+    out = tmp_path / "learning.jsonl"
+    assert experiment.main(learning.EXPERIMENT, ["--short", "--out", str(out), "--algorithm", algorithm]) == 0
+    result = json.loads(out.read_text())["result"]
+    assert result["reached"] and result["curve"][-1][0] == result["samples"]
+    assert result["curve"][-1][1] == pytest.approx(result["seconds"], abs=1e-4) and result["curve"][-1][2] >= 0.0
+    assert f"| hopper | {algorithm.upper()} | default | 8 | 0 | 0 |" in capsys.readouterr().out
+
+
+def test_the_mean_of_the_last_episodes_decides_without_evaluations(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = itertools.count(step=0.01)  # each iteration takes 0.01 s
+    monkeypatch.setattr(learning, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    monkeypatch.setitem(learning.TARGETS, "hopper", ("npg", 1e9, 8, 64, 0))
+    case = learning.Case("hopper", "npg", "default", 0, 8, 1e9, 0.3, "cpu")
+    result = learning.measure(case, learning.Options())
+    assert not result["reached"] and 64 * 30 <= result["samples"] <= 64 * 31
+    assert 0 < len(result["curve"]) < 30  # not before the first episodes that began at step 0
+
+
+def test_a_robot_that_stands_has_tracking_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    import lyceum_warp as lw
+
+    monkeypatch.setattr(learning, "WALKED", (8, 50))
+    env = lw.make("go1_velocity", nworld=2)
+    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
+    case = learning.Case("go1_velocity", "ppo", "default", 0, 8, 80.0, 1.0, "cpu")
+    found = learning.walk(case, policy)
+    assert 0.1 < found["velocity_error"] < 2.0 and found["falls_per_world_second"] >= 0.0
+
+
+def test_figure_needs_results_alone(tmp_path: Path) -> None:
+    rows = experiment.read(experiment.RESULTS / "learning.jsonl")
+    walkers = [row for row in rows if row.case["task"] == "go1_velocity"]
+    learning.figure(walkers).savefig(tmp_path / "learning.png")
+    assert learning.figure([row for row in rows if row not in walkers]) is None
