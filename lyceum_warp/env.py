@@ -212,10 +212,11 @@ class Env:
 
     @functools.cached_property
     def model(self) -> mujoco.MjModel:
-        """The compiled model, which can be read alone; ``copy.copy(env.model)`` can be edited.
+        """The compiled model. It is read-only, because the engine has a copy of its own.
 
-        To change the physics, list model fields in the task's ``World`` and write them in ``startup`` or
-        ``randomize``, or pass an edited MjSpec as ``model=``.
+        An edit raises an error; an edit of an array raises NumPy's "assignment destination is read-only". To change
+        the physics, list model fields in the task's ``World`` and write them in ``startup`` or ``randomize``, or pass
+        an edited MjSpec as ``model=``. ``copy.copy(env.model)`` is an ordinary MjModel that can be edited.
         """
         return read_only(self.task.model)
 

@@ -53,12 +53,33 @@ class TaskSource:
                     f"{wanted.signature}"
                 )
             found[group] = function
-        for name, value in vars(self.task).items():
-            if name.startswith(GROUP_PREFIX) and isinstance(value, wp.Function | staticmethod):
-                group = name.removeprefix(GROUP_PREFIX)
-                if group not in groups:
-                    raise ValueError(f"obs of the task {self.name!r} has no group {group!r}, which {name} writes")
+        for name in (*self._class_observers(), *self._unused_observers()):
+            if (group := name.removeprefix(GROUP_PREFIX)) not in groups:
+                raise ValueError(f"obs of the task {self.name!r} has no group {group!r}, which {name} writes")
         return found
+
+    def _class_observers(self) -> list[str]:
+        return [
+            name
+            for name, value in vars(self.task).items()
+            if name.startswith(GROUP_PREFIX) and isinstance(value, wp.Function | staticmethod)
+        ]
+
+    def _unused_observers(self) -> list[str]:
+        """Names of functions in the module that look like the observer of a group, but that nothing there uses."""
+        module = vars(sys.modules[self.task.__module__])
+        functions = {name: value for name, value in module.items() if isinstance(value, wp.Function)}
+        tasks = [kind for kind in (self.task, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
+        used = {id(value) for task in tasks for value in vars(task).values()}
+        called = {name for f in functions.values() if has_source(f) for name in f.func.__code__.co_names}
+        forms = (FUNCTIONS["observe"].kinds, FUNCTIONS["observe"].all_kinds)
+        return [
+            name
+            for name, function in functions.items()
+            if name.startswith(GROUP_PREFIX) and name not in called and id(function) not in used
+            and tuple(map(self._kind, function.input_types.values())) in forms  # not another task's
+            and not any(_may_list(task, name.removeprefix(GROUP_PREFIX)) for task in tasks)
+        ]  # fmt: skip
 
     def _written(self, name: str) -> Any:
         """The value of a name in the class, in its module, or in those of the classes that it extends."""
@@ -144,6 +165,12 @@ class TaskSource:
                 close = difflib.get_close_matches(name, [f for f in FUNCTIONS if self.functions[f] is None], 1, 0.85)
                 if own and close:
                     raise ValueError(f"the task {self.name!r} has a function {name!r}: did you mean {close[0]}?")
+
+
+def _may_list(task: type[Task], group: str) -> bool:
+    """Whether a class lists a group of observations, or may do so, because its ``obs`` is a method."""
+    obs = getattr(task, "obs", None)
+    return callable(obs) or (isinstance(obs, Mapping) and isinstance(obs.get(group), Mapping))
 
 
 def _origin(struct: Any) -> str:

@@ -1,46 +1,65 @@
-"""Copy a compiled model for its user so that edits, which the engines' own copies would not see, raise an error."""
+"""Copy a compiled model for its user, and refuse edits, which the engine's own copy would not see."""
 
 from typing import Any
 
 import mujoco
 import numpy as np
 
-_REFUSAL = (
-    "env.model is read-only, because the physics has its own copy: list the model field in World and write it in "
-    "startup or randomize, or pass an edited MjSpec as model="
-)
-
 
 def _refuse(self: Any, name: str, value: Any) -> None:
-    raise AttributeError(_REFUSAL)
+    raise AttributeError(
+        "env.model is read-only, because the engine has a copy of its own: list model fields in the task's World and "
+        "write them in startup or randomize, or pass an edited MjSpec as model="
+    )
 
 
-class _Options:
-    """The options of a model, ``model.opt``."""
+class _Part:
+    """A read-only part of a model, such as ``model.opt`` or ``model.body("torso")``."""
 
-    def __init__(self, options: mujoco.MjOption) -> None:
-        object.__setattr__(self, "_options", options)
+    def __init__(self, part: Any) -> None:
+        object.__setattr__(self, "_part", part)
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(object.__getattribute__(self, "_options"), name)
+        if name == "_part":  # not set yet, as in a copy
+            raise AttributeError(name)
+        value = getattr(self._part, name)
+        return _locked(value.view()) if isinstance(value, np.ndarray) else value
 
     __setattr__ = _refuse
+
+    def __repr__(self) -> str:
+        return repr(self._part)
+
+
+def _locked(array: np.ndarray) -> np.ndarray:
+    array.flags.writeable = False
+    return array
 
 
 class ReadOnlyModel(mujoco.MjModel):  # type: ignore[misc]
-    """A compiled model whose fields and options cannot be assigned. ``copy.copy(model)`` is an ordinary MjModel."""
+    """A compiled model whose fields and options cannot be changed. ``copy.copy(model)`` is an ordinary MjModel."""
 
-    __slots__ = ()
-    opt = property(lambda self: _Options(mujoco.MjModel.opt.__get__(self)))
     __setattr__ = _refuse
+
+    def __setstate__(self, state: Any) -> None:
+        super().__setstate__(state)
+        for name in dir(mujoco.MjModel):
+            if isinstance(array := getattr(self, name), np.ndarray):
+                _locked(array)
+
+
+_PARTS = ("opt", "stat")
+_BY_NAME = "actuator body cam camera eq equality geom jnt joint key keyframe light mat pair sensor site tendon".split()
+for _name in _PARTS:
+    _get = getattr(mujoco.MjModel, _name).__get__
+    setattr(ReadOnlyModel, _name, property(lambda self, get=_get: _Part(get(self))))
+for _name in _BY_NAME:
+    _find = getattr(mujoco.MjModel, _name)
+    setattr(ReadOnlyModel, _name, lambda self, *key, find=_find: _Part(find(self, *key)))
 
 
 def read_only(model: mujoco.MjModel) -> ReadOnlyModel:
-    """A copy of a model whose arrays are read-only, too."""
+    """A copy of a model that refuses edits."""
     copy = ReadOnlyModel.__new__(ReadOnlyModel)
     copy.__setstate__(model.__getstate__())
-    for part in (copy, copy.opt._options):
-        for name in dir(part):
-            if isinstance(array := getattr(part, name), np.ndarray):
-                array.flags.writeable = False
     return copy
