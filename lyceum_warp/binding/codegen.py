@@ -5,8 +5,6 @@ one more axis, a view of world w in it, and default functions. It is text, becau
 """
 
 import dataclasses
-import linecache
-import re
 import threading
 from collections.abc import Mapping
 from typing import Any
@@ -15,12 +13,13 @@ import numpy as np
 import warp as wp
 
 from lyceum_warp.binding.functions import TaskSource
+from lyceum_warp.binding.sources import free_module_name, run_source
 from lyceum_warp.binding.writes import written_fields
 from lyceum_warp.fields import is_data_field
 from lyceum_warp.kernels import random, steps
 from lyceum_warp.kernels import rows as kernel_rows
 from lyceum_warp.model_fields import NOT_NEGATIVE
-from lyceum_warp.task import FUNCTIONS, MEMORIES, Row, Task, TaskFunction
+from lyceum_warp.task import FUNCTIONS, MEMORIES, Row, TaskFunction
 
 _BATCH = """
 @wp.struct
@@ -78,7 +77,6 @@ def valid_model(s: World, lane: int, lanes: int) -> bool:
 
 _kernels: dict[Any, steps.Kernels] = {}
 _MAKING = threading.RLock()
-_module_names: list[str] = []
 
 
 def kernels_of(source: TaskSource, groups: Mapping[str, wp.Function]) -> steps.Kernels:
@@ -94,18 +92,11 @@ def kernels_of(source: TaskSource, groups: Mapping[str, wp.Function]) -> steps.K
             scope = _generated(source, groups)
             functions = {name: function or scope[f"no_{name}"] for name, function in source.functions.items()}
             written = [name for name, function in source.functions.items() if function is not None]
-            given: dict[str, Any] = {"module": _module_name(source.task), "functions": functions, "written": written}
+            module = free_module_name(f"lyceum_warp.generated.{source.path}")
+            given: dict[str, Any] = {"module": module, "functions": functions, "written": written}
             names = [field.name for field in dataclasses.fields(steps.TaskCode) if field.name not in given]
             _kernels[key] = steps.make_kernels(steps.TaskCode(**given, **{name: scope[name] for name in names}))
         return _kernels[key]
-
-
-def _module_name(task: type[Task]) -> str:
-    """The same name in every process, so that Warp finds the module in its cache; with a number if it is taken."""
-    name = f"lyceum_warp.generated.{task.__module__}.{task.__qualname__}"
-    taken = sum(module == name or module.startswith(f"{name}#") for module in _module_names)
-    _module_names.append(f"{name}#{taken}" if taken else name)
-    return re.sub(r"[^\w.]", "_", _module_names[-1])
 
 
 def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[str, Any]:
@@ -148,11 +139,8 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
     parts = [_BATCH.format(**{name: "\n".join(lines) for name, lines in blocks.items()})]
     parts += [_default(function) for function in FUNCTIONS.values() if function.default is not None]
     text = "\n".join(parts)
-    task = source.task
-    file = f"<lyceum_warp {task.__module__}.{task.__qualname__}>"
-    linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
     scope["__name__"] = f"lyceum_warp.generated.{source.name}"
-    exec(compile(text, file, "exec"), scope)
+    run_source(text, f"<lyceum_warp {source.path}>", scope)
     return scope
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from lyceum_warp.binding.sources import FunctionSource, has_source
+from lyceum_warp.binding.sources import FunctionSource
 from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, Task, TaskFunction, observer_name
 
 
@@ -27,6 +27,7 @@ class TaskSource:
 
     def __init__(self, task: type[Task], name: str) -> None:
         self.task, self.name = task, name
+        self.path = f"{task.__module__}.{task.__qualname__}"
         self.world: Any = self._struct("World")
         self.params: Any = self._struct("Params")
         self.functions: dict[str, wp.Function | None] = {
@@ -71,7 +72,7 @@ class TaskSource:
         functions = {name: value for name, value in module.items() if isinstance(value, wp.Function)}
         tasks = [kind for kind in (self.task, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
         used = {id(value) for task in tasks for value in vars(task).values()}
-        called = {name for f in functions.values() if has_source(f) for name in f.func.__code__.co_names}
+        called = {name for f in functions.values() if f.func is not None for name in f.func.__code__.co_names}
         forms = (FUNCTIONS["observe"].kinds, FUNCTIONS["observe"].all_kinds)
         return [
             name

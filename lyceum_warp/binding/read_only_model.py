@@ -48,14 +48,20 @@ class ReadOnlyModel(mujoco.MjModel):  # type: ignore[misc]
                 _locked(array)
 
 
-_PARTS = ("opt", "stat")
-_BY_NAME = "actuator body cam camera eq equality geom jnt joint key keyframe light mat pair sensor site tendon".split()
-for _name in _PARTS:
-    _get = getattr(mujoco.MjModel, _name).__get__
-    setattr(ReadOnlyModel, _name, property(lambda self, get=_get: _Part(get(self))))
-for _name in _BY_NAME:
-    _find = getattr(mujoco.MjModel, _name)
-    setattr(ReadOnlyModel, _name, lambda self, *key, find=_find: _Part(find(self, *key)))
+def _part(get: Any) -> property:
+    return property(lambda model: _Part(get(model)))
+
+
+def _finder(find: Any) -> Any:
+    return lambda model, *key: _Part(find(model, *key))
+
+
+for _name in ("opt", "stat"):
+    setattr(ReadOnlyModel, _name, _part(getattr(mujoco.MjModel, _name).__get__))
+for (
+    _name
+) in "actuator body cam camera eq equality geom jnt joint key keyframe light mat pair sensor site tendon".split():
+    setattr(ReadOnlyModel, _name, _finder(getattr(mujoco.MjModel, _name)))
 
 
 def read_only(model: mujoco.MjModel) -> ReadOnlyModel:

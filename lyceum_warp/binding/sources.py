@@ -1,10 +1,12 @@
-"""Parse the source of a Warp function, and resolve its lines in the file and its names."""
+"""Read the source of a Warp function: parse it, resolve its names and its calls, and run generated source."""
 
 import ast
 import builtins
+import linecache
+import re
 import types
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import warp as wp
 
@@ -74,6 +76,21 @@ class FunctionSource:
             and len(node.args) == 1
         )
 
+    def call(self, node: ast.Call) -> tuple[Literal["static", "helper", "native", "builtin", "other"], Any]:
+        """The kind of a call, and what it calls.
+
+        A helper is a function with a source, a native function a ``wp.func_native``, a builtin one of Warp's own.
+        Others are types and Python's functions, or None if the name stands for no known value.
+        """
+        callee = self.value(node.func)
+        if self.is_static(node):
+            return "static", callee
+        if not isinstance(callee, wp.Function):
+            return "other", callee
+        if callee.func is None:
+            return "builtin", callee
+        return "helper" if has_source(callee) else "native", callee
+
     def condition(self, node: ast.expr) -> bool | None:
         """The value of a condition ``wp.static(...)``, whose other branch Warp does not compile; None for any other."""
         found = self.value(node) if self.is_static(node) else None
@@ -107,8 +124,6 @@ def builtin(name: str) -> Any:
 
 def overloads(function: wp.Function) -> list[wp.Function]:
     """A function and those of the same name with arguments of other types."""
-    if not has_source(function):
-        return [function]
     found = [*function.user_overloads.values(), *function.user_templates.values()]
     # without those that Warp made from a generic one
     return [overload for overload in found if overload.generic_parent is None] or [function]
@@ -123,3 +138,23 @@ def _scope(function: Any) -> dict[str, Any]:
         except ValueError:  # not assigned yet
             scope.pop(name, None)
     return scope
+
+
+_module_names: set[str] = set()
+
+
+def free_module_name(name: str) -> str:
+    """A name for a Warp module, the same in every process, so that Warp's cache has it; numbered if it is taken."""
+    free = name = re.sub(r"[^\w.]", "_", name)
+    number = 0
+    while free in _module_names:
+        number += 1
+        free = f"{name}_{number}"
+    _module_names.add(free)
+    return free
+
+
+def run_source(text: str, file: str, scope: dict[str, Any]) -> None:
+    """Run generated source in a scope, and keep it where Warp looks for the source of functions."""
+    linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
+    exec(compile(text, file, "exec"), scope)

@@ -1,7 +1,8 @@
-"""Find what a Warp function writes into its arguments, from its source and the sources of the functions that it calls.
+"""Find the writes of a Warp function into its arguments, in its source and in those of the functions that it calls.
 
-The analysis follows elements, components, calls and local names of a row. A row that is used in any other way
-(returned, put into a tuple or a struct, chosen by ``wp.where``, given to a native function) counts as written.
+The analysis follows elements, components, calls, local names of a row, and rows in the fields of a local struct. A row
+that is used in any other way (returned, put into a tuple, chosen by ``wp.where``, given to a native function) counts as
+written.
 """
 
 import ast
@@ -168,9 +169,11 @@ class _Reader:
     ) -> None:
         self.arguments, self.writes, self.seen = arguments, writes, seen
         self.source = FunctionSource(function)
-        self.places = dict(zip(function.input_types, places, strict=True))
-        for statement in self.source.tree.body:
-            self._read(statement)
+        # by name, and "name.field" for a row in a local struct
+        self.places: dict[str, _Place | None] = dict(zip(function.input_types, places, strict=True))
+        for _ in range(2):  # the first round of a loop may use a local struct before the line that puts a row into it
+            for statement in self.source.tree.body:
+                self._read(statement)
 
     def _note(self, place: _Place, node: ast.AST, *, replaced: bool = False, follows: bool = True) -> None:
         """Note a write; ``follows=False`` says that the analysis ends here."""
@@ -182,17 +185,20 @@ class _Reader:
     def _read(self, node: ast.AST) -> _Place | None:
         """The memory of an argument that an expression names; notes the writes within an expression or a statement."""
         if isinstance(node, ast.Name):
+            for name, place in self.places.items():
+                if place is not None and name.startswith(f"{node.id}."):  # a local struct is used as a whole
+                    self._note(place, node, follows=False)
             return self.places.get(node.id)
         if isinstance(node, ast.Attribute):
-            owner = self._read(node.value)
-            return owner and owner.attribute(node.attr)
+            named = isinstance(node.value, ast.Name)
+            owner = self.places.get(ast.unparse(node.value)) if named else self._read(node.value)
+            return owner.attribute(node.attr) if owner else self.places.get(ast.unparse(node))
         if isinstance(node, ast.Subscript):
             self._read_all(node, [node.slice])
             owner = self._read(node.value)
             return owner and owner.element(node.slice)
         if isinstance(node, ast.Call):
-            if not self.source.is_static(node):
-                self._call(node)
+            self._call(node)
         elif isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign):
             self._assign(node)
         elif isinstance(node, ast.If) and (chosen := self.source.condition(node.test)) is not None:
@@ -213,12 +219,19 @@ class _Reader:
         whole = place if place is not None and place.kind is not None else None
         for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
             known = None
-            if isinstance(target, ast.Name) and whole is not None:
-                known = self.places[target.id] = self.places.get(target.id) or whole
-            self._store(target)
+            if not self._is_local(target):
+                self._store(target)
+            elif whole is not None:
+                name = ast.unparse(target)
+                known = self.places[name] = self.places.get(name) or whole
             if whole is not None and known != whole:
                 for lost in filter(None, (known, whole)):
                     self._note(lost, node, follows=False)
+
+    def _is_local(self, target: ast.expr) -> bool:
+        """Whether a name is assigned, or a field of a local struct."""
+        owner = target.value if isinstance(target, ast.Attribute) else None
+        return isinstance(target, ast.Name) or (isinstance(owner, ast.Name) and owner.id not in self.places)
 
     def _store(self, target: ast.expr) -> None:
         """Note that an element, a component or a field is assigned."""
@@ -231,20 +244,20 @@ class _Reader:
             self._note(place, target, replaced=replaced)
 
     def _call(self, node: ast.Call) -> None:
-        callee = self.source.value(node.func)
+        kind, callee = self.source.call(node)
         given = [*node.args, *(keyword.value for keyword in node.keywords)]
-        if not isinstance(callee, wp.Function):
-            self._read_all(node, [node.func, *given], elements=callee is wp.address_of)
-        elif has_source(callee):
+        if kind == "helper":
             for overload in overloads(callee):
-                self._call_function(overload, node)
-        elif callee.func is None and callee.key in _READERS:
+                self._call_helper(overload, node)
+        elif kind == "builtin" and callee.key in _READERS:
             for argument in given:
                 self._read(argument)
-        else:
+        elif kind == "other":
+            self._read_all(node, [node.func, *given], elements=callee is wp.address_of)
+        elif kind != "static":
             self._read_all(node, given)
 
-    def _call_function(self, callee: wp.Function, node: ast.Call) -> None:
+    def _call_helper(self, callee: wp.Function, node: ast.Call) -> None:
         """Note what a function with a source writes into the arguments of a call."""
         expressions: dict[str, ast.expr] = dict(zip(callee.input_types, node.args, strict=False))
         expressions |= {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg}

@@ -46,10 +46,9 @@ class _Run:
         task = self.env.task
         self.functions = {name: function for name, function in task.functions.items() if function is not None}
         self.functions |= {observer_name(group): function for group, function in task.observers.items()}
-        name = f"{task.task.__module__}.{task.task.__qualname__}"
         try:
             self.checked: CheckedFunctions = checked_functions(
-                name, self.functions, task.source.world, task.kernels.Batch, self.env.device
+                task.source.path, self.functions, task.source.world, task.kernels.Batch, self.env.device
             )
         except Unchecked as error:
             ctx.fail(f"the functions could not be checked: {error}")

@@ -1,22 +1,21 @@
-"""Copies of a task's functions that check every index, and kernels that run them.
+"""Copy a task's functions with a check of every index, and make kernels that run the copies.
 
-The copies are made from the functions' sources: each index of a row, a vector or a matrix goes through a function that
-compares it with the size, and each ``while`` loop counts its rounds. Everything else stays as it is, so that the
-numbers are those of the task. Native functions (``wp.func_native``) are C++ and cannot be checked.
+In a copy each index of a row, a vector or a matrix goes through a function that compares it with the size, and each
+``while`` loop counts its rounds. Everything else stays as it is, so that a copy computes the same numbers. Native
+functions (``wp.func_native``) are C++ and cannot be checked.
 """
 
 import ast
 import copy
 import dataclasses
-import linecache
-import re
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from lyceum_warp.binding.sources import FunctionSource, has_source, is_row, is_struct, name_of, overloads
+from lyceum_warp.binding import sources
+from lyceum_warp.binding.sources import FunctionSource, is_row, is_struct, name_of, overloads
 from lyceum_warp.kernels import bounds
 
 _SHAPES = ("shape", "strides")
@@ -146,16 +145,13 @@ class CheckedFunctions:
         if number in self._copies:  # Warp takes the next for an overload of this one
             scope[tree.name] = self._copies[number]
         self._scopes.append((scope, rewriter.callees))
-        self._execute(ast.unparse(ast.fix_missing_locations(tree)), scope, len(self._scopes))
+        self._run(ast.unparse(ast.fix_missing_locations(tree)), scope, len(self._scopes))
         copied: wp.Function = scope[tree.name]
         return copied
 
-    def _execute(self, text: str, scope: dict[str, Any], part: int | str) -> None:
-        """Run generated source in a scope, and keep it where Warp looks for it."""
-        file = f"<{self._module} {part}>"
-        linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
+    def _run(self, text: str, scope: dict[str, Any], part: int | str) -> None:
         scope["__name__"] = self._module
-        exec(compile(text, file, "exec"), scope)
+        sources.run_source(text, f"<{self._module} {part}>", scope)
 
     def _kernel(self, name: str, function: wp.Function) -> wp.Kernel:
         """The kernel that runs the copy of one function in every world."""
@@ -176,7 +172,7 @@ class CheckedFunctions:
                 values.append(f"values_{i}[w % values_{i}.shape[0]]")
         lines.append(f"copy({', '.join(values)})")
         text = f"def run_{name}({', '.join(arguments)}):\n" + "\n".join(f"    {line}" for line in lines) + "\n"
-        self._execute(text, scope, name)
+        self._run(text, scope, name)
         return wp.kernel(scope[f"run_{name}"], module=wp.get_module(self._module), enable_backward=False)
 
 
@@ -220,30 +216,28 @@ class _Rewriter(ast.NodeTransformer):
         return node
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
-        if self.source.is_static(node):
+        kind, callee = self.source.call(node)
+        if kind == "static":
             return node
-        callee = self.source.value(node.func)
         if callee is None and self.source.is_static(node.func):
             raise Unchecked(f"{self.source.name} calls what a loop chooses ({self.source.place(node)})")
-        if isinstance(callee, wp.Function) and callee.func is None and callee.key.startswith("atomic_"):
-            self._check_atomic(node, callee.key)
-        node.args = [self.visit(argument) for argument in node.args]
-        for keyword in node.keywords:
-            keyword.value = self.visit(keyword.value)
-        if not isinstance(callee, wp.Function) or callee.func is None:
-            if not isinstance(node.func, ast.Name):
-                node.func = self.visit(node.func)
-            return node
-        if has_source(callee):
-            number = self.checked.number(callee)
-            self.callees.append(number)
-            node.func = _name(f"bounds_{number}")
-            node.args.insert(0, _name("bounds_report"))
-        elif any(is_row(kind) or is_struct(kind) for kind in callee.input_types.values()):
+        if kind == "native" and any(is_row(given) or is_struct(given) for given in callee.input_types.values()):
             raise Unchecked(
                 f"{self.source.name} calls the native function {name_of(callee)} ({self.source.place(node)}), which "
                 "has no source in Python: give it numbers instead of rows"
             )
+        if kind == "builtin" and callee.key.startswith("atomic_"):
+            self._check_atomic(node, callee.key)
+        node.args = [self.visit(argument) for argument in node.args]
+        for keyword in node.keywords:
+            keyword.value = self.visit(keyword.value)
+        if kind == "helper":
+            number = self.checked.number(callee)
+            self.callees.append(number)
+            node.func = _name(f"bounds_{number}")
+            node.args.insert(0, _name("bounds_report"))
+        elif kind != "native" and not isinstance(node.func, ast.Name):
+            node.func = self.visit(node.func)
         return node
 
     def _check_atomic(self, node: ast.Call, key: str) -> None:
@@ -321,7 +315,6 @@ def _loaded(node: ast.expr) -> ast.expr:
 
 
 _made: dict[Any, CheckedFunctions] = {}
-_module_names: list[str] = []
 
 
 def checked_functions(
@@ -341,10 +334,7 @@ def checked_functions(
     """
     key = (world, batch, *functions.items())
     if key not in _made:
-        module = re.sub(r"[^\w.]", "_", f"lyceum_warp.checked.{name}")
-        taken = sum(other == module or other.startswith(f"{module}_again") for other in _module_names)
-        module = f"{module}_again{taken}" if taken else module
-        _module_names.append(module)
+        module = sources.free_module_name(f"lyceum_warp.checked.{name}")
         _made[key] = CheckedFunctions(module, functions, world, batch)
     _made[key].load(device)
     return _made[key]

@@ -68,6 +68,7 @@ class Forms:
     of_a_struct: Row[float]
     by_static: Row[float]
     in_a_loop: Row[float]
+    of_a_local_struct: Row[float]
     not_at_all: Row[float]
 
 
@@ -102,8 +103,12 @@ def writes_forms(s: Forms, p: Params):
     if wp.static(THIS.vec7 is None):
         s.not_at_all[0] = 1.0
     elif p.gain > 1.0:
+        own = Forms()
         while s.in_a_loop[0] < 0.0:
             s.in_a_loop[0] = 1.0
+            if s.in_a_loop[1] > 0.0:
+                own.element[0] = 1.0
+            own.element = s.of_a_local_struct
 
 
 def test_every_form_of_a_write_is_found() -> None:
@@ -121,6 +126,8 @@ class Uses:
     before: Row[float]
     after: Row[float]
     in_a_struct: Row[float]
+    by_an_attribute: Row[float]
+    by_another: Row[float]
     by_a_name: Row[float]
     by_reference: Row[float]
     by_pointer: Row[float]
@@ -130,6 +137,11 @@ class Uses:
 @wp.func
 def row_of(s: Uses) -> Row[float]:
     return s.returned
+
+
+@wp.func
+def reads_row_of(s: Uses) -> float:
+    return s.before[0]
 
 
 @wp.func
@@ -158,9 +170,11 @@ def uses_rows(s: Uses, p: Params):
         if i > 0:
             row[0] = 1.0  # from the second round on it is another
         row = s.after
-    own = Uses()
-    own.in_a_struct = s.in_a_struct
-    own.in_a_struct[0] = 1.0
+    first, second = Uses(), Uses()
+    first.before = s.in_a_struct
+    reads_row_of(first)
+    second.after = s.by_an_attribute
+    second.after = s.by_another
     helper = fill
     helper(s.by_a_name, 1.0)
     advanced(s.by_reference[0])
@@ -182,8 +196,12 @@ def reads_only(s: World, p: Params, obs: Row[float]):
     row = s.qpos
     obs[0] = row[0] + position.x + turned[0, 0] + float(len(s.qvel)) + float(s.qpos.shape[0])
     obs[1] = wp.where(s.time > 0.5, s.qpos[0], p.gain) + wp.length(s.xpos[0]) + p.table[0, 1]
+    local = World()
+    local.qpos = s.memory
+    local.qvel = s.qvel[2:4]
+    local.time = local.qpos[0] + local.qvel[1]
     own = wp.zeros(shape=3, dtype=float)
-    fill(own, 1.0)
+    fill(own, local.time)
     own[0] = 1.0
     obs[2] = own[0] + vec7()[0] + wp.max(float(int(s.qpos[0])), 1.0)
 
