@@ -12,6 +12,7 @@ import warp as wp
 
 from lyceum_warp.binding.bound_task import BoundTask, check_field_name
 from lyceum_warp.binding.compile_errors import explained
+from lyceum_warp.binding.probe import Probe
 from lyceum_warp.binding.read_only_model import read_only
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.done import FAULTS
@@ -185,7 +186,7 @@ class Env:
             if self.engine.capturable and options.graphs:
                 self.engine.prepare_capture()
             self.engine.reset(worlds.everyone)
-            probe = self.task.probe(worlds.after, worlds.params, self.device)
+            probe = Probe(self.task, worlds.after, worlds.params, self.device)
             probe.check_bounds()  # before a function writes into an array
             self.rand_reset(options.seed)
             if self.task.dynamics and not _replica:  # later, and in a replica, a bad draw is a fault of its world

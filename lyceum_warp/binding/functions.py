@@ -1,4 +1,4 @@
-"""A task's structs and functions: found in its class or module, and checked against the table in ``task.FUNCTIONS``."""
+"""Find a task's structs and functions in its class or module, and check them against ``task.FUNCTIONS``."""
 
 import ast
 import dataclasses
@@ -14,15 +14,15 @@ from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, Task, TaskFunction, observ
 
 
 class TaskSource:
-    """The structs and the functions that a task consists of.
+    """The structs and the functions of a task.
 
     Args:
         task: The task's class.
         name: The task's name, for messages.
 
     Raises:
-        ValueError: A struct or ``observe`` is missing, a function is not written as the table says, or a name looks
-            like a misspelt one of the table.
+        ValueError: A struct or ``observe`` is missing, a function has another signature than in the table, or a name
+            resembles one of the table.
     """
 
     def __init__(self, task: type[Task], name: str) -> None:
@@ -33,9 +33,9 @@ class TaskSource:
         self.functions: dict[str, wp.Function | None] = {
             name: self._function(wanted) for name, wanted in FUNCTIONS.items()
         }
-        """The task's functions by the names of the table; None for those that it does not have."""
+        """The task's functions by their names in the table; None for a function that the task lacks."""
         if self.functions["observe"] is None:
-            raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), the one function it needs")
+            raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), which every task needs")
         self._check_names()
 
     def group_functions(self, groups: Collection[str]) -> dict[str, wp.Function]:
@@ -54,36 +54,31 @@ class TaskSource:
                     f"{wanted.signature}"
                 )
             found[group] = function
-        for name in (*self._class_observers(), *self._unused_observers()):
+        for name in self._observers():
             if (group := name.removeprefix(GROUP_PREFIX)) not in groups:
                 raise ValueError(f"obs of the task {self.name!r} has no group {group!r}, which {name} writes")
         return found
 
-    def _class_observers(self) -> list[str]:
-        return [
-            name
-            for name, value in vars(self.task).items()
-            if name.startswith(GROUP_PREFIX) and isinstance(value, wp.Function | staticmethod)
-        ]
-
-    def _unused_observers(self) -> list[str]:
-        """Names of functions in the module that look like the observer of a group, but that nothing there uses."""
+    def _observers(self) -> list[str]:
+        """Names of functions for groups: those in the class, and those in the module that nothing there uses."""
         module = vars(sys.modules[self.task.__module__])
         functions = {name: value for name, value in module.items() if isinstance(value, wp.Function)}
         tasks = [kind for kind in (self.task, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
         used = {id(value) for task in tasks for value in vars(task).values()}
         called = {name for f in functions.values() if f.func is not None for name in f.func.__code__.co_names}
         forms = (FUNCTIONS["observe"].kinds, FUNCTIONS["observe"].all_kinds)
-        return [
+        own = [name for name, value in vars(self.task).items() if isinstance(value, wp.Function | staticmethod)]
+        unused = [
             name
             for name, function in functions.items()
-            if name.startswith(GROUP_PREFIX) and name not in called and id(function) not in used
+            if name not in called and id(function) not in used
             and tuple(map(self._kind, function.input_types.values())) in forms  # not another task's
             and not any(_may_list(task, name.removeprefix(GROUP_PREFIX)) for task in tasks)
         ]  # fmt: skip
+        return [name for name in (*own, *unused) if name.startswith(GROUP_PREFIX)]
 
     def _written(self, name: str) -> Any:
-        """The value of a name in the class, in its module, or in those of the classes that it extends."""
+        """The value of a name in the class, in its module, or in a base class or its module."""
         owners: Any = self.task.__mro__[: self.task.__mro__.index(Task)]
         for owner in owners:
             found = vars(owner).get(name, owner.scope.get(name, vars(sys.modules[owner.__module__]).get(name)))
@@ -110,17 +105,17 @@ class TaskSource:
         structs = [kind for kind in types if hasattr(kind, "vars") and hasattr(kind, "cls")]
         foreign = structs and self.world not in structs and self.params not in structs
         if foreign and function.func.__module__ in {owner.__module__ for owner in self.task.__mro__}:
-            return None  # another task's of the same module
+            return None  # it belongs to another task of the module
         annotations = function.func.__annotations__
         if any(isinstance(annotation, str) for annotation in annotations.values()):
             raise ValueError(
-                f"{name} of the task {self.name!r} has annotations that are text, not types: leave out "
-                "'from __future__ import annotations', and quotes around types"
+                f"{name} of the task {self.name!r} has annotations that are text, not types: remove "
+                "'from __future__ import annotations' and quotes around types"
             )
         returned = annotations.get("return")
         values = _return_values(function)
         if wanted.result is not None and not values:
-            raise ValueError(f"{name} of the task {self.name!r} has no return: it is written as {wanted.signature}")
+            raise ValueError(f"{name} of the task {self.name!r} has no return: write it as {wanted.signature}")
         if wanted.result is not None and any(isinstance(value, ast.Tuple) for value in values):
             raise ValueError(
                 f"{name} of the task {self.name!r} returns a tuple, and must return a single {wanted.result.__name__}"
@@ -133,18 +128,18 @@ class TaskSource:
         return function
 
     def _check_structs(self, name: str, structs: list[Any]) -> None:
-        """Refuse a function of another file that takes that file's own World or Params."""
+        """Refuse a function that takes the World or the Params of another file."""
         for kind in structs:
             for own_name, own in (("World", self.world), ("Params", self.params)):
                 if kind is not own and kind.key.rpartition(".")[2] == own_name:
                     raise ValueError(
-                        f"{name} of the task {self.name!r} takes the {own_name} of {_origin(kind)}, but the task has "
+                        f"{name} of the task {self.name!r} takes the {own_name} of {_origin(kind)}, but the task uses "
                         f"the {own_name} of {_origin(own)}: import both structs from one module, or write {name} for "
-                        "the task's own"
+                        "the task's structs"
                     )
 
     def _kind(self, argument: Any) -> str:
-        """How the table writes the type of an argument."""
+        """The annotation that the table has for the type of an argument."""
         if argument is self.world:
             return "World"
         if argument is self.params:
@@ -153,7 +148,7 @@ class TaskSource:
         return {wp.float32: "Row[float]", wp.uint32: "Row[wp.uint32]"}.get(element, "?")
 
     def _check_names(self) -> None:
-        """Refuse what looks like a misspelt name of the table: it would never be called."""
+        """Refuse names that resemble one of the table: nothing would ever call such a function."""
         attributes = [name for name in vars(Task) if not name.startswith("_")]
         for name in vars(self.task):
             if name.startswith(("_", GROUP_PREFIX)) or name in (*attributes, "World", "Params", *FUNCTIONS):
@@ -168,6 +163,11 @@ class TaskSource:
                     raise ValueError(f"the task {self.name!r} has a function {name!r}: did you mean {close[0]}?")
 
 
+def draws_noise(observer: wp.Function) -> bool:
+    """Whether the function of a group of observations takes a random stream."""
+    return len(observer.input_types) > len(FUNCTIONS["observe"].kinds)
+
+
 def _may_list(task: type[Task], group: str) -> bool:
     """Whether a class lists a group of observations, or may do so, because its ``obs`` is a method."""
     obs = getattr(task, "obs", None)
@@ -175,7 +175,7 @@ def _may_list(task: type[Task], group: str) -> bool:
 
 
 def _origin(struct: Any) -> str:
-    """The file that a struct comes from; its module where there is no file."""
+    """The file that defines a struct, or its module if it has no file."""
     module = struct.cls.__module__
     return str(getattr(sys.modules.get(module), "__file__", None) or module)
 

@@ -5,6 +5,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+_BY_NAME = "actuator body cam camera eq equality geom jnt joint key keyframe light mat pair sensor site tendon".split()
+
 
 def _refuse(self: Any, name: str, value: Any) -> None:
     raise AttributeError(
@@ -20,20 +22,13 @@ class _Part:
         object.__setattr__(self, "_part", part)
 
     def __getattr__(self, name: str) -> Any:
-        if name == "_part":  # not set yet, as in a copy
-            raise AttributeError(name)
-        value = getattr(self._part, name)
-        return _locked(value.view()) if isinstance(value, np.ndarray) else value
+        value = getattr(object.__getattribute__(self, "_part"), name)
+        if isinstance(value, np.ndarray):
+            value = value.view()
+            value.flags.writeable = False
+        return value
 
     __setattr__ = _refuse
-
-    def __repr__(self) -> str:
-        return repr(self._part)
-
-
-def _locked(array: np.ndarray) -> np.ndarray:
-    array.flags.writeable = False
-    return array
 
 
 class ReadOnlyModel(mujoco.MjModel):  # type: ignore[misc]
@@ -41,27 +36,17 @@ class ReadOnlyModel(mujoco.MjModel):  # type: ignore[misc]
 
     __setattr__ = _refuse
 
+    def __getattribute__(self, name: str) -> Any:
+        value = super().__getattribute__(name)
+        if name in _BY_NAME:
+            return lambda *key: _Part(value(*key))
+        return _Part(value) if name in ("opt", "stat") else value
+
     def __setstate__(self, state: Any) -> None:
         super().__setstate__(state)
         for name in dir(mujoco.MjModel):
             if isinstance(array := getattr(self, name), np.ndarray):
-                _locked(array)
-
-
-def _part(get: Any) -> property:
-    return property(lambda model: _Part(get(model)))
-
-
-def _finder(find: Any) -> Any:
-    return lambda model, *key: _Part(find(model, *key))
-
-
-for _name in ("opt", "stat"):
-    setattr(ReadOnlyModel, _name, _part(getattr(mujoco.MjModel, _name).__get__))
-for (
-    _name
-) in "actuator body cam camera eq equality geom jnt joint key keyframe light mat pair sensor site tendon".split():
-    setattr(ReadOnlyModel, _name, _finder(getattr(mujoco.MjModel, _name)))
+                array.flags.writeable = False
 
 
 def read_only(model: mujoco.MjModel) -> ReadOnlyModel:

@@ -14,7 +14,7 @@ from lyceum_warp.support.upstream import builtin_functions
 
 
 class FunctionSource:
-    """The source of a ``wp.func`` as it was when the function was made, even if its file has changed since.
+    """The source of a ``wp.func`` when it was defined, even if its file has changed since.
 
     Args:
         function: A function with a source; see ``has_source``.
@@ -34,22 +34,18 @@ class FunctionSource:
         self.file = Path(adj.filename).name
         self._first_line: int = adj.fun_lineno
         self.scope = _scope(function.func)
-        """The values of global names and of those that the function encloses."""
+        """The values of global names and of names from enclosing functions."""
         self.locals = {argument.arg for argument in self.tree.args.args} | {
             node.id for node in ast.walk(self.tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
         }
         """Its arguments, and the names that it assigns."""
 
-    def line(self, node: ast.AST) -> int:
-        """The line of a node in the file."""
-        return self._first_line + getattr(node, "lineno", 1) - 1
-
     def place(self, node: ast.AST) -> str:
         """The file and the line of a node, for messages."""
-        return f"{self.file}, line {self.line(node)}"
+        return f"{self.file}, line {self._first_line + getattr(node, 'lineno', 1) - 1}"
 
     def value(self, node: ast.expr) -> Any:
-        """What a name, a path such as ``module.helper`` or a ``wp.static(...)`` stands for; None if it is not known."""
+        """The value of a name, of a path such as ``module.helper`` or of ``wp.static(...)``; None if it is not known."""
         if isinstance(node, ast.Name):
             if node.id in self.locals:
                 return None
@@ -92,13 +88,13 @@ class FunctionSource:
         return "helper" if has_source(callee) else "native", callee
 
     def condition(self, node: ast.expr) -> bool | None:
-        """The value of a condition ``wp.static(...)``, whose other branch Warp does not compile; None for any other."""
+        """The value of a condition ``wp.static(...)``, of which Warp compiles one branch; None for another condition."""
         found = self.value(node) if self.is_static(node) else None
         return None if found is None else bool(found)
 
 
 def has_source(function: wp.Function) -> bool:
-    """Whether a function's source is Python: not that of a builtin, or of a ``wp.func_native``."""
+    """Whether a function has Python source; a builtin and a ``wp.func_native`` have none."""
     return function.func is not None and function.native_snippet is None
 
 
@@ -118,12 +114,12 @@ def name_of(function: wp.Function) -> str:
 
 
 def builtin(name: str) -> Any:
-    """Warp's builtin of a name, which may not be an attribute of the module, or Python's; None if there is none."""
+    """Warp's builtin of a name, which need not be an attribute of the module, or Python's; None if there is none."""
     return builtin_functions().get(name) or getattr(wp, name, None) or getattr(builtins, name, None)
 
 
 def overloads(function: wp.Function) -> list[wp.Function]:
-    """A function and those of the same name with arguments of other types."""
+    """The overloads of a function with Python source: functions of its name with arguments of other types."""
     found = [*function.user_overloads.values(), *function.user_templates.values()]
     # without those that Warp made from a generic one
     return [overload for overload in found if overload.generic_parent is None] or [function]

@@ -6,7 +6,6 @@ from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import steps
 from lyceum_warp.support.arrays import launch_worlds, torch_view
-from lyceum_warp.task import FUNCTIONS
 from lyceum_warp.testing.context import SHORT, Context
 
 
@@ -51,7 +50,7 @@ def check_groups(ctx: Context) -> None:
 def check_noise(ctx: Context) -> None:
     """A state always has the same noise in its observation; another world, episode or step has another."""
     env = ctx.a
-    if not env.task.has_noise:
+    if not env.task.noisy_groups:
         return
     ctx.restart()
     env.step(ctx.actions(1)[0])
@@ -62,7 +61,6 @@ def check_noise(ctx: Context) -> None:
     parts = env.state_space.parts
     # the same world in the same state, except for its place in the random stream
     same = state[:1].expand_as(state).contiguous()
-    noisy = [group for group, f in env.task.observers.items() if len(f.input_types) > len(FUNCTIONS["observe"].kinds)]
     changes: dict[str, torch.Tensor] = {"key": state[:, parts["key"]]}
     for name in ("episode", "step"):
         changes[name] = same[:, parts[name]] + torch.arange(env.nworld, device=state.device)[:, None].double()
@@ -70,7 +68,7 @@ def check_noise(ctx: Context) -> None:
     for name, values in changes.items():
         moved = same.clone()
         moved[:, parts[name]] = values
-        shown = [env.get_obs(moved, group=group) for group in noisy]
+        shown = [env.get_obs(moved, group=group) for group in env.task.noisy_groups]
         differ[name] = any(bool((obs[1:] != obs[:1]).any(dim=1).all()) for obs in shown)
     if any(differ.values()):  # its scale may be 0
         for name, found in differ.items():

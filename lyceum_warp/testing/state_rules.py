@@ -168,7 +168,7 @@ def check_reset(ctx: Context) -> None:
 
     reset()
     state, obs = _physics(env, env.get_state()), env.obs.clone()
-    noisy = env.task.has_noise  # each episode has noise of its own
+    noisy = bool(env.task.noisy_groups)  # each episode has its own noise
     if not noisy and not env.task.parameters.per_world:
         ctx.equal(obs, obs[:1].expand_as(obs).contiguous(), "the worlds' observations after reset")
     for action in ctx.actions(100):

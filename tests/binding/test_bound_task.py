@@ -25,9 +25,9 @@ def bound(file: Path, **options: Any) -> BoundTask:
     ("line", "message"),
     [
         ("obs = 10", "obs of the task 'tiny' is 10: add the parts of its observation"),
-        ("memory = 1", "the task 'tiny' needs both, memory = ... in the class and memory in World"),
-        ("lagged = ('qvel',)", "the task 'tiny' wants 'qvel' lagged but does not list it in World"),
-        ("cleared = ('qacc',)", "the task 'tiny' wants 'qacc' cleared but does not list it in World"),
+        ("memory = 1", "the task 'tiny' needs both memory = ... in its class and memory in World"),
+        ("lagged = ('qvel',)", "lagged of the task 'tiny' has 'qvel': list it in World, too"),
+        ("cleared = ('qacc',)", "cleared of the task 'tiny' has 'qacc': list it in World, too"),
         ("frame_skip = 0", "frame_skip of the task 'tiny' must be a whole number from 1 to .*, not 0"),
         *(
             (
@@ -41,7 +41,7 @@ def bound(file: Path, **options: Any) -> BoundTask:
             r"^success_steps of the task 'tiny' is 2, but the task has no success\(s: World, p: Params\)",
         ),
         ("horizon = -1", "horizon of the task 'tiny' must be a whole number from 0 to .*, not -1"),
-        ("action_range = 1.0", r"must be two finite numbers, lowest first, as \(-1.0, 1.0\), not 1.0"),
+        ("action_range = 1.0", r"must be two finite numbers, lowest first, such as \(-1.0, 1.0\), not 1.0"),
         ("action_range = (1.0, -1.0)", r"action_range of the task 'tiny' must be .* not \(1.0, -1.0\)"),
         ("action_range = (0.0, float('inf'))", r"must be two finite numbers, lowest first"),
     ],
@@ -57,7 +57,7 @@ INCOMPLETE = {
     "no memory": (
         "qpos: Row[float]",
         "qpos: Row[float]\n    memory: Row[float]",
-        "needs both, memory = ... in the class",
+        "needs both memory = ... in its class",
     ),
     "no such field": ("qpos: Row[float]", "qpoz: Row[float]", "no field 'qpoz': did you mean qpos"),
 }

@@ -77,7 +77,7 @@ WRITTEN_OTHERWISE = {
     ),
     "no return": (
         "def evaluate(s: World, p: Params) -> float:\n    wp.abs(s.qpos[0])",
-        r"evaluate of the task 'tiny' has no return: it is written as evaluate\(s: World, p: Params\) -> float",
+        r"evaluate of the task 'tiny' has no return: write it as evaluate\(s: World, p: Params\) -> float",
     ),
     "a tuple": (
         f"{REWARD}:\n    return 1.0, 2.0",

@@ -76,8 +76,8 @@ def test_named_elements_become_their_places_in_the_model(model: mujoco.MjModel) 
         ({"num_envs": 4}, "no parameter 'num_envs': did you mean nworld"),
         ({"gain": "much"}, "the parameter gain='much' of 'arm' is not a number"),
         ({"gain": np.nan}, "the parameter gain=nan of 'arm' is not a number"),
-        ({"gain": [1.0, 2.0, 3.0]}, r"gain of 'arm' has shape \(3,\); it takes one number, or one a world, \(2,\)"),
-        ({"offset": 1.0}, r"offset of 'arm' has shape \(\); it takes \(3,\), or one a world, \(2, 3\)"),
+        ({"gain": [1.0, 2.0, 3.0]}, r"gain of 'arm' has shape \(3,\); it takes one number, or one per world, \(2,\)"),
+        ({"offset": 1.0}, r"offset of 'arm' has shape \(\); it takes \(3,\), or one per world, \(2, 3\)"),
         ({"count": 2.5}, "count=2.5 of 'arm' must be a whole number"),
         ({"lively": 0.5}, "lively=0.5 of 'arm' must be a whole number"),
         ({"tip": 1}, "tip=1 of 'arm' is an index of 'site_xpos', of which the model has 1: give one from 0 to 0"),
@@ -169,9 +169,9 @@ def test_a_table_is_a_copy_that_cannot_be_written(model: mujoco.MjModel) -> None
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"motion": 1.0}, r"the parameter motion of 'arm' has shape \(\): it takes 2 axes, none of them empty"),
+        ({"motion": 1.0}, r"the parameter motion of 'arm' has shape \(\): it takes 2 axes, none of length 0"),
         ({"motion": [1.0, 2.0]}, r"has shape \(2,\): it takes 2 axes"),
-        ({"motion": np.zeros((0, 2))}, r"has shape \(0, 2\): it takes 2 axes, none of them empty"),
+        ({"motion": np.zeros((0, 2))}, r"has shape \(0, 2\): it takes 2 axes, none of length 0"),
         ({"motion": [[1.0], [2.0, 3.0]]}, "motion of 'arm' must be a table of numbers: "),
         ({"motion": [[1.0, np.nan]]}, r"motion of 'arm' has nan at \[0, 1\]: it must be a finite number of 32 bits"),
         ({"motion": [[1e60, 1.0]]}, r"motion of 'arm' has 1e\+60 at \[0, 0\]: it must be a finite number of 32 bits"),
