@@ -2,7 +2,7 @@
 
 import ast
 import contextlib
-import importlib
+import importlib.util
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -49,14 +49,9 @@ def _imported_names(tree: ast.AST, package: str) -> Iterator[str]:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            owner = node.module or ""
-            if node.level:
-                parents = package.split(".") if package else []
-                if node.level > len(parents):
-                    continue
-                owner = ".".join([*parents[: len(parents) - node.level + 1], *filter(None, [node.module])])
-            yield owner
-            yield from (f"{owner}.{alias.name}" for alias in node.names)
+            with contextlib.suppress(ImportError):  # too many dots
+                owner = importlib.util.resolve_name("." * node.level + (node.module or ""), package or None)
+                yield from (owner, *(f"{owner}.{alias.name}" for alias in node.names))
 
 
 def _prefixes(name: str) -> list[str]:
@@ -77,12 +72,10 @@ def _module_file(folder: Path, name: str) -> Path | None:
 
 def stamps(files: Iterable[Path]) -> Stamps:
     """The current stamps of files, to find those that changed."""
-    found: Stamps = {}
-    for file in files:
+    found: Stamps = dict.fromkeys(files)
+    for file in found:
         with contextlib.suppress(OSError):
-            stat = file.stat()
-            found[file] = stat.st_mtime_ns, stat.st_size
-        found.setdefault(file, None)
+            found[file] = (stat := file.stat()).st_mtime_ns, stat.st_size
     return found
 
 

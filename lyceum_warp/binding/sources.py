@@ -16,9 +16,6 @@ from lyceum_warp.support.upstream import builtin_functions
 class FunctionSource:
     """The source of a ``wp.func`` when it was defined, even if its file has changed since.
 
-    Args:
-        function: A function with a source; see ``has_source``.
-
     Raises:
         ValueError: The source is not a single function definition.
     """
@@ -45,7 +42,7 @@ class FunctionSource:
         return f"{self.file}, line {self._first_line + getattr(node, 'lineno', 1) - 1}"
 
     def value(self, node: ast.expr) -> Any:
-        """The value of a name, of a path such as ``module.helper`` or of ``wp.static(...)``; None if it is not known."""
+        """The value of a name, of a path such as ``module.helper`` or of ``wp.static(...)``; None if unknown."""
         if isinstance(node, ast.Name):
             if node.id in self.locals:
                 return None
@@ -88,7 +85,7 @@ class FunctionSource:
         return "helper" if has_source(callee) else "native", callee
 
     def condition(self, node: ast.expr) -> bool | None:
-        """The value of a condition ``wp.static(...)``, of which Warp compiles one branch; None for another condition."""
+        """The value of a ``wp.static(...)`` condition, of which Warp compiles one branch; None for any other."""
         found = self.value(node) if self.is_static(node) else None
         return None if found is None else bool(found)
 
