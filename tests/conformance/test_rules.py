@@ -144,7 +144,7 @@ BREAKS: list[Break] = [
     ("round_trip", Worlds, "unpack_state", nothing),
     ("restoring", MujocoEngine, "_set_integration", nothing),
     ("masked_restoring", lw.Env, "set_state", lambda method: lambda self, state, mask=None: method(self, state)),
-    ("masked_getting", lw.Env, "get_state", lambda method: lambda self, out=None, mask=None: method(self, out)),
+    ("round_trip", lw.Env, "get_state", lambda method: lambda self, out=None, mask=None: method(self, out)),
     ("set_state_shows", Worlds, "_judge_state", nothing),
     ("purity", lw.Env, "_scratch_at", lambda method: lambda self, state: self.set_state(state) or self),
     ("determinism", lw.Env, "step", then(lambda env: env.reward.add_(1e-6 * next(counter)))),
@@ -152,7 +152,7 @@ BREAKS: list[Break] = [
     ("masked_reset", lw.Env, "reset", lambda method: lambda self, mask=None: method(self)),
     ("rand_reset", lw.Env, "rand_reset", lambda method: lambda self, seed=None, mask=None: method(self, None, mask)),
     ("world_count", lw.Env, "rand_reset", then(lambda env: env.obs.add_(env.nworld))),
-    ("saved_stream", Worlds, "unpack_state", nothing),
+    ("restoring", Worlds, "unpack_state", nothing),
     ("truncation", lw.Env, "step", then(lambda env: env.final_obs.copy_(env.obs))),
     ("truncation", lw.Env, "step", then(lambda env: env.terminated.copy_(env.done))),
     ("no_autoreset", lw.Env, "step", then(lambda env: env.done.zero_())),
@@ -189,7 +189,7 @@ FULL_BREAKS: list[Break] = [
 
 SETTLED_BREAKS: list[Break] = [
     ("settle", MujocoEngine, "settle", at_once),
-    ("settle", MujocoEngine, "settle", everywhere),
+    ("masked_reset", MujocoEngine, "settle", everywhere),
 ]
 """The same for its variant that settles."""
 
