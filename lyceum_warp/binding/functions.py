@@ -133,9 +133,9 @@ class TaskSource:
             for own_name, own in (("World", self.world), ("Params", self.params)):
                 if kind is not own and kind.key.rpartition(".")[2] == own_name:
                     raise ValueError(
-                        f"{name} of the task {self.name!r} takes the {own_name} of {_origin(kind)}, but the task uses "
+                        f"{name} of the task {self.name!r} takes the {own_name} of {_origin(kind)}, but the task has "
                         f"the {own_name} of {_origin(own)}: import both structs from one module, or write {name} for "
-                        "the task's structs"
+                        "the task's own"
                     )
 
     def _kind(self, argument: Any) -> str:

@@ -177,7 +177,7 @@ def _explained(error: Exception) -> str:
     text = str(error).strip()
     if found := re.search(r"argument '(\w+)' of function (\w+): Unrecognized type '<class '[\w.]*?(\w+)'>'", text):
         argument, function, kind = found.groups()
-        return f"the argument {argument} of {function} has the type {kind}: decorate that class with @wp.struct"
+        return f"the argument {argument} of {function} has the type {kind}, which must be decorated with @wp.struct"
     if found := re.search(r"type object '(\w+)' has no attribute '_type_'", text):
         return (
             f"a @wp.struct has a field of the type {found.group(1)}: it can hold float, int, bool, vectors and "

@@ -26,22 +26,9 @@ def ball(option: str = "") -> mujoco.MjSpec:
 # sources
 
 
-def test_a_spec_is_copied() -> None:
-    spec = ball()
-    copy = load_spec(spec)
-    copy.bodies[1].name = "moved"
-    assert spec.bodies[1].name == ""
-
-
 def test_a_compiled_model_is_refused() -> None:
     with pytest.raises(ValueError, match="must be a file or an MjSpec, not a compiled MjModel: give its MjSpec"):
         load_spec(ball().compile())
-
-
-def test_a_name_alone_is_one_of_gymnasiums_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert load_spec("hopper.xml").modelname == "hopper"
-    assert lw.gymnasium_model("hopper.xml").spec().modelname == "hopper"
 
 
 def test_a_relative_path_belongs_to_the_tasks_file_not_to_the_current_folder(
@@ -71,7 +58,6 @@ def test_the_current_folder_is_searched_only_for_the_option_model(
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        ("hoper.xml", "no model file 'hoper.xml' in .*; it has hopper.xml"),
         ("/nowhere/hopper.xml", "there is no model file '/nowhere/hopper.xml'"),
         ("robott.xml", r"no model file .*robott.xml \(did you mean robot.xml\?\), and of Gymnasium's models: "),
     ],

@@ -107,12 +107,6 @@ def test_a_parameter_with_the_name_of_an_option_is_refused(name: str, model: muj
         parameters(model, struct)
 
 
-def test_an_element_in_a_field_that_is_not_an_index_is_refused(model: mujoco.MjModel) -> None:
-    struct = wp.struct(type("Params", (), {"__annotations__": {"tip": float}, "tip": lw.site("tip")}))
-    with pytest.raises(ValueError, match="the parameter tip of 'arm' must be declared as int: it is an index"):
-        parameters(model, struct)
-
-
 @pytest.mark.parametrize("values", [[1.0, 2.0], (1, 2), np.array([1.0, 2.0]), torch.tensor([1.0, 2.0])])
 def test_one_value_a_world_may_come_as_any_sequence(values: Any, model: mujoco.MjModel) -> None:
     np.testing.assert_array_equal(parameters(model, gain=values).values["gain"], [1.0, 2.0])
@@ -127,12 +121,6 @@ def test_the_array_has_one_entry_until_a_value_differs_between_worlds(model: muj
     assert own["gain"].tolist() == [1.0, 2.0]
     assert own["offset"].tolist() == [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
     assert own["count"].tolist() == [7, 7]
-
-
-def test_checked_leaves_the_values_as_they_are(model: mujoco.MjModel) -> None:
-    values = parameters(model)
-    assert values.checked({"gain": 5.0})["gain"] == 5.0
-    assert values.values["gain"] == 1.0
 
 
 # tables
@@ -243,13 +231,6 @@ def test_other_environments_get_the_tables() -> None:
     assert planner.env.obs[0, 1] == 0.125
     npg = lw.NPG(env, config=lw.NPGConfig(samples=32, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2))
     assert next(npg).mean_return is not None
-
-
-def test_a_table_is_not_written_by_functions(task_file: Any) -> None:
-    source = (Path(__file__).parent.parent / "table_task.py").read_text()
-    wrong = source.replace("    obs[0] = s.qpos[0]", "    obs[0] = s.qpos[0]\n    p.motion[0, 0] = 1.0")
-    with pytest.raises(ValueError, match=r"observe .*writes p\.motion|p\.motion.*observe"):
-        lw.make(str(task_file("writes_table.py", wrong)))
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
