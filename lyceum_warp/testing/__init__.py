@@ -13,6 +13,7 @@ from typing import Any
 from lyceum_warp.engines.base import EngineFactory
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import whole_number
 from lyceum_warp.task import Task
 from lyceum_warp.testing import bounds_rules as bounds
 from lyceum_warp.testing import buffer_rules as buffers
@@ -85,14 +86,14 @@ def check_task(
 
     Raises:
         AssertionError: Rules are broken; the message lists them.
-        ValueError: There are fewer than 2 worlds, or an option does not fit.
+        ValueError: There are fewer than 2 worlds or 1 step, or an option does not fit.
 
     Example:
         >>> print(check_task("hopper", engine="mujoco"))
     """
     if nworld < 2:
         raise ValueError(f"the checks compare worlds with one another: nworld must be at least 2, not {nworld}")
-
+    whole_number("steps", steps, low=1)
     if str(device or "").startswith("cuda"):
         options = {"deterministic": True} | options
 
