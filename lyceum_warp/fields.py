@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 quat = wp.vec4
-"""A quaternion in MuJoCo's order w, x, y, z. Functions of Warp that expect x, y, z, w do not take it."""
+"""A quaternion in MuJoCo's order w, x, y, z. Warp's functions that expect x, y, z, w refuse it."""
 
 vec10 = wp.types.vector(length=10, dtype=wp.float32)
 

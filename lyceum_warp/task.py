@@ -127,7 +127,7 @@ RESULTS = ("obs", "ctrl", "metrics", "rng")
 """Arguments that are rows for results, which a function may write."""
 
 MEMORIES = ("memory", "lasting_memory")
-"""Fields of World with the task's own memory, and the class attributes with their sizes."""
+"""Fields of World for a task's memory. The class attributes of the same names are their sizes."""
 
 GROUP_PREFIX = "observe_"
 """``observe_critic`` writes the group ``critic`` of the observations."""
@@ -318,10 +318,10 @@ class Task:
     horizon: ClassVar[int] = 1000
     """Steps after which an episode is truncated; 0 for never."""
     success_steps: ClassVar[int] = 1
-    """Steps in a row at whose end ``success`` must be True before ``env.success`` is. With more than 1, the steps so
-    far belong to the state, in its part ``success_steps``, where they count up to this number. A reset clears them."""
+    """Number of successive steps that must end with ``success`` before ``env.success`` is True. If it is more than 1,
+    the state has the count so far, in its part ``success_steps``, and a reset clears it."""
     lagged: ClassVar[tuple[str, ...]] = ()
-    """Fields to read as ``mj_step`` leaves them, one substep behind the state, as some Gymnasium tasks do."""
+    """Fields that keep the values that ``mj_step`` leaves, one substep behind the state, as in some Gymnasium tasks."""
     cleared: ClassVar[tuple[str, ...]] = ()
     """Fields left by the last substep, such as contact forces, to zero at the start of an episode. Otherwise they are
     computed then, which takes a forward pass of the worlds that restart. A reset clears them before ``initialize``."""

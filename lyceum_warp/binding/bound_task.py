@@ -81,7 +81,7 @@ def check_field_name(name: str) -> None:
 
 
 def obs_layouts(task: type[Task], params: Mapping[str, Any]) -> dict[str, dict[str, int]]:
-    """The parts of each group of a task's observations and their sizes, for values of its parameters.
+    """The parts of each group of a task's observations and their sizes, for given values of its parameters.
 
     Raises:
         ValueError: ``obs`` of the task is not a dict of sizes, or a dict of groups of them.
@@ -170,7 +170,7 @@ class BoundTask:
         """The fields that the engine keeps: those in World, the requested ones, time and controls."""
         self._sort_model_fields(of_model, dynamics)
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
-        """The integration state at which a reset starts, (integration_size,) float64; None for the model's own."""
+        """The integration state at which a reset starts, (integration_size,) float64; None for the model's default."""
         self.parameters = Parameters(
             self.source.params, self.name, self.model, nworld=nworld, timestep=self.timestep, given=params or {}
         )
@@ -184,7 +184,7 @@ class BoundTask:
 
     @property
     def params(self) -> dict[str, Any]:
-        """The parameters' values by name; arrays where they differ between worlds."""
+        """The parameters' values by name; an array for a parameter that differs between worlds."""
         return self.parameters.values
 
     @property
@@ -208,7 +208,7 @@ class BoundTask:
         }
 
     def _sort_model_fields(self, named: list[str], dynamics: Collection[str]) -> None:
-        """Sort the model fields into those that differ between worlds and those that are the model's own."""
+        """Sort the model fields into varied fields and constants."""
         drawn = {name: self.writes.get(name, frozenset()) for name in ("startup", "initialize", "randomize", "event")}
         between = drawn["initialize"] | drawn["randomize"] | drawn["event"]
         self.reset_dynamics = [name for name in named if name in between]

@@ -154,7 +154,7 @@ def _copy(name: str, ndim: int) -> list[str]:
 
 
 def _memory_checks(source: TaskSource) -> list[str]:
-    """Lines that find memory that is not finite. Lasting memory gets its value before the step back."""
+    """Lines that find memory that is not finite, and restore lasting memory to its value before the step."""
     checks = {
         "memory": "finite_row(s1.memory, lane, lanes)",
         "lasting_memory": "restored_row(s0.lasting_memory, s1.lasting_memory, lane, lanes)",

@@ -6,16 +6,11 @@ from lyceum_warp.task import FUNCTIONS
 
 
 def explained(error: Exception, task: str) -> Exception:
-    """A one-line error if Warp could not compile a task's functions; any other error unchanged.
-
-    Args:
-        error: The error.
-        task: The task's name.
-    """
+    """A one-line error if Warp could not compile the functions of a task; any other error unchanged."""
     text = str(error)
     if "while parsing function" not in text and not type(error).__module__.startswith("warp"):
         return error
-    # which kernel is compiled first, and so which of its lines is in the message, differs from run to run
+    # the message names the kernel that Warp compiled first, which differs from run to run
     flat = " ".join(text.split())
     # the last function in the message contains the error: if it is a kernel that calls a function of the task, the
     # type of the result is wrong

@@ -139,7 +139,7 @@ class TaskSource:
                     )
 
     def _kind(self, argument: Any) -> str:
-        """The annotation that the table has for the type of an argument."""
+        """The table's annotation for the type of an argument."""
         if argument is self.world:
             return "World"
         if argument is self.params:

@@ -105,7 +105,7 @@ def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
         sys.path.remove(folder)
         sys.dont_write_bytecode = bytecode
     for name, path in modules.items():
-        if (module := sys.modules.get(name)) is not None and module is not before[name] and _is_at(module, path):
+        if (module := sys.modules.get(name)) is not None and module is not before[name]:
             _taken[name] = stamps([path])
 
 
@@ -114,9 +114,3 @@ def _put(name: str, module: ModuleType | None) -> None:
         sys.modules[name] = module
     else:
         sys.modules.pop(name, None)
-
-
-def _is_at(module: ModuleType, path: Path) -> bool:
-    """Whether a module was imported from a file, or from a folder."""
-    places = [getattr(module, "__file__", None)] if path.is_file() else [*getattr(module, "__path__", [])]
-    return any(place is not None and Path(place).resolve() == path.resolve() for place in places)

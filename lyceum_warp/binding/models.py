@@ -3,6 +3,7 @@
 import difflib
 import logging
 import sys
+import textwrap
 import warnings
 from collections.abc import Collection
 from pathlib import Path
@@ -51,7 +52,8 @@ def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFil
         ValueError: The source is XML.
     """
     if isinstance(source, str) and source.lstrip().startswith("<"):
-        raise ValueError(f"the model {_start(source)} is XML, not a file: give mujoco.MjSpec.from_string(...) of it")
+        start = textwrap.shorten(source, 24, placeholder=" ...")
+        raise ValueError(f"the model {start!r} is XML, not a file: give mujoco.MjSpec.from_string(...) of it")
     folder = Path()
     if owner is not None and (file := getattr(sys.modules.get(owner.__module__), "__file__", None)):
         folder = Path(file).parent
@@ -68,12 +70,6 @@ def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFil
         hint = f" (did you mean {' or '.join(close)}?)" if close else ""
         raise FileNotFoundError(f"there is no model file {path}{hint}, and of Gymnasium's models: {error}") from None
     return shipped
-
-
-def _start(text: str) -> str:
-    """The beginning of a text, in one line."""
-    flat = " ".join(text.split())
-    return repr(flat if len(flat) <= 24 else f"{flat[:20]} ...")
 
 
 def keyframe_state(model: mujoco.MjModel, name: str) -> np.ndarray:

@@ -128,7 +128,7 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
 
 
 def source_files(task: type[Task]) -> Mapping[Path, bytes]:
-    """The contents of a task's file, first, and of the modules beside it that it imports, when the task was loaded.
+    """The contents of a task's file, then of the modules beside it that it imports, at the time it was loaded.
 
     A class that the program imports or defines counts as loaded when ``find_task`` first returns it. A class without
     a file, as in a notebook, has none.

@@ -56,7 +56,7 @@ class FunctionSource:
             assert isinstance(node, ast.Call)
             try:
                 return eval(ast.unparse(node.args[0]), dict(self.scope))
-            except Exception:  # it may be anything, such as the counter of a loop that Warp unrolls
+            except Exception:  # it may use other names, such as the counter of a loop that Warp unrolls
                 return None
         return None
 
@@ -118,7 +118,7 @@ def builtin(name: str) -> Any:
 def overloads(function: wp.Function) -> list[wp.Function]:
     """The overloads of a function with Python source: functions of its name with arguments of other types."""
     found = [*function.user_overloads.values(), *function.user_templates.values()]
-    # without those that Warp made from a generic one
+    # without instances that Warp made from a generic function
     return [overload for overload in found if overload.generic_parent is None] or [function]
 
 

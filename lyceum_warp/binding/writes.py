@@ -1,4 +1,4 @@
-"""Find the writes of a Warp function into its arguments, in its source and in those of the functions that it calls.
+"""Find the writes of a Warp function, and of the functions that it calls, into its arguments.
 
 The analysis follows elements, components, calls, local names of a row, and rows in the fields of a local struct. A row
 that is used in any other way (returned, put into a tuple, chosen by ``wp.where``, given to a native function) counts as

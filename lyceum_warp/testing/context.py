@@ -29,7 +29,7 @@ class Context:
     a: Env
     """The environment that most checks use."""
     b: Env
-    """One for comparison."""
+    """An environment to compare with."""
     make: Callable[..., Env]
     """Makes another environment with the same options and the given changes."""
     steps: int
@@ -48,7 +48,7 @@ class Context:
         raise AssertionError(f"{self.task} on the {self.engine} engine breaks the rule {self.rule!r}: {problem}")
 
     def that(self, holds: bool | torch.Tensor, problem: str) -> None:
-        """Fail unless something holds."""
+        """Fail unless a condition holds."""
         if not bool(holds):
             self.fail(problem)
 

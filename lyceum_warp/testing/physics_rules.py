@@ -116,8 +116,7 @@ def check_dynamics(ctx: Context) -> None:
     if not varied:
         return
     parts = a.state_space.parts
-    at_reset = a.task.reset_dynamics
-    once = [name for name in varied if name not in at_reset]
+    once = [name for name in varied if name not in a.task.reset_dynamics]
 
     def rows(env: Env, name: str) -> torch.Tensor:
         return torch_view(flat(env.engine.arrays[name])).clone()

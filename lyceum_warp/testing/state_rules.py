@@ -26,7 +26,7 @@ def check_round_trip(ctx: Context) -> None:
 
 
 def check_restoring(ctx: Context) -> None:
-    """Steps after ``set_state`` repeat the first ones, through automatic resets, also in another environment."""
+    """Steps after ``set_state`` repeat the original steps, through automatic resets, also in another environment."""
     a, b = ctx.a, ctx.b
     with ctx.changed(a, b, horizon=6):
         ctx.restart()

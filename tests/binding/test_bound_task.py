@@ -1,4 +1,4 @@
-"""A task bound to its model: its class, the types of its fields, and the size of its observation are checked."""
+"""Binding checks a task's class, the types of its fields, and the size of its observation."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Kernels made of a task's functions: once for the same functions, under the same name in every process."""
+"""Kernels are made once for the same functions, under the same name in every process."""
 
 from pathlib import Path
 from typing import Any

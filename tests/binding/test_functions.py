@@ -1,4 +1,4 @@
-"""A task's structs and functions: found in its class or its module, and checked against the table in ``task.py``."""
+"""A task's structs and functions are found in its class or module and checked against ``task.FUNCTIONS``."""
 
 from pathlib import Path
 

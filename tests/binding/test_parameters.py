@@ -1,4 +1,4 @@
-"""The values of a task's parameters: defaults, checks, and what the kernels read."""
+"""The values of a task's parameters: defaults, checks, and the array for the kernels."""
 
 from pathlib import Path
 from typing import Any
@@ -108,7 +108,7 @@ def test_a_parameter_with_the_name_of_an_option_is_refused(name: str, model: muj
 
 
 @pytest.mark.parametrize("values", [[1.0, 2.0], (1, 2), np.array([1.0, 2.0]), torch.tensor([1.0, 2.0])])
-def test_one_value_a_world_may_come_as_any_sequence(values: Any, model: mujoco.MjModel) -> None:
+def test_one_value_per_world_may_be_any_sequence(values: Any, model: mujoco.MjModel) -> None:
     np.testing.assert_array_equal(parameters(model, gain=values).values["gain"], [1.0, 2.0])
 
 
@@ -191,7 +191,7 @@ def test_a_table_of_another_type_is_refused(model: mujoco.MjModel) -> None:
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_functions_read_tables_which_change_in_place(engine: str) -> None:
-    """With graphs, which are captured by then: the same shape, another shape, and beside a value a world."""
+    """After graphs were captured: with the same shape, another shape, and with one value per world."""
     env = lw.make(Follow, engine=engine, nworld=2)
 
     def first_steps() -> torch.Tensor:
@@ -214,7 +214,7 @@ def test_functions_read_tables_which_change_in_place(engine: str) -> None:
 
 
 def test_other_environments_get_the_tables() -> None:
-    """A replica of another size, scratch worlds, worlds that follow, a planner, and a trained policy's evaluation."""
+    """A replica of another size, scratch worlds, followers, a planner, and the evaluation of a trained policy."""
     motion = np.array([[0.25, 0.0]])
     env = lw.make(Follow, motion=motion, gain=[1.0, 2.0], nworld=2)
     motion[:] = 9.0  # the environment has a copy
@@ -236,7 +236,7 @@ def test_other_environments_get_the_tables() -> None:
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("found", ["number", "nan"])
 def test_check_task_finds_a_read_out_of_a_table(task_file: Any, found: str, engine: str) -> None:
-    """Also where what lies beyond the table is not-a-number, so that the episode ends with a fault there."""
+    """Also if NaN lies beyond the table, so that the episode ends with a fault."""
     source = (Path(__file__).parent.parent / "table_task.py").read_text()
     wrong = source.replace("p.motion.shape[0] - 1)", "p.motion.shape[0])")
     value = {"number": "0.0", "nan": "wp.nan"}[found]

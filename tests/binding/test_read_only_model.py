@@ -1,4 +1,4 @@
-"""An environment's model refuses edits, and is a model of MuJoCo's in every other respect."""
+"""An environment's model refuses edits, and is an ordinary MjModel in every other respect."""
 
 import copy
 import pickle

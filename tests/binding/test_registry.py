@@ -1,4 +1,4 @@
-"""Tasks by name, by file and as classes: how they are found, registered and read again."""
+"""Tasks are found by name, by file and by class, and registered."""
 
 import importlib.util
 import sys
@@ -20,7 +20,7 @@ Load = Callable[[str, str], ModuleType]
 
 @pytest.fixture
 def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
-    """``load("name", source)``: import a file as a module of that name; what it registers goes with the test."""
+    """``load("name", source)``: import a file as a module of that name, and undo its registrations after the test."""
     monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
 
     def imported(name: str, source: str) -> ModuleType:

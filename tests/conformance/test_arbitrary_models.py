@@ -56,7 +56,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 
 class Moving(lw.Task):
-    """Moves, and sees where it is."""
+    """Moves, and observes positions and velocities."""
 
     horizon = 15
 
@@ -87,20 +87,20 @@ def start_sensing(s: SensingWorld, p: Params, rng: Row[wp.uint32]):
 
 
 class Sensing(lw.Task):
-    """Moves, and sees what its sensors measure."""
+    """Moves, and observes its sensors."""
 
     horizon = 15
 
 
 def moving(model: str) -> type[lw.Task]:
-    """A task of a model that sees positions and velocities."""
+    """A task of a model that observes positions and velocities."""
     spec = mujoco.MjSpec.from_string(model)
     compiled = spec.copy().compile()
     return type("Moving", (Moving,), {"model": spec, "obs": {"position": compiled.nq, "velocity": compiled.nv}})
 
 
 def sensing(model: str) -> type[lw.Task]:
-    """A task of a model that sees its sensors."""
+    """A task of a model that observes its sensors."""
     spec = mujoco.MjSpec.from_string(model)
     obs = {"velocity": 1, "sensors": spec.copy().compile().nsensordata}
     own = {"World": SensingWorld, "observe": sense, "reward": judge, "randomize": start_sensing}
@@ -134,7 +134,7 @@ def test_a_model_that_the_warp_engine_does_not_support_is_refused_in_a_line(reas
         lw.make(task, engine="warp")
 
 
-# fields that only some models have
+# fields of only some models
 
 RICH = text(
     ARM

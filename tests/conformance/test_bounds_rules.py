@@ -1,4 +1,4 @@
-"""The rule about indices: mistakes in a task's file that give wrong numbers silently are found and named."""
+"""The rule about indices finds mistakes in a task's file that otherwise give wrong numbers without an error."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Copies of Warp functions that check every index: what they find, and that they compute the same numbers."""
+"""Copies of Warp functions that check every index find mistakes and compute the same numbers."""
 
 import re
 import sys
@@ -41,7 +41,7 @@ class Batch:
     sensordata: wp.array2d[float]
 
 
-# functions without a mistake, in every form that Warp takes
+# functions without mistakes, in every form that Warp supports
 
 ORDER = wp.constant(wp.vec3i(2, 1, 0))
 
@@ -85,7 +85,7 @@ def doubled(v: wp.vec3) -> wp.vec3:
 @wp.func
 def right(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):
     total = 0.0
-    for i in range(3):  # written out, because it changes a constant
+    for i in range(3):  # unrolled, because it changes a constant
         total += s.qpos[i] * p.gains[i]
     obs[0] = total
     obs[1] = s.qpos[-1] + s.site_xpos[1][2] + s.site_xpos[-1].x + s.xmat[0][1, 2] + s.xmat[0][-1][0]

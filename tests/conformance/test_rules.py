@@ -1,4 +1,4 @@
-"""Every rule can be broken: an environment is changed in one place, and the check of the rule must fail."""
+"""The check of every rule fails if an environment is changed in one place so that it breaks the rule."""
 
 import itertools
 from collections.abc import Callable, Iterable
@@ -23,7 +23,7 @@ Function = Callable[..., Any]
 
 
 def then(extra: Callable[[Any], object]) -> Callable[[Function], Function]:
-    """Wraps a method so that every call does something more at its end."""
+    """Decorator for a method: call a function after each call."""
 
     def wrap(method: Function) -> Function:
         def longer(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -74,7 +74,7 @@ def spoil_rewards(env: lw.Env) -> None:
 
 
 def count_steps_as_none(method: Function) -> Function:
-    """Judged states draw the noise of the reset."""
+    """Let judged states draw the noise of the reset."""
 
     def judge(self: Worlds, *args: Any, **kwargs: Any) -> None:
         kept = self.counters.step.numpy().copy()
@@ -161,7 +161,7 @@ BREAKS: list[Break] = [
     ("bad_warmstart", MujocoEngine, "__init__", then(keep_warm_start)),
     ("not_finite", lw.Env, "step", then(spoil_rewards)),
 ]
-"""A rule, and the function whose change breaks it for hopper."""
+"""Rules, and changes of a function that break them for hopper."""
 
 FULL_BREAKS: list[Break] = [
     ("groups", lw.Env, "step", then(another_critic)),
@@ -179,12 +179,12 @@ FULL_BREAKS: list[Break] = [
     ("keyframe", MujocoEngine, "__init__", then(from_the_default)),
     ("rejection", Worlds, "_redraw", nothing),
 ]
-"""The same for the task with every feature."""
+"""Rules and changes for the task with every feature."""
 
 SETTLED_BREAKS: list[Break] = [
     ("settle", MujocoEngine, "settle", at_once),
 ]
-"""The same for its variant that settles."""
+"""Rules and changes for its variant that settles."""
 
 ALL_BREAKS = [
     *(("hopper", *broken) for broken in BREAKS),
