@@ -211,7 +211,7 @@ def test_a_bad_action_is_applied_as_zero(engine: str) -> None:
         ({"dt": 1.0}, "no parameter 'dt'"),
         ({"ctrl_cost_weight": float("nan")}, "ctrl_cost_weight=nan of 'hopper' is not a number"),
         ({"ctrl_cost_weight": "much"}, "ctrl_cost_weight='much' of 'hopper' is not a number"),
-        ({"ctrl_cost_weight": [1.0, 2.0]}, r"shape \(2,\); it takes one number, or one a world, \(4,\)"),
+        ({"ctrl_cost_weight": [1.0, 2.0]}, r"shape \(2,\); it takes one number, or one per world, \(4,\)"),
         ({"healthy_z_range": 1.0}, r"healthy_z_range of 'hopper' has shape \(\); it takes \(2,\)"),
         ({"terminate_when_unhealthy": 0.5}, "terminate_when_unhealthy=0.5 of 'hopper' must be a whole number"),
         ({"nworld": 0}, "nworld must be a whole number from 1 to .*, not 0"),

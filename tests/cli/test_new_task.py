@@ -97,7 +97,7 @@ def test_a_model_whose_sensors_measure_every_joint_is_observed_through_them_alon
 def test_any_model_gets_a_task_that_fits_it(model: str, folder: Path) -> None:
     task = BoundTask(find_task(new("walk", model)))
     sizes = {"position": task.model.nq, "velocity": task.model.nv, "activation": task.model.na}
-    found = dict(task.obs_layout)
+    found = dict(task.obs_layouts["policy"])
     assert found.pop("sensors", 0) <= task.model.nsensordata
     assert all(sizes[part] == size for part, size in found.items())
     assert task.timestep == pytest.approx(0.02)

@@ -482,7 +482,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     ),
     "a group of two words": (
         [('obs = {"x": 1}', 'obs = {"policy": {"x": 1}, "my group": {"x": 1}}')],
-        "obs of the task 'tiny' has the group 'my group': a group's name must be a Python name, as 'critic'",
+        "obs of the task 'tiny' has the group 'my group': a group's name must be a Python name, such as 'critic'",
     ),
     "a group with the name of a keyword": (
         [('obs = {"x": 1}', 'obs = {"policy": {"x": 1}, "class": {"x": 1}}')],
@@ -490,7 +490,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     ),
     "groups without a policy": (
         [('obs = {"x": 1}', 'obs = {"actor": {"x": 1}, "critic": {"x": 1}}')],
-        "must name parts with sizes, or groups of them, of which one is 'policy'",
+        "must be a dict of parts and sizes, or of groups of them, one of them 'policy'",
     ),
     "metrics as a number": ([line("metrics = 5")], r"metrics of the task 'tiny' must be names, .*, not 5"),
     "a comma in a metric's name": (
@@ -504,21 +504,23 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
         "the task 'tiny' names the metric 'a' twice: give each one name",
     ),
     "metrics without measure": (
-        [line('metrics = ("a",)')], r"needs both, metrics = \(\.\.\.\) in the class and measure",
+        [line('metrics = ("a",)')], r"needs both metrics = \(\.\.\.\) in its class and measure",
     ),
     "measure without metrics": (
         [function(f"def measure({STEP}, metrics: Row[float]):\n    metrics[0] = 1.0")],
-        r"needs both, metrics = \(\.\.\.\) in the class and measure",
+        r"needs both metrics = \(\.\.\.\) in its class and measure",
     ),
-    "metrics as one name": ([line('metrics = "forward"')], r"metrics of the task 'tiny' must be names, as \('forward'"),
+    "metrics as one name": ([line('metrics = "forward"')], r"must be names, such as \('forward'"),
     "a keyframe that is not there": ([line('keyframe = "home"')], "'home'"),
     "a keyframe by its number": (
-        [line("keyframe = 0")], "keyframe of the task 'tiny' must be the name of .* keyframes, as 'home', not 0",
+        [line("keyframe = 0")], "keyframe of the task 'tiny' must be the name of a keyframe .*, such as 'home', not 0",
     ),
     "actions without control": ([line('actions = {"speed": 1}')], "has actions of its own, so it needs control"),
-    "actions without sizes": ([line('actions = ("speed",)')], r"must be names with sizes, as \{'speed': 1\}"),
+    "actions without sizes": (
+        [line('actions = ("speed",)')], r"must be a dict of names and sizes, such as \{'speed': 1\}",
+    ),
     "lasting memory that World does not list": (
-        [line("lasting_memory = 1")], "needs both, lasting_memory = ... in the class and lasting_memory in World",
+        [line("lasting_memory = 1")], "needs both lasting_memory = ... in its class and lasting_memory in World",
     ),
     "no draw": ([line("draws = 0")], "draws of the task 'tiny' must be a whole number from 1"),
     "settling backwards": ([line("settle = -1")], "settle of the task 'tiny' must be a whole number from 0"),

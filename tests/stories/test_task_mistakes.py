@@ -104,7 +104,7 @@ MISTAKES: dict[str, tuple[tuple[str, str], str]] = {
     ),
     "a reward without return": (
         function(f"{REWARD} -> float:\n    wp.abs(action[0])"),
-        f"reward of the task 'tiny' has no return: it is written as {WRITE_REWARD}",
+        f"reward of the task 'tiny' has no return: write it as {WRITE_REWARD}",
     ),
     "another order of arguments": (
         function("def reward(s0: World, s1: World, action: Row[float], p: Params) -> float:\n    return 1.0"),
@@ -128,7 +128,7 @@ MISTAKES: dict[str, tuple[tuple[str, str], str]] = {
     "a misspelt attribute": (line("frameskip = 5"), "the task 'tiny' has 'frameskip' in its class: did you mean frame"),
     "action_range as one number": (
         line("action_range = 1.0"),
-        r"action_range of the task 'tiny' must be two finite numbers, lowest first, as \(-1\.0, 1\.0\), not 1\.0",
+        r"action_range of the task 'tiny' must be two finite numbers, lowest first, such as \(-1\.0, 1\.0\), not 1\.0",
     ),
     "a misspelt model": (('"hopper.xml"', '"hoper.xml"'), "there is no model file .*; it has hopper.xml"),
 }  # fmt: skip
