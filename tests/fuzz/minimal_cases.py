@@ -2,7 +2,6 @@
 
 import io
 import json
-import struct
 from collections.abc import Callable
 from typing import Any
 
@@ -36,13 +35,6 @@ def _policy(**changes: Any) -> Callable[[bytes], bytes]:
 
 def _shape(**sizes: Any) -> Callable[[bytes], bytes]:
     return _saved(lambda content: content["policy"]["shape"].update(sizes))
-
-
-def _weight(data: bytes) -> bytes:
-    """Flip a bit of a weight within the file."""
-    weights = torch.load(io.BytesIO(data), weights_only=True)["policy"]["state"]["network.0.weight"].flatten()
-    found = data.index(struct.pack("<3f", *weights[:3].tolist()))
-    return data[: found + 2] + bytes([data[found + 2] ^ 0x40]) + data[found + 3 :]
 
 
 def _info(**changes: Any) -> Callable[[bytes], bytes]:
