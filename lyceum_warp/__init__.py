@@ -7,6 +7,8 @@ used (PEP 562).
 import importlib
 from typing import TYPE_CHECKING, Any
 
+# fmt: off
+# isort: off
 if TYPE_CHECKING:
     from lyceum_warp.actuators import follow_velocity
     from lyceum_warp.algos.evaluation import Episodes, evaluate
@@ -34,68 +36,37 @@ if TYPE_CHECKING:
     from lyceum_warp.fields import quat, vec10
     from lyceum_warp.kernels.random import normal, uniform
     from lyceum_warp.kernels.rotations import (
-        quat_angle,
-        quat_difference,
-        quat_from_axis_angle,
-        quat_from_euler,
-        quat_from_mat,
-        quat_from_rotvec,
-        quat_inverse,
-        quat_mul,
-        quat_random,
-        quat_rotate,
-        quat_rotate_inverse,
-        quat_to_euler,
-        quat_to_mat,
-        quat_to_rotvec,
-    )
+        quat_angle, quat_difference, quat_from_axis_angle, quat_from_euler, quat_from_mat, quat_from_rotvec,
+        quat_inverse, quat_mul, quat_random, quat_rotate, quat_rotate_inverse, quat_to_euler, quat_to_mat,
+        quat_to_rotvec)
     from lyceum_warp.kernels.terms import (
-        Sigmoid,
-        all_inside,
-        angle_between,
-        body_velocity,
-        grasp_terms,
-        inside,
-        local_velocity,
-        put,
-        put_upright,
-        sum_squares,
-        tolerance,
-    )
+        Sigmoid, all_inside, angle_between, body_velocity, grasp_terms, inside, local_velocity, put, put_upright,
+        sum_squares, tolerance)
     from lyceum_warp.model_files import (
-        ModelFile,
-        gymnasium_model,
-        gymnasium_robotics_model,
-        menagerie_model,
-        package_model,
-    )
+        ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, package_model)
     from lyceum_warp.openloop import OpenLoop
     from lyceum_warp.options import EnvOptions, PhysicsOptions
     from lyceum_warp.runs.folder import load, load_value
     from lyceum_warp.task import (
-        Planning,
-        Row,
-        Task,
-        act,
-        actuator,
-        body,
-        camera,
-        ctrl,
-        dof,
-        equality,
-        geom,
-        joint,
-        mocap,
-        qpos,
-        sensor,
-        site,
-        tendon,
-    )
+        Planning, Row, Task, act, actuator, body, camera, ctrl, dof, equality, geom, joint, mocap, qpos, sensor, site,
+        tendon)
     from lyceum_warp.training import train
     from lyceum_warp.viewer.follow import RunViewer
     from lyceum_warp.viewer.show import view
 
-__version__ = "0.1.0"
+__all__ = [
+    "CEM", "MPPI", "NPG", "PPO", "ControlProgress", "ControlReport", "Controller", "Done", "Env", "EnvOptions",
+    "Episodes", "GaussianPolicy", "Iteration", "Learner", "MPPIConfig", "ModelFile", "NPGConfig", "OpenLoop",
+    "PPOConfig", "PhysicsOptions", "PlanSamples", "PlanUpdate", "Planner", "Planning", "PlanningController",
+    "PredictiveSampling", "Rollout", "Row", "RunViewer", "Sigmoid", "Task", "Trajectory", "ValueFunction", "act",
+    "actuator", "all_inside", "angle_between", "body", "body_velocity", "camera", "control", "control_async",
+    "control_report", "ctrl", "dof", "equality", "evaluate", "export_policy", "follow_velocity", "geom", "grasp_terms",
+    "gymnasium_model", "gymnasium_robotics_model", "inside", "joint", "load", "load_value", "local_velocity", "make",
+    "menagerie_model", "mocap", "normal", "package_model", "put", "put_upright", "qpos", "quat", "quat_angle",
+    "quat_difference", "quat_from_axis_angle", "quat_from_euler", "quat_from_mat", "quat_from_rotvec", "quat_inverse",
+    "quat_mul", "quat_random", "quat_rotate", "quat_rotate_inverse", "quat_to_euler", "quat_to_mat", "quat_to_rotvec",
+    "register", "sensor", "site", "sum_squares", "task_names", "tendon", "tolerance", "train", "uniform", "vec10",
+    "view"]
 
 _NAMES = {
     "actuators": "follow_velocity",
@@ -123,11 +94,12 @@ _NAMES = {
     "env": "Env make",
     "fields": "quat vec10",
     "kernels.random": "normal uniform",
-    "kernels.rotations": "quat_angle quat_difference quat_from_axis_angle quat_from_euler quat_from_mat "
-    "quat_from_rotvec quat_inverse quat_mul quat_random quat_rotate quat_rotate_inverse quat_to_euler quat_to_mat "
-    "quat_to_rotvec",
-    "kernels.terms": "Sigmoid all_inside angle_between body_velocity grasp_terms inside local_velocity put put_upright "
-    "sum_squares tolerance",
+    "kernels.rotations":
+        "quat_angle quat_difference quat_from_axis_angle quat_from_euler quat_from_mat quat_from_rotvec quat_inverse "
+        "quat_mul quat_random quat_rotate quat_rotate_inverse quat_to_euler quat_to_mat quat_to_rotvec",
+    "kernels.terms":
+        "Sigmoid all_inside angle_between body_velocity grasp_terms inside local_velocity put put_upright sum_squares "
+        "tolerance",
     "model_files": "ModelFile gymnasium_model gymnasium_robotics_model menagerie_model package_model",
     "openloop": "OpenLoop",
     "options": "EnvOptions PhysicsOptions",
@@ -138,7 +110,10 @@ _NAMES = {
     "viewer.show": "view",
 }
 """The public names that each module defines, as the imports above have them for type checkers."""
+# isort: on
+# fmt: on
 
+__version__ = "0.1.0"
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 
@@ -153,99 +128,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-__all__ = [
-    "CEM",
-    "MPPI",
-    "NPG",
-    "PPO",
-    "ControlProgress",
-    "ControlReport",
-    "Controller",
-    "Done",
-    "Env",
-    "EnvOptions",
-    "Episodes",
-    "GaussianPolicy",
-    "Iteration",
-    "Learner",
-    "MPPIConfig",
-    "ModelFile",
-    "NPGConfig",
-    "OpenLoop",
-    "PPOConfig",
-    "PhysicsOptions",
-    "PlanSamples",
-    "PlanUpdate",
-    "Planner",
-    "Planning",
-    "PlanningController",
-    "PredictiveSampling",
-    "Rollout",
-    "Row",
-    "RunViewer",
-    "Sigmoid",
-    "Task",
-    "Trajectory",
-    "ValueFunction",
-    "act",
-    "actuator",
-    "all_inside",
-    "angle_between",
-    "body",
-    "body_velocity",
-    "camera",
-    "control",
-    "control_async",
-    "control_report",
-    "ctrl",
-    "dof",
-    "equality",
-    "evaluate",
-    "export_policy",
-    "follow_velocity",
-    "geom",
-    "grasp_terms",
-    "gymnasium_model",
-    "gymnasium_robotics_model",
-    "inside",
-    "joint",
-    "load",
-    "load_value",
-    "local_velocity",
-    "make",
-    "menagerie_model",
-    "mocap",
-    "normal",
-    "package_model",
-    "put",
-    "put_upright",
-    "qpos",
-    "quat",
-    "quat_angle",
-    "quat_difference",
-    "quat_from_axis_angle",
-    "quat_from_euler",
-    "quat_from_mat",
-    "quat_from_rotvec",
-    "quat_inverse",
-    "quat_mul",
-    "quat_random",
-    "quat_rotate",
-    "quat_rotate_inverse",
-    "quat_to_euler",
-    "quat_to_mat",
-    "quat_to_rotvec",
-    "register",
-    "sensor",
-    "site",
-    "sum_squares",
-    "task_names",
-    "tendon",
-    "tolerance",
-    "train",
-    "uniform",
-    "vec10",
-    "view",
-]

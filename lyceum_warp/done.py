@@ -1,6 +1,8 @@
 """Why an episode ended, as bits.
 
-Both engines report the same bits for the same fault, so that a task, a log and a test need not know which engine ran.
+Both engines report the same bits for the same fault. Only limits that one engine has differ: a C world that runs out
+of its arena memory may report ENGINE_WARNING beside an overflow, and MuJoCo Warp reports an overflow of its contact
+pool in every world that it touched.
 """
 
 import enum
@@ -15,9 +17,9 @@ class Done(enum.IntFlag):
     TERMINATED = 1
     """The task's ``terminated`` returned True."""
     TRUNCATED = 2
-    """The time limit was reached."""
+    """The time limit was reached. ``env.truncated`` also includes faults."""
     NAN = 4
-    """The state became not-a-number or absurd (beyond 1e10), or task memory not finite."""
+    """A state or a control became not-a-number or absurd (beyond 1e10), or task memory not finite."""
     CONTACT_OVERFLOW = 8
     """More contacts than the engine had room for."""
     CONSTRAINT_OVERFLOW = 16

@@ -1,8 +1,8 @@
-"""Env: one task in many worlds, the public face of the package."""
+"""Make, step, reset and observe an environment: one task in many worlds."""
 
 import functools
 import inspect
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import mujoco
@@ -21,13 +21,13 @@ from lyceum_warp.engines.placement import bytes_per_world, find_device, open_eng
 from lyceum_warp.fields import describe, elements, has_several_rows
 from lyceum_warp.graphs.compile_ahead import compile_ahead
 from lyceum_warp.kernels import steps
-from lyceum_warp.model_fields import describe_model_field, is_model_field
+from lyceum_warp.model_fields import describe_model_field, is_model_field, put_rows
 from lyceum_warp.options import OPTION_DOCS, EnvOptions, signature_of_options
 from lyceum_warp.spaces import Space
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.forks import leave_in_parent
-from lyceum_warp.support.validate import check_group, check_kind, check_tensor, described, whole_number
+from lyceum_warp.support.forks import call_once_gone, leave_in_parent
+from lyceum_warp.support.validate import check_group, check_kind, check_tensor, whole_number
 from lyceum_warp.task import Task
 from lyceum_warp.world_arrays import own_bytes_per_world
 from lyceum_warp.worlds import Worlds
@@ -87,28 +87,27 @@ class Env:
     obs: torch.Tensor
     """Observations, (nworld, nobs), float32."""
     final_obs: torch.Tensor
-    """Observations of the states that the last step led to, before any reset, (nworld, nobs), float32."""
+    """Observations at the end of the last step, before any reset, (nworld, nobs), float32."""
     obs_groups: dict[str, torch.Tensor]
-    """Observations by the names of their groups, each (nworld, size of the group); ``policy`` is ``obs``."""
+    """Observations by group, each (nworld, size of the group); ``policy`` is ``obs``."""
     final_obs_groups: dict[str, torch.Tensor]
     """The same for ``final_obs``."""
     reward: torch.Tensor
     """Rewards of the last step, (nworld,), float32."""
     eval: torch.Tensor
-    """The task's evaluation metric of the states that the last step led to, (nworld,), float32."""
+    """The task's evaluation metric after the last step, (nworld,), float32."""
     terminated: torch.Tensor
-    """Whether the task, or a fault, ended the episode, (nworld,), bool."""
+    """Whether the task ended the episode, (nworld,), bool."""
     truncated: torch.Tensor
-    """Whether the time limit was reached, (nworld,), bool."""
+    """Whether the time limit or a fault ended the episode, (nworld,), bool."""
     metrics: dict[str, torch.Tensor]
-    """The task's metrics of the last step by their names, each (nworld,), float32."""
+    """The task's metrics of the last step by name, each (nworld,), float32."""
     episode_metrics: dict[str, torch.Tensor]
     """The sums of the metrics over the episode that the last step belongs to, each (nworld,), float32."""
     episode_metric_sums: torch.Tensor
-    """The same as one tensor, (nworld, number of metrics), in the order of their names."""
+    """The same as one tensor, (nworld, number of metrics), in the order of ``metrics``."""
     success: torch.Tensor
-    """Whether the task's goal is met, (nworld,), bool; where the task has ``success_steps``, for so many steps in a row
-    up to now."""
+    """Whether the task's goal is met, or has been for ``success_steps`` steps in a row, (nworld,), bool."""
     done: torch.Tensor
     """Whether the episode ended for any reason, (nworld,), bool."""
     done_reason: torch.Tensor
@@ -122,25 +121,25 @@ class Env:
     nworld: int
     """Number of worlds."""
     timestep: float
-    """Simulated seconds in a step, all its substeps together."""
+    """Simulated seconds in a step, over all its substeps."""
     device: wp.Device
-    """The Warp device; ``obs.device`` is torch's name of it."""
+    """The Warp device; ``obs.device`` is the same one in torch."""
     options: EnvOptions
     """The options that the environment was made with."""
     task: BoundTask
     """The task with its model, parameters (``task.params``) and kernels."""
     engine: Engine
-    """The physics; ``engine.name`` is mujoco or warp."""
+    """The physics; ``engine.name`` is "mujoco" or "warp"."""
     worlds: Worlds
-    """The arrays and the phases behind this environment; not needed to use it."""
+    """The arrays and phases behind this environment; internal."""
     obs_space: Space
-    """Parts of an observation and their places."""
+    """Parts of an observation and their columns."""
     obs_spaces: dict[str, Space]
-    """The same for every group of observations, by name; ``policy`` is ``obs_space``."""
+    """The same for every group of observations; ``policy`` is ``obs_space``."""
     action_space: Space
-    """Names, places and bounds of an action's numbers."""
+    """Names, columns and bounds of actions."""
     state_space: Space
-    """Parts of a state and their places."""
+    """Parts of a state and their columns."""
     reward_space: Space
     """A scalar."""
     eval_space: Space
@@ -169,6 +168,7 @@ class Env:
         self._scratch: Env | None = None
         try:
             self.worlds = worlds = Worlds(self.task, self.engine, options)
+            call_once_gone(self, worlds.drop_programs)
             for name, buffer in worlds.buffers.items():
                 setattr(self, name, buffer)
             self.obs_groups, self.final_obs_groups = worlds.obs_groups, worlds.final_obs_groups
@@ -228,7 +228,7 @@ class Env:
 
     @property
     def first_world(self) -> int:
-        """Number of the first world among those of all processes; 0 where there is only one process."""
+        """Index of the first world among the worlds of all processes; 0 with a single process."""
         return self.options.first_world
 
     @property
@@ -287,12 +287,11 @@ class Env:
     # the state
 
     def get_state(self, out: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> torch.Tensor:
-        """Everything that the future depends on, (nworld, state_space.size), float64.
+        """The full state of every world, on which its future depends, (nworld, state_space.size), float64.
 
-        The engine's integration state, fields that are as the last substep left them, model fields that differ
-        between worlds, the step counter, the random stream, the task's memory and lasting memory, the sums of the
-        metrics over the episode, and the steps in a row with the goal met where the task asks for several;
-        ``state_space.parts`` gives the place of each.
+        It holds the engine's integration state, fields left by the last substep, model fields that differ between
+        worlds, the counters of steps and episodes, the random stream, the task's memory, the sums of the metrics, and
+        the count of ``success_steps``; ``state_space.parts`` has the columns of each.
 
         Args:
             out: Where to write the states.
@@ -330,10 +329,8 @@ class Env:
         worlds.set_mask(mask)
         if check and (bad := ~torch.isfinite(state) & worlds.mask_view[:, None]).any():
             world, column = bad.nonzero()[0].tolist()
-            part = next(name for name, part in self.state_space.parts.items() if part.start <= column < part.stop)
-            raise ValueError(
-                f"the state of world {world} has {state[world, column].item()} in its {part!r}: it must be finite"
-            )
+            part, number = self.state_space.part_at(column), state[world, column].item()
+            raise ValueError(f"the state of world {world} has {number} in its {part!r}: it must be finite")
         worlds.state_view.copy_(state)
         for call in worlds.programs.restore_state:
             call()
@@ -361,19 +358,17 @@ class Env:
         return _copied(self.eval if state is None else self._scratch_at(state).eval, out)
 
     def get_terminated(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
-        """Whether the last step, or given states, end the episode, (nworld,) bool."""
-        return _copied(self.terminated if state is None else self._scratch_at(state).terminated, out)
+        """Whether the last step terminated the episode, or ``terminated`` holds in given states, (nworld,) bool."""
+        return _copied(self.terminated if state is None else self._scratch_at(state).worlds.terminated_view, out)
 
     def get_reward(
-        self,
-        before: torch.Tensor | None = None,
-        action: torch.Tensor | None = None,
-        after: torch.Tensor | None = None,
-        out: torch.Tensor | None = None,
-    ) -> torch.Tensor:
+        self, before: torch.Tensor | None = None, action: torch.Tensor | None = None,
+        after: torch.Tensor | None = None, out: torch.Tensor | None = None,
+    ) -> torch.Tensor:  # fmt: skip
         """Rewards of the last step, or of given transitions, (nworld,).
 
-        Given transitions are judged in scratch worlds; the live ones stay untouched.
+        Given transitions are judged in scratch worlds; the live ones stay unchanged. If an event of the task changed
+        what its reward reads, ``env.reward`` differs, because it was judged before the event.
 
         Args:
             before: States before, (nworld, state_space.size).
@@ -388,9 +383,7 @@ class Env:
             return _copied(self.reward, out)
         if before is None or action is None or after is None:
             raise ValueError("a reward belongs to a transition: give before, action and after, or none of them")
-        check_tensor(action, "action", self.action)
-        if not torch.isfinite(action).all():
-            raise ValueError("an action is not finite: such a transition is a fault, and has no reward")
+        self._check_action(action)
         scratch = self._scratch_at(before)
         scratch.worlds.keep_before()
         scratch.set_state(after)
@@ -407,20 +400,22 @@ class Env:
         Raises:
             ValueError: The action has another shape or type, or is not finite.
         """
+        self._check_action(action)
+        self.action.copy_(action.detach())
+
+    def _check_action(self, action: torch.Tensor) -> None:
         check_tensor(action, "action", self.action)
         if not torch.isfinite(action).all():
             world, i = (~torch.isfinite(action)).nonzero()[0].tolist()
-            name = next(name for name, part in self.action_space.parts.items() if part.start <= i < part.stop)
+            name = self.action_space.part_at(i)
             raise ValueError(f"the action {name!r} of world {world} is {action[world, i].item()}: it must be finite")
-        self.action.copy_(action.detach())
 
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
-        """A live view of a field of the simulation or of the model, by MuJoCo's name.
+        """A live view of a field of MjData or MjModel, by MuJoCo's name.
 
         An environment keeps the fields that its task reads, ``time`` and ``ctrl``; name further ones when making it,
-        as in ``make("hopper", fields=["site_xpos", "body_mass"])``. The view is for reading: write through
-        ``set_state`` or ``set_dynamics``. A number that is written into the view has no effect or gives wrong results
-        on either engine.
+        as in ``make("hopper", fields=["site_xpos", "body_mass"])``. The view is for reading: numbers written into it
+        have no effect or give wrong results. Use ``set_state`` or ``set_dynamics`` instead.
 
         Args:
             name: Attribute of MjData or MjModel, for instance "qpos", "site_xpos" or "body_mass".
@@ -448,8 +443,8 @@ class Env:
     def set_dynamics(self, mask: torch.Tensor | None = None, **fields: Any) -> None:
         """Set model fields that differ between worlds: those that the task draws, and those named by ``dynamics=``.
 
-        Derived constants follow. Fields that the task's ``initialize``, ``randomize`` or ``event`` writes go back to
-        their nominal values at a reset, which then draws them again; the others keep these values until
+        Derived constants follow. A reset restores the nominal values of fields that the task's ``initialize``,
+        ``randomize`` or ``event`` writes, before they are drawn again; others keep these values until
         ``rand_reset(seed=...)``.
 
         Args:
@@ -462,34 +457,18 @@ class Env:
                 finite, or negative where only positive ones make sense.
         """
         state = self.get_state()
-        varied = {field.name: field for field in self.task.dynamics}
-        for name, value in fields.items():
-            if name not in varied:
-                describe_model_field(self.task.model, name)  # a misspelt name has an error of its own
-                raise ValueError(
-                    f"the model field {name!r} is the same in every world of this environment: make it with "
-                    f"dynamics=[{name!r}], or let the task write it"
-                )
-            columns = state[:, self.state_space.parts[name]]
-            try:
-                numbers = value if isinstance(value, torch.Tensor) else np.asarray(value)
-                given = torch.as_tensor(numbers, dtype=torch.float64, device=state.device)
-                columns.copy_(given.reshape(-1, columns.shape[1]))
-            except (TypeError, ValueError, RuntimeError):
-                shape = tuple(self.field(name).shape)
-                raise ValueError(
-                    f"{name} must be numbers of shape {shape}, or {shape[1:]} for all worlds, not {described(value)}"
-                ) from None
+        put_rows(self.task.model, fields, self._columns_of_dynamics(state))
         self._check_dynamics(state, fields)
         self.set_state(state, mask)
 
-    def _check_dynamics(self, state: torch.Tensor, names: Iterable[str]) -> None:
-        """Refuse model fields that MuJoCo can't simulate."""
+    def _columns_of_dynamics(self, state: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {field.name: state[:, self.state_space.parts[field.name]] for field in self.task.dynamics}
+
+    def _check_dynamics(self, state: torch.Tensor, names: Collection[str]) -> None:
+        """Refuse model fields that MuJoCo cannot simulate."""
+        columns = self._columns_of_dynamics(state)
         for field in self.task.dynamics:
-            if field.name not in names:
-                continue
-            rows = state[:, self.state_space.parts[field.name]].cpu().numpy()
-            if (problem := field.problem(self.task.model, rows)) is not None:
+            if field.name in names and (problem := field.problem(self.task.model, columns[field.name].cpu().numpy())):
                 raise ValueError(f"{self.task.name!r}: {problem}")
 
     # parameters and other environments of the same task
@@ -523,39 +502,31 @@ class Env:
     def replicate(self, *, nworld: int | None = None, **changes: Any) -> "Env":
         """Another environment of the same task with the same options and parameters, except for the given changes.
 
-        Its ``seed`` and ``first_world`` are 0 unless they are given. Where a parameter has one value a world and the
-        number of worlds differs, its values are repeated.
+        Its ``seed`` and ``first_world`` are 0 unless they are given. Parameters with one value a world are repeated if
+        the number of worlds differs.
         """
         nworld = self.nworld if nworld is None else nworld
-        known, params = EnvOptions.split(changes, self._own_options())
+        # not the model's source, which may have changed since
+        own = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
+        known, params = EnvOptions.split(changes, self.options.changed(own | {"seed": 0, "first_world": 0}))
         given = self._params_for(nworld, self._given_params)
         return Env(self.task.task, known.changed({"nworld": nworld}), _replica=True, **(given | params))
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
         """``replicate`` for a few worlds, such as an evaluation's.
 
-        On a GPU a step of a few worlds takes nearly as long as one of thousands. Where engine="auto" leaves the
-        choice, they step on CPU cores through the C engine, in double precision.
+        With engine="auto" they step on CPU cores through the C engine, in double precision: on a GPU a step of a few
+        worlds takes nearly as long as a step of thousands.
         """
         return self.replicate(nworld=nworld, **(options_for_few_worlds(self.options.engine, self.device) | changes))
 
-    def _own_options(self) -> EnvOptions:
-        # not the model's source, which may have changed since
-        current = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
-        return self.options.changed(current | {"seed": 0, "first_world": 0})
-
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
         """The values of some parameters, for a number of worlds."""
-        parameters, worlds = self.task.parameters, np.arange(nworld) % self.nworld
-        values: dict[str, Any] = {}
-        for name in names:
-            if name in parameters.per_world:
-                values[name] = parameters.values[name][worlds]
-            elif name in parameters.tables:
-                values[name] = parameters.values[name]
-            else:  # as it was given: a name of the model, not its index
-                values[name] = self._given_params.get(name, parameters.values[name])
-        return values
+        known, worlds = self.task.parameters, np.arange(nworld) % self.nworld
+        # other values as they were given: a name of the model, not its index
+        given = {name: value for name, value in self._given_params.items() if name not in known.tables}
+        values = {name: (known.values | given)[name] for name in names}
+        return values | {name: known.values[name][worlds] for name in names if name in known.per_world}
 
     def _scratch_at(self, given: torch.Tensor) -> "Env":
         """Worlds of the same task in given states; made when first needed."""
@@ -572,14 +543,14 @@ class Env:
 
     @property
     def bytes_per_world(self) -> float:
-        """An estimate of the memory that a world takes, in bytes, without the model, which all worlds share."""
+        """Estimated memory of a world in bytes, without the model, which all worlds share."""
         physics = self.options.engine, self.task.model, self.device, self.task.fields
         engine = bytes_per_world(*physics, dynamics=self.task.dynamics, **self.options.for_engine())
         return engine + own_bytes_per_world(self.task)
 
     @property
     def fault_counts(self) -> dict[str, int]:
-        """How often each kind of fault has happened since construction; waits for the device."""
+        """Number of faults of each kind since construction; waits for the device."""
         counts = self.worlds.fault_count.numpy().sum(axis=0)
         return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
 

@@ -288,14 +288,14 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
         ValueError: The model has no such element, or the element has no rows in the field.
     """
     if name in ("mocap_pos", "mocap_quat"):
-        i = int(model.body_mocapid[_find(model, _Kind.mjOBJ_BODY, name, element)])
+        i = int(model.body_mocapid[_find(model, _Kind.mjOBJ_BODY, element)])
         if i < 0:
             raise ValueError(f"the body {element!r} is not a mocap body, so it has no {name!r}")
         return slice(i, i + 1)
     prefix = name.partition("_")[0]
     if (place := _RANGES.get(name) or _RANGES.get(prefix)) is not None:
         kind, starts, counts = place
-        i = _find(model, kind, name, element)
+        i = _find(model, kind, element)
         first = getattr(model, starts)
         if counts in ("nq", "nv"):
             end = first[i + 1] if i + 1 < len(first) else getattr(model, counts)
@@ -306,7 +306,7 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
         return slice(int(first[i]), int(end))
     if (kind := _KINDS.get(name) or _KINDS.get(prefix)) is None:
         raise ValueError(f"the field {name!r} has no named elements")
-    i = _find(model, kind, name, element)
+    i = _find(model, kind, element)
     return slice(i, i + 1)
 
 
@@ -325,10 +325,10 @@ def _called(kind: mujoco.mjtObj) -> str:
     return kind.name.removeprefix("mjOBJ_").lower()
 
 
-def _find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, element: str) -> int:
+def _find(model: mujoco.MjModel, kind: mujoco.mjtObj, element: str) -> int:
     index = mujoco.mj_name2id(model, kind, element)
     if index < 0:
         names = [mujoco.mj_id2name(model, kind, i) for i in range(getattr(model, _COUNTS[kind]))]
         known = ", ".join(sorted(n for n in names if n)) or "none with names"
-        raise ValueError(f"the model has no {_called(kind)} {element!r} for the field {name!r}; it has: {known}")
+        raise ValueError(f"the model has no {_called(kind)} {element!r}; it has: {known}")
     return index

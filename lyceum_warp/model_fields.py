@@ -3,11 +3,15 @@
 import dataclasses
 import difflib
 import enum
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
 import numpy as np
+import torch
 import warp as wp
+
+from lyceum_warp.support.validate import described
 
 
 class Constants(enum.IntFlag):
@@ -158,6 +162,35 @@ class ModelField:
     def value(self, model: mujoco.MjModel) -> np.ndarray:
         """The field in a model, float64; for an array the model's own memory."""
         return np.asarray(getattr(model.opt if self.option else model, self.name))
+
+
+def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[str, torch.Tensor]) -> None:
+    """Write values of model fields into the columns of states.
+
+    Args:
+        model: The compiled model.
+        values: By the names of the fields; rows of all worlds, or one row for all.
+        columns: Columns of all model fields that differ between worlds, by their names, (nworld, size) each.
+
+    Raises:
+        ValueError: A field is unknown or the same in every world, or a value has another size.
+    """
+    for name, value in values.items():
+        field = describe_model_field(model, name)  # a misspelt name has an error of its own
+        if name not in columns:
+            raise ValueError(
+                f"the model field {name!r} is the same in every world of this environment: make it with "
+                f"dynamics=[{name!r}], or let the task write it"
+            )
+        target = columns[name]
+        try:
+            numbers = value if isinstance(value, torch.Tensor) else np.asarray(value)
+            given = torch.as_tensor(numbers, dtype=torch.float64, device=target.device)
+            target.copy_(given.reshape(-1, target.shape[1]))
+        except (TypeError, ValueError, RuntimeError):
+            own = field.value(model).shape or (1,)
+            shapes = f"{(len(target), *own)}, or {own} for all worlds"
+            raise ValueError(f"{name} must be numbers of shape {shapes}, not {described(value)}") from None
 
 
 def similar_model_fields(name: str) -> list[str]:

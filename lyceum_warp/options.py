@@ -7,7 +7,7 @@ misspelt words all read these two classes. A new option is a new field here, and
 import dataclasses
 import difflib
 import inspect
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Set
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -163,12 +163,11 @@ class EnvOptions:
             raise ValueError(f"engine must be 'auto', 'mujoco', 'warp' or a callable, not {described(self.engine)}")
         if self.model is not None and not isinstance(self.model, mujoco.MjModel):  # which has an error of its own
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
-        check_kind("physics", self.physics, PhysicsOptions, "as lw.PhysicsOptions(cone='elliptic')")
+        check_kind("physics", self.physics, PhysicsOptions, _PHYSICS_EXAMPLE)
         _flags(self, "autoreset", "graphs", "nvtx")
         for option, example in (("fields", "sensordata"), ("dynamics", "body_mass")):
             names = getattr(self, option)
-            listed = isinstance(names, Collection) and not isinstance(names, str)
-            if not listed or not all(isinstance(name, str) for name in names):
+            if not isinstance(names, list | tuple | Set) or not all(isinstance(name, str) for name in names):
                 raise ValueError(f"{option} must be names of fields, as in {option}=[{example!r}], not {names!r}")
             object.__setattr__(self, option, tuple(names))
 
@@ -189,7 +188,9 @@ class EnvOptions:
         physics = {name: value for name, value in words.items() if name in _PHYSICS}
         others = {name: value for name, value in words.items() if name not in _PHYSICS}
         if physics:
-            others["physics"] = dataclasses.replace(others.get("physics", self.physics), **physics)
+            base = others.get("physics", self.physics)
+            check_kind("physics", base, PhysicsOptions, _PHYSICS_EXAMPLE)
+            others["physics"] = dataclasses.replace(base, **physics)
         return dataclasses.replace(self, **others)
 
     def for_engine(self) -> dict[str, Any]:
@@ -205,6 +206,7 @@ class EnvOptions:
 
 
 _PHYSICS = tuple(field.name for field in dataclasses.fields(PhysicsOptions))
+_PHYSICS_EXAMPLE = "as lw.PhysicsOptions(cone='elliptic')"
 OPTIONS = (*(field.name for field in dataclasses.fields(EnvOptions)), *_PHYSICS)
 """Names of all options, in the order of the help text."""
 

@@ -1,4 +1,4 @@
-"""Shapes, parts and bounds of observations, actions and states."""
+"""Describe the shapes, parts and bounds of observations, actions and states."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -13,13 +13,13 @@ from lyceum_warp.model_fields import ModelField
 
 @dataclasses.dataclass(frozen=True)
 class Space:
-    """The vector of one world: its parts by name, its type, and its bounds where there are any.
+    """The vector of one world: its parts by name, its type and its bounds, if any.
 
-    A scalar has no axis. The arrays of an environment have one more axis in front, for the worlds.
+    A scalar has no axis. The arrays of an environment have an additional leading axis, for the worlds.
     """
 
     parts: Mapping[str, slice] = dataclasses.field(default_factory=dict)
-    """The place of each named part, in order."""
+    """The columns of each named part, in order."""
     dtype: torch.dtype = torch.float32
     low: np.ndarray | None = None
     """Lower bounds, of the shape ``shape``; None without bounds."""
@@ -28,7 +28,7 @@ class Space:
 
     @classmethod
     def of(cls, sizes: Mapping[str, int], **rest: object) -> "Space":
-        """A space from the sizes of its parts."""
+        """Make a space from the sizes of its parts."""
         parts, start = {}, 0
         for name, size in sizes.items():
             parts[name] = slice(start, start + size)
@@ -54,6 +54,10 @@ class Space:
             for i in range(part.stop - part.start)
         ]
 
+    def part_at(self, column: int) -> str:
+        """Name of the part that a column belongs to."""
+        return next(name for name, part in self.parts.items() if part.start <= column < part.stop)
+
     def split(self, values: torch.Tensor) -> dict[str, torch.Tensor]:
         """Views of the parts of (..., size) values, by name."""
         return {name: values[..., part] for name, part in self.parts.items()}
@@ -66,10 +70,10 @@ COUNTERS = ("step", "key", "episode", "done_reason")
 def action_space(
     model: mujoco.MjModel, action_range: tuple[float, float] | None, actions: Mapping[str, int] | None = None
 ) -> Space:
-    """Actions: the controls of each actuator, by its name, within ``action_range`` or the control ranges.
+    """The space of actions: the controls of each actuator, by its name, within ``action_range`` or the control ranges.
 
-    Most actuators have one control, some have several or none. One without a name is called by its number. A task's own
-    ``actions`` have bounds only with an ``action_range``.
+    Most actuators have one control; some have several or none. An actuator without a name is named by its index. A
+    task's own ``actions`` have bounds only with an ``action_range``.
     """
     if actions is not None:
         space = Space.of(actions)
@@ -121,7 +125,7 @@ def control_ranges(model: mujoco.MjModel) -> np.ndarray:
 def state_space(
     model: mujoco.MjModel, snapshots: Iterable[Field], dynamics: Iterable[ModelField], own: Mapping[str, int]
 ) -> Space:
-    """States: the integration state in MuJoCo's order, fields saved with it, model fields, counters, and further parts.
+    """The space of states: integration state in MuJoCo's order, saved fields, model fields, counters, further parts.
 
     Args:
         model: The compiled model.

@@ -4,6 +4,7 @@ import contextlib
 import json
 import logging
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,12 @@ from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.runs.configuration import Configuration, describe
 from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.lock import RunLock
 from lyceum_warp.runs.metrics_table import cut_rows
 from lyceum_warp.runs.saving import Saver
 from lyceum_warp.runs.task_copy import note_changes, run_params, task_copy
 from lyceum_warp.support.interrupts import Interrupted, ending, postponed
-from lyceum_warp.support.validate import check_flag, check_function, check_kind, whole_number
+from lyceum_warp.support.validate import check_flag, check_function, check_kind, positive_number, whole_number
 from lyceum_warp.support.versions import versions
 from lyceum_warp.viz.cameras import CameraChoice, find_camera
 from lyceum_warp.viz.policy_videos import Videos
@@ -56,12 +58,14 @@ def train(
     iterations: int = 100,
     callback: Callback | None = None,
     target_return: float | None = None,
+    minutes: float | None = None,
     keep_every: int = 0,
     save_every: int = 0,
     tensorboard: bool = False,
     video_every: int = 0,
     camera: CameraChoice = None,
     resume: bool = False,
+    take_over: bool = False,
     entries: Mapping[str, Any] | None = None,
     display: Display | None = None,
 ) -> Run:
@@ -83,6 +87,7 @@ def train(
         callback: Called with each iteration after its row was written. Training ends if it returns True. If it raises
             an error, the run is saved, and the error is raised again.
         target_return: Training ends once the return that selects the best policy reaches this number.
+        minutes: Training ends with the iteration in which this call has trained for so long; None for no limit.
         keep_every: Iterations between two numbered policies; 0 for none.
         save_every: Iterations between two saves; 0 to save by time.
         tensorboard: Whether to also write the metrics for TensorBoard.
@@ -91,6 +96,8 @@ def train(
         camera: Camera of the videos: a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or "free"
             for MuJoCo's default free camera.
         resume: Whether to continue the run in the folder. ``learner`` must be made with the same arguments.
+        take_over: Whether to continue a run that another process still locks, on this or another host. That process
+            then ends at its next write.
         entries: Further entries of config.json, of JSON values.
         display: Shows the progress; by default messages are logged.
 
@@ -98,7 +105,8 @@ def train(
         The run. ``run.rows()`` returns the metrics.
 
     Raises:
-        ValueError: The folder is not empty, an argument is out of range, or the run does not fit ``learner``.
+        ValueError: The folder is not empty, an argument is out of range, the run does not fit ``learner``, or another
+            process writes it or has taken it over.
         ImportError: The extra ``tensorboard`` is not installed.
         NoVideoError: ``video_every`` is given, and the extra ``viz`` is not installed.
         OSError: The folder cannot be written. ``resume=True`` continues from the last save.
@@ -109,9 +117,11 @@ def train(
     check_kind("folder", folder, str | Path, "as 'runs/mine'")
     check_function("callback", callback)
     check_flag("resume", resume)
+    check_flag("take_over", take_over)
     check_flag("tensorboard", tensorboard)
     if target_return is not None and (not isinstance(target_return, (int, float)) or math.isnan(target_return)):
         raise ValueError(f"target_return must be a number, not {target_return!r}")
+    limit = math.inf if minutes is None else 60 * positive_number("minutes", minutes, "minutes")
     settings: dict[str, Any] = {
         "iterations": whole_number("iterations", iterations, low=1),
         "target_return": None if target_return is None else float(target_return),
@@ -121,26 +131,29 @@ def train(
         "video_every": whole_number("video_every", video_every, low=0),
     }
     env, leads, display = learner.env, learner.team.leads, display or Display()
-    with learner.team.together():
-        if tensorboard:
-            check_tensorboard()
-        if video_every:
-            check_video()
-        find_camera(env.model, camera)
-        if resume:
-            run = _reopened(Path(folder), learner, settings, display.note if leads else log.debug)
-        else:
-            run = Run(Path(folder), describe(learner) | settings | dict(entries or {}))
-            if leads:
-                kept, files = task_copy(env)
-                device = env.options.device or "cpu"
-                run = Run.create(folder, run.config | {"kept": kept}, device=device, files=files)
-    saver = Saver(
-        run if leads else None, learner, keep_every=keep_every, save_every=save_every,
-        saved=learner.iteration if resume else -1,
-    )  # fmt: skip
-    callbacks: list[Callback] = []
     with contextlib.ExitStack() as shown:
+        with learner.team.together():
+            if tensorboard:
+                check_tensorboard()
+            if video_every:
+                check_video()
+            find_camera(env.model, camera)
+            if resume:
+                run = Run.open(folder)
+            else:
+                run = Run(Path(folder), describe(learner) | settings | dict(entries or {}))
+                if leads:
+                    kept, files = task_copy(env)
+                    device = env.options.device or "cpu"
+                    run = Run.create(folder, run.config | {"kept": kept}, device=device, files=files)
+            lock = shown.enter_context(RunLock(run.folder, take_over=take_over, note=display.note)) if leads else None
+            if resume:
+                run = _reopened(Path(folder), learner, settings, display.note if leads else log.debug)
+        saver = Saver(
+            run if leads else None, learner, keep_every=keep_every, save_every=save_every,
+            saved=learner.iteration if resume else -1, lock=lock, note=display.note,
+        )  # fmt: skip
+        callbacks: list[Callback] = []
         if leads:
             board = shown.enter_context(TensorBoard(run.folder, run.config)) if tensorboard else None
             seed = evaluation_seed(env.options.seed + 1)
@@ -151,7 +164,7 @@ def train(
             shown.enter_context(display.training(run, learner, iterations))
             callbacks = [function for function in (board, display, videos, callback) if function is not None]
         try:
-            _learn(learner, saver, iterations, callbacks, target_return)
+            _learn(learner, saver, iterations, callbacks, target_return, limit)
         except Exception as error:
             if leads and saver.saved >= 0:
                 error.add_note(f"the run in {run.folder} is saved up to iteration {saver.saved}")
@@ -160,10 +173,11 @@ def train(
 
 
 def _learn(
-    learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None
-) -> None:
-    """Iterate. All ranks agree on when the run is saved and when it ends."""
-    team, run = learner.team, saver.run
+    learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None,
+    limit: float,
+) -> None:  # fmt: skip
+    """Iterate for at most ``limit`` seconds. All ranks agree on when the run is saved and when it ends."""
+    team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
     with ending(), postponed(insist=team.size == 1) as noted:
         if saver.saved != learner.iteration:
@@ -181,7 +195,7 @@ def _learn(
                     ended = function(iteration) is True or ended
             except Exception as raised:
                 error = raised
-            ended = ended or error is not None or learner.iteration >= iterations
+            ended = ended or error is not None or learner.iteration >= iterations or time.monotonic() >= deadline
             numbers = max(noted, default=0), ended, error is not None, saver.due()
             signal, last, failed, due = team.largest(*map(int, numbers))
             if signal or last or due:
@@ -214,14 +228,14 @@ def _reopened(folder: Path, learner: Learner, settings: dict[str, Any], note: Ca
     note_changes(run, learner.env, note=note)
     try:
         learner.load_state_dict(content["state"])
-    except (KeyError, RuntimeError, ValueError) as error:
+    except Exception as error:  # the state may hold anything
         text = " ".join(str(error).split())
         raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {text}") from error
     if learner.team.leads:
+        cut_rows(run.metrics, done)  # a killed run may have rows of unsaved iterations
         if changed := run.changed(versions(run.config["device"])):
             text = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
             note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")
-        cut_rows(run.metrics, done)  # a killed run may have rows of unsaved iterations
         run.amend(**settings)
     return run
 

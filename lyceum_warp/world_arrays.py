@@ -156,6 +156,7 @@ class WorldArrays:
         self._outdated = wp.zeros(n, dtype=bool)
         """They changed since they were observed: they restart, or events changed them."""
         self.mask_view, self.changed_view = torch_view(self.mask), torch_view(self._changed)
+        self.terminated_view = torch_view(self._found.terminated)
 
     def _allocate_groups(self, into: Any) -> dict[str, torch.Tensor]:
         for group, space in self.obs_spaces.items():

@@ -1,6 +1,6 @@
-"""Run the phases of a step, a reset, and a state that is read or restored, in every world of an environment.
+"""Run the phases of a step, of a reset, and of reading or restoring states.
 
-The order of a step is the list in ``Worlds.step_phases``, and stands nowhere else.
+``Worlds.step_phases`` is the only place that knows the order of a step.
 """
 
 import dataclasses
@@ -64,7 +64,7 @@ class Worlds(WorldArrays):
     def configure(self, *, horizon: int, autoreset: bool, graphs: bool) -> None:
         """Choose the horizon, whether episodes restart automatically, and whether launches become graphs.
 
-        Graphs hold the first two, so each combination has graphs of its own.
+        The first two are baked into captured graphs, so each combination has graphs of its own.
         """
         self.horizon, self.autoreset = horizon, autoreset
         key = (horizon, autoreset, graphs)
@@ -84,8 +84,13 @@ class Worlds(WorldArrays):
         self.programs = self._programs[key]
         self.step = self.programs.step
 
+    def drop_programs(self) -> None:
+        """Break the reference cycles through the programs, so that threads and memory go with the environment."""
+        self._programs.clear()
+        del self.programs, self.step
+
     def _make_workers(self) -> Workers | None:
-        """Threads for the launches around the engine's calls, or None where the caller's is the only one."""
+        """Threads for the launches around the engine's calls; None for the caller's alone."""
         # Warp's kernels for debugging keep the address of a stack in a variable that all threads share
         if not self.device.is_cpu or self.engine.capturable or wp.config.mode == "debug":
             return None
@@ -106,7 +111,7 @@ class Worlds(WorldArrays):
         ]
 
     def _phases_of_a_graph(self) -> list[Phase]:
-        """The same where a step is one graph: parts of it are left out in a step in which they concern no world."""
+        """The same for a step that is one graph, which leaves out parts that concern no world."""
         if not self.engine.capturable or self._nvtx:
             return self.step_phases()
         restart = self._restart_phases(self.restarting, randomly=True)
@@ -124,7 +129,7 @@ class Worlds(WorldArrays):
         ]
 
     def _only_for(self, mask: wp.array, *phases: list[Phase]) -> Phase:
-        """Phases as one that is left out where the mask holds no world."""
+        """Phases as one phase that is left out while the mask holds no world."""
         every = [phase for part in phases for phase in part]
 
         def run() -> None:
@@ -134,7 +139,7 @@ class Worlds(WorldArrays):
         return Phase(every[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
     def _transition_phases(self) -> list[Phase]:
-        """The transition to the next state, and its judgement."""
+        """Step to the next state, and judge the transition."""
         return [
             Phase("act", self.act, by_world=True),
             *self.physics_phases(),
@@ -150,7 +155,7 @@ class Worlds(WorldArrays):
         return substep * skip
 
     def reset_phases(self, *, randomly: bool) -> list[Phase]:
-        """New episodes in the worlds of ``mask``, in order."""
+        """Begin episodes in the worlds of ``mask``, in order."""
         return [
             *self._restart_phases(self.mask, randomly=randomly),
             *self._refresh_phases(self.mask),
@@ -158,7 +163,7 @@ class Worlds(WorldArrays):
         ]
 
     def _restart_phases(self, mask: wp.array, *, randomly: bool) -> list[Phase]:
-        """The masked worlds into initial states of the task, whose derived fields are not computed yet."""
+        """Put the masked worlds into initial states; derived fields are not computed yet."""
         phases = [Phase("restart", partial(self._restart, mask, randomly=randomly), by_world=True)]
         if self.task.reset_dynamics:
             phases.append(Phase("dynamics", partial(self.engine.apply_model, mask), engine=True))
@@ -169,12 +174,12 @@ class Worlds(WorldArrays):
         return phases
 
     def _event_phases(self) -> list[Phase]:
-        """What happens between two steps, in worlds that go on."""
+        """The task's events between two steps, in worlds that continue."""
         kernel = self.task.kernels.run_events
         return [] if kernel is None else [Phase("event", partial(self._event, kernel))]
 
     def _moved_phases(self) -> list[Phase]:
-        """What follows in the worlds whose physics an event changed."""
+        """Model constants and fields of the worlds whose physics an event changed."""
         if self.task.kernels.run_events is None:
             return []
         phases, changed = [], self._physics_changed
@@ -195,11 +200,11 @@ class Worlds(WorldArrays):
         return [Phase("refresh", partial(self.engine.refresh, mask), engine=True)]
 
     def read_phases(self) -> list[Phase]:
-        """Every world's state into ``state``."""
+        """Write every world's state into ``state``."""
         return [Phase("read state", self._read_state)]
 
     def restore_phases(self) -> list[Phase]:
-        """The worlds of ``mask`` into the states of ``state``, in order; every getter reflects them afterwards."""
+        """Put the worlds of ``mask`` into the states of ``state``, in order; every getter reflects them afterwards."""
         engine_columns = self.state[:, : self.engine.state_size]
         return [
             Phase("restore engine", partial(self.engine.set_state, engine_columns, self.mask), engine=True),
@@ -266,7 +271,7 @@ class Worlds(WorldArrays):
         self._hold_success(mask, transition=transition)
 
     def _hold_success(self, mask: wp.array, *, transition: bool) -> None:
-        """Ask for several steps in a row with the goal met, where the task does so."""
+        """Let a success count after ``success_steps`` in a row."""
         if self.success_counts.size:
             args = [mask, transition, self.task.task.success_steps, self.success_counts, self.outcome.success]
             launch_worlds(steps.hold_success, self.nworld, args, self.device)
@@ -309,28 +314,26 @@ class Worlds(WorldArrays):
 
     def _event(self, kernel: wp.Kernel) -> None:
         """Run the events, and find the worlds that they changed: their physics, or anything."""
-        written = self.task.writes["event"]
-        live = {name: getattr(self.after, name) for name in self._copies if name in written}
-        drawn = {name: self.engine.arrays[name] for name in self._model_copies}
-        for name, array in (live | drawn).items():
-            wp.copy(self._before_event(name), array)
+        before = {name: copy for name, copy in self._copies.items() if name in self.task.writes["event"]}
+        live = {name: getattr(self.after, name) for name in before}
+        before |= self._model_copies
+        live |= {name: self.engine.arrays[name] for name in self._model_copies}
+        for name, copy in before.items():
+            wp.copy(copy, live[name])
         launch_worlds(kernel, self.nworld, [
             self.restarting, self.after, self.params, self.counters, self._continuing, self._physics_changed,
             self._changed, self._outdated,
         ], self.device)  # fmt: skip
-        for name, array in (live | drawn).items():
-            self._mark_changes(self._before_event(name), array, physics=name not in MEMORIES)
-        self.engine.commit(self._physics_changed, [name for name in live if name not in MEMORIES])
+        for name, copy in before.items():
+            self._mark_changes(copy, live[name], physics=name not in MEMORIES)
+        state_fields = [name for name in before if name not in MEMORIES and name not in self._model_copies]
+        self.engine.commit(self._physics_changed, state_fields)
 
     def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
-        """Mark the worlds that go on and in which a field changed: it is physics, or the task's memory."""
+        """Mark the worlds that continue and in which a field changed: it is physics, or the task's memory."""
         found = [self._physics_changed, self._changed, self._outdated]
         args = [self._continuing, flat(before), flat(after), physics, *found]
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
-
-    def _before_event(self, name: str) -> wp.array:
-        """Where the values of a field before an event are kept."""
-        return self._model_copies[name] if name in self._model_copies else self._copies[name]
 
     def _observe(self, mask: wp.array) -> None:
         """Observe the masked worlds; the others were observed when they were judged."""
@@ -352,7 +355,7 @@ class Worlds(WorldArrays):
         # with automatic resets an end is over with its step, without them it stays
         self.pack_state(self._no_fault if self.autoreset else self.outcome.done_reason)
 
-    # parts of phases, and preparations, for environments and open-loop rollouts
+    # for environments and open-loop rollouts
 
     def judge_transition(self, action: torch.Tensor) -> None:
         """Judge the transition from ``before`` to the current state under some actions, without looking for faults."""
@@ -361,7 +364,7 @@ class Worlds(WorldArrays):
         self._judge(self.everyone, self._judged, self._no_fault, transition=True)
 
     def seed_streams(self, seed: int) -> None:
-        """Restart the random streams of the masked worlds, and draw what is drawn once for each stream."""
+        """Restart the random streams of the masked worlds, and call the task's ``startup`` in them."""
         self._seed.fill_(seed)
         args = [self.mask, self._seed, self.first_world, self.counters.key, self.counters.episode]
         wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
@@ -374,7 +377,7 @@ class Worlds(WorldArrays):
             self.engine.apply_model(self.mask)
 
     def update_params(self) -> None:
-        """Bring the parameters of the task into the array that kernels read."""
+        """Copy the task's parameters into the array that kernels read."""
         changed = self.task.parameters.array(self.device)
         if changed.shape == self.params.shape:
             wp.copy(self.params, changed)

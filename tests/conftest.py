@@ -22,6 +22,15 @@ SharedEnv = Callable[..., lw.Env]
 TaskFile = Callable[[str, str], Path]
 
 
+@pytest.fixture(scope="session", autouse=True)
+def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The directory in which runs are recorded, also by subprocesses, instead of the user's."""
+    with pytest.MonkeyPatch.context() as patched:
+        folder = tmp_path_factory.mktemp("state")
+        patched.setenv("XDG_STATE_HOME", str(folder))
+        yield folder
+
+
 @pytest.fixture(scope="module")
 def shared_env() -> Iterator[SharedEnv]:
     """``shared_env("hopper", engine="warp", nworld=4, ...)``: ``lw.make``, called once a file for the same arguments.

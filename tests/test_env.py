@@ -1,10 +1,12 @@
 """The public face: what reaches the engine, what is refused, and environments in other processes."""
 
 import copy
+import gc
 import multiprocessing
 import pickle
 import sys
 import traceback
+import weakref
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -122,6 +124,37 @@ def test_an_environment_in_a_forked_child_says_that_it_belongs_to_the_parent() -
     assert len(messages) == 6
     assert all("made before the process was forked" in text and "'spawn'" in text for text in messages)
     env.step()  # the parent's goes on
+
+
+def _make_another(connection: Connection) -> None:
+    gc.collect()
+    env = lw.make("hopper", nworld=64)
+    env.step()
+    connection.send(int(env.done_reason.sum()))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no fork")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_an_engine_goes_with_its_environment_before_a_fork(engine: str) -> None:
+    gc.disable()  # cycles would stay
+    try:
+        env = lw.make("hopper", nworld=64, engine=engine)
+        env.get_reward(state := env.get_state(), env.action, state)
+        env.step()
+        parts = [weakref.ref(part) for part in (env.worlds, env.engine, env.task)]
+        del env
+        assert [part() for part in parts] == [None, None, None]
+        here, there = multiprocessing.Pipe()
+        child = multiprocessing.get_context("fork").Process(target=_make_another, args=(there,))
+        child.start()
+        hangs = not here.poll(60)
+        if hangs:
+            child.kill()
+        child.join(60)
+        assert not hangs and child.exitcode == 0 and here.recv() == 0
+    finally:
+        gc.enable()
 
 
 # parameters and replicas

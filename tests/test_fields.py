@@ -168,9 +168,9 @@ def test_an_axis_is_as_long_as_its_field(model: mujoco.MjModel) -> None:
 @pytest.mark.parametrize(
     ("name", "element", "message"),
     [
-        ("site_xpos", "hand", "the model has no site 'hand' for the field 'site_xpos'; it has: here, tip"),
-        ("qpos", "knee", "the model has no joint 'knee' for the field 'qpos'; it has: elbow, root"),
-        ("light_xpos", "lamp", "the model has no light 'lamp' for the field 'light_xpos'; it has: none"),
+        ("site_xpos", "hand", "the model has no site 'hand'; it has: here, tip"),
+        ("qpos", "knee", "the model has no joint 'knee'; it has: elbow, root"),
+        ("light_xpos", "lamp", "the model has no light 'lamp'; it has: none"),
         ("mocap_pos", "arm", "the body 'arm' is .* mocap body, so it has no 'mocap_pos'"),
         ("time", "noon", "the field 'time' has no named elements"),
         ("gravity", "down", "the field 'gravity' has no named elements"),

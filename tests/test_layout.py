@@ -81,20 +81,16 @@ IMPORTS = {name: imported_modules(name) for name in MODULES}
 # imports
 
 
-@pytest.mark.parametrize("name", [name for name in MODULES if room(name) not in ("__init__", "tasks")])
-def test_imports_point_to_lower_rooms(name: str) -> None:
-    own = room(name)
-    for other in IMPORTS[name]:
-        assert room(other) == own or LEVELS.get(room(other), 99) < LEVELS[own], f"{name} imports {other}"
-
-
-def test_every_level_belongs_to_a_room() -> None:
+def test_imports_point_to_lower_rooms() -> None:
     assert set(LEVELS) == {room(name) for name in MODULES} - {"__init__", "tasks"}
-
-
-@pytest.mark.parametrize("name", [name for name in MODULES if room(name) == "tasks"])
-def test_a_task_file_imports_only_the_public_package(name: str) -> None:
-    assert IMPORTS[name] <= {"lyceum_warp"}
+    for name in MODULES:
+        if (own := room(name)) in LEVELS:
+            upward = {
+                other for other in IMPORTS[name] if room(other) != own and LEVELS.get(room(other), 99) >= LEVELS[own]
+            }
+            assert not upward, f"{name} imports {upward}"
+        elif own == "tasks":
+            assert IMPORTS[name] <= {"lyceum_warp"}, f"{name} imports more than the public package"
 
 
 def test_no_module_imports_itself_through_others() -> None:
@@ -121,9 +117,10 @@ def test_the_viewers_window_imports_neither_torch_nor_warp_nor_other_rooms() -> 
     assert own == {"lyceum_warp", "lyceum_warp.viewer", "lyceum_warp.viewer.protocol", *window}
 
 
-@pytest.mark.parametrize("name", [name for name in MODULES if name.startswith("lyceum_warp.viewer.session")])
-def test_the_viewers_session_imports_nothing_of_its_window(name: str) -> None:
-    assert not [other for other in IMPORTS[name] if other.startswith("lyceum_warp.viewer.window")]
+def test_the_viewers_session_imports_nothing_of_its_window() -> None:
+    session = [name for name in MODULES if name.startswith("lyceum_warp.viewer.session")]
+    imported = {other for name in session for other in IMPORTS[name]}
+    assert session and not [name for name in imported if name.startswith("lyceum_warp.viewer.window")]
 
 
 def test_module_names_are_unique() -> None:
@@ -165,23 +162,16 @@ for module, tree in TREES.items():
         PRIVATE[defined].add(module)
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_no_module_imports_private_names(name: str) -> None:
-    for node in ast.walk(TREES[name]):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lyceum_warp"):
-            private = [alias.name for alias in node.names if alias.name.startswith("_")]
-            assert not private, f"{name} imports {private} of {node.module}"
-
-
-@pytest.mark.parametrize("name", MODULES)
-def test_no_module_uses_private_attributes_of_another_modules_objects(name: str) -> None:
-    """Found by the attribute's name; private names of Warp, MuJoCo and torch are not defined in the package."""
-    found = [
-        f"line {node.lineno}: {ast.unparse(node)}, of {', '.join(sorted(PRIVATE[node.attr] - {name}))}"
-        for node in ast.walk(TREES[name])
-        if isinstance(node, ast.Attribute) and not is_own(node) and PRIVATE[node.attr] - {name}
-    ]
-    assert not found, f"{name} uses private attributes: {'; '.join(found)}"
+def test_no_module_uses_private_names_of_another_module() -> None:
+    """Attributes are found by name; private names of Warp, MuJoCo and torch are not defined in the package."""
+    found = []
+    for name, tree in TREES.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lyceum_warp"):
+                found += [f"{name} imports {alias.name}" for alias in node.names if alias.name.startswith("_")]
+            elif isinstance(node, ast.Attribute) and not is_own(node) and (others := PRIVATE[node.attr] - {name}):
+                found.append(f"{name}:{node.lineno}: {ast.unparse(node)}, of {', '.join(sorted(others))}")
+    assert not found, "\n".join(found)
 
 
 PUBLIC = {
@@ -220,15 +210,10 @@ def private_names_of_others(tree: ast.AST) -> Iterator[str]:
             yield ast.unparse(node)
 
 
-@pytest.mark.parametrize("name", [name for name in MODULES if name != UPSTREAM])
-def test_no_module_but_upstream_uses_private_names_of_other_packages(name: str) -> None:
-    found = list(private_names_of_others(TREES[name]))
-    assert not found, f"{name} uses {', '.join(found)}: reach it in {UPSTREAM}"
-
-
-def test_private_names_in_upstream_are_found() -> None:
-    found = {"wp._src", "mujoco_warp._src.collision_sdf", "mujoco_warp._src.forward"}
-    assert set(private_names_of_others(TREES[UPSTREAM])) == found
+def test_no_module_but_upstream_uses_private_names_of_other_packages() -> None:
+    found = {name: names for name, tree in TREES.items() if (names := set(private_names_of_others(tree)))}
+    known = {"wp._src", "mujoco_warp._src.collision_sdf", "mujoco_warp._src.forward"}
+    assert found == {UPSTREAM: known}, f"reach private names in {UPSTREAM}"
 
 
 def test_public_names_are_the_same_for_type_checkers_and_at_run_time() -> None:
@@ -244,16 +229,9 @@ def in_new_process(program: str) -> str:
     return result.stdout
 
 
-def test_public_names_stay_when_every_module_is_imported() -> None:
-    """A submodule becomes an attribute of the package, which would hide a function of its name."""
-    program = f"""
-        import importlib, types
-        for name in {[name for name in MODULES if not name.endswith("__main__")]}:
-            importlib.import_module(name)
-        import lyceum_warp as lw
-        print([name for name in lw.__all__ if isinstance(getattr(lw, name), types.ModuleType)])
-    """
-    assert in_new_process(program) == "[]\n"
+def test_no_submodule_has_a_public_name() -> None:
+    """Its import makes it an attribute of the package, which would hide the function of that name."""
+    assert not {room(name) for name in MODULES} & set(lw.__all__)
 
 
 def test_the_import_alone_loads_neither_torch_nor_warp_nor_mujoco() -> None:
@@ -264,7 +242,7 @@ def test_the_import_alone_loads_neither_torch_nor_warp_nor_mujoco() -> None:
     assert in_new_process(program) == "[]\n"
 
 
-@pytest.mark.parametrize("first", ["import warp as wp", "import lyceum_warp as lw", "from lyceum_warp import Row"])
+@pytest.mark.parametrize("first", ["import warp as wp", "from lyceum_warp import Row"])
 def test_warp_is_quiet_in_whatever_order_a_task_file_imports(first: str) -> None:
     program = f"""
         {first}
@@ -278,10 +256,10 @@ def test_warp_is_quiet_in_whatever_order_a_task_file_imports(first: str) -> None
 # tests
 
 
-@pytest.mark.parametrize("own", sorted({room(name) for name in MODULES} - {"__init__"}))
-def test_every_room_has_tests_of_its_name(own: str) -> None:
-    places = [TESTS / TESTED_BY[own]] if own in TESTED_BY else [TESTS / own, TESTS / f"test_{own}.py"]
-    assert any(place.exists() for place in places), f"no tests of {own}: none of {', '.join(map(str, places))}"
+def test_every_room_has_tests_of_its_name() -> None:
+    for own in {room(name) for name in MODULES} - {"__init__"}:
+        places = [TESTS / TESTED_BY[own]] if own in TESTED_BY else [TESTS / own, TESTS / f"test_{own}.py"]
+        assert any(place.exists() for place in places), f"no tests of {own}: none of {', '.join(map(str, places))}"
 
 
 def test_every_folder_of_tests_belongs_to_a_room_or_goes_across_rooms() -> None:

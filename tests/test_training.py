@@ -1,7 +1,10 @@
 """Training with a run's folder: ended, continued and warm-started."""
 
 import contextlib
+import os
 import shutil
+import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -193,6 +196,54 @@ def test_what_ends_an_iteration_leaves_the_last_save(
     assert metrics(folder) == metrics(six)
 
 
+class SlowToSave(lw.NPG):
+    """Saves so slowly that only the first and the last state are saved."""
+
+    saves = 0
+    signal_in_save = 0
+    """Number of the save during which a signal arrives."""
+
+    def state_dict(self) -> dict[str, Any]:
+        self.saves += 1
+        if self.saves == self.signal_in_save:
+            os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.5)
+        return super().state_dict()
+
+
+@pytest.fixture
+def sigint() -> Iterator[None]:
+    """Python's own handler of SIGINT, also where a shell made its children ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def interrupt_in_fifth(iteration: lw.Iteration) -> None:
+    if iteration.iteration == 5:
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.usefixtures("sigint")
+def test_a_signal_keeps_all_finished_iterations_of_a_run_with_slow_saves(tmp_path: Path) -> None:
+    npg = SlowToSave(lw.make("point_mass", nworld=2), config=CONFIG)
+    with pytest.raises(KeyboardInterrupt):
+        lw.train(npg, tmp_path / "run", iterations=100, callback=interrupt_in_fifth)
+    run = Run.open(tmp_path / "run")
+    assert npg.saves == 2 and run.read()["iteration"] == len(run.rows()) == 5
+
+
+@pytest.mark.usefixtures("sigint")
+def test_a_second_signal_during_a_slow_save_ends_the_run_at_once(six: Path, tmp_path: Path) -> None:
+    npg, folder = SlowToSave(lw.make("point_mass", nworld=2), config=CONFIG), tmp_path / "run"
+    npg.signal_in_save = 2
+    with pytest.raises(KeyboardInterrupt):
+        lw.train(npg, folder, iterations=100, callback=interrupt_in_fifth)
+    assert Run.open(folder).read()["iteration"] == 0 and not [*folder.glob("*.tmp"), *folder.glob("lock")]
+    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
+    assert metrics(folder) == metrics(six)
+
+
 def test_training_ends_at_the_target_return(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The mean policy is evaluated after every second iteration."""
     folder = tmp_path / "run"
@@ -203,6 +254,17 @@ def test_training_ends_at_the_target_return(tmp_path: Path, capsys: pytest.Captu
     refused(capsys, f"the run in {folder} is finished: its return reached", "in iteration 2", "give a target return")
     assert cli.main([*resume, "--target-return", "inf"]) == 0
     assert len(run.rows()) == 4
+
+
+def test_training_ends_after_its_minutes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "run"
+    run = lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=1000, minutes=1e-6)
+    assert len(run.rows()) == 1 and run.read()["iteration"] == 1
+    assert cli.main(["train", "--resume", str(folder), "--iterations", "1000", "--minutes", "1e-6", *QUIET]) == 0
+    assert "1e-06 minutes are over after 2 of 1000 iterations; continue with" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="minutes must be a positive number of minutes, not 0"):
+        lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "other", minutes=0)
+    assert not (tmp_path / "other").exists()
 
 
 # a run that was killed

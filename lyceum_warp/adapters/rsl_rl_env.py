@@ -6,7 +6,7 @@ import torch
 
 from lyceum_warp.adapters.adapted_env import environment_of
 from lyceum_warp.adapters.libraries import check_library
-from lyceum_warp.adapters.step_results import episode_ends, faulty
+from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import described
 from lyceum_warp.task import Task
@@ -17,7 +17,7 @@ from rsl_rl.env import VecEnv  # noqa: E402 (after the check)
 from tensordict import TensorDict  # noqa: E402
 
 RECENT = 100
-"""Episodes in the means of the log."""
+"""Number of recent episodes over which the logged means are taken."""
 
 
 class RslRlVecEnv(VecEnv):  # type: ignore[misc]
@@ -124,19 +124,17 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         """
         env = self.env
         env.step(actions)
-        fault = faulty(env)
-        terminated, _ = episode_ends(env, fault)
         extras = {
-            "time_outs": env.done & ~terminated,
+            "time_outs": env.truncated & ~env.terminated,
             "final_obs": self._final_obs,
-            "log": self._log() | {"faults/worlds": fault.sum()},
+            "log": self._log() | {"faults/worlds": ((env.done_reason & FAULTS) != 0).sum()},
         }
         return self._obs.clone(), env.reward, env.done, extras
 
     def _log(self) -> dict[str, torch.Tensor]:
         """Means of the metrics over recent episodes, computed on the device.
 
-        rsl_rl averages the log over the steps of an iteration. Means over the last step alone would give a step with
+        rsl_rl averages the log over the steps of an iteration. Means over only the last step would give a step with
         one ended episode the weight of a step with a thousand.
         """
         env = self.env

@@ -10,7 +10,7 @@ import torch
 from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, per_world, pictures_of
 from lyceum_warp.adapters.gymnasium_spaces import box, observation_space
 from lyceum_warp.adapters.libraries import check_library
-from lyceum_warp.adapters.step_results import HostArrays, Infos, Observations, episode_ends
+from lyceum_warp.adapters.step_results import HostArrays, Infos, Observations
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 from lyceum_warp.viz.cameras import CameraChoice
@@ -73,7 +73,7 @@ class StableBaselines3VecEnv(VecEnv):
         """Begin new, random episodes in all worlds, and return their first observations.
 
         Raises:
-            ValueError: ``set_options`` gave an option; there is none.
+            ValueError: ``set_options`` set an option, but a reset has no options.
         """
         if options := next(filter(None, self._options), None):
             raise ValueError(f"reset has no option {next(iter(options))!r}: leave set_options out")
@@ -164,8 +164,7 @@ class StableBaselines3VecEnv(VecEnv):
         """Fill in the infos of ended episodes, and reset the sums of their worlds."""
         env, count = self.env, self._observations.count
         index = torch.from_numpy(worlds).to(env.obs.device)
-        terminated, _ = episode_ends(env)
-        buffers = [*self._observations.final, terminated, *self._infos.tensors]
+        buffers = [*self._observations.final, env.terminated, *self._infos.tensors]
         values = self._host.of(*(buffer[index] for buffer in buffers))
         rows, terminations = self._observations.rows(values[:count]), values[count]
         said = self._infos.named(values[count + 1 :])

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.validate import described
@@ -128,24 +127,6 @@ class Infos:
         return infos
 
 
-def faulty(env: Env) -> torch.Tensor:
-    """The worlds that had a fault in the last step, (nworld,) bool."""
-    return (env.done_reason & FAULTS) != 0
-
-
-def episode_ends(env: Env, fault: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-    """Whether the last step terminated or truncated each episode, two masks (nworld,) bool.
-
-    A fault truncates, so that learners bootstrap from the last good observation.
-
-    Args:
-        env: The environment.
-        fault: The result of ``faulty``, if the caller has it.
-    """
-    fault = faulty(env) if fault is None else fault
-    return env.terminated & ~fault, env.truncated | fault
-
-
 class StepResults:
     """The results of a step as Gymnasium returns them.
 
@@ -161,7 +142,8 @@ class StepResults:
     def __call__(self) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Observations, rewards, terminations, truncations and infos."""
         shown = self._observations.current
-        values = iter(self._given(*shown, self._env.reward, *episode_ends(self._env), *self._infos.tensors))
+        env = self._env
+        values = iter(self._given(*shown, env.reward, env.terminated, env.truncated, *self._infos.tensors))
         obs = self._observations.formed(list(islice(values, len(shown))))
         reward, terminated, truncated = islice(values, 3)
         return obs, reward, terminated, truncated, self._infos.named(list(values))

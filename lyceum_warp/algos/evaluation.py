@@ -72,7 +72,8 @@ def evaluate(
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:
-        ValueError: The task has no horizon, or the environment was made with ``autoreset=False``.
+        ValueError: The task has no horizon, the environment was made with ``autoreset=False``, or its observations and
+            actions have other sizes than the policy's.
     """
     check_kind("env of evaluate", env, Env, "as lw.make(...) makes it")
     if not callable(policy):
@@ -93,7 +94,7 @@ def evaluate(
     worlds = torch.arange(env.nworld, device=env.obs.device)
     for t in range(each * env.horizon):
         length = env.episode_step + 1.0
-        env.action.copy_(act(env.obs))
+        env.action.copy_(act(env.obs) if t else _first_actions(act, env))
         env.step()
         total += env.reward
         now = torch.stack([total, length, env.reward, env.eval, env.success.float(), *metrics])
@@ -109,6 +110,18 @@ def evaluate(
                 break
     returns, lengths, rewards, evals, success, *sums = results.flatten(1).cpu()
     return Episodes(returns, lengths, rewards, evals, success, dict(zip(env.episode_metrics, sums, strict=True)))
+
+
+def _first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> torch.Tensor:
+    """Actions of a policy, checked, because later ones are only copied."""
+    try:
+        action = act(env.obs)
+    except RuntimeError as error:
+        sizes = f"{described(env.obs)}, of the task {env.task.name!r}"
+        raise ValueError(f"policy cannot take the observations, {sizes}: {str(error).splitlines()[0]}") from error
+    if not isinstance(action, torch.Tensor) or action.shape != env.action.shape:
+        raise ValueError(f"policy must return {described(env.action)}, not {described(action)}")
+    return action
 
 
 ENDLESS_STEPS = 1000

@@ -13,8 +13,11 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
 
-METRIC_COLUMN = "metrics/"
-"""Prefix of the columns of a task's own metrics."""
+METRIC_COLUMN, STEP_METRIC_COLUMN = "metrics/", "step_metrics/"
+"""Prefixes of the columns of a task's own metrics: sums over an episode, and means per step."""
+
+NESTED = ("metrics", "step_metrics", "numbers")
+"""Fields of ``Iteration`` with several numbers each."""
 
 
 @document_attributes
@@ -59,14 +62,20 @@ class Iteration:
     """Share of the evaluated episodes that ended with the goal met; None for tasks without ``success``."""
     metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Means over episodes of the task's metrics, each summed over an episode, by name."""
+    step_metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Means of the task's metrics per step, over all samples, by name. They do not depend on the length of episodes."""
     numbers: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Additional numbers of the algorithm, by the names of their columns."""
 
     def row(self) -> dict[str, Any]:
-        """Convert to a row of metrics.csv: numbers by column, without None; the metric ``x`` is ``metrics/x``."""
-        names = [field.name for field in dataclasses.fields(self) if field.name not in ("metrics", "numbers")]
-        own = {name: number for name in names if (number := getattr(self, name)) is not None}
-        return own | dict(self.numbers) | {METRIC_COLUMN + name: mean for name, mean in self.metrics.items()}
+        """Convert to a row of metrics.csv: numbers by column, without None.
+
+        The metric ``x`` has the columns ``metrics/x`` and ``step_metrics/x``.
+        """
+        names = [field.name for field in dataclasses.fields(self) if field.name not in NESTED]
+        own = {name: number for name in names if (number := getattr(self, name)) is not None} | dict(self.numbers)
+        columns = ((METRIC_COLUMN, self.metrics), (STEP_METRIC_COLUMN, self.step_metrics))
+        return own | {prefix + name: mean for prefix, means in columns for name, mean in means.items()}
 
 
 @document_attributes
@@ -80,7 +89,7 @@ class Learner(abc.ABC):
     Args:
         env: The environment; do not step it between iterations.
         seed: Seed of new networks and of the noise.
-        team: The processes that learn together, each with its share of the worlds; by default this process alone.
+        team: The processes that learn together, each with its share of the worlds; by default only this process.
 
     Raises:
         ValueError: The environment does not reset automatically, its worlds are not this process's share, or the seed
@@ -171,7 +180,7 @@ class Learner(abc.ABC):
         """Resume from a state of ``state_dict``; further iterations are equal to the bit.
 
         Raises:
-            ValueError: The state has another number of worlds.
+            ValueError: The state has another number of worlds, or its counters are no numbers.
         """
         nworld = self.env.nworld * self.team.size
         if len(state["env"]) != nworld:
@@ -182,4 +191,5 @@ class Learner(abc.ABC):
         if self.generator is not None:
             self.generator.set_state(state["generator"].cpu())
         self.env.set_state(state["env"][self._own].to(self.env.obs.device))
-        self.iteration, self.samples = state["iteration"], state["samples"]
+        self.iteration = whole_number("iteration", state["iteration"], low=0)
+        self.samples = whole_number("samples", state["samples"], low=0, high=2**63 - 1)

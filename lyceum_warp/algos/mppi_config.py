@@ -81,9 +81,9 @@ class MPPIConfig:
     def __post_init__(self) -> None:
         """Check what does not depend on the task."""
         checked: dict[str, Any] = {
-            name: whole_number(name, getattr(self, name), low=1)
-            for name in ("horizon", "samples", "iterations", "models")
+            name: whole_number(name, getattr(self, name), low=1) for name in ("horizon", "samples", "models")
         }
+        checked["iterations"] = whole_number("iterations", self.iterations, low=1, high=100_000)
         checked["temperature"] = finite_number("temperature", self.temperature, low=_SMALLEST)
         checked["noise"] = _noise(self.noise)
         checked["smoothing"] = _smoothing(self.smoothing)
@@ -191,7 +191,7 @@ class MPPIConfig:
 
 
 _OF_CEM = ("elites", "min_noise")
-"""Settings of CEM alone."""
+"""Settings that only CEM has."""
 
 SETTINGS = tuple(field.name for field in dataclasses.fields(MPPIConfig))
 """Names of the settings."""

@@ -4,13 +4,15 @@ import copy
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Literal, TypeAlias, TypeVar, get_args
+from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
 import torch
+import warp as wp
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.env import Env
+from lyceum_warp.support.machine import free_memory
 from lyceum_warp.support.validate import check_flag, check_kind, check_word, described
 
 Module = TypeVar("Module", bound=nn.Module)
@@ -22,6 +24,22 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {
     "tanh": nn.Tanh, "relu": nn.ReLU, "leaky_relu": nn.LeakyReLU, "elu": nn.ELU, "selu": nn.SELU, "gelu": nn.GELU,
     "silu": nn.SiLU, "softplus": nn.Softplus,
 }  # fmt: skip
+
+
+def check_memory(sizes: Sequence[int], **arguments: Any) -> None:
+    """Check that the weights of a fully connected network fit into the machine's memory.
+
+    Args:
+        sizes: Widths of all layers, including input and output.
+        arguments: The arguments that they follow from, for the message.
+
+    Raises:
+        ValueError: They do not fit.
+    """
+    needed, free = 4 * sum(n * m + m for n, m in itertools.pairwise(sizes)), free_memory(wp.get_device("cpu"))
+    if free is not None and needed > free:
+        given = ", ".join(f"{name}={value}" for name, value in arguments.items())
+        raise ValueError(f"a network of {given} needs {needed / 1e9:.3g} GB, and {free / 1e9:.3g} GB are free")
 
 
 def mlp(

@@ -27,7 +27,7 @@ from lyceum_warp.algos.npg_statistics import (
 )
 from lyceum_warp.algos.on_policy import OnPolicyLearner
 from lyceum_warp.algos.policy import GaussianPolicy, divergence
-from lyceum_warp.algos.rollout_statistics import finished, finished_metrics
+from lyceum_warp.algos.rollout_statistics import finished, metric_sums
 from lyceum_warp.algos.timing import PhaseTimer, beside, one_thread
 from lyceum_warp.algos.value import BOUND, ValueFunction
 from lyceum_warp.algos.value_fit import ValueFit
@@ -171,7 +171,7 @@ class NPG(OnPolicyLearner):
             std_mean=self.policy.log_std.detach().exp().mean(), reward=rollout.reward.double().mean(),
             faults=rollout.faults.sum(), outliers=outliers, fitted=fitted,
         )  # fmt: skip
-        packed = ProcessNumbers(update, prediction, finished(rollout), finished_metrics(rollout)).pack()
+        packed = ProcessNumbers(update, prediction, finished(rollout), metric_sums(rollout)).pack()
         processes = [ProcessNumbers.unpack(numbers) for numbers in team.gather(packed[None]).tolist()]
         self._check_updates(processes[0].update)
         timer.mark()

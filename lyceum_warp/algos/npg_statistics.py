@@ -83,7 +83,7 @@ class ProcessNumbers(NamedTuple):
     values: ValueSums
     episodes: EpisodeSums
     metrics: tuple[Scalar, ...] = ()
-    """Sums of the task's metrics over the episodes that ended, in the order of their names."""
+    """The numbers of ``metric_sums``."""
 
     def pack(self) -> torch.Tensor:
         """Pack all numbers into one float64 tensor, for a single transfer to other processes and to the host."""
@@ -133,7 +133,7 @@ def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence
         "faults": round(sum(process.update.faults for process in processes)),
         "outliers": round(sum(process.update.outliers for process in processes)),
         "skipped_updates": (not update.finite) + (not update.fitted),
-        "metrics": metric_means(
+        **metric_means(
             sum(process.episodes.episodes for process in processes), [process.metrics for process in processes], metrics
         ),
     }

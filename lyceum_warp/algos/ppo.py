@@ -25,8 +25,8 @@ from lyceum_warp.algos.rollout_statistics import (
     OnPolicyIteration,
     episode_statistics,
     finished,
-    finished_metrics,
     metric_means,
+    metric_sums,
 )
 from lyceum_warp.algos.timing import PhaseTimer, one_thread
 from lyceum_warp.algos.value import ValueFunction
@@ -168,16 +168,16 @@ class PPO(OnPolicyLearner):
         losses = self._losses / (config.epochs * config.minibatches)
         finite = torch.stack([numbers.isfinite().all() for numbers in (losses, *self._parameters)]).all()
         numbers = [
-            *finished(rollout), *finished_metrics(rollout), rollout.reward.double().mean(), rollout.faults.sum(),
+            *finished(rollout), *metric_sums(rollout), rollout.reward.double().mean(), rollout.faults.sum(),
             finite, kl, self.policy.log_std.detach().exp().mean(), self.rate, *losses,
         ]  # fmt: skip
         processes = team.gather(torch.stack([number.double() for number in numbers])[None]).tolist()
         self._recent.extend(self._returns()[-RECENT:])
         timer.mark()
         split = len(EpisodeSums._fields)
+        end = split + 2 * len(self.env.metrics)
         episodes = [EpisodeSums(*process[:split]) for process in processes]
-        others = [process[split : split + len(self.env.metrics)] for process in processes]
-        sums = [process[split + len(self.env.metrics) :] for process in processes]
+        metrics, sums = [process[split:end] for process in processes], [process[end:] for process in processes]
         _, _, finite, kl, std, rate, value_loss, surrogate, entropy = sums[0]
         if not finite:
             raise FloatingPointError(
@@ -209,7 +209,7 @@ class PPO(OnPolicyLearner):
             time_update=time_update,
             time_mean=time_mean,
             samples_per_second=self.count / time_sample,
-            metrics=metric_means(sum(part.episodes for part in episodes), others, list(self.env.metrics)),
+            **metric_means(sum(part.episodes for part in episodes), metrics, list(self.env.metrics)),
         )
 
     @torch.no_grad()

@@ -72,6 +72,8 @@ class Rollout:
     """Steps of the episode so far, (steps, nworld)."""
     episode_metrics: dict[str, torch.Tensor]
     """Sums of the task's metrics over the episode so far by name, each (steps, nworld)."""
+    metrics: dict[str, torch.Tensor]
+    """The task's metrics of each step by name, each (steps, nworld)."""
 
     running_return: torch.Tensor
     """Sum of the rewards of each world's current episode, (nworld,); nan in episodes that are not counted."""
@@ -111,10 +113,12 @@ class Rollout:
             if group != "policy":
                 self.obs_groups[group] = self._stored(env.obs_groups[group], self._rows_before)
                 self.final_obs_groups[group] = self._stored(env.final_obs_groups[group], self._rows_after)
-        self.episode_metrics = {}
-        if env.episode_metrics:
-            stored = self._stored(env.episode_metric_sums, self._rows_after)
-            self.episode_metrics = dict(zip(env.episode_metrics, stored.unbind(-1), strict=True))
+        self.metrics, self.episode_metrics = {}, {}
+        if env.metrics:
+            self.metrics, self.episode_metrics = (
+                dict(zip(env.metrics, self._stored(source, self._rows_after).unbind(-1), strict=True))
+                for source in (torch_view(env.worlds.metrics), env.episode_metric_sums)
+            )
         inputs = (env.obs, env.action, env.episode_step)
         outputs = (env.final_obs, env.reward, env.eval, env.terminated, env.done, env.success, env.done_reason)
         self._inputs, self._outputs = [wp.from_torch(t) for t in inputs], [wp.from_torch(t) for t in outputs]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import torch
 
-from lyceum_warp.algos.learner import Iteration
+from lyceum_warp.algos.learner import NESTED, Iteration
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.support.docstrings import document_attributes
 
@@ -38,7 +38,7 @@ class OnPolicyIteration(Iteration):
 
     def row(self) -> dict[str, Any]:
         """Convert to a row of metrics.csv: numbers by column, including None."""
-        names = [field.name for field in dataclasses.fields(self) if field.name not in ("metrics", "numbers")]
+        names = [field.name for field in dataclasses.fields(self) if field.name not in NESTED]
         return {name: getattr(self, name) for name in names} | super().row()
 
 
@@ -97,10 +97,15 @@ def finished(rollout: Rollout) -> EpisodeSums:
     )
 
 
-def finished_metrics(rollout: Rollout) -> tuple[torch.Tensor, ...]:
-    """Sum the task's metrics over the episodes that ended within a rollout, scalar tensors on its device."""
+def metric_sums(rollout: Rollout) -> tuple[torch.Tensor, ...]:
+    """Sum the task's metrics within a rollout, scalar tensors on its device.
+
+    The sums over the episodes that ended come first, then the means over all samples, in which a metric that is not
+    finite counts as 0, as in the sums.
+    """
     ended = _ended(rollout)
-    return tuple(sums.double().masked_fill(~ended, 0.0).sum() for sums in rollout.episode_metrics.values())
+    sums = [sums.double().masked_fill(~ended, 0.0).sum() for sums in rollout.episode_metrics.values()]
+    return (*sums, *(steps.double().nan_to_num(0.0, 0.0, 0.0).mean() for steps in rollout.metrics.values()))
 
 
 def _ended(rollout: Rollout) -> torch.Tensor:
@@ -108,16 +113,20 @@ def _ended(rollout: Rollout) -> torch.Tensor:
     return rollout.done & ~rollout.episode_return.isnan()
 
 
-def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, float]:
-    """Compute means of the task's metrics over the episodes that ended; nan if none ended.
+def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Any]:
+    """Compute ``metrics``, means over the episodes that ended (nan if none ended), and ``step_metrics``.
 
     Args:
         episodes: Number of episodes of all processes.
-        sums: The sums of each process, in the order of the names.
+        sums: The numbers of ``metric_sums`` of each process.
         names: Names of the metrics.
     """
-    totals = (sum(parts) for parts in zip(*sums, strict=True))
-    return {name: total / episodes if episodes else math.nan for name, total in zip(names, totals, strict=True)}
+    totals = [sum(parts) for parts in zip(*sums, strict=True)]
+    ended, steps = totals[: len(names)], totals[len(names) :]
+    return {
+        "metrics": {name: total / episodes if episodes else math.nan for name, total in zip(names, ended, strict=True)},
+        "step_metrics": {name: total / len(sums) for name, total in zip(names, steps, strict=True)},
+    }
 
 
 def episode_statistics(sums: Sequence[EpisodeSums]) -> dict[str, float]:

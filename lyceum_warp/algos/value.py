@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.networks import LIMIT, Activation, Normalized, mlp
+from lyceum_warp.algos.networks import LIMIT, Activation, Normalized, check_memory, mlp
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_group, check_kind, finite_number, layer_sizes, whole_number
@@ -63,6 +63,8 @@ class ValueFunction(Normalized):
         generator: torch.Generator | None = None,
     ) -> None:
         nobs, time_orders = whole_number("nobs", nobs, low=1), whole_number("time_orders", time_orders, low=0)
+        sizes = [nobs + time_orders, *layer_sizes(hidden), 1]
+        check_memory(sizes, nobs=nobs, hidden=hidden, time_orders=time_orders)
         super().__init__(nobs, normalize, limit)
         scale = finite_number("scale", scale)
         check_kind("group", group, str, "as 'policy'")
@@ -76,7 +78,7 @@ class ValueFunction(Normalized):
             self._shape["limit"] = limit
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
         # with a last layer of zeros, the prediction is the mean of the returns
-        self.network = mlp([nobs + time_orders, *hidden, 1], activation=activation, last_scale=0.0, generator=generator)
+        self.network = mlp(sizes, activation=activation, last_scale=0.0, generator=generator)
         self.register_buffer("shift", torch.zeros((), dtype=torch.float64))
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
 

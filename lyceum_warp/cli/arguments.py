@@ -26,6 +26,15 @@ ParamWords = Annotated[
 ]
 """The flag --param; ``parameters`` parses it."""
 
+Trust = Annotated[
+    bool,
+    tyro.conf.arg(
+        help="Allow a run that you did not make on this machine to run its task and to read the files that it names, "
+        "now and later.",
+    ),
+]
+"""The flag --trust; see ``lyceum_warp.runs.trust``."""
+
 CameraWords = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     tyro.conf.arg(
@@ -100,7 +109,7 @@ def given(flags: Any) -> dict[str, Any]:
 
 NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "nvtx", "model", "fields", "dynamics", "physics")
 """Options of an environment without a generated flag. Commands define nworld, seed and the model themselves,
-``Physics`` has the flags of ``physics``, and the others are for Python alone."""
+``Physics`` has the flags of ``physics``, and the others are only for Python."""
 
 
 @optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"))

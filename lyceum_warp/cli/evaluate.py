@@ -11,7 +11,7 @@ from rich.table import Table
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, ParamWords, given, optional_flags, parameters
+from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, ParamWords, Trust, given, optional_flags, parameters
 from lyceum_warp.cli.display import make_console, note, policy_video, tried
 from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.controllers.trajectory import source
@@ -69,6 +69,7 @@ class Eval:
     camera: CameraWords = ()
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Folder, new or empty, for a file of each episode in the format of lyceum-warp plan: episode-000.npz and so on."""
+    trust: Trust = False
     env: tyro.conf.OmitArgPrefixes[OtherEnv] = dataclasses.field(default_factory=OtherEnv)
 
     def run(self) -> int:
@@ -85,7 +86,7 @@ class Eval:
         run = Run.open(self.folder)
         nworld = min(self.nworld, self.episodes)
         path = run.policy_file(self.which)
-        env = run_worlds(run, self.env, parameters(self.param, self), nworld=nworld, task=self.task)
+        env = run_worlds(run, self.env, parameters(self.param, self), nworld=nworld, task=self.task, trust=self.trust)
         find_camera(env.model, camera)
         origin = _source(env, run)
         if env.horizon == 0:
@@ -104,7 +105,8 @@ class Eval:
             table.add_row(name, *(f"{number.item():.6g}" for number in numbers))
         console = make_console()
         which = "the mean policy" if self.which == "last" else f"the mean policy {self.which!r}"
-        console.print(f"{env.task.name}: {self.episodes} episodes of {which} in {self.folder}", soft_wrap=True)
+        text = f"{env.task.name}: {self.episodes} episodes of {which} in {self.folder}"
+        console.print(text, soft_wrap=True, markup=False)
         console.print(table)
         if env.task.functions["success"] is not None:
             console.print(f"success: {episodes.success.mean().item():.0%}")
@@ -119,7 +121,7 @@ class Eval:
         return 0
 
 
-def run_worlds(run: Run, flags: Any, params: dict[str, Any], *, nworld: int, task: str | None) -> Env:
+def run_worlds(run: Run, flags: Any, params: dict[str, Any], *, nworld: int, task: str | None, trust: bool) -> Env:
     """Make worlds of a run's task, with the run's options and parameters unless they are given.
 
     Args:
@@ -128,6 +130,7 @@ def run_worlds(run: Run, flags: Any, params: dict[str, Any], *, nworld: int, tas
         params: Parameters that replace the run's.
         nworld: Number of worlds.
         task: Another task, which is used with its own options and parameters.
+        trust: Whether to run the task of a run that this user did not make on this machine.
     """
     saved = Configuration.of(run)
     known, own = saved.options.changed({"seed": 0}), dict(saved.params)
@@ -136,7 +139,8 @@ def run_worlds(run: Run, flags: Any, params: dict[str, Any], *, nworld: int, tas
     known = known.changed({"nworld": nworld} | given(flags))
     if flags.device is None:
         known = known.changed(options_for_few_worlds(known.engine, known.device))
-    env = run_env(run, known, own | params, note=note, task=task)
+    with run.settings():
+        env = run_env(run, known, own | params, note=note, task=task, trust=trust)
     if task is None:
         note_changes(run, env, note=note)
     return env

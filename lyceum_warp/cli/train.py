@@ -16,7 +16,16 @@ from lyceum_warp.algos.learner import Learner
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.cli.algorithms import Hyperparameters
-from lyceum_warp.cli.arguments import NO_FLAGS, CameraWords, ParamWords, Physics, given, optional_flags, parameters
+from lyceum_warp.cli.arguments import (
+    NO_FLAGS,
+    CameraWords,
+    ParamWords,
+    Physics,
+    Trust,
+    given,
+    optional_flags,
+    parameters,
+)
 from lyceum_warp.cli.display import Display, curve_table, make_console, note, policy_video, tried
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import read_checkpoint
@@ -97,6 +106,8 @@ class Train:
     """Which policy of --from: last, best, or the number of an iteration that was kept."""
     target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """End the run once the return of the mean policy reaches this number; without --mean-every the mean return."""
+    minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    """End with the iteration in which the training has lasted for so long; --resume goes on."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Iterations between two numbered policies, 0 for none. The last and the best policy are always kept."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
@@ -117,6 +128,9 @@ class Train:
     video_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Iterations between two videos of the mean policy, videos/000100.mp4 and so on in the run's folder; 0 for none."""
     camera: CameraWords = ()
+    trust: Trust = False
+    take_over: bool = False
+    """Continue a run that another process still locks, on this or another host. That process ends at its next write."""
     view: bool = False
     """Whether to show the newest policy while the run trains, as lyceum-warp view FOLDER --follow does in another
     shell."""
@@ -139,6 +153,10 @@ class Train:
         elif self.from_run is None and self.task is None:
             raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
         folder = self.resume or self.from_run
+        if self.trust and folder is None:
+            raise ValueError("--trust has no effect without --resume or --from: leave it out")
+        if self.take_over and self.resume is None:
+            raise ValueError("--take-over has no effect without --resume: leave it out")
         source = None if folder is None else Run.open(folder)
         saved = {} if source is None else source.config
         settings = {}
@@ -156,7 +174,8 @@ class Train:
                 with RunViewer(folder) if self.view and leads else contextlib.nullcontext():
                     run = train(
                         learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
-                        entries=entries, display=Display(console), **settings,
+                        take_over=self.take_over, minutes=self.minutes, entries=entries, display=Display(console),
+                        **settings,
                     )  # fmt: skip
             except Interrupted as signalled:
                 if leads and (path := folder / "policy.pt").exists():
@@ -171,6 +190,10 @@ class Train:
             reached = run.config.get("reached", {})
             if reached.get("iteration") == learner.iteration < total:
                 text = f"the target return is reached: {reached['return']:.6g} in iteration {learner.iteration}"
+                console.print(text, soft_wrap=True, markup=False)
+            elif learner.iteration < total and self.minutes is not None:
+                text = f"{self.minutes:g} minutes are over after {learner.iteration} of {total} iterations; continue "
+                text += f"with\n  lyceum-warp train --resume {folder} --iterations {total}"
                 console.print(text, soft_wrap=True, markup=False)
             return self._report(run, learner, console)
 
@@ -222,8 +245,9 @@ class Train:
             if self.resume is None:
                 entries["from"] = {"run": str(source.folder.resolve()), "which": self.which, "iteration": iteration}
         says = note if team.leads else _silent
-        own = source if self.task is None else None  # a given task is used as it is now
-        learner = configuration.learner(team, run=own, networks=(policy, value), note=says)
+        learner = configuration.learner(
+            team, run=source, networks=(policy, value), note=says, task=self.task, trust=self.trust
+        )
         if policy is not None:
             fitted = type(learner.config)(**learner.settings())
             for name, value in given(self.hyperparameters).items():
@@ -232,8 +256,8 @@ class Train:
                         f"the networks in {self.from_run or self.resume} have {name} {found}, not {value}: leave out "
                         f"--{name.replace('_', '-')}"
                     )
-        if own is not None and self.resume is None:
-            note_changes(own, learner.env, note=says)
+        if source is not None and self.task is None and self.resume is None:
+            note_changes(source, learner.env, note=says)
         name = f"{learner.env.task.name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         return learner, self.resume or self.out or Path("runs", name), entries
 
@@ -251,7 +275,8 @@ class Train:
         )  # fmt: skip
         paths = {"checkpoint": str(run.checkpoint), "metrics": str(run.metrics)}
         if (best := run.best_score()) is not None:
-            console.print(f"best policy: return {best[1]:.1f} in iteration {best[0]}", soft_wrap=True)
+            every = "" if learner.best_by == "return_mean" else " (of the evaluated ones)"
+            console.print(f"best policy: return {best[1]:.1f} in iteration {best[0]}{every}", soft_wrap=True)
             paths["best"] = str(run.best)
         if self.plot:
             paths["curve"] = tried(learning_curve, run)

@@ -9,7 +9,7 @@ import tyro
 
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.planner import MPPI
-from lyceum_warp.cli.arguments import NO_FLAGS, ParamWords, given, optional_flags, parameters
+from lyceum_warp.cli.arguments import NO_FLAGS, ParamWords, Trust, given, optional_flags, parameters
 from lyceum_warp.cli.display import note
 from lyceum_warp.cli.evaluate import run_worlds
 from lyceum_warp.cli.plan import Settings
@@ -88,6 +88,7 @@ class View:
     browser: bool = False
     """Whether to open the page in this machine's browser."""
     param: ParamWords = ()
+    trust: Trust = False
     fps: float = 30.0
     """Maximal number of frames per second."""
     place: tyro.conf.OmitArgPrefixes[Place] = dataclasses.field(default_factory=Place)
@@ -107,7 +108,7 @@ class View:
         _check(self)
         torch.set_num_threads(1)
         kind = _kind(self.what)
-        for flag, fits in (("follow", ("run",)), ("mppi", ("task", "run"))):
+        for flag, fits in (("follow", ("run",)), ("mppi", ("task", "run")), ("trust", ("run",))):
             if getattr(self, flag) and kind not in fits:
                 raise ValueError(f"--{flag} needs a {' or a '.join(fits)}, and {self.what[0]} is not one: leave it out")
         shown: dict[str, Any] = {
@@ -209,7 +210,8 @@ def _run(options: View, parent: Parent | None) -> Run:
 def _run_worlds(options: View, run: Run) -> Env:
     nworld = options.nworld or _RUN_WORLDS
     check_world(options.world, nworld)
-    return run_worlds(run, options.place, parameters(options.param, options), nworld=nworld, task=options.task)
+    params = parameters(options.param, options)
+    return run_worlds(run, options.place, params, nworld=nworld, task=options.task, trust=options.trust)
 
 
 class _Ends:

@@ -1,4 +1,4 @@
-"""The contract between an environment and the physics behind it."""
+"""Define the contract between an environment and the physics behind it."""
 
 import abc
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -21,13 +21,13 @@ from lyceum_warp.support.docstrings import document_attributes
 class Engine(abc.ABC):
     """Many worlds of one model, stepped together.
 
-    An engine knows nothing of tasks. Its fields lie in Warp arrays with a leading ``nworld`` axis, whose addresses
-    never change, so that graphs of launches that read them can be captured once.
+    An engine knows nothing of tasks. Its fields lie in Warp arrays with a leading ``nworld`` axis. The addresses of the
+    arrays never change, so graphs that read them are captured once.
 
     The order of calls in a step is: write ``ctrl`` and other inputs, ``step``, ``find_faults``, read fields and
-    ``fault``; for worlds that restart, ``reset``, then write state fields and model fields, then ``commit``,
-    ``apply_model``, perhaps ``settle``, and ``refresh``. After construction the arrays hold no state yet: reset all
-    worlds first. Model fields hold the model's values, and no reset changes them.
+    ``fault``; for worlds that restart, ``reset``, write state fields and model fields, ``commit``, ``apply_model``,
+    optionally ``settle``, and ``refresh``. After construction the arrays hold no state: reset all worlds first. Model
+    fields hold the model's values, and resets do not change them.
 
     Args:
         model: The compiled model; the engine keeps it and does not change it.
@@ -87,28 +87,19 @@ class Engine(abc.ABC):
     """Floats in one world's state: the integration state, the snapshots, and the model fields."""
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        nworld: int,
-        device: wp.Device,
-        fields: Iterable[Field],
-        dynamics: Iterable[ModelField] = (),
-        initial: np.ndarray | None = None,
-    ) -> None:
-        self.model = model
-        self.nworld = nworld
-        self.device = device
+        self, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: Iterable[Field],
+        dynamics: Iterable[ModelField] = (), initial: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
+        self.model, self.nworld, self.device = model, nworld, device
         self.fields = {}
         for field in (describe(model, "ctrl"), *fields):
             if self.fields.setdefault(field.name, field) != field:
                 raise ValueError(f"the field {field.name!r} is listed both lagged and current: list it once")
-        self.dynamics = {}
-        self.nominal = {}
+        self.dynamics, self.nominal, self.arrays = {}, {}, {}
         for varied in dynamics:
             check_simple(model, varied.name)
             self.dynamics[varied.name] = varied
             self.nominal[varied.name] = self._nominal_rows(varied, 1)
-        self.arrays = {}
         self.fault = wp.zeros(nworld, dtype=int, device=device)
         self.stage = max(field.refresh for field in self.fields.values())
         self.reset_stage = max(field.reset for field in self.fields.values())
@@ -132,21 +123,15 @@ class Engine(abc.ABC):
     def bytes_per_world(
         cls, model: mujoco.MjModel, fields: Iterable[Field], dynamics: Iterable[ModelField] = (), **options: Any
     ) -> int:
-        """An estimate of the memory that the engine takes for each world, in bytes.
+        """Estimated memory of each world in bytes; the arguments are those of the constructor.
 
         The default counts a float64 state and one float32 array for each field.
-
-        Args:
-            model: The compiled model.
-            fields: The fields that the engine will keep.
-            dynamics: The model fields that will differ between worlds.
-            options: The engine's options, as for its constructor.
         """
         floats = sum(field.size for field in fields) + sum(field.size for field in dynamics)
         return 8 * _integration_size(model) + 4 * floats + 8
 
     def prepare_capture(self) -> None:  # noqa: B027
-        """Allocate the memory that graphs need; called when every kernel is compiled, before the first capture.
+        """Allocate memory for graphs; called once every kernel is compiled, before the first capture.
 
         Raises:
             ValueError: The memory is too small for this many worlds.
@@ -158,11 +143,11 @@ class Engine(abc.ABC):
     def step(self, nstep: int) -> None:
         """Advance every world by ``nstep`` substeps under ``ctrl`` and the other inputs, and update the fields.
 
-        The arrays of all fields that are ``written`` are taken over first.
+        The engine first reads the arrays of all fields that are ``written``.
         """
 
     def step_phases(self, nstep: int) -> list[Phase]:
-        """``step`` as phases. An engine that is not ``capturable`` can have its copies of fields in graphs this way."""
+        """``step`` as phases, with which an engine that is not ``capturable`` still captures its copies of fields."""
         return [Phase("physics", partial(self.step, nstep), engine=True)]
 
     @abc.abstractmethod
@@ -193,10 +178,10 @@ class Engine(abc.ABC):
         """
 
     def apply_model(self, mask: wp.array) -> None:
-        """Take over the masked worlds' model fields, and recompute the constants that follow from them.
+        """Apply the masked worlds' model fields, and recompute the constants that follow from them.
 
-        Worlds whose values are those that were applied last cost next to nothing. Fields that follow from the state
-        are not recomputed: see ``refresh`` and ``refresh_current``. An engine that takes ``dynamics`` must have it.
+        Worlds with unchanged values cost next to nothing. Fields that follow from the state are not recomputed: see
+        ``refresh`` and ``refresh_current``. An engine that takes ``dynamics`` must implement it.
         """
         if self.dynamics:
             raise NotImplementedError(f"the {self.name} engine does not let model fields differ between worlds")
@@ -209,7 +194,7 @@ class Engine(abc.ABC):
         raise NotImplementedError(f"the {self.name} engine cannot settle single worlds")
 
     def run_for(self, mask: wp.array, run: Callable[[], None]) -> None:
-        """Run launches that concern the masked worlds alone; an engine may leave them out where there are none.
+        """Run launches that concern the masked worlds alone; an engine may skip them while the mask is empty.
 
         Only for an engine that is ``capturable``. By default they always run.
         """
@@ -217,7 +202,7 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def refresh(self, mask: wp.array) -> None:
-        """Compute every derived field of the masked worlds as a forward pass at their state does.
+        """Compute every derived field of the masked worlds as by a forward pass at their state.
 
         Worlds outside the mask keep their values.
         """
@@ -254,7 +239,7 @@ class Engine(abc.ABC):
             self._copy_fields(buffers, t + 1)
 
     def rollout_bytes_per_world(self, steps: int, nstep: int, fields: Iterable[Field]) -> int:
-        """An estimate of the memory that ``rollout`` takes for each world beside its arguments, in bytes.
+        """Estimated memory of ``rollout`` for each world in bytes, without its arguments.
 
         Args:
             steps: Steps of the horizon.
@@ -300,12 +285,12 @@ class Engine(abc.ABC):
             start += field.size
 
     def _saved(self) -> list[Field | ModelField]:
-        """What follows the integration state in a state vector, in order."""
+        """The fields after the integration state in a state vector, in order."""
         return [*self.snapshots, *self.dynamics.values()]
 
     @property
     def _dynamics_size(self) -> int:
-        """Floats of one world's model fields, the last columns of its state."""
+        """Number of columns of model fields, the last ones of a state."""
         return sum(field.size for field in self.dynamics.values())
 
     @abc.abstractmethod
@@ -316,11 +301,9 @@ class Engine(abc.ABC):
 
 
 EngineFactory = Callable[..., Engine]
-"""Called with (model, nworld, device, fields, **options), the options being those that were given; returns an engine.
+"""Called with (model, nworld, device, fields, dynamics, initial, **options), the options that were given.
 
-``dynamics`` and ``initial`` are given to it by name, only where they are used.
-
-A factory with an attribute ``bytes_per_world``, as an engine class has, is asked before it is called.
+An engine class is such a factory. If a factory has ``bytes_per_world``, as a class does, memory is checked first.
 """
 
 

@@ -1,4 +1,4 @@
-"""Whether a number of worlds fits into memory, from an estimate of the bytes that each takes."""
+"""Check whether a number of worlds fits into memory, from an estimate of bytes per world."""
 
 import gc
 
@@ -8,7 +8,7 @@ import warp as wp
 from lyceum_warp.support.machine import free_memory
 
 _KEPT_FREE = 0.1
-"""The share of the free memory that is left for everything else."""
+"""The fraction of the free memory that is left for everything else."""
 
 
 class NotEnoughMemoryError(ValueError):
@@ -16,13 +16,13 @@ class NotEnoughMemoryError(ValueError):
 
 
 def most_worlds(bytes_per_world: float, device: wp.Device) -> int | None:
-    """The largest number of worlds that fits into the free memory of a device, or None where that is not known."""
+    """The largest number of worlds that fits into the free memory of a device, or None if that is unknown."""
     free = free_memory(device)
     return None if free is None else _most(bytes_per_world, free)
 
 
 def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: str = "", held: int = 0) -> None:
-    """Refuse a batch that does not fit into the free memory, before anything large is allocated.
+    """Refuse a batch that does not fit into the free memory, before its arrays are allocated.
 
     Args:
         bytes_per_world: Memory that each world takes.

@@ -1,4 +1,4 @@
-"""Where worlds run: devices by name, the meaning of "auto", and the engine for both."""
+"""Choose where worlds run: find devices by name, resolve engine="auto", and make the engine."""
 
 import importlib
 import inspect
@@ -22,19 +22,18 @@ _ENGINES = {
     "mujoco": ("lyceum_warp.engines.c.mujoco_engine", "MujocoEngine"),
     "warp": ("lyceum_warp.engines.warp.warp_engine", "WarpEngine"),
 }
-_DETERMINISTIC = "lyceum_warp.engines.deterministic"
-"""The room of the engine that takes the place of "warp" with deterministic=True on a CUDA device."""
+_DETERMINISTIC = "lyceum_warp.engines.deterministic.deterministic_engine", "DeterministicEngine"
+"""The engine that takes the place of "warp" with deterministic=True on a CUDA device."""
 
 _SAMPLES_PER_CORE = 40
-"""With fewer samples for each CPU core, the C engine plans faster than an H100. Measured with 16 cores, where the two
-meet at 27 samples a core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah (bench/README.md)."""
+"""With fewer samples for each CPU core, the C engine plans faster than an H100. Measured with 16 cores: they break even
+at 27 samples a core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah (bench/README.md)."""
 
 _MOST_CORES = 16
 """More cores were not measured, and a plan's work besides physics runs on one."""
 
 _NOSLIP = 6
-"""The factor on the samples where the planner's model has the noslip solver, which makes a substep on a GPU that much
-slower."""
+"""The factor on the number of samples for a model with the noslip solver, which makes a substep on a GPU slower."""
 
 
 def find_device(device: str | None) -> wp.Device:
@@ -65,7 +64,7 @@ def find_device(device: str | None) -> wp.Device:
 
 
 def engine_name(engine: str | EngineFactory, device: str | wp.Device | None) -> str:
-    """The name of an engine: "auto" stands for "warp" on a CUDA device and for "mujoco" on the CPU.
+    """The name of an engine; "auto" is "warp" on a CUDA device and "mujoco" on the CPU.
 
     Args:
         engine: A name, "auto", or an engine class or factory.
@@ -79,17 +78,9 @@ def engine_name(engine: str | EngineFactory, device: str | wp.Device | None) -> 
 
 
 def open_engine(
-    engine: str | EngineFactory,
-    model: mujoco.MjModel,
-    nworld: int,
-    device: wp.Device,
-    fields: Iterable[Field],
-    dynamics: Iterable[ModelField] = (),
-    initial: np.ndarray | None = None,
-    *,
-    reserved: int = 0,
-    **options: Any,
-) -> Engine:
+    engine: str | EngineFactory, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: Iterable[Field],
+    dynamics: Iterable[ModelField] = (), initial: np.ndarray | None = None, *, reserved: int = 0, **options: Any,
+) -> Engine:  # fmt: skip
     """Make an engine by name, or by a class or factory of your own.
 
     Args:
@@ -108,41 +99,37 @@ def open_engine(
         ValueError: There is no such engine, the worlds do not fit into memory, or the engine refuses the model, the
             device or an option, or lets no model fields differ between worlds.
     """
-    fields = list(fields)
+    fields, dynamics = list(fields), list(dynamics)
     factory, given = _resolved(engine, device, options)
-    contract = _contract(factory, engine_name(engine, device.alias), list(dynamics), initial)
-    needed = _bytes_per_world(factory, model, fields, contract.get("dynamics"), given)
-    if needed is not None:
-        check_fit(needed + reserved, nworld, device, model=_model_name(model))
-    return factory(model, nworld, device, fields, **contract, **given)
+    if hasattr(factory, "bytes_per_world"):
+        needed = int(factory.bytes_per_world(model, fields, dynamics, **given)) + reserved
+        check_fit(needed, nworld, device, model=_model_name(model))
+    return factory(model, nworld, device, fields, dynamics, initial, **given)
 
 
 def bytes_per_world(
-    engine: str | EngineFactory,
-    model: mujoco.MjModel,
-    device: wp.Device,
-    fields: Iterable[Field],
-    dynamics: Iterable[ModelField] = (),
-    **options: Any,
-) -> int:
-    """An estimate of the memory for each world of the engine that ``open_engine`` makes, in bytes; 0 if unknown."""
+    engine: str | EngineFactory, model: mujoco.MjModel, device: wp.Device, fields: Iterable[Field],
+    dynamics: Iterable[ModelField] = (), **options: Any,
+) -> int:  # fmt: skip
+    """Estimated memory in bytes of each world of the engine that ``open_engine`` makes; 0 if unknown."""
     factory, given = _resolved(engine, device, options)
-    return _bytes_per_world(factory, model, list(fields), list(dynamics), given) or 0
+    estimate = getattr(factory, "bytes_per_world", None)
+    return 0 if estimate is None else int(estimate(model, list(fields), list(dynamics), **given))
 
 
 def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
     """The options to change for an environment of a few worlds, such as an evaluation's.
 
-    On a GPU a step of a few worlds takes nearly as long as one of thousands. With engine="auto" a few worlds therefore
-    step on CPU cores, through the C engine, in double precision.
+    On a GPU a step of a few worlds takes nearly as long as a step of thousands. With engine="auto" a few worlds
+    therefore step on CPU cores, through the C engine, in double precision.
     """
     return _on_cpu_cores() if engine == "auto" and engine_name(engine, device) == "warp" else {}
 
 
 def options_for_plant(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
-    """The options to change for a world that keeps its rate beside a planner.
+    """The options to change for a world that a planner controls in real time.
 
-    On a GPU its steps would wait for the planner's work there. It therefore steps on a CPU core, through the C engine.
+    On a GPU its steps would wait for the planner's launches. It therefore steps on a CPU core, through the C engine.
     """
     name = device.alias if isinstance(device, wp.Device) else device
     on_gpu = engine in ("auto", "warp") and find_device(name).is_cuda
@@ -150,15 +137,10 @@ def options_for_plant(engine: str | EngineFactory, device: str | wp.Device | Non
 
 
 def place_samples(
-    engine: str | EngineFactory,
-    device: str | None,
-    *,
-    nthread: int | None,
-    samples: int,
-    spec: Callable[[], mujoco.MjSpec],
-    solver: Mapping[str, int | float] | None = None,
-) -> dict[str, Any]:
-    """The options to change for a planner's worlds: engine="auto" on a GPU chooses by the number of samples.
+    engine: str | EngineFactory, device: str | None, *, nthread: int | None, samples: int,
+    spec: Callable[[], mujoco.MjSpec], solver: Mapping[str, int | float] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """The options to change for a planner's worlds; with engine="auto" on a GPU the number of samples decides.
 
     Args:
         engine: The engine that was asked for.
@@ -185,7 +167,7 @@ def place_samples(
 
 
 def _on_cpu_cores() -> dict[str, Any]:
-    """The options that move an environment from a GPU to the C engine, without those that it does not take."""
+    """The options that move an environment from a GPU to the C engine; options that it does not take become None."""
     known = _options_of(_engine_class("mujoco", wp.get_device("cpu"), False)) or []
     defaults = EnvOptions().for_engine()
     others = {name: None for name, default in defaults.items() if default is None and name not in known}
@@ -195,7 +177,7 @@ def _on_cpu_cores() -> dict[str, Any]:
 def _resolved(
     engine: str | EngineFactory, device: wp.Device, options: dict[str, Any]
 ) -> tuple[EngineFactory, dict[str, Any]]:
-    """The engine's class or factory, and those of the options that it is given."""
+    """The engine's class or factory, and the options that it receives."""
     name = engine_name(engine, device.alias)
     factory = engine if callable(engine) else _engine_class(name, device, bool(options.get("deterministic")))
     given = {key: value for key, value in options.items() if value is not None and value is not False}
@@ -213,52 +195,17 @@ def _engine_class(name: str, device: wp.Device, deterministic: bool) -> type[Eng
         raise ValueError(f"there is no engine {name!r}: use one of 'auto', {', '.join(map(repr, _ENGINES))}")
     module, attribute = _ENGINES[name]
     if name == "warp" and deterministic and device.is_cuda:
-        module, attribute = f"{_DETERMINISTIC}.deterministic_engine", "DeterministicEngine"
-    try:
-        found: type[Engine] = getattr(importlib.import_module(module), attribute)
-    except ModuleNotFoundError as error:
-        if not str(error.name).startswith(_DETERMINISTIC):
-            raise
-        raise ValueError(
-            f"deterministic=True needs the package {_DETERMINISTIC}, which this installation lacks: leave it out"
-        ) from None
+        module, attribute = _DETERMINISTIC
+    found: type[Engine] = getattr(importlib.import_module(module), attribute)
     return found
 
 
 def _options_of(factory: EngineFactory) -> list[str] | None:
-    """The names of the options that an engine takes, or None where it takes any."""
+    """The names of the options that an engine takes, or None if it takes any."""
     parameters = inspect.signature(factory).parameters.values()
     if any(parameter.kind == parameter.VAR_KEYWORD for parameter in parameters):
         return None
     return [parameter.name for parameter in parameters if parameter.kind == parameter.KEYWORD_ONLY]
-
-
-def _contract(
-    factory: EngineFactory, name: str, dynamics: list[ModelField], initial: np.ndarray | None
-) -> dict[str, Any]:
-    """The arguments ``dynamics`` and ``initial`` where they are used, so that an engine needs them only then."""
-    used = {"dynamics": dynamics or None, "initial": initial}
-    contract = {key: value for key, value in used.items() if value is not None}
-    parameters = inspect.signature(factory).parameters.values()
-    takes = {parameter.name for parameter in parameters}
-    takes |= {key for key in contract if any(parameter.kind == parameter.VAR_KEYWORD for parameter in parameters)}
-    uses = {"dynamics": "model fields that differ between worlds", "initial": "an initial state of the task's"}
-    for key in contract.keys() - takes:
-        raise ValueError(f"the {name} engine takes no {uses[key]}: its constructor needs an argument {key!r}")
-    return contract
-
-
-def _bytes_per_world(
-    factory: EngineFactory,
-    model: mujoco.MjModel,
-    fields: list[Field],
-    dynamics: list[ModelField] | None,
-    given: dict[str, Any],
-) -> int | None:
-    estimate = getattr(factory, "bytes_per_world", None)
-    if estimate is None:
-        return None
-    return int(estimate(model, fields, **({"dynamics": dynamics} if dynamics else {}), **given))
 
 
 def _model_name(model: mujoco.MjModel) -> str:

@@ -16,14 +16,13 @@ import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import Any
 
 import torch
 import warp as wp
 
 from lyceum_warp.graphs.workers import Workers
 from lyceum_warp.support.arrays import part_of_worlds
-from lyceum_warp.support.upstream import separate_captures
+from lyceum_warp.support.upstream import TILES_ON_CPU, separate_captures, separate_tiles, tiles
 
 Calls = tuple[Callable[[], None], ...]
 """The result of ``Graphs.sequence``: functions to call in order."""
@@ -112,28 +111,7 @@ TIMED = 8
 _CAPTURING = threading.RLock()
 """One capture at a time: controllers and viewers have environments in threads of their own."""
 separate_captures()
-
-
-class _Tiles(threading.local):
-    """Whether this thread has launched a kernel with tiles since the flag was last cleared."""
-
-    launched = False
-
-
-_tiles = _Tiles()
-_TILES_ON_CPU = threading.RLock()
-"""Held while kernels with tiles run on the CPU. A module that Warp compiles for x86 keeps the address of its tiles in a
-variable that all threads share, so that two threads in one such kernel would write each other's tiles."""
-_launch_tiled = wp.launch_tiled
-
-
-def _launch_tiled_alone(*args: Any, **options: Any) -> Any:
-    _tiles.launched = True
-    with _TILES_ON_CPU if wp.get_device(options.get("device")).is_cpu else contextlib.nullcontext():
-        return _launch_tiled(*args, **options)
-
-
-wp.launch_tiled = _launch_tiled_alone
+separate_tiles()
 
 
 @contextlib.contextmanager
@@ -198,11 +176,11 @@ class _Graph:
             self._replay = partial(self._workers.run, [self._capture_part(k, parts) for k in range(parts)])
 
     def _capture_part(self, part: int, parts: int) -> Callable[[], object]:
-        _tiles.launched = False
+        tiles.launched = False
         with capturing(), part_of_worlds(part, parts), wp.ScopedCapture(device=self._device) as capture:
             self._run()
         replay = partial(wp.capture_launch, capture.graph)
-        return partial(_alone, replay) if _tiles.launched and self._device.is_cpu else replay
+        return partial(_alone, replay) if tiles.launched and self._device.is_cpu else replay
 
     def _run(self) -> None:
         for function in self._functions:
@@ -210,7 +188,7 @@ class _Graph:
 
 
 def _alone(replay: Callable[[], object]) -> None:
-    with _TILES_ON_CPU:
+    with TILES_ON_CPU:
         replay()
 
 

@@ -19,6 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from lyceum_warp.graphs.rehearsal import rehearse
 from lyceum_warp.support.machine import cpu_cores
+from lyceum_warp.support.upstream import is_compiled
 from lyceum_warp.support.warp_log import start_warp
 
 
@@ -46,7 +47,7 @@ def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str)
     with rehearse() as rehearsal:
         function()
     wanted = list(dict.fromkeys((module, _block(device, block)) for module, block in rehearsal.modules))
-    missing = [(module, block) for module, block in wanted if not _is_there(module, block, device)]
+    missing = [(module, block) for module, block in wanted if not is_compiled(module, block, device)]
     if not missing:
         return Built(known=len(wanted))
     start = time.perf_counter()
@@ -70,21 +71,6 @@ def _load(module: Any, block: int, device: wp.Device) -> tuple[str, float]:
 def _block(device: wp.Device, block: int | None) -> int:
     """The block size of a launch; on the CPU it is always 1."""
     return 1 if device.is_cpu else block or 256
-
-
-def _is_there(module: Any, block: int, device: wp.Device) -> bool:
-    """Whether a module is loaded or in Warp's cache.
-
-    Warp has no public function for this. Where its internals have changed the answer is no, which costs time only.
-    """
-    if (device.context, block) in module.execs:
-        return True
-    try:
-        module.get_module_hash(block)
-        folder = Path(wp.config.kernel_cache_dir or "", module.get_module_identifier(block))
-        return (folder / module._get_compile_output_name(device, block_dim=block)).is_file()
-    except AttributeError:
-        return False
 
 
 def cached() -> dict[Path, int]:

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-import warp as wp
+
+from lyceum_warp.support.upstream import replaced_in_this_thread
 
 _lock = threading.RLock()
 
@@ -32,24 +33,12 @@ def rehearse() -> Iterator[Rehearsal]:
     Copies and allocations do happen, so the called function may overwrite its arrays with meaningless numbers. Other
     threads launch as usual, and wait here for their own rehearsal.
     """
-    with _lock, contextlib.ExitStack() as replaced:
-        rehearsal, thread = Rehearsal(), threading.get_ident()
-
-        def replace(owner: Any, name: str, instead: Callable[..., Any]) -> None:
-            original = getattr(owner, name)
-
-            def call(*args: Any, **kwargs: Any) -> Any:
-                return (instead if threading.get_ident() == thread else original)(*args, **kwargs)
-
-            setattr(owner, name, call)
-            replaced.callback(setattr, owner, name, original)
-
-        replace(wp, "launch", rehearsal.launch)
-        replace(wp, "launch_tiled", rehearsal.launch)
-        replace(wp, "capture_while", _loop)
-        replace(wp, "capture_if", _branch)
-        for name in ("radix_sort_pairs", "segmented_sort_pairs", "array_scan"):  # their inputs would be meaningless
-            replace(wp.utils, name, _nothing)
+    rehearsal = Rehearsal()
+    functions: dict[str, Callable[..., None]] = {"launch": rehearsal.launch, "launch_tiled": rehearsal.launch}
+    functions |= {"capture_while": _loop, "capture_if": _branch}
+    # their inputs would be meaningless
+    functions |= dict.fromkeys(("radix_sort_pairs", "segmented_sort_pairs", "array_scan"), _nothing)
+    with _lock, replaced_in_this_thread(functions):
         yield rehearsal
 
 

@@ -2,7 +2,8 @@
 
 import io
 import pydoc
-from collections.abc import Mapping
+import zipfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -92,14 +93,20 @@ def value_of(content: PolicyContent, path: Path) -> nn.Module:
 
 def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | None) -> nn.Module:
     """Load the weights of a file into a network."""
+    saved = content[name]
     try:
-        saved = content[name]
-        module = given if given is not None else _made(name, saved)
+        module = given
+        if module is None:
+            with torch.device("meta"):  # the shapes are compared before memory is allocated
+                module = _made(name, saved)
         if different := _difference(module, saved["state"]):
             fix = _FIX if given is None else "give one like that of the run"
-            raise ValueError(f"{path} holds a {name} of other parameters ({different}): {fix}")
+            raise ValueError(f"it holds a {name} of other parameters ({different}): {fix}")
+        module = _made(name, saved) if given is None else given
         module.load_state_dict(saved["state"])
-    except (KeyError, TypeError, RuntimeError) as error:
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    except (KeyError, TypeError, RuntimeError, NotImplementedError) as error:
         raise ValueError(f"{path} holds no {name} of lyceum_warp ({_first_sentence(error)}): {_FIX}") from error
     return module
 
@@ -107,13 +114,15 @@ def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | No
 def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
     """Make a network of the class and shape in a file, which must be a class of the package."""
     kind: Any = _CLASSES[name]
-    own = saved.get("class")
+    own, shape = saved.get("class"), saved["shape"]
     if own is not None:
-        kind = pydoc.locate(own) if own.startswith("lyceum_warp.") and saved["shape"] is not None else None
+        # other rooms have modules that run something when they are imported
+        kind = pydoc.locate(own) if own.startswith("lyceum_warp.algos.") and shape is not None else None
         if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
             fix = f": give one, as in lw.load(run, policy={own.rpartition('.')[2]}(...))" if name == "policy" else ""
             raise ValueError(f"the {name} is of a class of its own, {own}{fix}")
-    return kind.like(saved["shape"]) if hasattr(kind, "like") else kind(**saved["shape"])
+    module: nn.Module = kind.like(shape) if hasattr(kind, "like") else kind(**shape)
+    return module
 
 
 def check_sizes(policy: Any, env: Env, path: Path) -> None:
@@ -163,17 +172,58 @@ def read_checkpoint(
     if not path.is_file():
         raise FileNotFoundError(f"there is no checkpoint {path}: train the run first")
     try:
-        content = torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:  # torch raises errors of many types
+        data = path.read_bytes()
+        _check_records(data)
+        content = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
+    except OSError:
+        raise
+    except Exception as error:  # zipfile and torch raise errors of many types
         raise ValueError(
-            f"the checkpoint {path} is cut off, or was not written by lyceum_warp ({_first_sentence(error)}): {_FIX}"
+            f"the checkpoint {path} is damaged, or was not written by lyceum_warp ({_first_sentence(error)}): {_FIX}"
         ) from error
     if not isinstance(content, dict) or "lyceum_warp" not in content:
         raise ValueError(f"the checkpoint {path} was not written by lyceum_warp: {_FIX}")
     check_format(path, content["lyceum_warp"])
     if missing := set(parts) - content.keys():
         raise ValueError(f"the checkpoint {path} lacks {', '.join(sorted(missing))}: {_FIX}")
+    if wrong := [name for name, value in content.items() if not _KINDS.get(name, lambda value: True)(value)]:
+        raise ValueError(f"the checkpoint {path} has other content than lyceum_warp writes as {wrong[0]}: {_FIX}")
+    if "state" in content and content["state"].get("iteration", content["iteration"]) != content["iteration"]:
+        raise ValueError(f"the checkpoint {path} has a policy and a state of different iterations: {_FIX}")
     return content
+
+
+def _is_network(saved: Any) -> bool:
+    """Whether a value of a file may be a saved network."""
+    return (
+        isinstance(saved, dict)
+        and isinstance(saved.get("shape", ""), dict | None)
+        and isinstance(saved.get("class", ""), str)
+        and isinstance(saved.get("state"), dict)
+        and all(isinstance(name, str) and type(part) is torch.Tensor for name, part in saved["state"].items())
+    )
+
+
+_KINDS: dict[str, Callable[[Any], bool]] = {
+    "iteration": lambda value: type(value) is int and value >= 0,
+    "policy": _is_network, "value": _is_network,
+    "state": lambda value: isinstance(value, dict) and type(value.get("iteration", 0)) is int,
+    "score": lambda value: isinstance(value, dict) and isinstance(value.get("value"), int | float),
+}  # fmt: skip
+"""Whether a value may be an entry of a file, by the entry's name."""
+
+
+def _check_records(data: bytes) -> None:
+    """Check the records of an archive of torch by their CRC-32, which torch writes and does not check.
+
+    Raises:
+        ValueError: A record is damaged.
+    """
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        # torch reads nothing of a record that is marked as a folder
+        folders = (record.filename for record in archive.infolist() if record.external_attr & 0x10)
+        if (name := archive.testzip() or next(folders, None)) is not None:
+            raise ValueError(f"its record {name} has other content than was written")
 
 
 def check_format(path: Path, number: Any) -> None:

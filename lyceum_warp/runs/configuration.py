@@ -1,5 +1,6 @@
 """Convert a learner to the config.json of its run, and back."""
 
+import contextlib
 import dataclasses
 import logging
 import math
@@ -134,6 +135,8 @@ class Configuration:
         run: Run | None = None,
         networks: tuple[Any, Any] = (None, None),
         note: Callable[[str], None] = log.warning,
+        task: str | None = None,
+        trust: bool = False,
     ) -> Learner:
         """Make the learner.
 
@@ -142,11 +145,20 @@ class Configuration:
             run: The run of the task. Its copies replace files that have moved or changed.
             networks: The initial policy and value function; None for new ones.
             note: Called with messages about the task's files.
+            task: A task that is used as it is now instead of the run's.
+            trust: Whether ``run`` may run its task, although this user did not make it on this machine.
 
         Raises:
-            ValueError: A value is not valid.
+            ValueError: A value is not valid, or ``run`` is not trusted.
             FileNotFoundError: The task or its model is missing.
         """
+        with contextlib.nullcontext() if run is None else run.settings():
+            return self._learner(team, run, networks, note, task, trust)
+
+    def _learner(
+        self, team: Team, run: Run | None, networks: tuple[Any, Any], note: Callable[[str], None], task: str | None,
+        trust: bool,
+    ) -> Learner:  # fmt: skip
         learner, _ = algorithm_of(self.algorithm)
         if self.threads < 1:
             raise ValueError(f"threads must be at least 1, not {self.threads}")
@@ -160,7 +172,8 @@ class Configuration:
             assert self.task is not None
             env = Env(self.task, options, **self.params)
         else:
-            env = run_env(run, options, self.params, note=note)
+            # rank 0 checks the run; other machines may have no record of it
+            env = run_env(run, options, self.params, note=note, task=task, trust=trust or not team.leads)
         seed = self.options.seed if self.seed is None else self.seed
         return learner(env, *networks, self.hyperparameters, seed=seed, team=team)
 

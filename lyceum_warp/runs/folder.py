@@ -4,7 +4,7 @@ import contextlib
 import json
 import logging
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +13,22 @@ import torch
 from lyceum_warp.runs.checkpoints import (
     FORMAT,
     PolicyContent,
-    check_format,
     policy_of,
     read_checkpoint,
     value_of,
     write_content,
 )
+from lyceum_warp.runs.config_file import read_config
 from lyceum_warp.runs.metrics_table import read_metrics
+from lyceum_warp.runs.trust import remember
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import check_kind
 from lyceum_warp.support.versions import versions
 
-_CONFIG, _VERSIONS = "config.json", "versions.json"
+_CONFIG, _VERSIONS, _TASK = "config.json", "versions.json", "task"
+_UNFINISHED = {f"{name}.tmp" for name in (_CONFIG, _VERSIONS, _TASK)}
+"""What a kill may leave of a run that is being made. It is replaced."""
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +69,7 @@ class Run:
 
     def __init__(self, folder: Path, config: dict[str, Any]) -> None:
         self.folder, self.config = folder, config
-        self.metrics, self.task_folder = folder / "metrics.csv", folder / "task"
+        self.metrics, self.task_folder = folder / "metrics.csv", folder / _TASK
         self.checkpoint, self.previous = folder / "checkpoint.pt", folder / "previous.pt"
         self.policy, self.best = folder / "policy.pt", folder / "best.pt"
 
@@ -91,7 +94,7 @@ class Run:
             way = f", or continue the run (train --resume {folder}, or resume=True in Python)"
             trained = (folder / "checkpoint.pt").exists()  # unlike a run of plan
             raise ValueError(f"{folder} holds a run: give another folder{way if trained else ''}")
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - _UNFINISHED):
             raise ValueError(f"{folder} exists and is not an empty folder: give another folder")
 
     @classmethod
@@ -105,7 +108,8 @@ class Run:
     ) -> "Run":
         """Make the folder of a run, with the versions, the copy of the task, and the configuration.
 
-        If this fails, nothing is left in the folder.
+        If this fails, nothing is left in the folder. The run may later run its task without being asked, because it is
+        recorded in the user's state directory (``lyceum_warp.runs.trust``).
 
         Args:
             folder: A new or empty folder.
@@ -120,17 +124,23 @@ class Run:
         cls.check_free(folder)
         run = cls(folder, {"format": FORMAT, **config})
         text = json.dumps(run.config, indent=2)  # may fail, so it comes before the folder is made
+        task, now = folder / f"{_TASK}.tmp", json.dumps(versions(device), indent=2)
         try:
+            shutil.rmtree(task, ignore_errors=True)
             folder.mkdir(parents=True, exist_ok=True)
-            (folder / _VERSIONS).write_text(json.dumps(versions(device), indent=2))
             for name, content in (files or {}).items():
-                path = run.task_folder / name
+                path = task / name
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(content if isinstance(content, bytes) else content.read_bytes())
-            (folder / _CONFIG).write_text(text)
+            with replaced(folder / _CONFIG) as config_file, replaced(folder / _VERSIONS) as versions_file:
+                config_file.write_text(text)
+                versions_file.write_text(now)
+                if files:
+                    task.rename(run.task_folder)
         except BaseException:  # a full disk, a folder that cannot be written, a signal
             shutil.rmtree(folder, ignore_errors=True)
             raise
+        remember(folder, run.config)
         return run
 
     @classmethod
@@ -145,19 +155,37 @@ class Run:
         path = folder / _CONFIG
         if not path.is_file():
             raise FileNotFoundError(f"there is no run in {folder}: it has no {_CONFIG}")
-        try:
-            config = json.loads(path.read_text())
-            number = config["format"]
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path} is not the configuration of a run of lyceum_warp ({error!r})") from error
-        check_format(path, number)
-        return cls(folder, config)
+        return cls(folder, read_config(path))
 
     def amend(self, **changes: Any) -> None:
         """Change entries of the configuration, in memory and in the file."""
         self.config = {**self.config, **changes}
         with replaced(self.folder / _CONFIG) as temporary:
             temporary.write_text(json.dumps(self.config, indent=2))
+
+    def versions(self) -> dict[str, Any]:
+        """The content of ``versions.json``; an empty dict if it is damaged."""
+        try:
+            then = json.loads((self.folder / _VERSIONS).read_text())
+        except (OSError, ValueError, RecursionError):
+            then = None
+        return then if isinstance(then, dict) else {}
+
+    @contextlib.contextmanager
+    def settings(self) -> Iterator[None]:
+        """Add the name of ``config.json`` to an error that its settings may cause within the block.
+
+        Raises:
+            ValueError: The settings do not make an environment or a learner.
+            FileNotFoundError: A file that they name is missing.
+        """
+        try:
+            yield
+        except (ValueError, FileNotFoundError) as error:
+            if str(self.folder) in str(error):
+                raise
+            kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
+            raise kind(f"{error} (with the settings in {self.folder / _CONFIG})") from error
 
     def changed(self, now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
         """Compare versions with those at the start of the run, and add changes to ``versions.json``.
@@ -168,18 +196,15 @@ class Run:
         Returns:
             The changed entries, as (then, now). The file lists them under "resumed".
         """
-        path = self.folder / _VERSIONS
-        try:
-            then = json.loads(path.read_text())
-        except (OSError, ValueError):
-            then = {}
+        then = self.versions()
         changed, noted = {}, {}
         for name, value in now.items():
             if then.get(name) != value:
                 changed[name], noted[name] = (then.get(name), value), value
         if changed:
-            then.setdefault("resumed", []).append(noted)
-            with replaced(path) as temporary:
+            resumed = then.get("resumed")
+            then["resumed"] = [*(resumed if isinstance(resumed, list) else []), noted]
+            with replaced(self.folder / _VERSIONS) as temporary:
                 temporary.write_text(json.dumps(then, indent=2))
         return changed
 
@@ -211,7 +236,7 @@ class Run:
             ValueError: ``which`` is something else.
         """
         if which == "last":
-            # earlier releases wrote the policy into the checkpoint alone
+            # earlier releases wrote the policy only into the checkpoint
             return self.policy if self.policy.is_file() else self.checkpoint
         if which == "best":
             path = self.best
@@ -230,13 +255,18 @@ class Run:
         numbers = sorted(int(path.stem) for path in self.numbered(0).parent.glob("*.pt") if path.stem.isdigit())
         return ", ".join([*known, *map(str, numbers)]) or "none yet"
 
-    def best_score(self) -> tuple[int, float] | None:
-        """The iteration and the score of the best policy; None if there is none."""
+    def best_score(self, *, note: Callable[[str], None] = log.warning) -> tuple[int, float] | None:
+        """The iteration and the score of the best policy; None if there is none.
+
+        Args:
+            note: Called with a message if the file of the best policy is damaged.
+        """
         if not self.best.is_file():
             return None
         try:
             content = read_checkpoint(self.best, parts=("iteration", "policy", "score"))
-        except ValueError:
+        except ValueError as error:
+            note(f"{str(error).rpartition(': ')[0]}: the next best policy replaces it, whatever its return")
             return None
         return content["iteration"], content["score"]["value"]
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -41,15 +42,26 @@ def read_metrics(path: Path) -> list[dict[str, float | None]]:
     Raises:
         ValueError: A cell is not a number, or the rows differ in length.
     """
-    with path.open(newline="") as file:
-        reader = csv.DictReader(file, strict=True)
-        try:
-            rows = []
-            for row in reader:
-                rows.append({key: float(cell) if cell else None for key, cell in row.items()})
-            return rows
-        except (ValueError, TypeError, csv.Error) as error:
-            raise ValueError(f"{path} is not a table of metrics: line {reader.line_num}: {error}") from error
+    return _rows(path, _text(path))
+
+
+def _text(path: Path) -> str:
+    try:
+        with path.open(newline="") as file:
+            return file.read()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not a table of metrics: {error}") from error
+
+
+def _rows(path: Path, text: str) -> list[dict[str, float | None]]:
+    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
+    try:
+        rows = []
+        for row in reader:
+            rows.append({key: float(cell) if cell else None for key, cell in row.items()})
+        return rows
+    except (ValueError, TypeError, csv.Error) as error:
+        raise ValueError(f"{path} is not a table of metrics: line {reader.line_num}: {error}") from error
 
 
 def cut_rows(path: Path, iteration: int) -> None:
@@ -58,10 +70,13 @@ def cut_rows(path: Path, iteration: int) -> None:
     Args:
         path: The table, which need not exist.
         iteration: Number of the last iteration to keep. The first row may have another number than 1.
+
+    Raises:
+        ValueError: A row that is kept is damaged. The file stays as it is.
     """
     if not path.exists():
         return
-    lines = path.read_text().splitlines(keepends=True)
+    lines = _text(path).splitlines(keepends=True)
     header = next(csv.reader(lines[:1]), [])
     column = header.index("iteration") if "iteration" in header else None
     kept = []
@@ -71,6 +86,7 @@ def cut_rows(path: Path, iteration: int) -> None:
             number = float(next(csv.reader([line]))[column]) if i and column is not None else i
         if line.endswith("\n") and (i == 0 or number <= iteration):
             kept.append(line)
+    _rows(path, "".join(kept))
     if kept != lines:
         with replaced(path) as temporary:
-            temporary.write_text("".join(kept))
+            temporary.write_text("".join(kept), newline="")

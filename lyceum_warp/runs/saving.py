@@ -1,12 +1,17 @@
 """Decide when a run is saved, and save it."""
 
+import logging
 import math
 import time
+from collections.abc import Callable
 
 from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.runs.checkpoints import policy_content, write_content
 from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.lock import RunLock
 from lyceum_warp.runs.metrics_table import append_row
+
+log = logging.getLogger(__name__)
 
 SAVE_SECONDS = 30.0
 """Seconds after which a run is saved."""
@@ -32,17 +37,27 @@ class Saver:
         keep_every: Iterations between two numbered policies; 0 for none.
         save_every: Iterations between two saves; 0 for the rule above.
         saved: Number of the iteration whose state is saved; -1 for none.
+        lock: The run's lock, which is checked before anything is written.
+        note: Called with a message if the file of the best policy is damaged.
     """
 
     saved: int
     """Number of the iteration whose state is saved."""
 
     def __init__(
-        self, run: Run | None, learner: Learner, *, keep_every: int = 0, save_every: int = 0, saved: int = -1
+        self,
+        run: Run | None,
+        learner: Learner,
+        *,
+        keep_every: int = 0,
+        save_every: int = 0,
+        saved: int = -1,
+        lock: RunLock | None = None,
+        note: Callable[[str], None] = log.warning,
     ) -> None:
         self.run, self.learner, self.keep_every, self.save_every = run, learner, keep_every, save_every
-        self.saved = saved
-        best = None if run is None else run.best_score()
+        self.saved, self._lock = saved, lock
+        best = None if run is None else run.best_score(note=note)
         self._best = -math.inf if best is None else best[1]
         self._before = policy_content(learner.iteration, learner.policy, learner.value)
         self._seconds, self._when = 0.0, time.perf_counter()
@@ -54,6 +69,7 @@ class Saver:
             The return that selects the best policy; None if the iteration has none.
         """
         assert self.run is not None
+        self._check_lock()
         append_row(self.run.metrics, iteration.row())
         learner, name = self.learner, self.learner.best_by
         score = getattr(iteration, name)
@@ -75,6 +91,10 @@ class Saver:
             write_content(path, self._before)
         return score
 
+    def _check_lock(self) -> None:
+        if self._lock is not None:
+            self._lock.check()
+
     def due(self) -> bool:
         """Whether it is time to save."""
         if self.save_every:
@@ -88,6 +108,7 @@ class Saver:
         state = learner.state_dict()  # gathers the worlds of all ranks
         with learner.team.together():
             if self.run is not None:
+                self._check_lock()
                 self.run.save(policy_content(learner.iteration, learner.policy, learner.value), state)
         self.saved, self._when = learner.iteration, time.perf_counter()
         self._seconds = self._when - start

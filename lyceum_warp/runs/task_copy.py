@@ -2,7 +2,6 @@
 
 import hashlib
 import io
-import json
 import logging
 import os
 import warnings
@@ -15,11 +14,12 @@ import mujoco
 import numpy as np
 
 from lyceum_warp.binding.models import find_model
-from lyceum_warp.binding.registry import source_files
+from lyceum_warp.binding.registry import package_task_names, source_files
 from lyceum_warp.env import Env
 from lyceum_warp.model_files import ModelFile, read_spec
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.trust import check_trust
 
 log = logging.getLogger(__name__)
 
@@ -78,10 +78,15 @@ def json_value(name: str, value: Any) -> Any:
 
 def _table(value: Any) -> Any:
     """The file or the array of a table; None for other parameters."""
-    if isinstance(value, str | Path) and str(value).endswith(".npy"):
+    if _is_table(value):
         return Path(value)
     array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
     return array if array.dtype.kind in "fiu" and array.size > 64 else None
+
+
+def _is_table(value: Any) -> bool:
+    """Whether a parameter is the path of a table."""
+    return isinstance(value, str | Path) and str(value).endswith(".npy")
 
 
 def _npy(array: np.ndarray) -> bytes:
@@ -101,7 +106,13 @@ def _sources(file: Path, loaded: Mapping[Path, bytes]) -> dict[Path, bytes]:
 
 
 def run_env(
-    run: Run, options: EnvOptions, params: Mapping[str, Any], *, note: Note = log.warning, task: str | None = None
+    run: Run,
+    options: EnvOptions,
+    params: Mapping[str, Any],
+    *,
+    note: Note = log.warning,
+    task: str | None = None,
+    trust: bool = False,
 ) -> Env:
     """Make an environment of a run's task.
 
@@ -114,30 +125,42 @@ def run_env(
         params: Parameters of the task.
         note: Called with each message.
         task: Another task, which is used as it is.
+        trust: Whether a run that this user did not make on this machine may run the task and read the files that it
+            names; see ``lyceum_warp.runs.trust``.
 
     Raises:
-        ValueError: The task does not fit.
+        ValueError: The task does not fit, or the run is not trusted.
         FileNotFoundError: The task or its model is missing, and the run has no copy.
     """
-    if task is not None:
-        return Env(task, options, **params)
     kept, chosen = run.config.get("kept", {}), run.config["task"]
+    saved = run.config["params"].items()
+    read: list[str | Path] = [value for name, value in saved if params.get(name, "") is value and _is_table(value)]
+    read += [options.model] if isinstance(options.model, str) else []
+    if task is not None:
+        if read:
+            check_trust(run.folder, run.config, read[0], runs=False, trust=trust)
+        return Env(task, options, **params)
     if chosen is None or kept.get("program"):
         where = "a notebook" if chosen is None else chosen.partition(":")[0]
         raise ValueError(
-            f"the task {kept['name']!r} of the run in {run.folder} was defined in {where}, which trained it: give a "
+            f"the task {run.task_name!r} of the run in {run.folder} was defined in {where}, which trained it: give a "
             "file that only defines it (eval --task my_task.py, train my_task.py --from), or go on there (resume=True)"
         )
     path, colon, attribute = chosen.partition(":")
-    copy = run.task_folder / kept.get("file", "-")
+    copy = run.task_folder / kept.get("file", "")
+    read += [run.task_folder / kept["model"]] if "model" in kept else []
+    if copy.is_file() or path not in package_task_names():
+        check_trust(run.folder, run.config, copy if copy.is_file() else path, runs=True, trust=trust)
+    elif read:
+        check_trust(run.folder, run.config, read[0], runs=False, trust=trust)
     if copy.is_file() and (changes := _source_changes(Path(path), kept)):
         new = f"; give {path} as the task to use the new version" if Path(path).is_file() else ""
         note(f"{changes[0]}: the run's own copy is used, {copy}{new}")
         chosen = f"{copy}{colon}{attribute}"
-    params, copy = run_params(run, params), run.task_folder / kept.get("model", "-")
+    params, copy = run_params(run, params), run.task_folder / kept.get("model", "")
     if not copy.is_file():
         return Env(chosen, options, **params)
-    if kept["model_given"] and not isinstance(options.model, str):  # it was made in Python
+    if kept.get("model_given") and not isinstance(options.model, str):  # it was made in Python
         return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
     try:
         env = Env(chosen, options, **params)
@@ -146,7 +169,7 @@ def run_env(
         reason = "has changed since the run began"
     except FileNotFoundError:
         reason = "is no longer where it was"
-    note(f"the model of the task {kept['name']!r} {reason}: the run's own copy is used, {copy}")
+    note(f"the model of the task {run.task_name!r} {reason}: the run's own copy is used, {copy}")
     return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
 
 
@@ -191,19 +214,15 @@ def run_params(run: Run, params: Mapping[str, Any]) -> dict[str, Any]:
     found = dict(params)
     for name, value in params.items():
         copy = run.task_folder / _TABLES / f"{name}.npy"
-        if isinstance(value, str) and value.endswith(".npy") and not Path(value).is_file() and copy.is_file():
+        if _is_table(value) and not Path(value).is_file() and copy.is_file():
             found[name] = str(copy)
     return found
 
 
 def _model_changed(run: Run, env: Env) -> bool:
     """Whether the model has changed since the run began; False with another version of MuJoCo."""
-    try:
-        version = json.loads((run.folder / "versions.json").read_text())["mujoco"]
-    except (OSError, ValueError, KeyError):
-        return False
     known = run.config.get("kept", {}).get("model_hash")
-    return version == mujoco.__version__ and known not in (None, _model_hash(env))
+    return run.versions().get("mujoco") == mujoco.__version__ and known not in (None, _model_hash(env))
 
 
 def _digest(content: bytes) -> str:

@@ -17,21 +17,23 @@ _SPARE = 256
 """Elements behind an array without elements."""
 
 
+def alias(array: wp.array, dtype: type, shape: tuple[int, ...], strides: tuple[int, ...] | None = None) -> wp.array:
+    """The same memory under another type, shape or strides; it stays allocated as long as the alias lives."""
+    view: Any = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device)
+    view.owner = array
+    return view
+
+
 def flat(array: wp.array) -> wp.array:
-    """The same memory as a (nworld, n) array of float32, for copies that do not care about types."""
+    """The same memory as a (nworld, n) array of float32, for copies that do not depend on types."""
     n = array.size * wp.types.type_size_in_bytes(array.dtype) // 4 // max(array.shape[0], 1)
-    alias: Any = wp.array(ptr=array.ptr, dtype=wp.float32, shape=(array.shape[0], n), device=array.device)
-    alias.owner = array  # keeps the memory alive as long as the alias
-    return alias
+    return alias(array, wp.float32, (array.shape[0], n))
 
 
 def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> wp.array:
     """One row as an array of many equal rows, (count, ...), that all lie in the same memory; only for reading."""
     single: Any = wp.array(row[None], dtype=dtype, device=device)
-    shape, strides = (count, *single.shape[1:]), (0, *single.strides[1:])
-    rows: Any = wp.array(ptr=single.ptr, dtype=dtype, shape=shape, strides=strides, device=device)
-    rows.owner = single  # keeps the memory alive as long as the view
-    return rows
+    return alias(single, dtype, (count, *single.shape[1:]), (0, *single.strides[1:]))
 
 
 def with_memory(array: wp.array) -> wp.array:
@@ -41,10 +43,7 @@ def with_memory(array: wp.array) -> wp.array:
     """
     if array.size:
         return array
-    memory = wp.zeros(_SPARE, dtype=array.dtype, device=array.device)
-    padded: Any = wp.array(ptr=memory.ptr, dtype=array.dtype, shape=array.shape, device=array.device)
-    padded.owner = memory  # keeps the memory alive as long as the view
-    return padded
+    return alias(wp.zeros(_SPARE, dtype=array.dtype, device=array.device), array.dtype, array.shape)
 
 
 def torch_view(array: wp.array) -> torch.Tensor:

@@ -1,7 +1,8 @@
-"""Attribute docstrings in ``help()``.
+"""Show the docstrings of attributes and of overloaded Warp functions in ``help()``.
 
 Python discards a string that follows an attribute. Editors and documentation tools read it from the source; ``help``
-does not, so ``document_attributes`` appends these strings to the docstring of the class.
+does not, so ``document_attributes`` appends these strings to the docstring of the class. An overloaded Warp function
+has no docstring at all, and ``help`` would show its class.
 """
 
 import ast
@@ -10,7 +11,7 @@ import enum
 import inspect
 import itertools
 import textwrap
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Class = TypeVar("Class", bound=type)
 
@@ -54,3 +55,10 @@ def document_attributes(cls: Class) -> Class:
     if docs:
         cls.__doc__ = f"{inspect.cleandoc(cls.__doc__ or '')}\n\nAttributes:\n{listed(docs)}\n"
     return cls
+
+
+def document_overloads(function: Any) -> None:
+    """Give an overloaded Warp function a docstring: the arguments of each overload, and the docstring of the first."""
+    found = [overload.func for overload in (*function.user_overloads.values(), *function.user_templates.values())]
+    signatures = dict.fromkeys(f"{function.key}({', '.join(inspect.signature(each).parameters)})" for each in found)
+    function.__doc__ = "\n".join([*signatures, "", inspect.cleandoc(found[0].__doc__)])

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -29,8 +30,8 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
             try:
                 os.link(path, previous)
             except OSError:  # a file system without links
-                os.replace(path, previous)
-        os.replace(temporary, path)
+                _moved(path, previous)
+        _moved(temporary, path)
     except OSError as error:
         if error.filename is None:  # as on a full disk
             error.filename = str(path)
@@ -38,6 +39,15 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def _moved(source: Path, target: Path) -> None:
+    """Move a file, with a second attempt: on a network or while another program reads the file, one may fail."""
+    try:
+        os.replace(source, target)
+    except OSError:
+        time.sleep(0.1)
+        os.replace(source, target)
 
 
 def newer_format(path: Path, number: int, known: int) -> ValueError:

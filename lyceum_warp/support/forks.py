@@ -2,6 +2,7 @@
 
 import os
 import weakref
+from collections.abc import Callable
 from typing import Any
 
 _watched: "weakref.WeakKeyDictionary[Any, tuple[str, ...]]" = weakref.WeakKeyDictionary()
@@ -21,6 +22,16 @@ class LeftInParent:
 def leave_in_parent(thing: Any, *attributes: str) -> None:
     """Replace attributes of an object in every child that is forked from now on, where they raise RuntimeError."""
     _watched[thing] = attributes
+
+
+def call_once_gone(thing: Any, function: Callable[[], object]) -> None:
+    """Call a function when an object is deleted, but not in forked children, nor at the end of the process."""
+    weakref.finalize(thing, _call_in, os.getpid(), function).atexit = False
+
+
+def _call_in(process: int, function: Callable[[], object]) -> None:
+    if os.getpid() == process:
+        function()
 
 
 def _after_fork() -> None:

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP as an exception, at once or postponed until the caller handles it."""
+"""Turn Ctrl-C, SIGTERM and SIGHUP into an exception, at once or once the caller handles it."""
 
 import contextlib
 import signal
@@ -17,21 +17,61 @@ class Interrupted(BaseException):
         self.number = number
 
 
+def _ignore(number: int, frame: Any) -> None:
+    """Handle a signal after Interrupted was raised.
+
+    It is not SIG_IGN, by which a shell makes a program ignore a signal, also in ``obeyed``.
+    """
+
+
+def _interrupt(number: int, frame: Any) -> None:
+    """Raise Interrupted, and ignore further signals."""
+    for other in _NUMBERS:
+        if signal.getsignal(other) is _interrupt:
+            signal.signal(other, _ignore)
+    raise Interrupted(number)
+
+
+def _leave(number: int, frame: Any) -> None:
+    raise SystemExit(128 + number)
+
+
+@contextlib.contextmanager
+def _handling(handler: Callable[[int, Any], None], replaces: Callable[[Any], bool]) -> Iterator[dict[int, Any]]:
+    """Within the context a handler takes the place of some others.
+
+    Args:
+        handler: The handler.
+        replaces: Whether the handler replaces another one.
+
+    Yields:
+        The replaced handlers by their signals; they are restored at the end.
+    """
+    previous: dict[int, Any] = {}
+    with contextlib.suppress(ValueError):  # only the main thread may set handlers
+        for number in _NUMBERS:
+            if replaces(signal.getsignal(number)):
+                previous[number] = signal.signal(number, handler)
+    try:
+        yield previous
+    finally:
+        for number, other in previous.items():
+            signal.signal(number, other)
+
+
+def _is_active(handler: Any) -> bool:
+    """Whether a signal with this handler reaches the program.
+
+    A shell that starts a program in the background makes it ignore SIGINT on purpose, and nohup SIGHUP.
+    """
+    return handler not in (signal.SIG_IGN, _ignore)
+
+
 @contextlib.contextmanager
 def signals() -> Iterator[None]:
     """Within the context the first Ctrl-C, SIGTERM or SIGHUP raises Interrupted; later ones only within ``obeyed``."""
-
-    def interrupt(number: int, frame: Any) -> None:
-        for other in previous:
-            signal.signal(other, _ignore)
-        raise Interrupted(number)
-
-    previous = _handled_by(interrupt)
-    try:
+    with _handling(_interrupt, _is_active):
         yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
@@ -40,44 +80,18 @@ def ending() -> Iterator[None]:
 
     By default they end a program at once, without its ``finally`` blocks.
     """
-
-    def leave(number: int, frame: Any) -> None:
-        raise SystemExit(128 + number)
-
-    previous: dict[int, Any] = {}
-    with contextlib.suppress(ValueError):  # only the main thread may set handlers
-        for number in _NUMBERS[1:]:
-            if signal.getsignal(number) is signal.SIG_DFL:
-                previous[number] = signal.signal(number, leave)
-    try:
+    with _handling(_leave, lambda handler: handler is signal.SIG_DFL):
         yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
 def obeyed() -> Iterator[None]:
-    """Within the context one more Ctrl-C, SIGTERM or SIGHUP raises Interrupted, after that of ``signals``.
+    """Within the context one more Ctrl-C, SIGTERM or SIGHUP raises Interrupted, after the first one of ``signals``.
 
-    It is for work at the end of a program that may take long, so that a second Ctrl-C gives it up.
+    It is for work at the end of a program that may take long, so that a second Ctrl-C cancels it.
     """
-
-    def interrupt(number: int, frame: Any) -> None:
-        for other in numbers:
-            signal.signal(other, _ignore)
-        raise Interrupted(number)
-
-    numbers = [number for number in _NUMBERS if signal.getsignal(number) is _ignore]
-    with contextlib.suppress(ValueError):  # only the main thread may set handlers
-        for number in numbers:
-            signal.signal(number, interrupt)
-    try:
+    with _handling(_interrupt, lambda handler: handler is _ignore):
         yield
-    finally:
-        with contextlib.suppress(ValueError):
-            for number in numbers:
-                signal.signal(number, _ignore)
 
 
 @contextlib.contextmanager
@@ -102,32 +116,11 @@ def postponed(*, insist: bool = False) -> Iterator[list[int]]:
         else:
             noted.append(number)
 
-    previous = _handled_by(note)
-    try:
-        yield noted
-    except Interrupted:
-        previous = dict.fromkeys(previous, _ignore)
-        raise
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+    with _handling(note, _is_active) as previous:
+        try:
+            yield noted
+        except Interrupted:
+            previous.update(dict.fromkeys(previous, _ignore))
+            raise
     if noted:
         signal.raise_signal(signal.Signals(noted[0]))
-
-
-def _ignore(number: int, frame: Any) -> None:
-    """Handles a signal after Interrupted was raised.
-
-    It is not SIG_IGN, by which a shell makes a program ignore a signal, also in ``obeyed``.
-    """
-
-
-def _handled_by(handler: Callable[[int, Any], None]) -> dict[int, Any]:
-    """Handle Ctrl-C, SIGTERM and SIGHUP, and return their previous handlers."""
-    previous: dict[int, Any] = {}
-    with contextlib.suppress(ValueError):  # only the main thread may set handlers
-        for number in _NUMBERS:
-            # a shell that starts a program in the background makes it ignore SIGINT on purpose, and nohup SIGHUP
-            if signal.getsignal(number) not in (signal.SIG_IGN, _ignore):
-                previous[number] = signal.signal(number, handler)
-    return previous

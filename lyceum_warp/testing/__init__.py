@@ -1,7 +1,7 @@
 """Check the rules of an environment for any task on any engine.
 
 Each check is one rule. It takes the environments under test, raises an AssertionError that names the task, the
-engine, the rule and the values, and leaves the environments usable for the next check.
+engine, the rule, the values, the seed and a world's state, and leaves the environments usable for the next check.
 """
 
 import dataclasses
@@ -86,14 +86,14 @@ def check_task(
 
     Raises:
         AssertionError: Rules are broken; the message lists them.
-        ValueError: There are fewer than 2 worlds or 1 step, or an option does not fit.
+        ValueError: There are fewer than 2 worlds or no step, or an option does not fit.
 
     Example:
         >>> print(check_task("hopper", engine="mujoco"))
     """
     if nworld < 2:
         raise ValueError(f"the checks compare worlds with one another: nworld must be at least 2, not {nworld}")
-    whole_number("steps", steps, low=1)
+    steps = whole_number("steps", steps, low=1)
     if str(device or "").startswith("cuda"):
         options = {"deterministic": True} | options
 
@@ -107,6 +107,7 @@ def check_task(
     for check in checks:
         ctx.rule = check.__name__.removeprefix("check_")
         start = time.perf_counter()
+        ctx.restart()  # so that a verdict does not depend on the checks before it
         try:
             check(ctx)
         except AssertionError as error:

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
@@ -43,9 +43,13 @@ class Context:
     rule: str = ""
     """Name of the rule that is being checked."""
 
-    def fail(self, problem: str) -> None:
-        """Raise the AssertionError for a problem."""
-        raise AssertionError(f"{self.task} on the {self.engine} engine breaks the rule {self.rule!r}: {problem}")
+    def fail(self, problem: str, world: int = 0) -> NoReturn:
+        """Raise the AssertionError for a problem, with the seed, and the step and the state of a world of ``a``."""
+        state, parts = self.a.get_state()[world], self.a.state_space.parts
+        values = ", ".join(f"{name} {state[part].tolist()}" for name, part in parts.items())
+        where = f"with seed {self.seed}, world {world} in step {int(state[parts['step']])} of its episode: {values}"
+        what = f"{self.task} on the {self.engine} engine breaks the rule {self.rule!r}: {problem}"
+        raise AssertionError(f"{what}\n  {where}")
 
     def that(self, holds: bool | torch.Tensor, problem: str) -> None:
         """Fail unless a condition holds."""
@@ -59,9 +63,11 @@ class Context:
         differ = ~((found == wanted) | ((found != found) & (wanted != wanted)))
         if differ.any():
             first = tuple(differ.nonzero()[0].tolist())
+            axis = next((i for i, size in enumerate(found.shape) if size == self.a.nworld), None)
             self.fail(
                 f"{what}: {int(differ.sum())} of {differ.numel()} values differ, the first at {first}: "
-                f"{found[first].item()!r} instead of {wanted[first].item()!r}"
+                f"{found[first].item()!r} instead of {wanted[first].item()!r}",
+                world=0 if axis is None else first[axis],
             )
 
     def restart(self, seed: int | None = None) -> None:

@@ -15,8 +15,8 @@ _PYTHON_BYTES = 2_048  # for the interpreter's caches; a leak of one float per s
 
 def _check_flags(ctx: Context, env: Env) -> None:
     reason = env.done_reason
-    ctx.equal(env.truncated, (reason & int(Done.TRUNCATED)) != 0, "truncated against done_reason")
-    ctx.equal(env.terminated, (reason & ~int(Done.TRUNCATED)) != 0, "terminated against done_reason")
+    ctx.equal(env.truncated, (reason & ~int(Done.TERMINATED)) != 0, "truncated against done_reason")
+    ctx.equal(env.terminated, (reason & int(Done.TERMINATED)) != 0, "terminated against done_reason")
     ctx.equal(env.done, env.terminated | env.truncated, "done against terminated and truncated")
 
 

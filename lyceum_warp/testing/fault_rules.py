@@ -26,7 +26,8 @@ def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, 
     b.step()
     found = Done(int(a.done_reason[bad]))
     ctx.that(reason in found, f"{what}: done_reason is {found!r}")
-    ctx.that(a.terminated[bad] and a.done[bad], f"{what}: terminated is {a.terminated.tolist()}")
+    ended = a.truncated[bad] and a.done[bad] and not a.terminated[bad]
+    ctx.that(ended, f"{what}: truncated is {a.truncated.tolist()}, terminated {a.terminated.tolist()}")
     ctx.that(a.reward[bad] == 0, f"{what}: the reward is {a.reward[bad].item()}")
     ctx.that(not a.success[bad], f"{what}: it counts as a success")
     ctx.that(torch.isfinite(a.eval[bad]), f"{what}: eval is {a.eval[bad].item()}")
@@ -112,7 +113,7 @@ def check_not_finite(ctx: Context) -> None:
                     b.step(action)
                     what = f"with {name}=inf in world {bad}, step {i}"
                     if int(a.done_reason[bad]) & int(Done.REWARD | Done.OBSERVATION):
-                        ctx.that(a.terminated[bad] and a.reward[bad] == 0, f"the reward is {a.reward[bad]} {what}")
+                        ctx.that(a.truncated[bad] and a.reward[bad] == 0, f"the reward is {a.reward[bad]} {what}")
                         ctx.equal(a.final_obs[bad], good, f"final_obs against the last good observation {what}")
                         ctx.that(a.time[bad] == 0, f"the world was not reset {what}")
                     for key in ("reward", "obs", "final_obs"):

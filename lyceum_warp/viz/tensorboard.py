@@ -1,4 +1,4 @@
-"""Curves, hyperparameters and videos of a run for TensorBoard. They need the extra ``tensorboard``.
+"""Write curves, hyperparameters and videos of a run for TensorBoard, with the extra ``tensorboard``.
 
 ``metrics.csv`` holds the same numbers; the files written here are a copy for another viewer.
 """
@@ -21,6 +21,7 @@ EXTRA = "pip install 'lyceum-warp[tensorboard]'"
 
 _GROUPS = {
     "mean_": "mean_policy", "return_": "return", "value_": "value", "time_": "time", "metrics/": "metrics",
+    "step_metrics/": "step_metrics",
 }  # fmt: skip
 """Groups of curves by the beginnings of their columns in metrics.csv."""
 
@@ -43,7 +44,7 @@ class TensorBoard:
     """Writes a run's iterations where TensorBoard reads them; the horizontal axis counts samples.
 
     Every number of an iteration is a curve, named by its group: return/, episode/, mean_policy/, policy/, value/, time/
-    and metrics/. The hyperparameters appear in the tabs HPARAMS and TEXT.
+    metrics/ and step_metrics/. The hyperparameters appear in the tabs HPARAMS and TEXT.
 
     In a folder that already holds curves, the curves continue: what they hold from the samples of the first new
     iteration on is replaced.

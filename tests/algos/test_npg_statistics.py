@@ -23,7 +23,7 @@ from lyceum_warp.algos.rollout_statistics import (
     EpisodeSums,
     episode_statistics,
     finished,
-    finished_metrics,
+    metric_sums,
 )
 
 NAMES = ("done", "episode_return", "episode_length", "reward", "eval", "success")
@@ -49,6 +49,7 @@ def part_of(rollout: lw.Rollout, worlds: slice) -> Any:
     return SimpleNamespace(
         **{name: getattr(rollout, name)[:, worlds] for name in NAMES},
         episode_metrics={name: sums[:, worlds] for name, sums in rollout.episode_metrics.items()},
+        metrics={name: values[:, worlds] for name, values in rollout.metrics.items()},
     )
 
 
@@ -94,13 +95,17 @@ def test_metric_means_are_those_of_the_episodes_that_ended(rollout: lw.Rollout) 
 
     def numbers(worlds: slice) -> ProcessNumbers:
         part = part_of(rollout, worlds)
-        sums = process(1.0, 0)._replace(episodes=finished(part), metrics=finished_metrics(part))
+        sums = process(1.0, 0)._replace(episodes=finished(part), metrics=metric_sums(part))
         return ProcessNumbers.unpack(sums.pack().tolist())
 
     parts = [numbers(slice(0, 1)), numbers(slice(1, None))]
     for processes in ([numbers(slice(None))], parts):
         assert summary(processes, 10, list(expected))["metrics"] == pytest.approx(expected, rel=1e-5)
-    none = [part._replace(episodes=EpisodeSums(*[0.0] * 9), metrics=(0.0, 0.0)) for part in parts]
+    steps = {name: values.mean().item() for name, values in rollout.metrics.items()}
+    for count in (rollout.env.nworld, 1):  # one process, and as many as worlds
+        shares = [numbers(slice(k, k + count)) for k in range(0, rollout.env.nworld, count)]
+        assert summary(shares, 10, list(steps))["step_metrics"] == pytest.approx(steps, rel=1e-5)
+    none = [part._replace(episodes=EpisodeSums(*[0.0] * 9), metrics=(0.0,) * 4) for part in parts]
     assert all(math.isnan(mean) for mean in summary(none, 10, list(expected))["metrics"].values())
 
 
@@ -111,7 +116,9 @@ def test_a_row_of_metrics_has_a_column_for_each_metric() -> None:
     assert list(it.metrics) == ["forward", "effort"]
     assert it.return_mean == pytest.approx(it.metrics["forward"] - 0.1 * it.metrics["effort"], abs=1e-5)
     row = it.row()
-    assert "metrics" not in row and list(row)[-2:] == ["metrics/forward", "metrics/effort"]
+    assert it.reward_mean == pytest.approx(it.step_metrics["forward"] - 0.1 * it.step_metrics["effort"], abs=1e-6)
+    wanted = ["metrics/forward", "metrics/effort", "step_metrics/forward", "step_metrics/effort"]
+    assert "metrics" not in row and list(row)[-4:] == wanted
     assert row["metrics/effort"] == it.metrics["effort"] and row["return_mean"] == it.return_mean
 
 

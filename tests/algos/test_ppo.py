@@ -88,6 +88,7 @@ def test_statistics_are_those_of_the_samples(shared_env: SharedEnv) -> None:
     assert it.reward_mean == pytest.approx(rollout.reward.mean().item())
     effort = rollout.episode_metrics["effort"][rollout.done].mean().item()
     assert it.row()["metrics/effort"] == pytest.approx(effort)
+    assert it.row()["step_metrics/effort"] == pytest.approx(rollout.metrics["effort"].mean().item())
     assert it.learning_rate == pytest.approx(ppo.rate.item())
     old = torch.distributions.Normal(ppo._mean.double(), ppo._old_log_std.double().exp())
     new = torch.distributions.Normal(ppo.policy(rollout.obs).double(), ppo.policy.log_std.double().exp())

@@ -83,7 +83,7 @@ def test_named_elements_become_their_places_in_the_model(model: mujoco.MjModel) 
         ({"tip": 1}, "tip=1 of 'arm' is an index of 'site_xpos', of which the model has 1: give one from 0 to 0"),
         ({"tip": -1}, "tip=-1 of 'arm' is an index of 'site_xpos', of which the model has 1"),
         ({"tip": [0, 1]}, r"tip=\[0, 1\] of 'arm' is an index of 'site_xpos', of which the model has 1"),
-        ({"tip": "top"}, "no site 'top' for the field 'site_xpos'; it has: tip"),
+        ({"tip": "top"}, "no site 'top'; it has: tip"),
         ({"tip": lw.body("lower")}, "tip of 'arm' can't be an element of 'xpos': it is one of 'site_xpos'"),
         ({"gain": lw.body("lower")}, "gain of 'arm' can't be an element of 'xpos': it is a number"),
     ],

@@ -61,6 +61,14 @@ def test_eval_refuses_no_episodes_and_folders_without_a_run(trained: Path, capsy
     refused(capsys, "there is no run in")
 
 
+def test_a_folder_may_have_the_name_of_markup(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Path(shutil.copytree(trained, tmp_path / "[" / "bold]x"))
+    assert cli.main(["eval", str(run), "--episodes", "1"]) == 0
+    assert f"1 episodes of the mean policy in {run}" in capsys.readouterr().out
+
+
 def test_the_evaluated_episodes_are_saved(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, options = tmp_path / "episodes", ["--episodes", "3", "--nworld", "2", "--seed", "7"]
     assert cli.main(["eval", str(trained), *options, "--episodes-to", str(out)]) == 0

@@ -44,6 +44,12 @@ def test_help_shows_examples_and_every_setting(capsys: pytest.CaptureFixture[str
     assert "--real-time, --no-real-time" in out and "(default: the task's)" in out
 
 
+def test_a_folder_may_have_the_name_of_markup(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "[" / "bold]x"
+    assert plan(out, "--steps", "2", "--no-video", "--no-plot") == 0
+    assert f"files in {out}" in capsys.readouterr().out
+
+
 def test_a_run_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     assert plan(out, "--episodes", "2", "--seed", "3", "--no-video") == 0

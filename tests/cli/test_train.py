@@ -272,7 +272,7 @@ def test_a_configuration_that_does_not_fit_is_one_line(
     change: Any, words: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(changed_config(trained, tmp_path / "run", change)) == 2
-    refused(capsys, "config.json is not the configuration of a training run (", words)
+    refused(capsys, "config.json is ", words)
 
 
 def test_a_configuration_of_an_earlier_release_has_the_defaults_of_newer_hyperparameters(
@@ -288,7 +288,7 @@ def test_resume_refuses_broken_checkpoints(trained: Path, tmp_path: Path, capsys
     for path in (checkpoint, checkpoint.with_name("previous.pt")):
         path.write_bytes(path.read_bytes()[:-1000])
     assert cli.main(resume) == 2
-    refused(capsys, str(checkpoint), "cut off", "restore the file from a copy")
+    refused(capsys, str(checkpoint), "is damaged", "restore the file from a copy")
     other = changed_config(trained, tmp_path / "other", lambda config: config.update(nworld=3))
     assert cli.main(other) == 2
     refused(capsys, "does not fit the configuration beside it")
@@ -296,16 +296,33 @@ def test_resume_refuses_broken_checkpoints(trained: Path, tmp_path: Path, capsys
         assert (tmp_path / folder / "metrics.csv").read_bytes() == (trained / "metrics.csv").read_bytes()
 
 
+@pytest.mark.parametrize("damage", ["cut off", "a flipped bit"])
 def test_a_broken_checkpoint_falls_back_to_the_one_before_it(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    damage: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
     assert train(out, "--iterations", "3", "--save-every", "2") == 0
-    (out / "checkpoint.pt").write_bytes(b"PK half")
+    whole = (out / "checkpoint.pt").read_bytes()
+    weight = lw.load(out).network[0].weight.detach().numpy().tobytes()
+    flipped = weight[:2] + bytes([weight[2] ^ 1]) + weight[3:]
+    (out / "checkpoint.pt").write_bytes(b"PK half" if damage == "cut off" else whole.replace(weight, flipped))
     capsys.readouterr()
     assert cli.main(["train", "--resume", str(out), "--iterations", "4", *QUIET]) == 0
-    refused(capsys, str(out / "checkpoint.pt"), "cut off", f"{out / 'previous.pt'}, of iteration 2, is used instead")
+    refused(capsys, str(out / "checkpoint.pt"), "is damaged", f"{out / 'previous.pt'}, of iteration 2, is used instead")
     assert metrics(out) == metrics(trained)
+
+
+def test_a_broken_best_policy_is_replaced_with_a_line(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    resume = changed_config(trained, tmp_path / "run", lambda config: None)
+    best = tmp_path / "run" / "best.pt"
+    best.write_bytes(best.read_bytes()[:-1000])
+    capsys.readouterr()
+    assert cli.main(["eval", str(tmp_path / "run"), "--which", "best"]) == 2
+    refused(capsys, str(best), "is damaged")
+    assert cli.main(resume) == 0
+    refused(capsys, str(best), "is damaged", "the next best policy replaces it")
 
 
 def test_train_refuses_to_overwrite_a_run(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:

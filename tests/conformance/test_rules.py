@@ -234,7 +234,7 @@ def test_all_broken_rules_are_reported_together(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(lw.Env, "reset", then(lambda env: env.action.fill_(0.1))(lw.Env.reset))
     with pytest.raises(AssertionError) as caught:
         check_task("hopper", engine="mujoco", checks=checks)
-    assert [line.split("'")[1] for line in str(caught.value).splitlines()] == ["reset", "masked_reset"]
+    assert [line.split("'")[1] for line in str(caught.value).splitlines()[::2]] == ["reset", "masked_reset"]
 
 
 def test_a_single_world_and_no_steps_are_refused() -> None:

@@ -1,15 +1,10 @@
-"""The deterministic mode: contacts and rows in order, scratch memory that graphs share, a room that can be left out."""
+"""The deterministic mode: contacts and rows in order, scratch memory that graphs share."""
 
 import contextlib
 import copy
 import dataclasses
 import itertools
-import os
-import shutil
-import subprocess
-import sys
 import types
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -27,48 +22,6 @@ from lyceum_warp.engines.deterministic.deterministic_engine import Deterministic
 from lyceum_warp.engines.deterministic.sort_memory import LARGEST_BUFFER, Scratch, ScratchSizes
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import describe
-
-WITHOUT = """
-import types
-import lyceum_warp as lw
-from lyceum_warp.engines.placement import open_engine
-
-for engine in ("warp", "mujoco"):
-    env = lw.make("hopper", engine=engine, nworld=2, deterministic=True)
-    for _ in range(3):
-        env.step()
-    print(lw.__file__, env.engine.name, bool(env.obs.isfinite().all()))
-gpu = types.SimpleNamespace(is_cpu=False, is_cuda=True, alias="cuda:0")
-try:
-    open_engine("auto", env.model, 2, gpu, [], deterministic=True)
-except ValueError as error:
-    print(error)
-"""
-
-
-def test_the_package_works_without_the_deterministic_room(tmp_path: Path) -> None:
-    """Its folder is left out of a copy of the package; only the option on a CUDA device then says so."""
-    package = Path(lw.__file__).parent
-    ignored = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(package, tmp_path / "lyceum_warp", ignore=ignored)
-    shutil.rmtree(tmp_path / "lyceum_warp/engines/deterministic")
-    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", WITHOUT], env=env, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    *steps, message = done.stdout.splitlines()
-    path = tmp_path / "lyceum_warp/__init__.py"
-    assert steps == [f"{path} warp True", f"{path} mujoco True"]
-    assert message == (
-        "deterministic=True needs the package lyceum_warp.engines.deterministic, which this installation lacks: "
-        "leave it out"
-    )
-
-
-def test_no_other_room_mentions_the_deterministic_room() -> None:
-    package = Path(lw.__file__).parent
-    for path in package.rglob("*.py"):
-        inside = path.parent.name == "deterministic" or path.name == "placement.py"
-        assert inside or "engines.deterministic" not in path.read_text(), path
 
 
 @pytest.fixture

@@ -382,21 +382,6 @@ def test_an_initial_state_of_another_size_is_refused() -> None:
 # placement
 
 
-class OldEngine(ToyEngine):
-    """An engine from before models could differ."""
-
-    name = "old"
-
-    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device, fields: list) -> None:  # type: ignore[type-arg]
-        super().__init__(model, nworld, device, fields)
-
-
-def test_engines_without_the_newer_arguments_run_where_these_are_not_used() -> None:
-    run(make(OldEngine))
-    with pytest.raises(ValueError, match="the old engine takes no model fields that differ between worlds"):
-        make(OldEngine, "body_mass")
-
-
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
 def test_worlds_of_different_models_take_more_memory(engine: type[Engine]) -> None:
     dynamics = [describe_model_field(MODEL, name) for name in DRAWN]

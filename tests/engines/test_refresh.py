@@ -10,7 +10,6 @@ import warp as wp
 
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
-from lyceum_warp.engines.warp import forward
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import Stage, describe, early_sensor_columns, state_columns
 
@@ -265,26 +264,6 @@ def test_the_sensor_of_a_limit_that_ended_is_zero(kind: type[Engine]) -> None:
         check_current(engine)
 
 
-@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
-@pytest.mark.parametrize("equality", ["", '<connect body1="torso" anchor=".1 0 .1"/>'], ids=["free", "connected"])
-@pytest.mark.parametrize("sensors", ["velocities of tendons", "mixed"])
-def test_a_step_goes_on_from_the_refresh_to_the_bit(sensors: str, equality: str, integrator: str) -> None:
-    """Its first substep takes over what the refresh after the last one computed, in worlds that restarted, too."""
-    one, other = (make(WarpEngine, sensors, integrator, equality) for _ in range(2))
-    assert isinstance(one, WarpEngine) and isinstance(other, WarpEngine)
-    assert mjw.kinematics in one._shared and mjw.tendon in one._shared
-    other._shared = ()
-    for t in range(6):
-        for engine in (one, other):
-            engine.ctrl.assign(np.full(engine.ctrl.shape, 0.3 * t, np.float32))
-            engine.step(1 + t % 2)
-            if t == 1:
-                begin(engine, only(engine, 0, 3), t)
-            if t == 3:
-                put(engine, state_of(engine)[::-1].copy(), only(engine, 1))
-        np.testing.assert_array_equal(state_of(one), state_of(other))
-
-
 def test_restarts_in_a_graph_equal_those_outside(sensors: str = "cheap") -> None:
     """A graph skips the refresh where no world restarts."""
     plain, captured = make(WarpEngine, sensors), make(WarpEngine, sensors)
@@ -302,22 +281,6 @@ def test_restarts_in_a_graph_equal_those_outside(sensors: str = "cheap") -> None
         for name, value in shown(captured).items():
             np.testing.assert_array_equal(value, shown(plain)[name], err_msg=name)
         check_current(captured)
-
-
-def test_fields_take_the_parts_that_compute_them() -> None:
-    parts, cheap = forward.forward_parts, model_of(CHEAP)
-    assert parts(cheap, []) == ()
-    assert parts(cheap, ["site_xpos"]) == (mjw.kinematics,)
-    assert parts(cheap, ["cam_xpos"]) == (mjw.kinematics, mjw.com_pos, mjw.camlight)
-    assert parts(cheap, ["xpos", "cvel"]) == (mjw.kinematics, mjw.com_pos, mjw.com_vel)
-    assert parts(cheap, ["qfrc_bias"])[-1] is mjw.fwd_velocity  # type: ignore[index]
-    assert parts(model_of('<jointpos joint="knee"/>'), ["sensordata"]) == (mjw.sensor_pos,)
-    gyro = (mjw.kinematics, mjw.com_pos, mjw.com_vel, mjw.sensor_pos, mjw.sensor_vel)
-    assert parts(model_of('<gyro site="tip"/> <accelerometer site="tip"/>'), ["sensordata"]) == gyro
-    assert parts(cheap, ["xpos", "qacc"]) is None
-    for name in ("jointlimitpos", "jointlimitvel"):
-        assert parts(model_of(f'<{name} joint="knee"/>'), ["sensordata"]) is None
-        assert parts(model_of(f'<{name} joint="knee"/>'), ["xpos"]) == (mjw.kinematics,)
 
 
 def test_fields_of_two_states_do_not_mix_in_an_mjdata_that_worlds_use_in_turn() -> None:

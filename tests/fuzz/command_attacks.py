@@ -1,6 +1,6 @@
 """Give random command lines to ``lyceum-warp``.
 
-A case is "COMMAND SEED", or the name of a minimal case in ``known_failures.py``. The flags come from the help texts, so
+A case is "COMMAND SEED", or the name of a minimal case in ``minimal_cases.py``. The flags come from the help texts, so
 that a new one is attacked, too.
 """
 
@@ -117,10 +117,10 @@ def words(command: str, random: Random) -> list[str]:
 
 def attack(case: str) -> str:
     """Run a case."""
-    from known_failures import COMMANDS
+    from minimal_cases import COMMANDS
 
     if case in COMMANDS:
-        return run(list(COMMANDS[case][0]))
+        return run(COMMANDS[case].split())
     return run(words(case.rsplit(" ", 1)[0], Random(case)))
 
 

@@ -1,6 +1,6 @@
 """Read files that were damaged at random: files of runs, saved episodes, models and tables.
 
-A case is "KIND SEED", or the name of a minimal case in ``known_failures.py``.
+A case is "KIND SEED", or the name of a minimal case in ``minimal_cases.py``.
 """
 
 import contextlib
@@ -93,8 +93,12 @@ _table = functools.partial(mutations.mutated_table, canary=CANARY)
 
 
 KINDS = {
-    "config.json": Kind("run/config.json", mutations.mutated_json, ("open", "eval", "resume", "from", "view")),
-    "kept config.json": Kind("kept/config.json", mutations.mutated_json, ("eval kept", "resume kept", "from kept")),
+    "config.json": Kind(
+        "run/config.json", mutations.mutated_json, ("open", "eval", "resume", "from", "view"), ("trained by",)
+    ),
+    "kept config.json": Kind(
+        "kept/config.json", mutations.mutated_json, ("eval kept", "resume kept", "from kept"), ("trained by",)
+    ),
     "versions.json": Kind("run/versions.json", mutations.mutated_json, ("eval", "resume")),
     "metrics.csv": Kind("run/metrics.csv", mutations.mutated_csv, ("open", "resume")),
     "policy.pt": Kind("run/policy.pt", _checkpoint, ("load", "load", "eval", "view", "from")),
@@ -110,16 +114,12 @@ KINDS = {
 
 
 def _both(run: Path, which: str = "last") -> None:
-    """Load both networks of a run, and compare their weights with those that were saved."""
-    saved = torch.load(BASE / run.name / ("best.pt" if which == "best" else "policy.pt"), weights_only=True)
-    for part, load in {"policy": lw.load, "value": lw.load_value}.items():
-        for key, tensor in load(run, which=which).state_dict().items():
-            if not torch.equal(tensor.cpu(), saved[part]["state"][key]):
-                raise ProblemError(f"other weights than those that were saved were accepted, {key} of the {part}")
+    for load in (lw.load, lw.load_value):
+        load(run, which=which)
 
 
 def _resume(run: Path) -> None:
-    command("train", "--resume", run, "--iterations", "3", "--no-video", "--no-plot")
+    command("train", "--resume", run, "--trust", "--iterations", "3", "--no-video", "--no-plot")
 
 
 def _episodes(path: Path) -> None:
@@ -134,9 +134,9 @@ READERS: dict[str, Callable[[], object]] = {
     "load": lambda: _both(CASE / "run"),
     "load best": lambda: _both(CASE / "run", "best"),
     "load alone": lambda: _both(CASE / "run"),
-    "eval": lambda: command("eval", CASE / "run", "--episodes", 2),
-    "eval kept": lambda: command("eval", CASE / "kept", "--episodes", 2),
-    "view": lambda: command("view", CASE / "run", "--nworld", 1),
+    "eval": lambda: command("eval", CASE / "run", "--trust", "--episodes", 2),
+    "eval kept": lambda: command("eval", CASE / "kept", "--trust", "--episodes", 2),
+    "view": lambda: command("view", CASE / "run", "--trust", "--nworld", 1),
     "resume": lambda: _resume(CASE / "run"),
     "resume alone": lambda: _resume(CASE / "run"),
     "resume previous": lambda: _resume(CASE / "run"),
@@ -153,7 +153,7 @@ READERS: dict[str, Callable[[], object]] = {
 WITHOUT = {"load alone": "run/policy.pt", "resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}
 """Files that are removed so that a reader falls back to another file."""
 SLIDE_PY = str(BASE / "slide.py")
-_NEW = ("--out", "case/new", "--iterations", "1", "--no-video", "--no-plot")
+_NEW = ("--trust", "--out", "case/new", "--iterations", "1", "--no-video", "--no-plot")
 
 
 class RefusedError(Exception):
@@ -174,10 +174,10 @@ def command(*words: object) -> None:
 
 def attack(case: str) -> str:
     """Run a case."""
-    from known_failures import FILES
+    from minimal_cases import FILES
 
     if case in FILES:
-        return read(*FILES[case][:3])
+        return read(*FILES[case])
     name = case.rpartition(" ")[0]
     random = Random(case)
     kind = KINDS[name]

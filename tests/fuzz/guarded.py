@@ -76,6 +76,7 @@ def serve(attack: Attack, warm_up: Callable[[], None]) -> None:
     """Run the cases in the command line; ``warm_up`` loads their modules before the memory is limited."""
     results = sys.argv[2] if sys.argv[1:2] == ["--results"] else None
     cases = sys.argv[3:] if results else sys.argv[1:]
+    os.environ["XDG_STATE_HOME"] = str(Path("state").absolute())
     warm_up()
     gc.collect()
     gc.freeze()

@@ -1,6 +1,6 @@
 """Call the public functions with random values for each of their arguments.
 
-A case is "CALL SEED", or the name of a minimal case in ``known_failures.py``. The arguments come from the signatures,
+A case is "CALL SEED", or the name of a minimal case in ``minimal_cases.py``. The arguments come from the signatures,
 so that a new one is attacked, too.
 """
 
@@ -102,10 +102,10 @@ CALLS = {
 
 def attack(case: str) -> str:
     """Run a case."""
-    from known_failures import KEYWORDS
+    from minimal_cases import KEYWORDS
 
     if case in KEYWORDS:
-        return call(*KEYWORDS[case][:2])
+        return call(*KEYWORDS[case])
     name = case.rpartition(" ")[0]
     random = Random(case)
     names = CALLS[name].names

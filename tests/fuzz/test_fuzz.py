@@ -1,6 +1,6 @@
 """Damaged files, random command lines and random arguments either work or are refused by an error that says why.
 
-A failure names its case and the command that repeats it. ``known_failures.py`` lists known failures.
+A failure names its case and the command that repeats it.
 """
 
 import functools
@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from guarded import Outcome, attacks, replay
-from known_failures import CLASSES, COMMANDS, FILES, KEYWORDS, open_classes
+from minimal_cases import COMMANDS, FILES, KEYWORDS
 
 FEW = {
     "file_attacks.py": {
@@ -64,29 +64,18 @@ def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFacto
 @pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.long)], ids=["few", "many"])
 @pytest.mark.parametrize(("program", "kind"), [(program, kind) for program in FEW for kind in FEW[program]])
 def test_random_cases_work_or_are_refused_in_one_line(outcomes: Any, program: str, kind: str, many: bool) -> None:
-    """No case of a kind breaks a rule, except for known failures."""
     count = (MANY if many else FEW)[program][kind]
     found = {case: o for case, o in outcomes(program, many).items() if case.rpartition(" ")[0] == kind}
     assert len(found) == count
     bad = [
         f"{outcome.problem}\n    {replay(program, case)}\n{outcome.trace}"
         for case, outcome in found.items()
-        if outcome.problem and not any(pattern.search(outcome.problem) for pattern in open_classes())
+        if outcome.problem
     ]
     assert not bad, "\n".join([f"{len(bad)} of {count} cases", *bad])
 
 
-MARKED = [
-    pytest.param(
-        program, name,
-        marks=[pytest.mark.xfail(strict=True, raises=AssertionError, reason=CLASSES[case[-1]][0])] if case[-1] else [],
-    )
-    for program, cases in MINIMAL.items()
-    for name, case in cases.items()
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("program", "name"), MARKED)
+@pytest.mark.parametrize(("program", "name"), [(program, name) for program in MINIMAL for name in MINIMAL[program]])
 def test_minimal_case_is_refused(outcomes: Any, program: str, name: str) -> None:
     outcome = outcomes(program, False)[name]
     assert not outcome.problem, f"{outcome.problem}\n    {replay(program, name)}\n{outcome.trace}"

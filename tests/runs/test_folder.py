@@ -2,6 +2,8 @@
 
 import json
 import resource
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -54,6 +56,34 @@ def test_create_leaves_no_folder_when_the_configuration_is_bad(tmp_path: Path) -
     with pytest.raises(TypeError):
         Run.create(tmp_path / "run", {"task": object()})
     assert not (tmp_path / "run").exists()
+
+
+KILLED = """
+import os, pathlib, sys
+from lyceum_warp.runs.folder import Run
+
+def killed(path, text):
+    path.write_bytes(text[:9].encode())
+    os.kill(os.getpid(), 9)
+
+pathlib.Path.write_text = killed
+Run.create(sys.argv[1], {}, files={"old.py": b"old"})
+"""
+
+
+def test_a_killed_creation_leaves_a_folder_for_another_run(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    assert subprocess.run([sys.executable, "-c", KILLED, str(folder)], check=False).returncode == -9
+    assert list(folder.iterdir())
+    run = Run.create(folder, {"task": "mine.py"}, files={"mine.py": b"new"})
+    assert sorted(path.name for path in folder.iterdir()) == ["config.json", "task", "versions.json"]
+    assert [path.name for path in run.task_folder.iterdir()] == ["mine.py"]
+
+
+def test_create_refuses_temporary_files_of_other_programs(tmp_path: Path) -> None:
+    (tmp_path / "mine.tmp").write_text("")
+    with pytest.raises(ValueError, match="is not an empty folder"):
+        Run.create(tmp_path, {})
 
 
 def test_open_of_an_empty_folder_finds_no_run(tmp_path: Path) -> None:

@@ -71,13 +71,13 @@ def test_a_run_of_0_1_loads_and_is_evaluated(run: Path, capsys: pytest.CaptureFi
     policy = lw.load(run)
     assert policy.act(torch.zeros(2, policy.nobs)).shape == (2, policy.nact)
     assert lw.load_value(run).discount == 0.995
-    assert main(["eval", str(run), "--episodes", "2"]) == 0
+    assert main(["eval", str(run), "--trust", "--episodes", "2"]) == 0
     assert "2 episodes of the mean policy" in capsys.readouterr().out
 
 
 def test_a_run_of_0_1_resumes_and_another_begins_with_it(run: Path, tmp_path: Path) -> None:
     before = Run.open(run)
-    assert main(["train", "--resume", str(run), "--iterations", "4", *QUIET]) == 0
+    assert main(["train", "--resume", str(run), "--trust", "--iterations", "4", *QUIET]) == 0
     after = Run.open(run)
     assert [row["iteration"] for row in after.rows()] == [1, 2, 3, 4] and after.read()["iteration"] == 4
     assert after.config["npg"] == before.config["npg"]

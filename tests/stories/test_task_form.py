@@ -189,7 +189,7 @@ def test_a_number_that_is_not_finite_is_a_fault_of_its_world(name: str, reason: 
         env.step(action)
         fine.step(action)
         assert env.done_reason.tolist() == [0, int(reason), 0]
-        assert env.terminated[1] and env.reward[1] == 0 and (env.episode_metrics["cost"][1] == 0)
+        assert env.truncated[1] and env.reward[1] == 0 and (env.episode_metrics["cost"][1] == 0)
         for obs in (*env.obs_groups.values(), *env.final_obs_groups.values()):
             assert torch.isfinite(obs).all()  # no learner meets them, not even after the reset
         if reason == lw.Done.OBSERVATION:

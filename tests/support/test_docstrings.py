@@ -1,6 +1,7 @@
 """``help`` shows what a user needs, attributes included."""
 
 import pydoc
+import re
 
 import pytest
 
@@ -35,3 +36,16 @@ def test_help_of_done_explains_every_bit() -> None:
     text = page(lw.Done)
     for bit in lw.Done:
         assert f"{bit.name} ({int(bit)}): " in text
+
+
+def test_help_of_every_public_function_shows_its_arguments() -> None:
+    functions = {
+        name: value for name in lw.__all__ if callable(value := getattr(lw, name)) and not isinstance(value, type)
+    }
+    assert len(functions) > 40
+    for name, function in functions.items():
+        text = page(function)
+        assert f"{name}(" in text and "class Function(" not in text, name
+        overloads = getattr(function, "user_overloads", {}).values()
+        for parameter in {each for overload in overloads for each in overload.input_types}:
+            assert re.search(rf"\b{parameter}\b", text), f"{name} has no {parameter}"

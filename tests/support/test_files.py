@@ -1,6 +1,8 @@
 """Files that are replaced whole."""
 
+import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -23,3 +25,25 @@ def test_replaced_keeps_the_old_file_after_an_exception(tmp_path: Path) -> None:
         temporary.write_text("half")
         raise KeyboardInterrupt
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("failures", [1, 2])
+def test_replaced_tries_a_second_time(failures: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a network, or while another program holds the file open."""
+    path, replace = tmp_path / "file.txt", os.replace
+    errors = [PermissionError(13, "Permission denied", str(path)) for _ in range(failures)]
+
+    def moved(*arguments: Any) -> None:
+        if errors:
+            raise errors.pop()
+        replace(*arguments)
+
+    monkeypatch.setattr(os, "replace", moved)
+    if failures == 1:
+        with replaced(path) as temporary:
+            temporary.write_text("new")
+        assert path.read_text() == "new"
+    else:
+        with pytest.raises(PermissionError), replaced(path) as temporary:
+            temporary.write_text("new")
+        assert not list(tmp_path.iterdir())

@@ -44,7 +44,7 @@ def curve(folder: Path, name: str) -> list[tuple[int, float]]:
 
 
 def test_every_number_of_an_iteration_is_a_curve_in_its_group(first: lw.Iteration, tmp_path: Path) -> None:
-    iteration = numbered(first, 1, metrics={"forward": 2.5})
+    iteration = numbered(first, 1, metrics={"forward": 2.5}, step_metrics={"forward": 0.5})
     with TensorBoard(tmp_path / "new" / "run", CONFIG) as board:
         board(iteration)
     scalars = read(tmp_path / "new" / "run").Tags()["scalars"]
@@ -52,11 +52,12 @@ def test_every_number_of_an_iteration_is_a_curve_in_its_group(first: lw.Iteratio
     assert len(scalars) == len(iteration.row())
     for name, value in [("return/mean", iteration.return_mean), ("mean_policy/return", iteration.mean_return),
                         ("policy/kl", 0.01), ("value/explained_variance", iteration.explained_variance),
-                        ("episode/length", 12.0), ("metrics/forward", 2.5), ("policy/std", iteration.std_mean),
+                        ("episode/length", 12.0), ("metrics/forward", 2.5),
+                        ("step_metrics/forward", 0.5), ("policy/std", iteration.std_mean),
                         ("time/sample", iteration.time_sample), ("episode/faults", 0.0)]:  # fmt: skip
         assert curve(tmp_path / "new" / "run", name) == [(96, value)]
     assert {name.partition("/")[0] for name in scalars} == {
-        "return", "episode", "mean_policy", "policy", "value", "time", "metrics",
+        "return", "episode", "mean_policy", "policy", "value", "time", "metrics", "step_metrics",
     }  # fmt: skip
 
 

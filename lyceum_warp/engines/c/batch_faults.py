@@ -1,4 +1,4 @@
-"""Errors that MuJoCo raises in single worlds of a batch."""
+"""Count errors that MuJoCo raises in single worlds of a batch."""
 
 import logging
 
@@ -8,14 +8,14 @@ from mujoco.batch import Batch, SimulationError
 log = logging.getLogger(__name__)
 
 _COUNTED_AS = mujoco.mjtWarning.mjWARN_INERTIA.value
-"""The kind of warning under which errors are counted; no other done reason stands for it."""
+"""The kind of warning under which errors are counted."""
 
 
 class ErrorsAsWarnings:
     """Context that counts errors of single worlds as warnings, which ``find_faults`` reads, instead of raising them.
 
-    MuJoCo leaves a world with an error in the state that it had before the call, and finishes the others. Every step
-    enters the context: one instance serves all of them, and a class enters in a quarter of a generator's time.
+    MuJoCo leaves a world with an error in its state before the call, and finishes the others. Every step enters the
+    same instance; a class takes a quarter of the time of a generator.
 
     Args:
         batch: The worlds.

@@ -1,6 +1,7 @@
 """The C engine: MuJoCo itself, many worlds on a pool of threads (mujoco.batch), float64 inside."""
 
 import copy
+import enum
 from collections.abc import Collection, Iterable, Mapping
 from functools import partial
 from typing import Any
@@ -46,6 +47,17 @@ _BATCH_BYTES = 150
 
 _MOST_MASKS = 16
 """Masks whose views are kept; an environment has fewer."""
+
+
+class _Copied(enum.Enum):
+    """When a step copies a field from the engine, where the stage after the substeps is a call of its own."""
+
+    BEFORE_STAGE = enum.auto()
+    """Fields that the stage does not compute, or computes in part: its MjData may be one that another world used."""
+    AFTER_STAGE = enum.auto()
+    """The parts of fields that the stage computes: sensors of its own and earlier stages."""
+    LAST = enum.auto()
+    """All others, by launches; without such a stage all fields."""
 
 
 class MujocoEngine(Engine):
@@ -110,12 +122,11 @@ class MujocoEngine(Engine):
         computed = [field for field in self._derived if field.refresh > Stage.NONE]
         positions = all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in computed)
         self._apart = bool(computed) and (positions or any(field.lagged for field in kept))
-        """Whether the stage after a step is a call of its own, in an MjData that another world may have used last."""
-        # copied before that call: fields that it does not compute, or in part
-        self._before_stage = [field for field in self._derived if field not in computed or field.snapshot]
-        self._mixed = [field for field in computed if field.snapshot]
-        early = self._state_fields + [field for field in computed if not field.snapshot]
-        self._shown = [field for field in (early if self._apart else kept) if field.name != "ctrl"]
+        """Whether the stage after the substeps is a call of its own."""
+        self._copied: dict[_Copied, list[Field]] = {moment: [] for moment in _Copied}
+        for field in kept:
+            for moment in self._moments(field):
+                self._copied[moment].append(field)
         # positions do not depend on contacts, whose search takes most of their stage
         without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if positions and computed else 0
         self._disabled = self.batch.expand("opt.disableflags") if without else np.zeros(0, dtype=int)
@@ -132,6 +143,15 @@ class MujocoEngine(Engine):
             self._values[name] = flat(self.arrays[name]).numpy()
         self._models = WorldModels(self.batch, self.dynamics.values())
         self._models.apply(self._values)
+
+    def _moments(self, field: Field) -> tuple[_Copied, ...]:
+        """When a step copies a field; an input never."""
+        if field.name == "ctrl":
+            return ()
+        computed = field.refresh > Stage.NONE
+        if not self._apart or field.name in STATE_FIELDS or (computed and not field.snapshot):
+            return (_Copied.LAST,)
+        return (_Copied.BEFORE_STAGE, _Copied.AFTER_STAGE) if computed else (_Copied.BEFORE_STAGE,)
 
     def _on_host(self, mask: wp.array) -> np.ndarray:
         """A mask's memory as a NumPy array. The view is kept, because making it takes longer than reading it."""
@@ -206,9 +226,9 @@ class MujocoEngine(Engine):
         with self._errors_as_warnings:
             self.batch.step(nstep=nstep, stage=Stage.NONE if self._apart else self.stage)
         if self._apart:
-            self._copy(self._before_stage)
+            self._copy(self._copied[_Copied.BEFORE_STAGE])
             self.compute_stage()
-            self._copy(self._mixed, early=True)
+            self._copy(self._copied[_Copied.AFTER_STAGE], early=True)
 
     def compute_stage(self) -> None:
         """Compute the stage of the fields that belong to the current state, in every world."""
@@ -220,7 +240,7 @@ class MujocoEngine(Engine):
             self._disabled[...] = self._step_flags
 
     def _show_fields(self) -> None:
-        self._read(self._shown, self._everyone)
+        self._read(self._copied[_Copied.LAST], self._everyone)
 
     def _copy(self, fields: list[Field], mask: np.ndarray | None = None, *, early: bool = False) -> None:
         """Copy fields of the masked worlds from the engine's float64 arrays into their float32 arrays.
@@ -247,7 +267,7 @@ class MujocoEngine(Engine):
         if native is None:
             super().rollout(state, controls, nstep, buffers)
             return
-        native(state, controls, buffers)
+        native.run(state, controls, buffers)
         self.batch.state[:] = native.batch.state
         self.batch.warning += native.batch.warning
         self._copy(self._state_fields)

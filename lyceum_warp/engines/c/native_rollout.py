@@ -1,11 +1,10 @@
-"""Open-loop rollouts on the C engine: the whole horizon of every world in one native call."""
+"""Roll out the whole horizon of every world in one native call of the C engine."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import mujoco
 import numpy as np
-import warp as wp
 from mujoco.batch import Batch
 
 from lyceum_warp.engines.c.batch_faults import ErrorsAsWarnings
@@ -15,11 +14,11 @@ from lyceum_warp.model_fields import ModelField
 
 
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
-    """Whether the rows of ``Batch.rollout`` hold the values that a call of ``Batch.step`` for each step would show.
+    """Whether the rows of ``Batch.rollout`` hold the same values as a call of ``Batch.step`` for each step.
 
     A row holds values as ``mj_step`` leaves them. Its state is the new one, but quantities of the position and velocity
-    stages belong to the state before the last substep: those of the new state are in the next row. With RK4 they belong
-    to an intermediate stage instead. Sensor data mix the stages, so they are not exact either.
+    stages belong to the state before the last substep; the next row has the values of the new state. With RK4 they
+    belong to an intermediate stage instead. Sensor data mix the stages and are not exact either.
     """
     current = [field for field in fields if field.refresh > Stage.NONE]
     if any(field.snapshot for field in current):
@@ -57,18 +56,18 @@ class NativeRollout:
         self.fields = [field for field in fields if field.size]
         self.stage = max((field.refresh for field in self.fields), default=Stage.NONE)
         self.start: dict[str, slice] = {}
-        """Columns of the state vector that hold a field's value at the start."""
+        """Columns of the state vector with a field's value at the start."""
         self.final: dict[str, np.ndarray] = {}
-        """The values at the end of those fields that must be computed for it."""
+        """Values at the end of the rollout, for fields that a forward pass must compute."""
         self.rows: dict[Any, np.ndarray] = {}
-        """A row for each substep, of each component of the state and each derived field."""
+        """One row per substep, for each component of the state and each derived field."""
         column = batch.nstate
         for field in snapshots:
             self.start[field.name] = slice(column, column + field.size)
             column += field.size
         self.models = WorldModels(batch, dynamics)
         self.model_columns: dict[str, slice] = {}
-        """Columns of the state vector that hold the model fields."""
+        """Columns of the state vector with the model fields."""
         for varied in dynamics:
             self.model_columns[varied.name] = slice(column, column + varied.size)
             column += varied.size
@@ -85,29 +84,24 @@ class NativeRollout:
                     self.final[field.name] = bound
         self._outputs: dict[str, Any] = {"record": list(self.rows), "out": self.rows}
 
-    def __call__(self, state: wp.array, controls: wp.array, buffers: Mapping[str, wp.array]) -> None:
-        """Roll out; see ``Engine.rollout``."""
-        given = (state, controls, buffers)
-        if self._given is None or any(a is not b for a, b in zip(given, self._given, strict=True)):
-            self._given = given  # views of Warp's arrays take longer to make than to fill
-            self._views = state.numpy(), controls.numpy(), {name: buffer.numpy() for name, buffer in buffers.items()}
-        self.run(*self._views)
-
-    def run(self, state: np.ndarray, controls: np.ndarray, buffers: Mapping[str, np.ndarray]) -> None:
+    def run(self, *given: Any) -> None:
         """Roll out, and copy the fields; ``batch.state`` and ``batch.warning`` then hold the end and all warnings.
 
         Args:
-            state: States at the start, (nworld, at least state_size) float64; each world runs on its model fields.
-            controls: Controls of each step, (steps, nworld, nu).
-            buffers: Where each field goes, (steps + 1, nworld, ...) float32.
+            given: The state, the controls and the buffers of ``Engine.rollout``.
         """
+        if self._given is None or any(a is not b for a, b in zip(given, self._given, strict=True)):
+            self._given, (start, held, arrays) = given, given
+            # views of Warp's arrays take longer to make than to fill
+            self._views = start.numpy(), held.numpy(), {name: buffer.numpy() for name, buffer in arrays.items()}
+        state, controls, buffers = self._views
         batch = self.batch
         batch.state[:] = state[:, : batch.nstate]
         batch.warning[:] = 0
         if self.model_columns:
             self.models.apply({name: state[:, part].astype(np.float32) for name, part in self.model_columns.items()})
         np.copyto(self.by_step, controls.transpose(1, 0, 2)[:, :, None])
-        # a world that MuJoCo warns of stops there and repeats its last row: only the warning shows it
+        # a world with a warning stops there and repeats its last row: only the warning shows it
         with ErrorsAsWarnings(batch):
             batch.rollout(nstep=self.control.shape[1], control=self.control, **self._outputs)
         if self.stage > Stage.NONE:

@@ -1,4 +1,4 @@
-"""Model fields that differ between the worlds of a batch."""
+"""Write model fields that differ between worlds into a batch."""
 
 from collections.abc import Iterable, Mapping
 
@@ -11,10 +11,10 @@ from lyceum_warp.model_fields import ModelField
 
 
 class WorldModels:
-    """Brings values of model fields into a batch, and the constants that follow from them.
+    """Writes values of model fields into a batch, and recomputes the constants that follow from them.
 
-    What a batch holds is a function of the float32 values alone: a value that rounds to the model's own is taken as
-    that, and every other one as it is.
+    The batch is a function of the float32 values alone: a value that equals the rounded value of the model becomes the
+    model's own float64 value; all others are taken as they are.
 
     Args:
         batch: The worlds.
@@ -36,17 +36,17 @@ class WorldModels:
             self._rounded[field.name] = self._own[field.name].astype(np.float32)
             if field.name in self._follows:
                 self._applied[field.name] = self._rows[field.name].astype(np.float32)
-        # constants that were computed once are computed by the same code for every value, also for the model's own
+        # the same code computes constants for every value, including the model's own
         self._stale = np.full(batch.nsim, bool(self._follows))
 
     def apply(self, values: Mapping[str, np.ndarray], mask: np.ndarray | None = None) -> None:
-        """Take over values, and recompute the constants of the worlds where any of them changed.
+        """Write values, and recompute the constants of the worlds in which any value changed.
 
         Args:
             values: By name, (nworld, size) float32.
             mask: Which worlds; None for all.
         """
-        if mask is not None and 1 not in mask.tobytes():  # as in most steps; faster than NumPy's own search
+        if mask is not None and 1 not in mask.tobytes():  # as in most steps; faster than mask.any()
             return
         worlds = np.arange(self.batch.nsim) if mask is None else np.flatnonzero(mask)
         derive = self._stale[worlds]

@@ -2,12 +2,12 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import mujoco_warp as mjw
 import warp as wp
 
 from lyceum_warp.engines.deterministic import order_kernels as order
+from lyceum_warp.support.arrays import alias
 
 _LANES = 8
 
@@ -88,6 +88,4 @@ def _words(array: wp.array) -> wp.array:
     size = array.size * wp.types.type_size_in_bytes(array.dtype) // 4
     if not rows or not size:
         return wp.empty((0, 0), dtype=int, device=array.device)
-    words: Any = wp.array(ptr=array.ptr, dtype=int, shape=(rows, size // rows), device=array.device)
-    words.owner = array  # keeps the memory alive as long as the alias
-    return words
+    return alias(array, int, (rows, size // rows))

@@ -66,7 +66,7 @@ class Turns:
         with wp.ScopedDevice(device):
             self._rank, self._world = wp.zeros(nworld, dtype=int), wp.zeros(size, dtype=int)
             self._count, self._first, self._left = (wp.zeros(1, dtype=int) for _ in range(3))
-        self._arena = Arena(device) if device.is_cuda and loop else None
+        self._memory = TemporaryMemory(device)
 
     def run(self, mask: wp.array, turn: Callable[[], None]) -> None:
         """Call ``turn`` for one group after another; it may use ``take`` and ``give``."""
@@ -77,8 +77,7 @@ class Turns:
             wp.launch(kernels.next_group, 1, [self._count, 0, self._first, self._left])
 
             def body() -> None:
-                if self._arena is not None:
-                    self._arena.open()
+                self._memory.open()
                 wp.launch(kernels.choose_group, self.nworld, [mask, self._rank, self._first, self._world])
                 turn()
                 wp.launch(kernels.next_group, 1, [self._count, self.size, self._first, self._left])
@@ -86,7 +85,7 @@ class Turns:
             if not self._loop:
                 body()
                 return
-            with self._reserved():
+            with self._memory():
                 wp.capture_while(self._left, while_body=body)
 
     def take(self, source: wp.array, target: wp.array) -> None:
@@ -104,12 +103,6 @@ class Turns:
     def give_bits(self, source: wp.array, target: wp.array) -> None:
         """Add the group's bits, (size,), to those of its worlds, (nworld,)."""
         wp.launch(kernels.return_bits, self.size, [self._world, self._left, source, target])
-
-    def _reserved(self) -> contextlib.AbstractContextManager[object]:
-        """Memory for the temporary arrays of a turn: within a loop of a CUDA graph nothing may be allocated."""
-        if self._arena is None:
-            return contextlib.nullcontext()
-        return self._arena.serving() if self.device.is_capturing else self._arena.counting()
 
 
 class Arena(Reserve):
@@ -162,6 +155,28 @@ class Arena(Reserve):
         return int(self.blocks[-1].ptr) + start
 
 
+class TemporaryMemory:
+    """Memory for temporary arrays within a loop or a branch of a CUDA graph, which may allocate nothing.
+
+    Args:
+        device: Where the launches run; on the CPU nothing is reserved.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        self._device, self._arena = device, None if device.is_cpu else Arena(device)
+
+    def open(self) -> None:
+        """Reuse the reserve from its start."""
+        if self._arena is not None:
+            self._arena.open()
+
+    def __call__(self) -> contextlib.AbstractContextManager[object]:
+        """The context of the launches: it counts what they allocate, or, during a capture, serves the reserve."""
+        if self._arena is None:
+            return contextlib.nullcontext()
+        return self._arena.serving() if self._device.is_capturing else self._arena.counting()
+
+
 class Conditional:
     """Runs launches if a mask holds a world, and costs next to nothing in a graph if it holds none.
 
@@ -174,7 +189,7 @@ class Conditional:
     def __init__(self, device: wp.Device) -> None:
         self._device = device
         self._any = wp.zeros(1, dtype=int, device=device)
-        self._arena = None if device.is_cpu else Arena(device)
+        self._memory = TemporaryMemory(device)
         self._inside = False
 
     def __call__(self, mask: wp.array, run: Callable[[], None]) -> None:
@@ -188,20 +203,14 @@ class Conditional:
         self._inside = True
         try:
             with wp.ScopedDevice(self._device):
+                self._memory.open()
                 if not self._device.is_capturing:
-                    with self._reserved(capturing=False):
+                    with self._memory():
                         run()
                     return
                 self._any.zero_()
                 wp.launch(kernels.find_any, len(mask), [mask, self._any])
-                with self._reserved(capturing=True):
+                with self._memory():
                     wp.capture_if(self._any, on_true=run)
         finally:
             self._inside = False
-
-    def _reserved(self, *, capturing: bool) -> contextlib.AbstractContextManager[object]:
-        """Memory for temporary arrays: within a conditional part of a CUDA graph nothing may be allocated."""
-        if self._arena is None:
-            return contextlib.nullcontext()
-        self._arena.open()
-        return self._arena.serving() if capturing else self._arena.counting()

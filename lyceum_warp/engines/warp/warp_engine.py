@@ -27,7 +27,7 @@ from lyceum_warp.fields import Field, Stage, early_sensor_columns
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_columns, copy_rows, fill_rows, narrow, widen, zero_columns
 from lyceum_warp.model_fields import ModelField
-from lyceum_warp.support.arrays import flat, launch_rows
+from lyceum_warp.support.arrays import alias, flat, launch_rows
 from lyceum_warp.support.upstream import has_sdf_functions
 from lyceum_warp.support.validate import whole_number
 
@@ -172,9 +172,7 @@ class WarpEngine(Engine):
         source = getattr(owner(self.m, field.name), field.name)
         if not field.size:
             return wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
-        own: Any = wp.array(ptr=source.ptr, dtype=field.dtype, shape=(self.nworld, *field.shape), device=self.device)
-        own.owner = source
-        return own
+        return alias(source, field.dtype, (self.nworld, *field.shape))
 
     def _model_constants(self) -> ModelConstants | None:
         """What keeps constants up to date, or None where none follow from the model fields."""
@@ -186,10 +184,7 @@ class WarpEngine(Engine):
 
     def _alias(self, field: Field) -> wp.array:
         """The memory of a field under the types of ``fields``, which differ from MuJoCo Warp's in name alone."""
-        source = getattr(self.d, field.name)
-        own: Any = wp.array(ptr=source.ptr, dtype=field.dtype, shape=(self.nworld, *field.shape), device=self.device)
-        own.owner = source  # a view of this memory may outlive the engine
-        return own
+        return alias(getattr(self.d, field.name), field.dtype, (self.nworld, *field.shape))
 
     def _copy_snapshots(self, mask: wp.array, fields: Iterable[Field]) -> None:
         for field in fields:

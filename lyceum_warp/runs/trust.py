@@ -1,0 +1,70 @@
+"""Record the run folders that this user made or trusts, and refuse to run or read what other folders name."""
+
+import datetime
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+log = logging.getLogger(__name__)
+
+
+def remember(folder: Path, config: Mapping[str, Any]) -> None:
+    """Record a run in this user's state directory, as a run that may run its task.
+
+    Args:
+        folder: The run's folder.
+        config: The content of its config.json.
+    """
+    record = _record(folder, config)
+    try:
+        record.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        record.write_text(f"{folder.resolve()}\n{datetime.datetime.now():%Y-%m-%d %H:%M:%S}\n")
+    except OSError as error:
+        log.warning("later commands need --trust for the run in %s, because %s cannot be written (%s)",
+                    folder, record, error.strerror)  # fmt: skip
+
+
+def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, runs: bool, trust: bool) -> None:
+    """Check that this user made a run on this machine, or trusts it.
+
+    Args:
+        folder: The run's folder.
+        config: The content of its config.json.
+        named: A file that the folder names, for the message.
+        runs: Whether the file is run as code; otherwise it is only read.
+        trust: Whether to trust and record the run.
+
+    Raises:
+        ValueError: The run is unknown, and ``trust`` is False.
+    """
+    if os.path.exists(_record(folder, config)):
+        return
+    if not trust:
+        raise ValueError(
+            f"the run in {folder} was not made by you on this machine, and it would {'run' if runs else 'read'} "
+            f"{named}: look at the folder, then allow it with --trust (trust=True in Python)"
+        )
+    remember(folder, config)
+
+
+def _record(folder: Path, config: Mapping[str, Any]) -> Path:
+    """The file that records a run. Its name is a digest of all that the folder can run or read."""
+    kept = config.get("kept", {})
+    paths = [{key: value for key, value in config.get(part, {}).items() if isinstance(value, str)}
+             for part in ("params", "options")]  # fmt: skip
+    found = hashlib.sha256(json.dumps([config.get("task"), kept, paths], sort_keys=True).encode())
+    task = folder / "task"
+    # a task's file outside may be edited, unless the folder has no copy with which it is compared
+    main = task / kept["file"] if "file" in kept else Path(str(config.get("task")).partition(":")[0])
+    for name, path in [*((str(path.relative_to(task)), path) for path in sorted(task.rglob("*"))), ("", main)]:
+        link, content = os.readlink(path) if path.is_symlink() else None, ""
+        if path.is_file():
+            with path.open("rb") as file:
+                content = hashlib.file_digest(file, "sha256").hexdigest()
+        found.update(json.dumps([name, link, content]).encode())
+    state = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
+    return Path(state, "lyceum_warp", "trusted", found.hexdigest())

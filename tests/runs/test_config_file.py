@@ -1,0 +1,65 @@
+"""The types of a configuration's entries, and errors of settings that name the file."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from training_runs import QUIET, algorithm, refused
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.runs.folder import Run
+
+
+@pytest.mark.parametrize(
+    ("entries", "words"),
+    [
+        ({"task": 3}, "task must be"),
+        ({"kept": []}, r"\[\] is in place of name, file"),
+        ({"kept": {"file": 3}}, "file must be of type str, not 3"),
+        ({"kept": {"modules": {"terms.py": 1}}}, "terms.py must be of type str, not 1"),
+        ({"params": None}, "params must be of type dict"),
+        ({"seed": 2**63}, "seed must be a whole number from 0"),
+        ({"nworld": True}, "nworld must be a whole number"),
+        ({"tensorboard": 1}, "tensorboard must be of type bool"),
+        ({"target_return": "1"}, "target_return must be of type"),
+        ({"reached": {"iteration": 1, "return": None}}, "return must be of type"),
+        ({"algorithm": "mine", "mine": 3}, "mine must be of type dict"),
+        ({"algorithm": "npg", "npg_seed": -1}, "npg_seed must be a whole number"),
+    ],
+)
+def test_an_entry_of_another_type_is_refused_with_the_name_of_the_file(
+    entries: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    (tmp_path / "config.json").write_text(json.dumps({"format": 1, **entries}))
+    with pytest.raises(ValueError, match=rf"{tmp_path}/config\.json is damaged: {words}"):
+        Run.open(tmp_path)
+
+
+def test_a_configuration_that_is_nested_too_deep_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text("[" * 100_000)
+    with pytest.raises(ValueError, match="is not the configuration of a run"):
+        Run.open(tmp_path)
+
+
+@pytest.mark.parametrize("command", ["eval", "resume"])
+def test_an_error_of_a_setting_names_the_file(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run", iterations=1)
+    run.amend(engine="x")
+    arguments = {"eval": ["eval", str(run.folder)],
+                 "resume": ["train", "--resume", str(run.folder), "--iterations", "2", *QUIET]}  # fmt: skip
+    assert cli.main(arguments[command]) == 2
+    refused(capsys, "'x'", f"(with the settings in {run.folder / 'config.json'})")
+
+
+def test_a_damaged_table_is_refused_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run", iterations=2)
+    run.metrics.write_text(run.metrics.read_text().replace("\n1,", "\none,"))
+    (run.folder / "versions.json").write_text("[]")
+    before = {path: path.read_bytes() for path in run.folder.iterdir()}
+    assert cli.main(["train", "--resume", str(run.folder), "--iterations", "3", *QUIET]) == 2
+    refused(capsys, f"{run.metrics} is not a table of metrics: line 2")
+    assert before == {path: path.read_bytes() for path in run.folder.iterdir()}

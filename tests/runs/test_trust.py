@@ -1,0 +1,247 @@
+"""A run folder of another user runs no code and reads no file that it names, before this user allows it."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from training_runs import QUIET, TINY, refused
+
+import lyceum_warp as lw
+import lyceum_warp.cli.view
+from lyceum_warp import cli
+from lyceum_warp.runs.configuration import Configuration
+from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.task_copy import run_env
+
+SOURCE = """
+import os
+from pathlib import Path
+
+import warp as wp
+import lyceum_warp as lw
+from lyceum_warp import Row
+
+if "WITNESS" in os.environ:
+    Path(os.environ["WITNESS"]).touch()
+
+@wp.struct
+class World:
+    qpos: Row[float]
+
+@wp.struct
+class Params:
+    dt: float
+    motion: wp.array2d[float] = [[0.0, 1.0]]
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    obs[0] = s.qpos[0] + p.motion[0, 1]
+
+class Told(lw.Task):
+    model, horizon, obs = "hopper.xml", 8, {"x": 1}
+"""
+
+
+@pytest.fixture(scope="module")
+def made(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs of a task's file and of a task of the package, at one path in every run of the tests, for Warp's cache."""
+    cache = getattr(pytestconfig, "cache", None)
+    folder = Path(cache.mkdir("trust")) if cache else tmp_path_factory.mktemp("trust")
+    shutil.rmtree(folder)
+    folder.mkdir()
+    (folder / "told.py").write_text(SOURCE)
+    np.save(folder / "motion.npy", np.zeros((40, 2), dtype=np.float32))
+    for name, task, param in (("own", folder / "told.py", f"motion={folder / 'motion.npy'}"),
+                              ("named", "point_mass", "success_distance=0.1")):  # fmt: skip
+        arguments = ["train", str(task), "--out", str(folder / name), "--param", param, "--horizon", "8", *TINY, *QUIET]
+        assert cli.main([*arguments, "--iterations", "1"]) == 0
+    return folder
+
+
+@pytest.fixture
+def witness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file that the task's file makes whenever it is run."""
+    monkeypatch.setenv("WITNESS", str(tmp_path / "witness"))
+    return tmp_path / "witness"
+
+
+@pytest.fixture
+def theirs(made: Path, witness: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The run of the task's file as another user gets it: elsewhere, without the original files and the record."""
+    folder = made / "theirs"
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(made / "own", folder, copy_function=shutil.copy)
+    change(folder, task="/home/other/told.py:Told", params={"motion": "/home/other/motion.npy"})
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    return folder
+
+
+def change(folder: Path, **entries: Any) -> None:
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | entries))
+
+
+def commands(folder: Path, out: Path) -> dict[str, list[str]]:
+    return {
+        "eval": ["eval", str(folder), "--episodes", "1"],
+        "view": ["view", str(folder), "--nworld", "1"],
+        "resume": ["train", "--resume", str(folder), "--iterations", "2", *QUIET],
+        "from": ["train", "--from", str(folder), "--out", str(out), "--iterations", "1", *QUIET],
+    }
+
+
+@pytest.mark.parametrize("name", ["eval", "view", "resume", "from"])
+def test_a_foreign_run_is_refused_until_it_is_trusted(
+    name: str, theirs: Path, witness: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.setattr(lyceum_warp.cli.view, "view", lambda *args, **options: None)
+    command = commands(theirs, tmp_path / "out")[name]
+    before = {path: path.read_bytes() for path in theirs.rglob("*.*") if path.is_file()}
+    capsys.readouterr()
+    assert cli.main(command) == 2
+    refused(capsys, f"the run in {theirs} was not made by you", f"would run {theirs / 'task' / 'told.py'}", "--trust")
+    assert not witness.exists()
+    assert before == {path: path.read_bytes() for path in theirs.rglob("*.*") if path.is_file()}
+    assert cli.main([*command, "--trust"]) == 0
+    assert witness.exists()
+    (record,) = {path.read_text().splitlines()[0] for path in (tmp_path / "state").rglob("trusted/*")} - {
+        str(tmp_path / "out")
+    }
+    assert record == str(theirs)
+    shutil.rmtree(tmp_path / "out", ignore_errors=True)
+    arguments = [word if word != "2" else "3" for word in command]
+    assert cli.main(arguments) == 0  # trusted from now on
+    (theirs / "task" / "told.py").write_text(SOURCE + "\n")
+    assert cli.main(command) == 2  # but not with another content
+
+
+def outside(folder: Path) -> Path:
+    file = folder.parent / "evil.py"
+    file.write_text(SOURCE)
+    return file
+
+
+def names_a_task(folder: Path) -> Path:
+    file = outside(folder)
+    change(folder, task=f"{file}:Told")
+    return file
+
+
+def names_a_file_outside(folder: Path) -> Path:
+    outside(folder)
+    (folder / "task").mkdir()
+    config = Run.open(folder).config
+    change(folder, kept=config["kept"] | {"file": "../../evil.py"})
+    return folder / "task" / "../../evil.py"
+
+
+def names_an_absolute_file(folder: Path) -> Path:
+    file = outside(folder)
+    change(folder, kept=Run.open(folder).config["kept"] | {"file": str(file)})
+    return file
+
+
+def brings_a_file(folder: Path) -> Path:
+    (folder / "task").mkdir()
+    (folder / "task" / "point_mass.py").write_text(SOURCE)
+    change(folder, kept=Run.open(folder).config["kept"] | {"file": "point_mass.py"})
+    return folder / "task" / "point_mass.py"
+
+
+def names_a_table(folder: Path) -> Path:
+    change(folder, params={"motion": "/home/other/table.npy"})
+    return Path("/home/other/table.npy")
+
+
+def names_a_model(folder: Path) -> Path:
+    change(folder, options={"model": "/home/other/model.xml"})
+    return Path("/home/other/model.xml")
+
+
+def brings_a_model(folder: Path) -> Path:
+    (folder / "task").mkdir()
+    change(folder, kept=Run.open(folder).config["kept"] | {"model": "../model.xml"})
+    return folder / "task" / "../model.xml"
+
+
+ATTACKS = [names_a_task, names_a_file_outside, names_an_absolute_file, brings_a_file, names_a_table, names_a_model,
+           brings_a_model]  # fmt: skip
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_a_run_of_a_named_task_is_refused_once_it_names_a_file(
+    attack: Callable[[Path], Path], made: Path, witness: Path, tmp_path: Path
+) -> None:
+    """The folder was recorded before it was edited."""
+    folder = Path(shutil.copytree(made / "named", tmp_path / "named"))
+    file = attack(folder)
+    run = Run.open(folder)
+    saved = Configuration.of(run)
+    with pytest.raises(ValueError, match=r"was not made by you .*--trust") as refusal:
+        run_env(run, saved.options, saved.params)
+    assert str(file) in str(refusal.value) and not witness.exists()
+    if attack in (names_a_table, names_a_model):  # the task is given, but what it reads is the folder's
+        with pytest.raises(ValueError, match=r"was not made by you .*--trust"):
+            run_env(run, saved.options, saved.params, task="point_mass")
+
+
+@pytest.mark.parametrize("link", ["file", "folder"])
+def test_a_link_out_of_the_folder_is_refused(link: str, made: Path, witness: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(made / "own", tmp_path / "own"))
+    change(folder, task="/home/other/told.py:Told")
+    kept = folder / "task" / "told.py"
+    if link == "file":  # of the same content, which may be replaced later
+        kept.rename(tmp_path / "told.py")
+        kept.symlink_to(tmp_path / "told.py")
+    else:
+        (folder / "task").rename(tmp_path / "task")
+        (folder / "task").mkdir()
+        (folder / "task" / "inner").symlink_to(tmp_path / "task")
+        change(folder, kept=Run.open(folder).config["kept"] | {"file": "inner/told.py"})
+    run = Run.open(folder)
+    saved = Configuration.of(run)
+    with pytest.raises(ValueError, match="was not made by you"):
+        run_env(run, saved.options, saved.params)
+    assert not witness.exists()
+
+
+def test_own_runs_may_move_and_their_tasks_change(made: Path, tmp_path: Path) -> None:
+    folder, file = tmp_path / "moved", made / "told.py"
+    shutil.copytree(made / "own", folder)
+    assert cli.main(["eval", str(folder), "--episodes", "1"]) == 0
+    file.write_text(SOURCE.replace("qpos[0] + ", "qpos[0] - "))
+    try:
+        assert cli.main(["eval", str(folder), "--episodes", "1"]) == 0
+    finally:
+        file.write_text(SOURCE)
+
+
+def test_a_run_of_a_named_task_needs_no_record(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert cli.main(["eval", str(made / "named"), "--episodes", "1"]) == 0
+
+
+def test_a_policy_is_loaded_and_exported_without_the_task(theirs: Path, witness: Path, tmp_path: Path) -> None:
+    assert lw.load(theirs).nobs == 1 and lw.load_value(theirs).discount > 0
+    assert cli.main(["export", str(theirs), "--to", str(tmp_path / "policy.pt2")]) == 0
+    assert not witness.exists() and not (tmp_path / "state").exists()
+
+
+def test_training_goes_on_with_a_line_if_the_run_cannot_be_recorded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    Run.create(tmp_path / "run", {"task": "mine.py"})
+    (line,) = caplog.messages
+    assert f"need --trust for the run in {tmp_path / 'run'}" in line
+
+
+def test_trust_without_a_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["train", "point_mass", "--trust", "--out", str(tmp_path / "run")]) == 2
+    refused(capsys, "--trust has no effect without --resume or --from")
