@@ -12,9 +12,9 @@ import warp as wp
 
 from lyceum_warp.binding.bound_task import BoundTask, check_field_name
 from lyceum_warp.binding.compile_errors import explained
-from lyceum_warp.binding.probe import Probe
 from lyceum_warp.binding.read_only_model import read_only
 from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding.write_probe import Probe
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.placement import bytes_per_world, find_device, open_engine, options_for_few_worlds

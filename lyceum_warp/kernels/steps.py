@@ -1,4 +1,4 @@
-"""Make the kernels of a step around the functions of a task."""
+"""Make the kernels of a step around the functions of a task: clip actions, judge transitions, begin episodes."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping

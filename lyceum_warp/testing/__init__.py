@@ -15,11 +15,11 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.task import Task
-from lyceum_warp.testing import bounds_rules as bounds
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import episode_rules as episodes
 from lyceum_warp.testing import fault_rules as faults
 from lyceum_warp.testing import form_rules as form
+from lyceum_warp.testing import index_rules as indices
 from lyceum_warp.testing import physics_rules as physics
 from lyceum_warp.testing import reset_rules as resets
 from lyceum_warp.testing import state_rules as state
@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 CHECKS: tuple[Callable[[Context], None], ...] = tuple(
     value
-    for module in (buffers, state, episodes, bounds, faults, form, physics, resets)
+    for module in (buffers, state, episodes, indices, faults, form, physics, resets)
     for name, value in vars(module).items()
     if name.startswith("check_")
 )

@@ -16,7 +16,7 @@ import warp as wp
 
 from lyceum_warp.binding import sources
 from lyceum_warp.binding.sources import FunctionSource, is_row, is_struct, name_of, overloads
-from lyceum_warp.kernels import bounds
+from lyceum_warp.kernels import index_checks
 
 _SHAPES = ("shape", "strides")
 """Attributes of an array that are tuples."""
@@ -37,15 +37,15 @@ class Place:
     def problem(self, index: int, size: int) -> str:
         """The message about an index out of range, or about an endless loop."""
         if self.verb == "loops":
-            rounds = int(bounds.MOST_ROUNDS)
+            rounds = int(index_checks.MOST_ROUNDS)
             return f"{self.function} is still in its loop {self.text!r} after {rounds} rounds ({self.where})"
         there = f"there are {size} elements, 0 to {size - 1}" if size else "there are no elements"
         return f"{self.function} {self.verb} {self.text} out of range ({self.where}): the index is {index}, and {there}"
 
 
 _HELPERS = {
-    "bounds_at": bounds.at, "bounds_from_end": bounds.from_end, "bounds_element": bounds.element,
-    "bounds_is_endless": bounds.is_endless,
+    "bounds_at": index_checks.at, "bounds_from_end": index_checks.from_end, "bounds_element": index_checks.element,
+    "bounds_is_endless": index_checks.is_endless,
 }  # fmt: skip
 """Functions that the copies call, by names that no task is likely to use."""
 

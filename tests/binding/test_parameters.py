@@ -14,7 +14,7 @@ import lyceum_warp as lw
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.options import OPTIONS
 from lyceum_warp.testing import check_task
-from lyceum_warp.testing.bounds_rules import check_bounds
+from lyceum_warp.testing.index_rules import check_bounds
 
 XML = """
 <mujoco>

@@ -7,7 +7,7 @@ import tiny_task
 from conftest import TaskFile
 
 from lyceum_warp.testing import check_task
-from lyceum_warp.testing.bounds_rules import check_bounds
+from lyceum_warp.testing.index_rules import check_bounds
 
 ENGINES = ["mujoco", "warp"]
 
