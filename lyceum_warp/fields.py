@@ -329,6 +329,6 @@ def _find(model: mujoco.MjModel, kind: mujoco.mjtObj, element: str) -> int:
     index = mujoco.mj_name2id(model, kind, element)
     if index < 0:
         names = [mujoco.mj_id2name(model, kind, i) for i in range(getattr(model, _COUNTS[kind]))]
-        known = ", ".join(sorted(n for n in names if n)) or "none that are named"
+        known = ", ".join(sorted(n for n in names if n)) or "none with names"
         raise ValueError(f"the model has no {_called(kind)} {element!r}; it has: {known}")
     return index

@@ -86,7 +86,7 @@ def check_task(
 
     Raises:
         AssertionError: Rules are broken; the message lists them.
-        ValueError: There are fewer than 2 worlds or 1 step, or an option does not fit.
+        ValueError: There are fewer than 2 worlds or no step, or an option does not fit.
 
     Example:
         >>> print(check_task("hopper", engine="mujoco"))

@@ -120,7 +120,7 @@ def attack(case: str) -> str:
     from minimal_cases import COMMANDS
 
     if case in COMMANDS:
-        return run(list(COMMANDS[case]))
+        return run(COMMANDS[case].split())
     return run(words(case.rsplit(" ", 1)[0], Random(case)))
 
 
