@@ -318,3 +318,13 @@ def test_dropped_environments_are_freed() -> None:
         gc.collect()
         made.append(sum(issubclass(type(thing), (lw.Env, wp.array)) for thing in gc.get_objects()))
     assert made[1] == made[2]
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_an_absurd_speed_has_one_reason_on_both_engines(engine: str) -> None:
+    env = lw.make("soft_ball", nworld=2, engine=engine)
+    state = env.get_state()
+    state[0, env.state_space.parts["qvel"].start] = 1e11
+    env.set_state(state, check=False)
+    env.step()
+    assert env.done_reason.tolist() == [int(Done.NAN), 0]
