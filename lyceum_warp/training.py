@@ -148,7 +148,7 @@ def train(
                     run = Run.create(folder, run.config | {"kept": kept}, device=device, files=files)
             lock = shown.enter_context(RunLock(run.folder, take_over=take_over, note=display.note)) if leads else None
             if resume:
-                run = _reopened(Path(folder), learner, settings, display.note if leads else log.debug)
+                _load_checkpoint(run, learner, settings, display.note if leads else log.debug)
         saver = Saver(
             run if leads else None, learner, keep_every=keep_every, save_every=save_every,
             saved=learner.iteration if resume else -1, lock=lock, note=display.note,
@@ -209,10 +209,9 @@ def _learn(
             ended = bool(last or signal)
 
 
-def _reopened(folder: Path, learner: Learner, settings: dict[str, Any], note: Callable[[str], None]) -> Run:
-    """Open a run, and load its checkpoint into the learner."""
-    run = Run.open(folder)
-    content = run.read(learner.env.obs.device, note=note)
+def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note: Callable[[str], None]) -> None:
+    """Load a run's checkpoint into the learner, and prepare its files for further iterations."""
+    folder, content = run.folder, run.read(learner.env.obs.device, note=note)
     reached, target, done = run.config.get("reached"), settings["target_return"], content["iteration"]
     if reached is not None and target is not None and reached["return"] >= target:
         raise ValueError(
@@ -237,7 +236,6 @@ def _reopened(folder: Path, learner: Learner, settings: dict[str, Any], note: Ca
             text = ", ".join(f"{name} {old} then, {new} now" for name, (old, new) in changed.items())
             note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")
         run.amend(**settings)
-    return run
 
 
 def _check_equal(run: Run, learner: Learner) -> None:

@@ -18,10 +18,7 @@ class Interrupted(BaseException):
 
 
 def _ignore(number: int, frame: Any) -> None:
-    """Handle a signal after Interrupted was raised.
-
-    It is not SIG_IGN, by which a shell makes a program ignore a signal, also in ``obeyed``.
-    """
+    """Ignore a signal after Interrupted was raised; ``obeyed`` replaces this handler, but never SIG_IGN."""
 
 
 def _interrupt(number: int, frame: Any) -> None:
@@ -86,7 +83,7 @@ def ending() -> Iterator[None]:
 
 @contextlib.contextmanager
 def obeyed() -> Iterator[None]:
-    """Within the context one more Ctrl-C, SIGTERM or SIGHUP raises Interrupted, after the first one of ``signals``.
+    """Within the context a second Ctrl-C, SIGTERM or SIGHUP raises Interrupted, after the first in ``signals``.
 
     It is for work at the end of a program that may take long, so that a second Ctrl-C cancels it.
     """

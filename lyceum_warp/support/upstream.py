@@ -1,4 +1,4 @@
-"""Reach and patch what Warp and MuJoCo Warp do not export.
+"""Access and patch internals of Warp and MuJoCo Warp.
 
 No other file does either, so that a new version of them is checked here alone.
 """

@@ -1,1 +1,1 @@
-"""Define the tasks of the package, one module each, with the module's name as the name of the task."""
+"""Define the tasks of the package, one module per task, named after the task."""

@@ -60,6 +60,13 @@ def test_a_run_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.Captu
     assert torch.equal(again.states, Trajectory.load(out / "episode-001.npz").states)
 
 
+def test_no_episode_begins_after_the_minutes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    assert plan(out, *QUIET, "--steps", "3", "--episodes", "3", "--minutes", "1e-9") == 0
+    assert "1e-09 minutes are over after 1 of 3 episodes" in capsys.readouterr().out
+    assert [file.name for file in out.glob("*.npz")] == ["episode-000.npz"]
+
+
 def test_a_video_is_made_of_the_first_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path / "run", "--no-plot", "--steps", "12", "--camera", "azimuth=20", "--camera", "track=1") == 0
     lines = capsys.readouterr().out.splitlines()

@@ -394,7 +394,7 @@ def test_random_resets_have_the_distribution_of_gymnasiums(task: str, times: flo
 def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
     """Compare two (n, k) samples: each coordinate, and each pair of coordinates.
 
-    Less than one in 10,000 pairs from equal distributions fails these thresholds; the seeds are fixed.
+    Fewer than one in 10,000 pairs from equal distributions fails these thresholds; the seeds are fixed.
     """
     n = len(a)
     assert a.shape == b.shape and np.isfinite(b).all()

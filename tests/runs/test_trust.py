@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tiny_task
 from training_runs import QUIET, TINY, refused
 
 import lyceum_warp as lw
@@ -17,33 +18,13 @@ from lyceum_warp.runs.configuration import Configuration
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.task_copy import run_env
 
-SOURCE = """
-import os
-from pathlib import Path
-
-import warp as wp
-import lyceum_warp as lw
-from lyceum_warp import Row
-
-if "WITNESS" in os.environ:
-    Path(os.environ["WITNESS"]).touch()
-
-@wp.struct
-class World:
-    qpos: Row[float]
-
-@wp.struct
-class Params:
-    dt: float
-    motion: wp.array2d[float] = [[0.0, 1.0]]
-
-@wp.func
-def observe(s: World, p: Params, obs: Row[float]):
-    obs[0] = s.qpos[0] + p.motion[0, 1]
-
-class Told(lw.Task):
-    model, horizon, obs = "hopper.xml", 8, {"x": 1}
-"""
+SOURCE = tiny_task.changed(
+    ("@wp.struct", 'if "WITNESS" in os.environ:\n    Path(os.environ["WITNESS"]).touch()\n\n@wp.struct'),
+    ("import warp as wp", "import os\nfrom pathlib import Path\n\nimport warp as wp"),
+    ("    dt: float", "    dt: float\n    motion: wp.array2d[float] = [[0.0, 1.0]]"),
+    ("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0] + p.motion[0, 1]"),
+    ("class Tiny", "class Told"),
+)
 
 
 @pytest.fixture(scope="module")
