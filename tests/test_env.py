@@ -35,17 +35,6 @@ def test_time_and_controls_are_always_kept() -> None:
     assert torch.equal(env.field("ctrl"), env.action)
 
 
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_fields_beside_the_task_do_not_change_its_numbers(engine: str) -> None:
-    plain, more = (lw.make("reach", nworld=3, engine=engine, fields=fields) for fields in ((), ("xpos", "cvel")))
-    for env in (plain, more):
-        env.rand_reset(1)
-        for _ in range(3):
-            env.step(torch.full_like(env.action, 0.3))
-    assert torch.equal(plain.obs, more.obs)
-    assert torch.equal(plain.reward, more.reward)
-
-
 @pytest.mark.parametrize("spoil", [pickle.dumps, copy.copy, copy.deepcopy])
 def test_an_environment_is_not_pickled_or_copied(spoil: Any) -> None:
     with pytest.raises(TypeError, match=r"cannot be pickled or copied: make it again .*env.replicate"):

@@ -1,7 +1,6 @@
 """Both engines offer a task the same: fields, controls, resets and options that the package's tasks do not use."""
 
 import gc
-import re
 from pathlib import Path
 
 import mujoco
@@ -215,23 +214,10 @@ def test_each_integrator_steps_alike_on_both_engines() -> None:
     assert (ends["euler", "mujoco"] - ends["rk4", "mujoco"]).abs().max() > 3e-3
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"integrator": "rk5"}, "no integrator 'rk5': use 'euler', 'rk4', 'implicit' or 'implicitfast'"),
-        ({"integrator": 1}, "no integrator 1: use"),
-        ({"solver": {"iteration": 3}}, "no limit 'iteration': it takes 'iterations', 'ls_iterations', 'noslip_"),
-        ({"solver": {"iterations": 0}}, "solver's iterations must be a whole number from 1 to .*, not 0"),
-        ({"solver": 4}, "solver must be a dict of limits, as .*, not 4"),
-        ({"iterations": 4}, r"no parameter 'iterations': did you mean solver=\{'iterations': ...\}"),
-        ({"nvtx": True}, "nvtx=True marks phases through torch"),
-    ],
-)
-def test_an_option_out_of_range_is_refused(options: dict[str, object], message: str) -> None:
-    if "nvtx" in options and torch.backends.cuda.is_built():
-        pytest.skip("this torch can")
-    with pytest.raises(ValueError, match=message):
-        lw.make("point_mass", **options)
+@pytest.mark.skipif(torch.backends.cuda.is_built(), reason="this torch can mark phases")
+def test_marks_for_a_profiler_are_refused_without_cuda() -> None:
+    with pytest.raises(ValueError, match="nvtx=True marks phases through torch"):
+        lw.make("point_mass", nvtx=True)
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
@@ -246,13 +232,6 @@ def test_fields_that_the_task_does_not_read_are_kept_if_listed(engine: str) -> N
     for task, name in (("hopper", "cfrc_ext"), ("hopper", "sensordata"), ("adroit_pen", "sensordata")):
         with pytest.raises(ValueError, match=f"'{name}' only for a sensor.*task's World.*fields=\\['{name}'\\]"):
             lw.make(task, engine=engine).field(name)
-    with pytest.raises(ValueError, match=r"does not keep the field 'cdof': make it with fields=\['cdof'\]"):
-        env.field("cdof")
-    for wrong in ("sensordata", 7, ["qpos", 7]):
-        with pytest.raises(ValueError, match=f"as in fields=.*, not {re.escape(repr(wrong))}"):
-            lw.make("adroit_pen", engine=engine, fields=wrong)
-    with pytest.raises(ValueError, match="there is no field 'qacceleration'"):
-        lw.make("adroit_pen", engine=engine, fields=["qacceleration"])
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])

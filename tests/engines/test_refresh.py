@@ -42,10 +42,10 @@ SENSORS = {
 FIELDS = "site_xpos xpos xquat subtree_com cam_xpos cvel sensordata"
 
 
-def model_of(sensors: str, integrator: str = "Euler", equality: str = "") -> mujoco.MjModel:
+def model_of(sensors: str, equality: str = "") -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(f"""
     <mujoco>
-      <option timestep="0.002" integrator="{integrator}"/>
+      <option timestep="0.002"/>
       <worldbody>
         <geom name="floor" type="plane" size="5 5 1"/>
         <site name="zone" type="box" size="1 1 .5" pos="0 0 .5"/>
@@ -146,16 +146,22 @@ def check_current(engine: Engine, *, whole: bool = False, worlds: slice = slice(
         np.testing.assert_array_equal(value[worlds], expected[worlds], err_msg=name)
 
 
-@pytest.fixture(params=[MujocoEngine, WarpEngine], ids=["mujoco", "warp"])
+class WholeWarpEngine(WarpEngine):
+    """A Warp engine without forward passes of only a few worlds."""
+
+    partial_refresh = False
+
+
+@pytest.fixture(params=[MujocoEngine, WarpEngine, WholeWarpEngine], ids=["mujoco", "warp", "whole_warp"])
 def kind(request: pytest.FixtureRequest) -> type[Engine]:
     engine: type[Engine] = request.param
     return engine
 
 
-def make(kind: type[Engine], sensors: str, integrator: str = "Euler", equality: str = "") -> Engine:
-    model = model_of(SENSORS[sensors], integrator, equality)
+def make(kind: type[Engine], sensors: str, equality: str = "") -> Engine:
+    model = model_of(SENSORS[sensors], equality)
     fields = [describe(model, name) for name in ("qpos", "qvel", *FIELDS.split())]
-    sizes = {"nconmax": 8, "njmax": 48} if kind is WarpEngine else {}
+    sizes = {} if kind is MujocoEngine else {"nconmax": 8, "njmax": 48}
     engine = kind(model, 4, wp.get_device("cpu"), fields, **sizes)
     begin(engine, everyone(engine), 0)
     return engine
@@ -245,6 +251,17 @@ def test_no_refresh_adds_to_a_sensors_history(kind: type[Engine]) -> None:
         begin(made, everyone(made), 6)
         made.step(2)
     np.testing.assert_array_equal(state_of(engine), state_of(fresh))
+
+
+def test_a_refresh_uses_the_equality_constraints_of_each_world(kind: type[Engine]) -> None:
+    engine = make(kind, "mixed", '<joint joint1="knee" polycoef="-.3 0 0 0 0"/>')
+    held = shown(engine)["sensordata"]
+    state = state_of(engine)
+    state[1, state_columns(engine.model, "eq_active")] = 0.0
+    put(engine, state, everyone(engine))
+    engine.refresh(everyone(engine))
+    check_current(engine, whole=True)
+    assert (shown(engine)["sensordata"] != held).any(axis=1).tolist() == [False, True, False, False]
 
 
 def test_the_sensor_of_a_limit_that_ended_is_zero(kind: type[Engine]) -> None:
