@@ -1,4 +1,4 @@
-"""The public face: what reaches the engine, what is refused, and environments in other processes."""
+"""Fields, parameters, replicas and refusals of environments, and environments in other processes."""
 
 import copy
 import gc
@@ -72,7 +72,7 @@ def test_an_environment_in_a_forked_child_says_that_it_belongs_to_the_parent() -
     assert not hangs and child.exitcode == 0
     assert len(messages) == 6
     assert all("made before the process was forked" in text and "'spawn'" in text for text in messages)
-    env.step()  # the parent's goes on
+    env.step()  # the parent's environment still works
 
 
 def _make_another(connection: Connection) -> None:

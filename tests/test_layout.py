@@ -1,4 +1,4 @@
-"""Who may import whom, what is private to whom, and where tests lie."""
+"""Modules import only from lower rooms, private names stay private, and every room has tests."""
 
 import ast
 import importlib

@@ -67,7 +67,7 @@ def test_a_replica_has_the_options_of_the_original_except_for_the_changes() -> N
     replica = env.replicate(nworld=3, horizon=6)
     assert replica.options.given() == {
         "nworld": 3, "horizon": 6, "integrator": "euler", "solver": {"iterations": 4},
-        "model": env.task.spec,  # as it was read, whatever became of its file
+        "model": env.task.spec,  # as it was read, even if its file has changed
     }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Phases become graphs: the same numbers, the same order, captured where they are made of launches."""
+"""Phases that are made of launches become graphs, with the same numbers in the same order."""
 
 import gc
 import threading
@@ -92,7 +92,7 @@ def test_threads_have_a_part_of_the_worlds_each_in_phases_that_allow_it(monkeypa
         for call in calls:
             call()
         assert digits.numpy().tolist() == [1234] * 5
-    # the first calls launch for all worlds, the second ones capture that, and later ones two parts where they may
+    # the first calls launch for all worlds, the second calls capture that, and later calls capture two parts if allowed
     assert sizes == [5, 5, 5, 5, 5, 5, 5, 5, *(2, 2, 3, 3), *(2, 3)]
 
 
@@ -124,7 +124,7 @@ def test_a_graph_holds_the_launches_of_its_own_thread_alone() -> None:
         thread.start()
         thread.join()
 
-    # the lock keeps captures of the package apart, so that this one must be Warp's own
+    # captures of the package take a lock, so this one must be Warp's own
     mine.phase(1).run()
     with wp.ScopedCapture(device=cpu) as capture:
         mine.phase(1).run()

@@ -1,4 +1,4 @@
-"""Environments that threads make, step and drop side by side have the numbers that each of them has alone."""
+"""Environments that are made, stepped and dropped in parallel threads produce the same numbers as in one thread."""
 
 import threading
 from collections.abc import Callable
@@ -30,7 +30,7 @@ def numbers(engine: str, task: str, seed: int, envs: int) -> list[torch.Tensor]:
 
 
 def in_threads(*functions: Callable[[], list[torch.Tensor]]) -> list[list[torch.Tensor] | Exception]:
-    """Results of functions that run side by side, or their errors."""
+    """Results or errors of functions that run in parallel."""
     results: list[list[torch.Tensor] | Exception] = [RuntimeError("did not end")] * len(functions)
 
     def call(i: int) -> None:
