@@ -70,11 +70,7 @@ class PackageFile(ModelFile):
     """The first version of Python without that package, as "3.13"; None if there is none."""
 
     def folder(self) -> Path:
-        """The package's folder of models.
-
-        Raises:
-            FileNotFoundError: The package is not installed.
-        """
+        """The package's folder of models; FileNotFoundError if the package is not installed."""
         package = importlib.util.find_spec(self.package)
         if package is None or not package.submodule_search_locations:
             what = f"the model {self.file} comes with the package {self.source}, which"
@@ -93,11 +89,7 @@ class MenagerieFile(ModelFile):
     """A model file in a local checkout of MuJoCo Menagerie."""
 
     def folder(self) -> Path:
-        """The checkout, to which the environment variable MENAGERIE_ROOT points.
-
-        Raises:
-            FileNotFoundError: The variable is not set, or names no folder with models.
-        """
+        """The checkout that MENAGERIE_ROOT names; FileNotFoundError if it is not set or names no folder with models."""
         root = os.environ.get("MENAGERIE_ROOT", "")
         if not root:
             raise FileNotFoundError(

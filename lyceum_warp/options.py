@@ -18,7 +18,7 @@ from lyceum_warp.support.docstrings import attribute_docs, document_attributes, 
 from lyceum_warp.support.validate import check_flag, check_kind, described, whole_number
 
 ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
-"""Where a model comes from: a file, or an MjSpec."""
+"""The source of a model: a file or an MjSpec."""
 
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 INTEGRATORS = {
@@ -143,7 +143,7 @@ class EnvOptions:
     """Whether launches are captured as graphs and replayed. False is for debugging and changes no numbers."""
     nvtx: bool = False
     """Whether to mark the phases of a step (act, physics, judge, restart, refresh, observe) for NVIDIA's profilers.
-    Each phase then is a graph of its own."""
+    Each phase is then a separate graph."""
     model: ModelSource | None = None
     """A model that replaces the task's: a file or an MjSpec."""
     fields: Collection[str] = ()

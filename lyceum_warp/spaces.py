@@ -118,7 +118,7 @@ def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | Non
 
 
 def control_ranges(model: mujoco.MjModel) -> np.ndarray:
-    """Lower and upper bound of each control, (nu, 2); infinite where the model sets none."""
+    """Lower and upper bound of each control, (nu, 2); infinite if the model sets none."""
     return np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf))
 
 

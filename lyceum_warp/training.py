@@ -69,7 +69,7 @@ def train(
     entries: Mapping[str, Any] | None = None,
     display: Display | None = None,
 ) -> Run:
-    """Train, and write the same folder as ``lyceum-warp train``: metrics, policies and checkpoints.
+    """Train, and write the folder of a run, as ``lyceum-warp train`` does: metrics, policies and checkpoints.
 
     ``lw.load(folder)`` returns the last policy, and ``lw.load(folder, which="best")`` the policy with the best return.
     The return is ``mean_return`` if the learner evaluates the mean policy. Otherwise it is ``return_mean``, over the

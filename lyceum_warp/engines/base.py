@@ -122,7 +122,7 @@ class Engine(abc.ABC):
     def bytes_per_world(
         cls, model: mujoco.MjModel, fields: Iterable[Field], dynamics: Iterable[ModelField] = (), **options: Any
     ) -> int:
-        """Estimated memory of each world in bytes; the arguments are those of the constructor.
+        """Estimated memory of each world in bytes; takes the arguments of the constructor.
 
         The default counts a float64 state and one float32 array for each field.
         """

@@ -13,7 +13,7 @@ _lock = threading.RLock()
 
 
 class Rehearsal:
-    """Stands in for Warp's launches, and notes the kernels."""
+    """Replaces Warp's launches, and notes the kernels."""
 
     def __init__(self) -> None:
         self.modules: dict[tuple[Any, int | None], None] = {}

@@ -18,7 +18,7 @@ _SPARE = 256
 
 
 def alias(array: wp.array, dtype: type, shape: tuple[int, ...], strides: tuple[int, ...] | None = None) -> wp.array:
-    """The same memory under another type, shape or strides; it stays allocated as long as the alias lives."""
+    """An alias of an array's memory with another type, shape or strides, which keeps the memory alive."""
     view: Any = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device)
     view.owner = array
     return view

@@ -83,7 +83,7 @@ variable, so two threads would overwrite each other's tiles."""
 
 
 def separate_tiles() -> None:
-    """Let one thread at a time launch kernels with tiles on the CPU, and note the launches in ``tiles``."""
+    """Serialise launches of kernels with tiles on the CPU, and note the launches in ``tiles``."""
     launch_tiled = wp.launch_tiled
 
     def launch(*args: Any, **options: Any) -> Any:

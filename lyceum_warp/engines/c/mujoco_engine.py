@@ -113,7 +113,7 @@ class MujocoEngine(Engine):
         self._before_stage = [field for field in late if field.name not in STATE_FIELDS]
         """Fields to copy before that call, which may use the MjData of another world."""
         self._after_stage = [field for field in self._before_stage if field in computed]
-        """Those of which the call computes a part: sensors of its own and earlier stages."""
+        """Fields of which the call computes a part: sensors up to its stage."""
         self._last = [field for field in shown if field not in self._before_stage]
         """Fields to copy at the end of a step, by launches."""
         # positions do not depend on contacts, whose search takes most of their stage

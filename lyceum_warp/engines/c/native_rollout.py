@@ -14,7 +14,7 @@ from lyceum_warp.model_fields import ModelField
 
 
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
-    """Whether the rows of ``Batch.rollout`` hold the same values as a call of ``Batch.step`` for each step.
+    """Whether ``Batch.rollout`` returns the same values as a call of ``Batch.step`` for each step.
 
     A row holds values as ``mj_step`` leaves them. Its state is the new one, but quantities of the position and velocity
     stages belong to the state before the last substep; the next row has the values of the new state. With RK4 they

@@ -116,7 +116,7 @@ class Rows:
 
 @wp.func
 def _kind(rows: Rows, w: int, r: int):
-    # a contact's rows stay together whatever its friction is
+    # all contact types are one type here, so that the rows of a contact stay together
     return wp.min(rows.type[w, r], _FIRST_CONTACT)
 
 

@@ -22,7 +22,7 @@ Part = Callable[[mjw.Model, mjw.Data], None]
 """A part of a forward pass, in every world of a data."""
 
 POSITION: tuple[Part, ...] = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex, mjw.tendon)
-"""The parts that a substep and a forward pass begin with; they are functions of positions alone."""
+"""The first parts of a substep and of a forward pass, which depend only on positions."""
 
 
 def step(model: mjw.Model, data: mjw.Data, done: Collection[Part] = ()) -> None:

@@ -95,13 +95,13 @@ class Turns:
             wp.launch(kernels.take_rows, rows.shape, [self._world, self._left, flat(source), rows])
 
     def give(self, source: wp.array, target: wp.array) -> None:
-        """Copy the group's rows, (size, ...), back into those of its worlds, (nworld, ...)."""
+        """Copy the group's rows, (size, ...), back to the rows of its worlds, (nworld, ...)."""
         rows = flat(source)
         if rows.size:
             wp.launch(kernels.return_rows, rows.shape, [self._world, self._left, rows, flat(target)])
 
     def give_bits(self, source: wp.array, target: wp.array) -> None:
-        """Add the group's bits, (size,), to those of its worlds, (nworld,)."""
+        """Add the group's bits, (size,), to the bits of its worlds, (nworld,)."""
         wp.launch(kernels.return_bits, self.size, [self._world, self._left, source, target])
 
 

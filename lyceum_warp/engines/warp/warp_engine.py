@@ -139,7 +139,7 @@ class WarpEngine(Engine):
         return wp.ScopedDevice(self.device)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
-        """Another model and data of MuJoCo Warp with the same options and sizes, to measure it alone."""
+        """Another model and data with the same options and sizes, to measure MuJoCo Warp by itself."""
         return self._put_model(), self._make_data(self.nworld)
 
     # memory
@@ -212,7 +212,7 @@ class WarpEngine(Engine):
             elif stage == Stage.ACCELERATION:
                 forward.forward(m, d)
             else:
-                # MuJoCo Warp writes sensors of limits and contacts only where there is one
+                # MuJoCo Warp writes sensors of limits and contacts only while the limit or contact is active
                 wp.launch(zero_columns, (d.nworld, len(self._columns)), [self._columns, d.sensordata])
                 mjw.fwd_position(m, d, factorize=False)
                 mjw.sensor_pos(m, d)
@@ -330,7 +330,7 @@ class WarpEngine(Engine):
 
     @contextlib.contextmanager
     def _histories_kept(self) -> Iterator[None]:
-        """A forward pass adds samples to the sensors' histories; the step that follows adds the same ones."""
+        """Restore the sensors' histories after a forward pass, because the next step adds the same samples."""
         if self.d.history.size:
             wp.copy(self._history, self.d.history)
         yield
