@@ -144,7 +144,7 @@ def test_an_element_that_is_not_there_is_refused(name: str, element: str, messag
         elements(model, name, element)
 
 
-def test_inputs_alone_may_be_written_before_a_step(model: mujoco.MjModel) -> None:
+def test_only_inputs_may_be_written_before_a_step(model: mujoco.MjModel) -> None:
     assert describe(model, "ctrl").written
     assert describe(model, "xfrc_applied", written=True).written
     assert not describe(model, "xfrc_applied").written
