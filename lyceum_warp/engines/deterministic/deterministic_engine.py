@@ -50,7 +50,7 @@ class DeterministicEngine(WarpEngine):
         return _TIMES_THE_MEMORY * super().bytes_per_world(model, fields, dynamics, **options)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
-        """Another model and data with the same options and sizes, to measure MuJoCo Warp by itself.
+        """Another model and data with the same options and sizes, for measurements of bare MuJoCo Warp.
 
         Graphs of their steps take about a hundred times the memory, because they share no scratch.
         """

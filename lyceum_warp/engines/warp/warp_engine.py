@@ -139,7 +139,7 @@ class WarpEngine(Engine):
         return wp.ScopedDevice(self.device)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
-        """Another model and data with the same options and sizes, to measure MuJoCo Warp by itself."""
+        """Another model and data with the same options and sizes, for measurements of bare MuJoCo Warp."""
         return self._put_model(), self._make_data(self.nworld)
 
     # memory
