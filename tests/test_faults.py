@@ -312,3 +312,13 @@ def test_dropped_environments_are_freed() -> None:
         gc.collect()
         made.append(sum(issubclass(type(thing), (lw.Env, wp.array)) for thing in gc.get_objects()))
     assert made[1] == made[2]
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_an_absurd_speed_has_one_reason_on_both_engines(engine: str) -> None:
+    env = lw.make("hopper", nworld=6, engine=engine)
+    state = env.get_state()
+    state[:, env.state_space.parts["qvel"]] += 1e11 * torch.eye(6, dtype=state.dtype)
+    env.set_state(state, check=False)
+    env.step()
+    assert env.done_reason.tolist() == [int(Done.NAN)] * 6

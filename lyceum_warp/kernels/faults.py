@@ -58,6 +58,8 @@ def faults_of_rows(
                 fault = fault | NAN
             else:
                 fault = fault | WARNING
+    if (fault & NAN) != 0:  # a bad state leads to further warnings, such as one of inertia
+        fault = fault & ~WARNING
     fault_out[w] = fault
 
 
