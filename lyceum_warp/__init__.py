@@ -1,7 +1,6 @@
 """Batched MuJoCo worlds for robot learning: one task source, two engines, arrays shared with torch.
 
-Importing the package loads nothing: a public name loads its module, and with it torch, Warp or MuJoCo, when it is first
-used (PEP 562).
+Importing the package loads neither torch nor Warp nor MuJoCo: each public name loads its module at first use (PEP 562).
 """
 
 import importlib
@@ -109,7 +108,7 @@ _NAMES = {
     "viewer.follow": "RunViewer",
     "viewer.show": "view",
 }
-"""The public names that each module defines, as the imports above have them for type checkers."""
+"""The public names of each module; type checkers read the imports above instead."""
 # isort: on
 # fmt: on
 

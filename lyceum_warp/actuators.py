@@ -1,4 +1,4 @@
-"""Changes to a model's actuators, for a task's ``edit_model``."""
+"""Change a model's actuators, in a task's ``edit_model``."""
 
 import mujoco
 
@@ -6,14 +6,14 @@ from lyceum_warp.support.validate import positive_number
 
 
 def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:
-    """Turn a position servo into one whose target moves with a velocity, which becomes its control.
+    """Turn a position servo into one whose control is the velocity of its target.
 
-    The servo keeps its gains. Its target, one of the model's activations (``act``), stays within the former control
-    range.
+    The servo keeps its gains. The target becomes an activation of the model (``act``) and stays within the former
+    control range.
 
     Args:
         actuator: A position servo with a control range; changed in place.
-        speed: The range of the control becomes plus or minus this, in m/s or rad/s.
+        speed: The new controls range from -speed to speed, in m/s or rad/s.
 
     Raises:
         ValueError: The actuator is not such a servo, or the speed is not positive.

@@ -1,8 +1,8 @@
-"""Why an episode ended, as bits.
+"""Name the reasons why an episode ends, as bits.
 
-Both engines report the same bits for the same fault. Only limits that one engine has differ: a C world that runs out
-of its arena memory may report ENGINE_WARNING beside an overflow, and MuJoCo Warp reports an overflow of its contact
-pool in every world that it touched.
+Both engines report the same bits for the same fault, except for their own limits: a world of the C engine that runs out
+of arena memory may report ENGINE_WARNING beside an overflow, and MuJoCo Warp reports an overflow of the contact pool in
+every world whose contacts did not fit.
 """
 
 import enum
@@ -19,7 +19,7 @@ class Done(enum.IntFlag):
     TRUNCATED = 2
     """The time limit was reached. ``env.truncated`` also includes faults."""
     NAN = 4
-    """A state or a control became not-a-number or absurd (beyond 1e10), or task memory not finite."""
+    """A state or a control is not-a-number or beyond 1e10, or task memory is not finite."""
     CONTACT_OVERFLOW = 8
     """More contacts than the engine had room for."""
     CONSTRAINT_OVERFLOW = 16
@@ -27,13 +27,13 @@ class Done(enum.IntFlag):
     ENGINE_WARNING = 32
     """Any other warning of the engine."""
     ACTION = 64
-    """The action was not finite; it was applied as zero."""
+    """The action was not finite, and was applied as zero."""
     REWARD = 128
     """The reward was not finite."""
     OBSERVATION = 256
-    """A number of the observation was not finite."""
+    """The observation was not finite."""
     MODEL = 512
-    """A model field was drawn that cannot be simulated, such as a negative mass."""
+    """A drawn model field cannot be simulated, such as a negative mass."""
 
 
 FAULTS = ~(Done.TERMINATED | Done.TRUNCATED)

@@ -34,13 +34,12 @@ from lyceum_warp.worlds import Worlds
 
 _BUFFERS = (*steps.OUTCOMES, "obs", "final_obs", "action")
 
-
 _ARGUMENTS = """Args:
     task: Name of a task, a file with one (path/to/file.py, or path/to/file.py:Class), or its class.
-    options: Options in one piece; those given by name replace single ones.
+    options: Options as one object; options given by name replace its fields.
 {options}
-    **params: Every other keyword is a parameter of the task, a field of its ``Params``; a scalar may also be given
-        as one value a world, (nworld,). A table is an array, a tensor, a nested list, or the path of a ``.npy`` file.
+    **params: Parameters of the task, fields of its ``Params``. A scalar may also be given as one value per world,
+        (nworld,). A table is an array, a tensor, a nested list, or the path of a ``.npy`` file.
 
 Raises:
     ValueError: An argument is unknown or does not fit; the message names the argument and says how to fix it.
@@ -49,7 +48,7 @@ Raises:
 
 
 def _document_arguments(function: Any) -> Any:
-    """Decorator: put the arguments into the docstring and the signature, where ``help`` shows them."""
+    """Decorator: insert the arguments into the docstring and the signature, for ``help``."""
     arguments = _ARGUMENTS.replace("{options}", OPTION_DOCS)
     function.__doc__ = inspect.cleandoc(function.__doc__).replace("{arguments}", arguments)
     function.__signature__ = signature_of_options(function)
@@ -70,16 +69,16 @@ def make(task: str | type[Task], options: EnvOptions | None = None, **words: Any
 class Env:
     """One task in many worlds, with every array allocated once and shared with torch.
 
-    Write ``action``, call ``step``, read the other buffers: they stay the same tensors at the same addresses and change
-    in place. A world whose episode ends begins a new, random one within the same step; ``obs`` is then the first
-    observation of the new episode, ``final_obs`` the last one of the old.
+    Write ``action``, call ``step``, and read the other buffers, which are updated in place. A world whose episode ends
+    begins a new, random one within the same step: ``obs`` is then the first observation of the new episode, and
+    ``final_obs`` the last observation of the old one.
 
-    A world with a fault (see ``Done``) restarts, is counted in ``fault_counts``, and leaves the numbers of all other
-    worlds unchanged to the bit. The transition has reward 0 and the last good observation as ``final_obs``. Under the
-    Warp engine the worlds share a pool of contacts: when it overflows, every world that it touched has a fault.
+    A world with a fault (see ``Done``) restarts and is counted in ``fault_counts``. All other worlds stay equal to the
+    bit. The transition has reward 0 and the last good observation as ``final_obs``. In the Warp engine the worlds share
+    a pool of contacts: if it overflows, every world whose contacts did not fit has a fault.
 
-    On a GPU, torch's work on these tensors belongs on torch's default stream, which is synchronised with Warp's. Work
-    on other streams must be synchronised by the caller.
+    On a GPU, use these tensors on torch's default stream, which is synchronised with Warp's, or synchronise other
+    streams yourself.
 
     {arguments}
     """
@@ -91,7 +90,7 @@ class Env:
     obs_groups: dict[str, torch.Tensor]
     """Observations by group, each (nworld, size of the group); ``policy`` is ``obs``."""
     final_obs_groups: dict[str, torch.Tensor]
-    """The same for ``final_obs``."""
+    """``final_obs`` by group."""
     reward: torch.Tensor
     """Rewards of the last step, (nworld,), float32."""
     eval: torch.Tensor
@@ -103,11 +102,11 @@ class Env:
     metrics: dict[str, torch.Tensor]
     """The task's metrics of the last step by name, each (nworld,), float32."""
     episode_metrics: dict[str, torch.Tensor]
-    """The sums of the metrics over the episode that the last step belongs to, each (nworld,), float32."""
+    """The sums of the metrics over the episode of the last step, each (nworld,), float32."""
     episode_metric_sums: torch.Tensor
-    """The same as one tensor, (nworld, number of metrics), in the order of ``metrics``."""
+    """``episode_metrics`` as one tensor, (nworld, number of metrics), in the order of ``metrics``."""
     success: torch.Tensor
-    """Whether the task's goal is met, or has been for ``success_steps`` steps in a row, (nworld,), bool."""
+    """Whether the task's goal has been met for ``success_steps`` steps in a row, (nworld,), bool."""
     done: torch.Tensor
     """Whether the episode ended for any reason, (nworld,), bool."""
     done_reason: torch.Tensor
@@ -123,7 +122,7 @@ class Env:
     timestep: float
     """Simulated seconds in a step, over all its substeps."""
     device: wp.Device
-    """The Warp device; ``obs.device`` is the same one in torch."""
+    """The Warp device; ``obs.device`` is its torch counterpart."""
     options: EnvOptions
     """The options that the environment was made with."""
     task: BoundTask
@@ -135,7 +134,7 @@ class Env:
     obs_space: Space
     """Parts of an observation and their columns."""
     obs_spaces: dict[str, Space]
-    """The same for every group of observations; ``policy`` is ``obs_space``."""
+    """The spaces of all groups of observations; ``policy`` is ``obs_space``."""
     action_space: Space
     """Names, columns and bounds of actions."""
     state_space: Space
@@ -187,9 +186,9 @@ class Env:
                 self.engine.prepare_capture()
             self.engine.reset(worlds.everyone)
             probe = Probe(self.task, worlds.after, worlds.params, self.device)
-            probe.check_bounds()  # before a function writes into an array
+            probe.check_bounds()  # before any function of the task writes into an array
             self.rand_reset(options.seed)
-            if self.task.dynamics and not _replica:  # later, and in a replica, a bad draw is a fault of its world
+            if self.task.dynamics and not _replica:  # a later bad draw is a fault of its world
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
             probe.check_observations()
             if not _replica:
@@ -213,11 +212,10 @@ class Env:
 
     @functools.cached_property
     def model(self) -> mujoco.MjModel:
-        """The compiled model. It is read-only, because the engine has a copy of its own.
+        """The compiled model, read-only, because the engine has a copy of its own.
 
-        An edit raises an error; an edit of an array raises NumPy's "assignment destination is read-only". To change
-        the physics, list model fields in the task's ``World`` and write them in ``startup`` or ``randomize``, or pass
-        an edited MjSpec as ``model=``. ``copy.copy(env.model)`` is an ordinary MjModel that can be edited.
+        To change the physics, list model fields in the task's ``World`` and write them in ``startup`` or ``randomize``,
+        or pass an edited MjSpec as ``model=``. ``copy.copy(env.model)`` is an ordinary MjModel that can be edited.
         """
         return read_only(self.task.model)
 
@@ -239,9 +237,9 @@ class Env:
     # the step
 
     def step(self, action: torch.Tensor | None = None) -> None:
-        """Advance every world by one step under ``action``, and begin new episodes where one ended.
+        """Advance every world by one step under ``action``, and begin new episodes in worlds whose episode ended.
 
-        ``Worlds.step_phases`` lists what happens, in order.
+        ``Worlds.step_phases`` lists the phases in order.
 
         Args:
             action: Copied into ``env.action`` first, if given; (nworld, nact).
@@ -287,11 +285,11 @@ class Env:
     # the state
 
     def get_state(self, out: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> torch.Tensor:
-        """The full state of every world, on which its future depends, (nworld, state_space.size), float64.
+        """The full state of every world, which determines its future, (nworld, state_space.size), float64.
 
         It holds the engine's integration state, fields left by the last substep, model fields that differ between
         worlds, the counters of steps and episodes, the random stream, the task's memory, the sums of the metrics, and
-        the count of ``success_steps``; ``state_space.parts`` has the columns of each.
+        the count for ``success_steps``. ``state_space.parts`` names their columns.
 
         Args:
             out: Where to write the states.
@@ -314,12 +312,12 @@ class Env:
     def set_state(self, state: torch.Tensor, mask: torch.Tensor | None = None, *, check: bool = True) -> None:
         """Put worlds into states from ``get_state``, exactly; every getter reflects them afterwards.
 
-        The reward becomes 0, because no action led there.
+        The reward becomes 0, because there is no transition.
 
         Args:
             state: (nworld, state_space.size), float64.
             mask: Which worlds, (nworld,) bool; all by default.
-            check: Whether to refuse states that are not finite, which on a GPU waits for the device.
+            check: Whether to refuse states that are not finite. On a GPU the check waits for the device.
 
         Raises:
             ValueError: The state has another shape or type, or is not finite.
@@ -358,7 +356,7 @@ class Env:
         return _copied(self.eval if state is None else self._scratch_at(state).eval, out)
 
     def get_terminated(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
-        """Whether the last step terminated the episode, or ``terminated`` holds in given states, (nworld,) bool."""
+        """Whether the last step terminated the episode, or given states are terminal, (nworld,) bool."""
         return _copied(self.terminated if state is None else self._scratch_at(state).worlds.terminated_view, out)
 
     def get_reward(
@@ -367,8 +365,8 @@ class Env:
     ) -> torch.Tensor:  # fmt: skip
         """Rewards of the last step, or of given transitions, (nworld,).
 
-        Given transitions are judged in scratch worlds; the live ones stay unchanged. If an event of the task changed
-        what its reward reads, ``env.reward`` differs, because it was judged before the event.
+        Given transitions are judged in scratch worlds; the live worlds stay unchanged. The result differs from
+        ``env.reward`` if an event of the task changed fields that the reward reads, because events follow the reward.
 
         Args:
             before: States before, (nworld, state_space.size).
@@ -377,7 +375,7 @@ class Env:
             out: Where to write the rewards.
 
         Raises:
-            ValueError: Only a part of a transition is given, or it has the wrong shape or type.
+            ValueError: Only a part of a transition is given, or an argument has the wrong shape or type.
         """
         if before is None and action is None and after is None:
             return _copied(self.reward, out)
@@ -413,14 +411,14 @@ class Env:
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
         """A live view of a field of MjData or MjModel, by MuJoCo's name.
 
-        An environment keeps the fields that its task reads, ``time`` and ``ctrl``; name further ones when making it,
-        as in ``make("hopper", fields=["site_xpos", "body_mass"])``. The view is for reading: numbers written into it
-        have no effect or give wrong results. Use ``set_state`` or ``set_dynamics`` instead.
+        An environment keeps ``time``, ``ctrl`` and the fields that its task reads. Name further ones when you make it,
+        as in ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write into the view: use ``set_state`` or
+        ``set_dynamics``.
 
         Args:
             name: Attribute of MjData or MjModel, for instance "qpos", "site_xpos" or "body_mass".
-            element: A name from the model: a joint in "qpos" or "qvel", a sensor in "sensordata", a body,
-                site, geom or camera elsewhere.
+            element: A name from the model: a joint for "qpos" or "qvel", a sensor for "sensordata", or a body, site,
+                geom or camera.
 
         Raises:
             ValueError: The environment does not keep this field, or the model has no such element.
@@ -441,16 +439,15 @@ class Env:
         return view[:, where.start] if one_object else view[:, where]
 
     def set_dynamics(self, mask: torch.Tensor | None = None, **fields: Any) -> None:
-        """Set model fields that differ between worlds: those that the task draws, and those named by ``dynamics=``.
+        """Set model fields that the task draws or that ``dynamics=`` names; derived constants follow.
 
-        Derived constants follow. A reset restores the nominal values of fields that the task's ``initialize``,
-        ``randomize`` or ``event`` writes, before they are drawn again; others keep these values until
-        ``rand_reset(seed=...)``.
+        A reset restores the nominal values of fields that the task's ``initialize``, ``randomize`` or ``event`` writes,
+        before they are drawn again. Other fields keep the new values until ``rand_reset(seed=...)``.
 
         Args:
             mask: Which worlds, (nworld,) bool; all by default.
-            fields: Values by the names of model fields, as ``body_mass=masses``; each a row for every world, of the
-                shape of ``env.field(name)``, or one row for all worlds.
+            fields: Values by the names of model fields, as ``body_mass=masses``: a row for each world, or one row for
+                all worlds.
 
         Raises:
             ValueError: A field is unknown or does not differ between worlds, or a value is of the wrong size, not
@@ -475,7 +472,7 @@ class Env:
 
     @property
     def given_params(self) -> dict[str, Any]:
-        """The parameters of the task that were given, by name; all others have their defaults."""
+        """The given parameters of the task by name; all others have their defaults."""
         return dict(self._given_params)
 
     def set_params(self, **params: Any) -> None:
@@ -491,39 +488,38 @@ class Env:
             self._scratch.follow(self)
 
     def follow(self, other: "Env") -> None:
-        """Take over the parameters of another environment of the same task, as ``replicate`` does.
+        """Copy the parameters of another environment of the same task.
 
         Raises:
-            ValueError: The other is not an environment, or has other parameters.
+            ValueError: ``other`` is not an environment, or belongs to a task with other parameters.
         """
         check_kind("other", other, Env, "an environment of the same task")
         self.set_params(**other._params_for(self.nworld, {**self._given_params, **other._given_params}))
 
     def replicate(self, *, nworld: int | None = None, **changes: Any) -> "Env":
-        """Another environment of the same task with the same options and parameters, except for the given changes.
+        """Make another environment of the same task with the same options and parameters, except for the given changes.
 
-        Its ``seed`` and ``first_world`` are 0 unless they are given. Parameters with one value a world are repeated if
-        the number of worlds differs.
+        ``seed`` and ``first_world`` become 0 unless given. Parameters with one value per world are repeated if the
+        number of worlds differs.
         """
         nworld = self.nworld if nworld is None else nworld
-        # not the model's source, which may have changed since
+        # the parsed model, because its file may have changed
         own = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
         known, params = EnvOptions.split(changes, self.options.changed(own | {"seed": 0, "first_world": 0}))
         given = self._params_for(nworld, self._given_params)
         return Env(self.task.task, known.changed({"nworld": nworld}), _replica=True, **(given | params))
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
-        """``replicate`` for a few worlds, such as an evaluation's.
+        """``replicate`` for a few worlds, such as an evaluation's: with engine="auto" they run on the C engine.
 
-        With engine="auto" they step on CPU cores through the C engine, in double precision: on a GPU a step of a few
-        worlds takes nearly as long as a step of thousands.
+        On a GPU a step of a few worlds takes nearly as long as a step of thousands.
         """
         return self.replicate(nworld=nworld, **(options_for_few_worlds(self.options.engine, self.device) | changes))
 
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
         """The values of some parameters, for a number of worlds."""
         known, worlds = self.task.parameters, np.arange(nworld) % self.nworld
-        # other values as they were given: a name of the model, not its index
+        # other values stay in their given form, such as an element's name, not its index
         given = {name: value for name, value in self._given_params.items() if name not in known.tables}
         values = {name: (known.values | given)[name] for name in names}
         return values | {name: known.values[name][worlds] for name in names if name in known.per_world}

@@ -1,7 +1,7 @@
 """Register all tasks with Gymnasium: ``gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=64)``.
 
-Importing this module gives each registered task an id in the namespace ``lyceum``, by the name of its class:
-``lyceum/HalfCheetah-v0``. A task's file is read when an environment is made. ``register`` adds a task of your own.
+Importing this module registers each task under the name of its class, as ``lyceum/HalfCheetah-v0``. A task's file is
+read when an environment is made. ``register`` adds a task of your own.
 """
 
 from pathlib import Path
@@ -16,9 +16,9 @@ __all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "register"]
 
 
 def register(task: str | Path | type[Task]) -> str:
-    """Give a task a Gymnasium id, and return the id, such as "lyceum/MyHopper-v0".
+    """Register a task with Gymnasium, and return its id, such as "lyceum/MyHopper-v0".
 
-    It replaces a task with the same id.
+    A task with the same id is replaced.
 
     Args:
         task: Name of a task, path of its file, or its class.

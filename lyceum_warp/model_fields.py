@@ -1,4 +1,4 @@
-"""Fields of the model that can differ between worlds: their Warp types, and the constants that follow from each."""
+"""Describe the model fields that can differ between worlds, and the constants that follow from each."""
 
 import dataclasses
 import difflib
@@ -25,13 +25,13 @@ class Constants(enum.IntFlag):
     INERTIAL = 4
     """Inverse weights and unit accelerations in ``qpos0``."""
     PRIVATE = 8
-    """What the C engine alone keeps: which frames coincide, bounding volumes of bodies, indices and flags."""
+    """Constants that only the C engine keeps: coinciding frames, bounding volumes of bodies, indices and flags."""
 
 
 _ALL = Constants.FIXED | Constants.KINEMATIC | Constants.INERTIAL | Constants.PRIVATE
 _POSES = Constants.KINEMATIC | Constants.INERTIAL | Constants.PRIVATE
 _WRAPPED = {"geom_pos", "geom_quat", "geom_size"}
-"""Fields of geoms around which tendons may be wrapped."""
+"""Fields of geoms that tendons may wrap around."""
 
 _WRAPS = [int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER)]
 
@@ -68,7 +68,7 @@ _FIELDS = (
 """The fields that can differ between worlds on every engine, and the constants that follow from each."""
 
 _OPTIONS = {"gravity", "magnetic", "wind", "density", "viscosity"}
-"""Those of the fields that are options of the model, attributes of MjModel.opt."""
+"""The fields that are attributes of MjModel.opt."""
 
 _COMPUTED = set(
     "body_subtreemass body_invweight0 dof_invweight0 dof_M0 tendon_invweight0 tendon_length0 actuator_acc0 "
@@ -83,14 +83,14 @@ _REASONS = (
         "MuJoCo computes it from other fields; write those instead",
     )
     | {"timestep": "all worlds share it; the parameters dt and substep_dt have the seconds of a step and a substep",
-       "impratio": "MuJoCo Warp keeps another number instead of it"}
+       "impratio": "MuJoCo Warp stores a number computed from it instead"}
     | dict.fromkeys(("geom_surfacevel", "geom_adhesion", "pair_adhesion"),
                     "MuJoCo Warp decides on the host whether any geom has it")
     | dict.fromkeys(("actuator_ctrlrange", "actuator_ctrllimited"), "controls are clipped to the model's own ranges")
 )  # fmt: skip
 
 _POSITIVE = {"body_mass", "body_inertia", "geom_size"}
-"""Fields whose numbers must stay positive where the nominal value is."""
+"""Fields whose numbers must be positive if their nominal values are."""
 
 NOT_NEGATIVE = _POSITIVE | set(
     "geom_friction pair_friction jnt_stiffness dof_damping dof_armature dof_frictionloss tendon_stiffness "
@@ -132,7 +132,7 @@ class ModelField:
         return self.name in _COMPUTED
 
     def problem(self, model: mujoco.MjModel, rows: np.ndarray) -> str | None:
-        """What is wrong with the values of some worlds, in one line; None if MuJoCo can simulate them.
+        """The first value that MuJoCo cannot simulate, as a message of one line; None if there is none.
 
         Args:
             model: The compiled model.
@@ -169,8 +169,8 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
 
     Args:
         model: The compiled model.
-        values: By the names of the fields; rows of all worlds, or one row for all.
-        columns: Columns of all model fields that differ between worlds, by their names, (nworld, size) each.
+        values: Values by the names of the fields: a row for each world, or one row for all.
+        columns: Columns of all model fields that differ between worlds, by name, (nworld, size) each.
 
     Raises:
         ValueError: A field is unknown or the same in every world, or a value has another size.
@@ -194,12 +194,12 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
 
 
 def similar_model_fields(name: str) -> list[str]:
-    """Names of fields that can differ between worlds and resemble a name, the nearest first."""
+    """Similar names of fields that can differ between worlds, the nearest first."""
     return difflib.get_close_matches(name, _FIELDS, 3)
 
 
 def is_model_field(name: str) -> bool:
-    """Whether a name is that of an attribute of MjModel or of its options."""
+    """Whether MjModel or its options have an attribute of this name."""
     return name in _FIELDS or hasattr(mujoco.MjModel, name) or hasattr(mujoco.MjOption, name)
 
 
@@ -208,7 +208,7 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
 
     Args:
         model: The compiled model.
-        name: MuJoCo's name of the field, an attribute of MjModel or, as "gravity", of MjModel.opt.
+        name: MuJoCo's name of the field, an attribute of MjModel or, like "gravity", of MjModel.opt.
         varies: Whether the field must be one that can differ between worlds.
 
     Raises:
@@ -231,7 +231,7 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
     constants = _FIELDS[name]
     if name in _WRAPPED and np.isin(model.wrap_type, _WRAPS).any():
         constants |= _POSES
-    # a single number is a row of one element, so that a task can write it
+    # a scalar becomes a row of one element, so that a task can write it
     shape: tuple[int, ...] = np.shape(getattr(model.opt if name in _OPTIONS else model, name)) or (1,)
     return _described(name, shape, constants)
 
@@ -243,7 +243,7 @@ def _described(name: str, shape: tuple[int, ...], constants: Constants) -> Model
 
 
 MOVED_INERTIA = {"body_ipos", "body_iquat"}
-"""Fields that a body must not be compiled as "simple" for: MuJoCo assumes that its inertial frame is the body's."""
+"""Fields that cannot differ for bodies compiled as "simple", whose inertial frame must equal the body's frame."""
 
 
 def check_simple(model: mujoco.MjModel, name: str) -> None:

@@ -1,4 +1,4 @@
-"""Model files that other packages or a local folder bring, named without being read."""
+"""Name model files of other packages or of a local folder, and find them when they are needed."""
 
 import dataclasses
 import difflib
@@ -12,20 +12,19 @@ import mujoco
 
 @dataclasses.dataclass(frozen=True)
 class ModelFile:
-    """A model file that an installed package or a local folder brings.
+    """A model file of an installed package or a local folder, which a task may name as its ``model``.
 
-    A task may name one as its ``model``. The file is looked for when an environment is made, so that tasks can be
-    listed on a machine without it. ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model`` and
-    ``menagerie_model`` make such names.
+    The file is searched for when an environment is made, so that tasks can be listed on a machine without it. Make one
+    by ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model`` or ``menagerie_model``.
     """
 
     file: str
     """The path of the file within the folder."""
     source: str
-    """What brings the file: a package as pip names it, or "MuJoCo Menagerie"."""
+    """The source of the file: a package as pip names it, or "MuJoCo Menagerie"."""
 
     def folder(self) -> Path:
-        """The folder that holds the files of this source.
+        """The folder with the files of this source.
 
         Raises:
             FileNotFoundError: There is none.
@@ -33,7 +32,7 @@ class ModelFile:
         raise NotImplementedError
 
     def path(self) -> Path:
-        """Where the file lies.
+        """The path of the file.
 
         Raises:
             FileNotFoundError: The package is not installed, or there is no such file.
@@ -48,7 +47,7 @@ class ModelFile:
         return folder / self.file
 
     def spec(self) -> mujoco.MjSpec:
-        """Read the file, for changing.
+        """Load the file as an editable MjSpec.
 
         Raises:
             FileNotFoundError: The package is not installed, or there is no such file.
@@ -59,23 +58,19 @@ class ModelFile:
 
 @dataclasses.dataclass(frozen=True)
 class PackageFile(ModelFile):
-    """A model file in an installed package, which is never imported."""
+    """A model file in an installed package, which is not imported."""
 
     package: str
     """The package as Python imports it."""
     within: str
     """The folder of the models in the package."""
     install: str
-    """What pip installs to get the package, as "lyceum-warp[hand]"."""
+    """The requirement that pip installs, as "lyceum-warp[hand]"."""
     before_python: str | None = None
-    """The first version of Python on which that installs nothing, as "3.13"; None where there is none."""
+    """The first version of Python without that package, as "3.13"; None if there is none."""
 
     def folder(self) -> Path:
-        """The package's folder of models.
-
-        Raises:
-            FileNotFoundError: The package is not installed.
-        """
+        """The package's folder of models; FileNotFoundError if the package is not installed."""
         package = importlib.util.find_spec(self.package)
         if package is None or not package.submodule_search_locations:
             what = f"the model {self.file} comes with the package {self.source}, which"
@@ -94,11 +89,7 @@ class MenagerieFile(ModelFile):
     """A model file in a local checkout of MuJoCo Menagerie."""
 
     def folder(self) -> Path:
-        """The checkout, to which the environment variable MENAGERIE_ROOT points.
-
-        Raises:
-            FileNotFoundError: The variable is not set, or names no folder with models.
-        """
+        """The checkout that MENAGERIE_ROOT names; FileNotFoundError if it is not set or names no folder with models."""
         root = os.environ.get("MENAGERIE_ROOT", "")
         if not root:
             raise FileNotFoundError(
@@ -128,13 +119,13 @@ def gymnasium_robotics_model(file: str) -> ModelFile:
 def package_model(
     package: str, file: str, *, install: str | None = None, before_python: str | None = None
 ) -> ModelFile:
-    """A model that an installed package brings; the package is not imported.
+    """A model of an installed package, which is not imported.
 
     Args:
         package: The package as Python imports it.
         file: The path of the file within the package's folder.
-        install: What pip installs to get the package, with its extra or version; by default the package's name.
-        before_python: The first version of Python on which that installs nothing, as "3.13".
+        install: The requirement that pip installs, with an extra or a version; by default the package's name.
+        before_python: The first version of Python without that package, as "3.13".
     """
     name = package.replace("_", "-")
     return PackageFile(file, name, package, "", install or name, before_python)
@@ -143,14 +134,14 @@ def package_model(
 def menagerie_model(file: str) -> ModelFile:
     """A model of a local checkout of MuJoCo Menagerie, such as "unitree_go1/scene.xml".
 
-    ``git clone https://github.com/google-deepmind/mujoco_menagerie`` makes a checkout. The environment variable
-    MENAGERIE_ROOT must point to it where an environment is made; until then a task with such a model can be listed.
+    The environment variable MENAGERIE_ROOT must name the checkout, as ``git clone
+    https://github.com/google-deepmind/mujoco_menagerie`` makes it. Tasks with such a model can be listed without it.
     """
     return MenagerieFile(file, "MuJoCo Menagerie")
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:
-    """Read a model file, editable.
+    """Load a model file as an editable MjSpec.
 
     Raises:
         ValueError: MuJoCo cannot read the file.

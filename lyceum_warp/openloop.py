@@ -1,4 +1,4 @@
-"""Open-loop rollouts: a horizon of given actions in every world, judged by the task."""
+"""Roll out given actions in every world, and let the task judge them."""
 
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -30,29 +30,29 @@ from lyceum_warp.world_arrays import own_parts
 class OpenLoop:
     """Rolls out the worlds of an environment from one or several states under given actions, and keeps their rewards.
 
-    Write ``state`` and ``actions``, call ``run``, read the rest; every tensor stays the same object. Episodes do not
-    end on the way: the caller decides what a task's termination means. The engine takes the whole horizon at once: on
-    the C engine as a single native call where its results are exact and the task has neither ``control`` nor
-    ``substep``, which run step by step, on the Warp engine as launches that become one graph.
+    Write ``state`` and ``actions``, call ``run``, and read the other tensors, which are updated in place. Episodes do
+    not end within the horizon: the caller decides what termination means. The C engine takes the whole horizon in one
+    native call if that is exact and the task has neither ``control`` nor ``substep``, otherwise step by step. On the
+    Warp engine the rollout is one graph.
 
     Args:
-        env: Worlds to roll out in; they belong to the rollouts from then on.
+        env: Worlds to roll out in; do not use them for anything else.
         horizon: Steps.
         keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device, read in every run. By
-            default every world has the key in ``state``, and so draws what ``env.step`` would draw from there.
-        nominal_model: Whether model fields that differ between worlds have their nominal values instead of those in
-            ``state``.
+            default every world uses the key in ``state``, and draws the same numbers as ``env.step`` would.
+        nominal_model: Whether model fields that differ between worlds have their nominal values instead of the values
+            in ``state``.
         models: Values of model fields that differ between worlds, by name, each (n, size) float64 on the environment's
             device, read in every run: world w has row w % n instead of the values in ``state``.
         states: Number of states to start from. Each has nworld / states consecutive worlds.
 
     Raises:
         ValueError: The environment resets its worlds automatically, ``keys`` has another shape, type or device, the
-            worlds cannot be shared among the states, or the buffers do not fit into memory.
+            worlds cannot be divided among the states, or the buffers do not fit into memory.
     """
 
     state: torch.Tensor
-    """Where every world starts, (state_space.size,) float64; with several states the same as ``states``."""
+    """The start of every world, (state_space.size,) float64; with several states the same as ``states``."""
     states: torch.Tensor
     """The states to start from, (states, state_space.size) float64."""
     actions: torch.Tensor
@@ -64,11 +64,11 @@ class OpenLoop:
     final_obs: torch.Tensor
     """Observations after the last step, (nworld, nobs)."""
     final_obs_groups: dict[str, torch.Tensor]
-    """The same for every group of observations, by name; ``policy`` is ``final_obs``."""
+    """Observations after the last step by group; ``policy`` is ``final_obs``."""
     fault: torch.Tensor
     """Bits of ``Done`` for the faults of a world, (nworld,) int32; if a bit is set, ignore that world's rewards."""
     phases: tuple[Phase, ...]
-    """What ``run`` does, in order, for a caller that puts more into the same graph."""
+    """The phases of ``run``, for a caller that adds its own to the same graph."""
 
     def __init__(
         self, env: Env, horizon: int, *, keys: wp.array | None = None, nominal_model: bool = False,
@@ -107,7 +107,7 @@ class OpenLoop:
             for group, space in env.obs_spaces.items():
                 setattr(self._obs, group, wp.zeros((n, space.size), dtype=float))
             self._no_memory = wp.zeros((rows + n, 0), dtype=float)
-            # each field for all steps: the states before a step, after it, and the last ones are views of one buffer
+            # the states before each step, after it, and at the end are views of one buffer per field
             self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
             constant = {f.name: shared_rows(f.value(task.model), f.dtype, rows + n, env.device) for f in task.constants}
@@ -140,7 +140,7 @@ class OpenLoop:
             call()
 
     def sequence(self, phases: Iterable[Phase]) -> Calls:
-        """The calls that run some phases, those of the rollout among them, in as few graphs as the engine allows."""
+        """The calls that run some phases, such as the rollout's, in as few graphs as the engine allows."""
         return self.worlds.programs.graphs.sequence(phases)
 
     @staticmethod
@@ -165,7 +165,7 @@ class OpenLoop:
         )
 
     def _step_by_step(self) -> tuple[Phase, ...]:
-        """For a task with a ``control`` or a ``substep``, which must see the state at every step or substep."""
+        """The phases for a task with ``control`` or ``substep``, which read the state at every step or substep."""
         engine, worlds = self.env.engine, self.worlds
         phases = [
             Phase("start", self._start),
@@ -181,7 +181,7 @@ class OpenLoop:
         return (*phases, Phase("end", partial(self._end, worlds.after)))
 
     def _start(self) -> None:
-        """Put every world at the start, and map the actions of all steps to controls."""
+        """Write the start into every world's state, and map all actions to controls."""
         worlds, device = self.worlds, self.env.device
         wp.launch(planning.broadcast, worlds.state.shape, [self._state, worlds.state], device=device)
         if self._nominal_model:
@@ -230,13 +230,13 @@ class OpenLoop:
             ]
             args = [*self._transitions(), self.worlds.counters, *memories]
             launch_worlds(kernels.advance_rows, n, args, self.env.device)
-        else:  # they stay as they are at the start
+        else:  # the memory stays constant
             for buffer in self._memories.values():
                 for t in range(self.horizon):
                     wp.copy(buffer[t + 1], buffer[0])
 
     def _judge_rows(self) -> None:
-        """Judge the transitions of the whole horizon, each of which stands alone."""
+        """Judge all transitions of the horizon at once."""
         rows, args = self.horizon * self.env.nworld, [*self._transitions(), self._reward, self._terminated]
         launch_worlds(self.env.task.kernels.judge_rows, rows, args, self.env.device)
 
@@ -260,7 +260,7 @@ class OpenLoop:
         launch_worlds(kernels.judge_rows, n, args, device)
 
     def _end(self, batch: object) -> None:
-        """Collect the worlds' faults, and observe where they ended."""
+        """Collect the worlds' faults, and observe their last states."""
         worlds, n, device = self.worlds, self.env.nworld, self.env.device
         self.env.engine.find_faults(worlds.everyone)
         wp.launch(planning.merge_faults, n, [self.env.engine.fault, self._fault], device=device)

@@ -1,7 +1,7 @@
-"""The options of an environment and of its physics.
+"""Define the options of an environment and of its physics.
 
-This is the only list of them: ``make``, ``replicate``, MPPI, the command line, the help texts and the suggestions for
-misspelt words all read these two classes. A new option is a new field here, and is read where it takes effect.
+``make``, ``replicate``, MPPI, the command line, the help texts and the suggestions for misspelt words all read these
+two classes. A new option is a new field here.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from lyceum_warp.support.docstrings import attribute_docs, document_attributes, 
 from lyceum_warp.support.validate import check_flag, check_kind, described, whole_number
 
 ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
-"""Where a model comes from: a file, or an MjSpec."""
+"""The source of a model: a file or an MjSpec."""
 
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 INTEGRATORS = {
@@ -32,7 +32,7 @@ SOLVER_LIMITS = {"iterations": 1, "ls_iterations": 1, "noslip_iterations": 0}
 
 
 def _for_engine(default: Any) -> Any:
-    """A field of an option that the engine's constructor takes."""
+    """The dataclass field of an option that is passed to the engine's constructor."""
     return dataclasses.field(default=default, metadata={"engine": True})
 
 
@@ -68,7 +68,7 @@ def _checked_limits(solver: Any) -> dict[str, int]:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhysicsOptions:
-    """How the worlds are simulated. None keeps what the task or its model says.
+    """How the worlds are simulated. None keeps the setting of the task or its model.
 
     Raises:
         ValueError: A value is unknown or out of range.
@@ -84,17 +84,17 @@ class PhysicsOptions:
     """Limits of the constraint solver: any of iterations, ls_iterations (of its line search) and noslip_iterations
     (0 turns the noslip solver off)."""
     nconmax: int | None = _for_engine(None)
-    """Contact capacity per world, on average (Warp engine); by default twice the peak of a probe."""
+    """Contact capacity per world, on average (Warp engine); by default twice the peak of random rollouts."""
     njmax: int | None = _for_engine(None)
-    """Constraint capacity of each world (Warp engine); by default twice the peak of a probe, and room for inactive
-    equality constraints."""
+    """Constraint capacity of each world (Warp engine); by default twice the peak of random rollouts, and room for
+    inactive equality constraints."""
     deterministic: bool = _for_engine(False)
     """Make two runs on a CUDA device equal to the bit. Costs 5 to 18 times the time and 5 to 7 times the memory on
     hopper, half_cheetah and humanoid. Runs on the CPU are always equal to the bit."""
     unroll: bool = _for_engine(False)
-    """Unroll the solver's iterations in the Warp engine instead of a loop that ends with the last world's. The numbers
-    stay the same. Needs a solver limit of at most 20 iterations; with 4 it gained 3 to 5 % on half_cheetah and
-    humanoid and lost 1 to 2 % on hopper. The C engine ignores it."""
+    """Unroll the solver's iterations in the Warp engine, instead of a loop that ends once every world has converged.
+    The numbers stay the same. Needs a solver limit of at most 20 iterations; with 4 it gained 3 to 5 % on half_cheetah
+    and humanoid and lost 1 to 2 % on hopper. The C engine ignores it."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -114,7 +114,7 @@ class PhysicsOptions:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EnvOptions:
-    """How an environment runs: how many worlds, where, and how their episodes go.
+    """The number of worlds, where they run, and how their episodes begin and end.
 
     Raises:
         ValueError: A value is of the wrong type or out of range.
@@ -132,21 +132,20 @@ class EnvOptions:
     seed: int = 0
     """Seed of the worlds' random streams."""
     first_world: int = 0
-    """Number of the first world, where several processes share a batch: a world's random stream depends on its number
-    in the whole batch."""
+    """Number of the first world, if several processes share a batch: a world's random stream depends on its number in
+    the whole batch."""
     autoreset: bool = True
     """Whether a world whose episode ended begins a new one within the same step. With False finished worlds keep
     stepping with ``done`` set until they are reset; only a world with a fault restarts at once."""
     horizon: int | None = None
     """Steps after which an episode is truncated, 0 for never; by default the task's."""
     graphs: bool = True
-    """Whether launches are captured as graphs and replayed. False is for debugging; the numbers are the same to the
-    bit."""
+    """Whether launches are captured as graphs and replayed. False is for debugging and changes no numbers."""
     nvtx: bool = False
     """Whether to mark the phases of a step (act, physics, judge, restart, refresh, observe) for NVIDIA's profilers.
-    Each phase then is a graph of its own."""
+    Each phase is then a separate graph."""
     model: ModelSource | None = None
-    """Another model than the task's: a file or an MjSpec."""
+    """A model that replaces the task's: a file or an MjSpec."""
     fields: Collection[str] = ()
     """Additional fields to keep, for ``env.field``."""
     dynamics: Collection[str] = ()
@@ -184,7 +183,7 @@ class EnvOptions:
         return (base or cls()).changed(options), rest
 
     def changed(self, words: Mapping[str, Any]) -> "EnvOptions":
-        """The same options with some changed, those of the physics included, all by name."""
+        """A copy with some options changed, by name; physics options may be among them."""
         physics = {name: value for name, value in words.items() if name in _PHYSICS}
         others = {name: value for name, value in words.items() if name not in _PHYSICS}
         if physics:
@@ -199,7 +198,7 @@ class EnvOptions:
         return {field.name: getattr(options, field.name) for options, field in both if field.metadata.get("engine")}
 
     def given(self) -> dict[str, Any]:
-        """The options that differ from their defaults, those of the physics included, by name."""
+        """The options that differ from their defaults, physics options included, by name."""
         own = _given(self)
         own.pop("physics", None)
         return own | self.physics.given()
@@ -218,22 +217,22 @@ _OTHER_WORDS = {
     "iterations": "solver={'iterations': ...}", "ls_iterations": "solver={'ls_iterations': ...}",
     "noslip_iterations": "solver={'noslip_iterations': ...}",
 }  # fmt: skip
-"""What other packages, and earlier releases of this one, call an option."""
+"""Names of options in other packages and in earlier releases."""
 
 
 def suggestion(word: str, others: Iterable[str] = ()) -> str:
-    """The known words that an unknown one may stand for, as "did you mean ...?"; empty where nothing is close.
+    """Suggest known words for an unknown one, as "did you mean ...?"; empty if none is similar.
 
     Args:
-        word: The word.
-        others: Names that are known beside the options.
+        word: The unknown word.
+        others: Known names beside the options.
     """
     close = [_OTHER_WORDS[word]] if word in _OTHER_WORDS else difflib.get_close_matches(word, [*others, *OPTIONS], 3)
     return f"did you mean {' or '.join(close)}?" if close else ""
 
 
 def signature_of_options(function: Callable[..., Any]) -> inspect.Signature:
-    """The signature of a flat call, with every option in place of its ``**options``."""
+    """The signature of a function with every option as a keyword in place of ``**words``."""
     keyword = inspect.Parameter.KEYWORD_ONLY
     options = [
         inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type)

@@ -15,7 +15,7 @@ from lyceum_warp.model_fields import ModelField
 class Space:
     """The vector of one world: its parts by name, its type and its bounds, if any.
 
-    A scalar has no axis. The arrays of an environment have an additional leading axis, for the worlds.
+    A scalar has no axis. Arrays of an environment have an additional leading axis over worlds.
     """
 
     parts: Mapping[str, slice] = dataclasses.field(default_factory=dict)
@@ -70,10 +70,10 @@ COUNTERS = ("step", "key", "episode", "done_reason")
 def action_space(
     model: mujoco.MjModel, action_range: tuple[float, float] | None, actions: Mapping[str, int] | None = None
 ) -> Space:
-    """The space of actions: the controls of each actuator, by its name, within ``action_range`` or the control ranges.
+    """The space of actions: each actuator's controls, bounded by ``action_range`` or the control ranges.
 
-    Most actuators have one control; some have several or none. An actuator without a name is named by its index. A
-    task's own ``actions`` have bounds only with an ``action_range``.
+    An actuator may have several controls or none. Without a name it is named by its index. A task's own ``actions``
+    have bounds only with an ``action_range``.
     """
     if actions is not None:
         space = Space.of(actions)
@@ -118,14 +118,14 @@ def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | Non
 
 
 def control_ranges(model: mujoco.MjModel) -> np.ndarray:
-    """Lower and upper bound of each control, (nu, 2); infinite where the model sets none."""
+    """Lower and upper bound of each control, (nu, 2); infinite if the model sets none."""
     return np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf))
 
 
 def state_space(
     model: mujoco.MjModel, snapshots: Iterable[Field], dynamics: Iterable[ModelField], own: Mapping[str, int]
 ) -> Space:
-    """The space of states: integration state in MuJoCo's order, saved fields, model fields, counters, further parts.
+    """The space of states: integration state in MuJoCo's order, snapshots, model fields, counters, further parts.
 
     Args:
         model: The compiled model.

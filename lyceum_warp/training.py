@@ -33,18 +33,18 @@ Callback = Callable[[Any], Any]
 
 
 class Display:
-    """Show the progress of a training. This class only logs messages; subclasses show more."""
+    """Show the progress of a training; this base class only logs messages."""
 
     @contextlib.contextmanager
     def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
-        """Show a training up to a number of iterations, within the context."""
+        """Context of a training that lasts until a number of iterations."""
         yield
 
     def __call__(self, iteration: Iteration) -> None:
-        """An iteration is complete."""
+        """Show a complete iteration."""
 
     def work(self, text: str, unit: str, done: int, total: int) -> None:
-        """Work between two iterations has made progress, such as a video."""
+        """Show progress of work between two iterations, such as a video."""
 
     def note(self, line: str) -> None:
         """Show a message."""
@@ -69,25 +69,25 @@ def train(
     entries: Mapping[str, Any] | None = None,
     display: Display | None = None,
 ) -> Run:
-    """Train, and write the same folder as ``lyceum-warp train``: metrics, policies and checkpoints.
+    """Train, and write the folder of a run, as ``lyceum-warp train`` does: metrics, policies and checkpoints.
 
     ``lw.load(folder)`` returns the last policy, and ``lw.load(folder, which="best")`` the policy with the best return.
-    The return is ``mean_return`` if the learner evaluates the mean policy. Otherwise it is ``return_mean``, of the
-    episodes of an iteration, which are sampled by the policy before the iteration.
+    The return is ``mean_return`` if the learner evaluates the mean policy. Otherwise it is ``return_mean``, over the
+    episodes that the policy before an iteration sampled.
 
     The policy and the complete state are saved at the start, at the end, and every 30 s, or more often while saving
-    takes at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run continues from the last save with the
-    same numbers. Ctrl-C, SIGTERM and SIGHUP end the run after the iteration, with a save; a second signal ends it at
-    once.
+    takes at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run resumes from the last save with the
+    same numbers. Ctrl-C, SIGTERM and SIGHUP save and end the run after the current iteration; a second signal ends it
+    at once.
 
     Args:
         learner: The algorithm: ``NPG(env)``, or another ``lyceum_warp.algos.learner.Learner``.
         folder: The run's folder, new or empty.
-        iterations: Iterations in all, including those before ``resume``.
+        iterations: Total number of iterations, including iterations before ``resume``.
         callback: Called with each iteration after its row was written. Training ends if it returns True. If it raises
             an error, the run is saved, and the error is raised again.
         target_return: Training ends once the return that selects the best policy reaches this number.
-        minutes: Training ends with the iteration in which this call has trained for so long; None for no limit.
+        minutes: Training ends after the iteration in which this time is over; None for no limit.
         keep_every: Iterations between two numbered policies; 0 for none.
         save_every: Iterations between two saves; 0 to save by time.
         tensorboard: Whether to also write the metrics for TensorBoard.
@@ -96,7 +96,7 @@ def train(
         camera: Camera of the videos: a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or "free"
             for MuJoCo's default free camera.
         resume: Whether to continue the run in the folder. ``learner`` must be made with the same arguments.
-        take_over: Whether to continue a run that another process still locks, on this or another host. That process
+        take_over: Whether to continue a run that another process has locked, on this or another host. That process
             then ends at its next write.
         entries: Further entries of config.json, of JSON values.
         display: Shows the progress; by default messages are logged.
@@ -106,9 +106,9 @@ def train(
 
     Raises:
         ValueError: The folder is not empty, an argument is out of range, the run does not fit ``learner``, or another
-            process writes it or has taken it over.
-        ImportError: The extra ``tensorboard`` is not installed.
-        NoVideoError: ``video_every`` is given, and the extra ``viz`` is not installed.
+            process has locked it or taken it over.
+        ImportError: ``tensorboard`` is given, but the extra of that name is not installed.
+        NoVideoError: ``video_every`` is given, but the extra ``viz`` is not installed.
         OSError: The folder cannot be written. ``resume=True`` continues from the last save.
         FloatingPointError: The learner's updates are no longer finite.
         Interrupted: One of several ranks received a signal.
@@ -227,7 +227,7 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
     note_changes(run, learner.env, note=note)
     try:
         learner.load_state_dict(content["state"])
-    except Exception as error:  # the state may hold anything
+    except Exception as error:  # a damaged state may raise any error
         text = " ".join(str(error).split())
         raise ValueError(f"{run.checkpoint} does not fit the configuration beside it: {text}") from error
     if learner.team.leads:
@@ -244,7 +244,7 @@ def _check_equal(run: Run, learner: Learner) -> None:
     old, new, algorithm = then.options, env.options, run.config["algorithm"]
     now["engine"] = engine_name(now["engine"], now["device"])
     own = {"engine": engine_name(old.engine, old.device), "algorithm": algorithm, "nworld": old.nworld}
-    # nthread and graphs do not change the numbers; note_changes compares the model
+    # options that do not change the numbers are left out; note_changes compares the model
     options = {"horizon": old.horizon, "fields": old.fields, "dynamics": old.dynamics}
     params = dict.fromkeys(now["params"]) | run_params(run, then.params)
     # a run of an earlier release lacks the newest hyperparameters

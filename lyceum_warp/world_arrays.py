@@ -18,7 +18,7 @@ from lyceum_warp.task import MEMORIES
 
 
 def own_bytes_per_world(task: BoundTask) -> int:
-    """An estimate of the memory that ``Worlds`` takes for each world beside its engine, in bytes."""
+    """Estimate the bytes that ``Worlds`` takes for each world, without the engine."""
     snapshots = [field for field in task.fields if field.snapshot]
     state_size = state_space(task.model, snapshots, task.dynamics, own_parts(task)).size
     copies = sum(field.size for field in task.fields)
@@ -27,7 +27,7 @@ def own_bytes_per_world(task: BoundTask) -> int:
 
 
 def own_parts(task: BoundTask) -> dict[str, int]:
-    """The parts of a state that ``Worlds`` keeps beside the counters, and their sizes."""
+    """The sizes of the parts that ``Worlds`` adds to a state beside the counters."""
     form = task.task
     sizes = {name: getattr(form, name) for name in MEMORIES}
     sizes |= {"metrics": len(form.metrics), "success_steps": int(form.success_steps > 1)}
@@ -35,7 +35,7 @@ def own_parts(task: BoundTask) -> dict[str, int]:
 
 
 class WorldArrays:
-    """The arrays of many worlds of one task on one engine; a step, a reset or a restored state makes no other.
+    """The arrays of many worlds of one task on one engine, all allocated here.
 
     Args:
         task: The task, bound to its model and parameters.
@@ -54,7 +54,7 @@ class WorldArrays:
         self.state_view = torch_view(self.state)
 
     def _allocate_fields(self) -> None:
-        """The fields of the state that a step leads to and of the state before, and the task's memory."""
+        """The fields of the states after and before a step, and the task's memory."""
         n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
         self.memory = wp.zeros((n, task.memory), dtype=float)
         self.lasting_memory = wp.zeros((n, task.lasting_memory), dtype=float)
@@ -62,12 +62,12 @@ class WorldArrays:
         self.metric_sums = wp.zeros((n, len(task.metrics)), dtype=float)
         """Sums of the metrics over the episode so far."""
         self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
-        """Steps in a row with the goal met, up to ``success_steps``; without a column where one step is enough."""
+        """Successful steps in a row, up to ``success_steps``; without a column if one step is enough."""
         own = ("memory", "lasting_memory", "metric_sums", "success_counts")
         self._clearable = {name: getattr(self, name) for name in own}
         self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}
         self._zeros = wp.zeros(max(array.shape[1] for array in self._clearable.values()), dtype=float)
-        # the fields of the state that a step leads to, live, and copies of those of the state before
+        # the live fields after a step, and copies of them from before the step
         self.after, self.before = kernels.Batch(), kernels.Batch()
         self._copies: dict[str, wp.array] = {}
         constant = {f.name: shared_rows(f.value(model), f.dtype, n, self.device) for f in self.task.constants}
@@ -100,7 +100,7 @@ class WorldArrays:
         self.metrics: wp.array = wp.zeros((n, len(task.metrics)), dtype=float)
         """The metrics of the last step, (nworld, number of metrics)."""
         self.episode_metrics: wp.array = wp.zeros_like(self.metrics)
-        """Their sums over the episode of that step."""
+        """The sums of the metrics over the episode of that step."""
         self.outcome.metrics = self.metrics  # type: ignore[assignment]
         self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
         parts = int(steps.OBSERVE_FIRST) + len(self.obs_spaces)
@@ -138,23 +138,23 @@ class WorldArrays:
         self.fault_count = wp.zeros((n, int(FAULTS).bit_length()), dtype=int)
 
     def _allocate_masks(self) -> None:
-        """Masks of worlds, (nworld,) bool each, by what is true of the worlds in them."""
+        """Masks of worlds, (nworld,) bool each."""
         n = self.nworld
         self.everyone = wp.full(n, True, dtype=bool)
         self.mask = wp.zeros(n, dtype=bool)
-        """Chosen for the next reset or restored state; see ``set_mask``."""
+        """Worlds of the next reset or restored state; see ``set_mask``."""
         self.restarting = wp.zeros(n, dtype=bool)
-        """Their episodes ended with this step."""
+        """Worlds whose episodes ended with this step."""
         self._rejected = wp.zeros(n, dtype=bool)
-        """The task rejects their initial states, which are drawn again."""
+        """Worlds whose initial states the task rejects, to be drawn again."""
         self._continuing = wp.zeros(n, dtype=bool)
-        """They do not restart, and had events."""
+        """Worlds that do not restart, and had events."""
         self._physics_changed = wp.zeros(n, dtype=bool)
-        """Events of this step changed their physics."""
+        """Worlds whose physics an event of this step changed."""
         self._changed = wp.zeros(n, dtype=bool)
-        """Events of this step changed their physics or the task's memory."""
+        """Worlds whose physics or task memory an event of this step changed."""
         self._outdated = wp.zeros(n, dtype=bool)
-        """They changed since they were observed: they restart, or events changed them."""
+        """Worlds that restarted or were changed by events since they were observed."""
         self.mask_view, self.changed_view = torch_view(self.mask), torch_view(self._changed)
         self.terminated_view = torch_view(self._found.terminated)
 
@@ -164,7 +164,7 @@ class WorldArrays:
         return {group: torch_view(getattr(into, group)) for group in self.obs_spaces}
 
     def set_mask(self, mask: torch.Tensor | None) -> None:
-        """Choose the worlds that the next reset or restored state concerns; None for all."""
+        """Choose the worlds of the next reset or restored state; None for all."""
         if mask is None:
             self.mask_view.fill_(True)
         else:
@@ -172,7 +172,7 @@ class WorldArrays:
             self.mask_view.copy_(mask)
 
     def pack_state(self, ended: wp.array) -> None:
-        """Write every world's state into ``state``; ``ended`` holds the reasons of ends that last, (nworld,)."""
+        """Write every world's state into ``state``; ``ended`` is its ``done_reason`` part, (nworld,)."""
         size = self.engine.state_size
         self.engine.get_state(self.state[:, :size])
         own = self.counters
@@ -188,7 +188,7 @@ class WorldArrays:
             launch_rows(state.narrow, self.mask, columns, array)
 
     def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
-        """Arrays that belong to the state beside the engine's and the counters, with their columns."""
+        """The arrays of ``own_parts``, with their columns of the state."""
         arrays = {name: getattr(self, name) for name in MEMORIES}
         arrays |= {"metrics": self.metric_sums, "success_steps": self.success_counts}
         for name in own_parts(self.task):

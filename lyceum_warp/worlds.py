@@ -1,7 +1,4 @@
-"""Run the phases of a step, of a reset, and of reading or restoring states.
-
-``Worlds.step_phases`` is the only place that knows the order of a step.
-"""
+"""Run the phases of a step, a reset, and of reading or restoring states; ``Worlds.step_phases`` orders a step."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -31,7 +28,7 @@ from lyceum_warp.world_arrays import WorldArrays
 
 @dataclasses.dataclass(frozen=True)
 class Programs:
-    """The phases of an environment as calls, for one horizon, one way to reset, and one choice about graphs."""
+    """The phases of an environment as calls, for one combination of horizon, autoreset and graphs."""
 
     graphs: Graphs
     step: Calls
@@ -44,7 +41,7 @@ class Programs:
 class Worlds(WorldArrays):
     """Many worlds of one task on one engine: arrays of fixed address, and the phases that work on them.
 
-    Every method that a phase names launches the same kernels on the same arrays each time.
+    Every method that is run as a phase launches the same kernels on the same arrays each time.
 
     Args:
         task: The task, bound to its model and parameters.
@@ -85,13 +82,13 @@ class Worlds(WorldArrays):
         self.step = self.programs.step
 
     def drop_programs(self) -> None:
-        """Break the reference cycles through the programs, so that threads and memory go with the environment."""
+        """Break the reference cycles through the programs, so that the environment's threads and memory are freed."""
         self._programs.clear()
         del self.programs, self.step
 
     def _make_workers(self) -> Workers | None:
-        """Threads for the launches around the engine's calls; None for the caller's alone."""
-        # Warp's kernels for debugging keep the address of a stack in a variable that all threads share
+        """Threads for the launches around the engine's calls; None if only the caller's thread launches."""
+        # Warp's kernels in debug mode are not thread-safe
         if not self.device.is_cpu or self.engine.capturable or wp.config.mode == "debug":
             return None
         nthread = self.engine.launch_threads
@@ -111,7 +108,7 @@ class Worlds(WorldArrays):
         ]
 
     def _phases_of_a_graph(self) -> list[Phase]:
-        """The same for a step that is one graph, which leaves out parts that concern no world."""
+        """``step_phases`` for a step that is one graph, in which parts are skipped if they concern no world."""
         if not self.engine.capturable or self._nvtx:
             return self.step_phases()
         restart = self._restart_phases(self.restarting, randomly=True)
@@ -129,7 +126,7 @@ class Worlds(WorldArrays):
         ]
 
     def _only_for(self, mask: wp.array, *phases: list[Phase]) -> Phase:
-        """Phases as one phase that is left out while the mask holds no world."""
+        """Merge phases into one that is skipped if the mask holds no world."""
         every = [phase for part in phases for phase in part]
 
         def run() -> None:
@@ -139,7 +136,7 @@ class Worlds(WorldArrays):
         return Phase(every[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
     def _transition_phases(self) -> list[Phase]:
-        """Step to the next state, and judge the transition."""
+        """Advance to the next state, and judge the transition."""
         return [
             Phase("act", self.act, by_world=True),
             *self.physics_phases(),
@@ -179,7 +176,7 @@ class Worlds(WorldArrays):
         return [] if kernel is None else [Phase("event", partial(self._event, kernel))]
 
     def _moved_phases(self) -> list[Phase]:
-        """Model constants and fields of the worlds whose physics an event changed."""
+        """Update model constants and derived fields in worlds whose physics an event changed."""
         if self.task.kernels.run_events is None:
             return []
         phases, changed = [], self._physics_changed
@@ -190,7 +187,7 @@ class Worlds(WorldArrays):
         return phases
 
     def _observe_phases(self) -> list[Phase]:
-        """Observations of the worlds that changed since they were judged."""
+        """Observe the worlds that changed since they were judged."""
         changed = self.restarting if self.task.kernels.run_events is None else self._outdated
         return [Phase("observe", partial(self._observe, changed), by_world=True)]
 
@@ -213,7 +210,7 @@ class Worlds(WorldArrays):
         ]
 
     def rehearsal(self) -> None:
-        """Run every phase that is made of launches once, in arbitrary order, to find the kernels that they launch."""
+        """Run every phase that is made of launches once, for ``compile_ahead``, which notes the kernels."""
         self.seed_streams(0)
         phases = (*self.reset_phases(randomly=True), *self.step_phases(), *self.read_phases(), *self.restore_phases())
         for phase in phases:
@@ -221,12 +218,12 @@ class Worlds(WorldArrays):
                 phase.run()
 
     def keep_before(self) -> None:
-        """Keep the current state as the one that a transition starts from."""
+        """Copy the current state into ``before``, the start of a transition."""
         if (kernel := self.task.kernels.keep_before) is not None:
             launch_lanes(kernel, self.nworld, [self.after, self.before], self.device)
 
     def act(self) -> None:
-        """Keep the state that the step starts from, and turn actions into controls."""
+        """Keep the state before the step, and turn actions into controls."""
         self.keep_before()
         launch_worlds(self.task.kernels.act, self.nworld, [
             self.after, self.params, self.action, self.ranges, self.scale, self.counters, self.safe_action,
@@ -271,7 +268,7 @@ class Worlds(WorldArrays):
         self._hold_success(mask, transition=transition)
 
     def _hold_success(self, mask: wp.array, *, transition: bool) -> None:
-        """Let a success count after ``success_steps`` in a row."""
+        """Report success only after ``success_steps`` successful steps in a row."""
         if self.success_counts.size:
             args = [mask, transition, self.task.task.success_steps, self.success_counts, self.outcome.success]
             launch_worlds(steps.hold_success, self.nworld, args, self.device)
@@ -280,7 +277,7 @@ class Worlds(WorldArrays):
         """Put the masked worlds into an initial state of the task."""
         self.engine.reset(mask)
         self._clear(mask, "memory", *self.task.task.cleared, *([] if again else ["metric_sums", "success_counts"]))
-        if self.task.kernels.reject_worlds is not None:  # a rejected draw changes nothing else
+        if self.task.kernels.reject_worlds is not None:  # a rejected draw must not change lasting memory
             kept, live = self._lasting_before, self.lasting_memory
             launch_rows(state.copy_rows, mask, *((kept, live) if again else (live, kept)))
         self._make_nominal(mask, self.task.reset_dynamics)
@@ -302,7 +299,7 @@ class Worlds(WorldArrays):
         """Draw initial states of the masked worlds again while the task rejects them."""
         wp.copy(self._rejected, mask)
         for _ in range(self.task.task.draws - 1):
-            # on a device that runs behind, the launches go on with an empty mask instead
+            # reading the mask would wait for a GPU, where the remaining launches run with an empty mask instead
             if not self.engine.capturable and not self._rejected.numpy().any():
                 return
             self.engine.refresh(self._rejected)
@@ -313,7 +310,7 @@ class Worlds(WorldArrays):
                 self.engine.apply_model(self._rejected)
 
     def _event(self, kernel: wp.Kernel) -> None:
-        """Run the events, and find the worlds that they changed: their physics, or anything."""
+        """Run the events, and mark the worlds whose physics or memory they changed."""
         before = {name: copy for name, copy in self._copies.items() if name in self.task.writes["event"]}
         live = {name: getattr(self.after, name) for name in before}
         before |= self._model_copies
@@ -330,7 +327,7 @@ class Worlds(WorldArrays):
         self.engine.commit(self._physics_changed, state_fields)
 
     def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
-        """Mark the worlds that continue and in which a field changed: it is physics, or the task's memory."""
+        """Mark continuing worlds in which a field changed, which belongs to the physics or to the task's memory."""
         found = [self._physics_changed, self._changed, self._outdated]
         args = [self._continuing, flat(before), flat(after), physics, *found]
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
@@ -346,7 +343,7 @@ class Worlds(WorldArrays):
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Observe and judge the states of the masked worlds, without a transition."""
-        # a state that was set unchecked may be a fault: its world shows the last good observation, as after a step
+        # a state that was set unchecked may be a fault; its world keeps the last good observation
         self.engine.find_faults(self.mask)
         keep_reason = keep_reason and not self.autoreset
         self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)
@@ -358,9 +355,9 @@ class Worlds(WorldArrays):
     # for environments and open-loop rollouts
 
     def judge_transition(self, action: torch.Tensor) -> None:
-        """Judge the transition from ``before`` to the current state under some actions, without looking for faults."""
+        """Judge the transition from ``before`` to the current state under actions, without the engine's faults."""
         torch_view(self.safe_action).copy_(action)
-        self._judged.zero_()  # gets the faults of this transition
+        self._judged.zero_()  # receives the faults of this transition
         self._judge(self.everyone, self._judged, self._no_fault, transition=True)
 
     def seed_streams(self, seed: int) -> None:

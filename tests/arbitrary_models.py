@@ -1,11 +1,11 @@
-"""Models of every kind of element, as XML, for what must work with any model, and the rules that depend on a model."""
+"""Models with every kind of element, as XML, and the rules whose results depend on the model."""
 
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import episode_rules as episodes
 from lyceum_warp.testing import fault_rules as faults
 from lyceum_warp.testing import state_rules as state
 
-# those rules that depend on the model, where an engine is slow on the CPU, or a model slow to compile
+# the rules that depend on the model; only these run if an engine is slow on the CPU or a model slow to compile
 MODEL_CHECKS = (
     buffers.check_spaces,
     state.check_restoring,
@@ -161,4 +161,4 @@ PLUGINS = {
         ARM, actuated('<orientation name="aim" site="tip" refsite="here" kp="1"/>', '<motor joint="wrist"/>')
     ),
 }
-"""Models that the C engine alone takes, by what the Warp engine says of them."""
+"""Models that only the C engine accepts, by the error of the Warp engine."""

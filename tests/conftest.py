@@ -41,7 +41,7 @@ def shared_env() -> Iterator[SharedEnv]:
     made: dict[tuple[Any, ...], lw.Env] = {}
 
     def get(task: str | type[lw.Task], *, engine: str = "mujoco", nworld: int = 1, **options: Any) -> lw.Env:
-        # the repr of a value can be looked up, also where the value is a list or an array
+        # the repr can be a key even if the value is a list or an array
         key = (task, engine, nworld, *sorted((name, repr(value)) for name, value in options.items()))
         if key not in made:
             made[key] = lw.make(task, engine=engine, nworld=nworld, **options)
@@ -108,7 +108,7 @@ def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests marked ``gpu`` on machines without a GPU, and those of tasks whose model cannot be installed."""
+    """Skip tests marked ``gpu`` without a GPU, and tests of tasks whose model cannot be installed."""
     for item in items:
         if (missing := _missing_model(_task(item))) is not None:
             item.add_marker(pytest.mark.skip(reason=missing))

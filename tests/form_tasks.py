@@ -1,4 +1,4 @@
-"""Tasks of small models whose physics both engines simulate to a rounding, with pushes, and with drawn dynamics."""
+"""Tasks with pushes and drawn dynamics, whose small models both engines simulate equally up to rounding."""
 
 import mujoco
 import warp as wp
@@ -154,7 +154,7 @@ def observe_gravity(s: PuckWorld, p: PuckParams, obs: Row[float]):
 
 
 class Weighed(Drawn):
-    """The same with an observation of what is drawn once for each world."""
+    """``Drawn`` with an observation of gravity, which is drawn once for each world."""
 
     obs = {"x": 1, "gravity": 1}
     World = PuckWorld
@@ -203,7 +203,7 @@ def draw_practice(s: PracticedWorld, p: PuckParams, rng: Row[wp.uint32]):
 
 
 class Gifted(Practiced):
-    """The same with practice at the start, which is drawn once for each world; its model is the same in all worlds."""
+    """``Practiced`` with initial practice that is drawn once for each world; the model is the same in all worlds."""
 
     World = PracticedWorld
     Params = PuckParams

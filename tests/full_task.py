@@ -153,7 +153,7 @@ def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uin
 
 
 class Full(lw.Task):
-    """Every function and every attribute; a new episode begins at a keyframe, and draws again what it rejects."""
+    """A task with every function and every attribute; episodes begin at a keyframe, and rejected states are redrawn."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))
     frame_skip = 3

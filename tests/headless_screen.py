@@ -78,7 +78,7 @@ class HeadlessViewer(viewer_protocol.Viewer):
 
 
 class Bench:
-    """A panel in a viewer of its own, which keeps what the panel sends."""
+    """A panel in a separate viewer, which keeps the messages that the panel sends."""
 
     def __init__(self, model: mujoco.MjModel, scene: Scene, **options: Any) -> None:
         self.model, self.data = model, mujoco.MjData(model)
@@ -110,12 +110,12 @@ class Bench:
         return given
 
     def show(self, status: Status) -> None:
-        """Draw a frame with this status, and forget what was sent before."""
+        """Draw a frame with this status, and drop earlier messages."""
         self.draw(frame_of(self.model, self.data, status))
         self.sent.clear()
 
     def draw(self, frame: Frame | None = None) -> list[Reply]:
-        """Draw one frame; what the panel sent meanwhile."""
+        """Draw one frame, and return the messages that the panel sent."""
         self.given, before = frame, len(self.sent)
         imgui.NewFrame()
         self.viewer.dispatch(messages.UpdateEvent())

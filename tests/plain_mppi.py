@@ -102,7 +102,7 @@ class Plain:
             self.smoothing = (1.0, 0.0, 0.0)
         self.knots = np.tile(np.clip(self.fill, self.low, self.high), (count or horizon, 1))
         self.deviation = np.tile(np.diag(self.factor), (len(self.knots), 1))
-        # what smoothing leaves of the deviation of independent noise, from its answers to impulses
+        # the standard deviation of smoothed independent noise, from the impulse response
         self.spread = np.sqrt((smoothed(np.eye(len(self.knots)), self.smoothing) ** 2).sum(1))[:, None]
 
     @property
@@ -179,7 +179,7 @@ class Plain:
 
 
 class PlainReach(Plain):
-    """The same with the physics and the reward of the reach task in MuJoCo and NumPy alone."""
+    """The same with the physics and the reward of the reach task in MuJoCo and NumPy."""
 
     def roll_out(self, state: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         model = self.env.model

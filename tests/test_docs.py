@@ -1,4 +1,4 @@
-"""The pages in docs/ run as they stand, and they, the contributors' guide and the project's files name what exists."""
+"""The commands and Python of pages run, and links and file names in documents and project files exist."""
 
 import re
 import runpy

@@ -1,4 +1,4 @@
-"""Each program in examples/ runs as a newcomer runs it, and prints what it promises."""
+"""Each program in examples/ runs and prints the expected results."""
 
 import ast
 import os

@@ -32,7 +32,7 @@ def hopper(engine: str, **options: Any) -> lw.Env:
 
 
 def lay_down(env: lw.Env, world: int) -> None:
-    """Put a hopper on the floor, with five contacts where a standing one has none."""
+    """Put a hopper on the floor, with five contacts; a standing one has none."""
     state, start = env.get_state(), env.state_space.parts["qpos"].start
     state[world, start + 1 : start + 3] = torch.tensor([0.05, 1.5], dtype=state.dtype)
     env.set_state(state, torch.arange(N) == world)
@@ -155,7 +155,7 @@ def test_faults_print_nothing_over_300_steps(
 @pytest.mark.parametrize("autoreset", [True, False])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_bad_warm_start_ends_with_its_episode(engine: str, autoreset: bool) -> None:
-    """Writing good positions and velocities alone would leave it: the world would have a fault at every step."""
+    """Resetting only positions and velocities would keep it, and the world would have a fault at every step."""
     env, clean = (hopper(engine, autoreset=autoreset) for _ in range(2))
     for each in (env, clean):
         lay_down(each, BAD)
@@ -199,14 +199,8 @@ def test_only_a_fault_restarts_a_world_without_automatic_resets(engine: str) -> 
         ({"ctrl_cost_weight": [1.0, 2.0]}, r"shape \(2,\); it takes one number, or one per world, \(4,\)"),
         ({"healthy_z_range": 1.0}, r"healthy_z_range of 'hopper' has shape \(\); it takes \(2,\)"),
         ({"terminate_when_unhealthy": 0.5}, "terminate_when_unhealthy=0.5 of 'hopper' must be a whole number"),
-        ({"device": "tpu"}, "no device 'tpu' on this machine; it has 'cpu'"),
         ({"device": "cuda:77"}, "no device 'cuda:77' on this machine; it has 'cpu'.*nvidia-smi"),
-        ({"engine": "bullet"}, "no engine 'bullet': use one of 'auto', 'mujoco', 'warp'"),
         ({"engine": None}, "engine must be .* not NoneType None"),
-        ({"engine": "mujoco", "njmax": 64}, "the mujoco engine takes no njmax; it takes nthread"),
-        ({"engine": "warp", "nthread": 2}, "the warp engine takes no nthread; it takes nconmax, njmax, unroll"),
-        ({"engine": "warp", "njmax": -3}, "njmax must be a whole number from 1 to .*, not -3"),
-        ({"engine": "mujoco", "nthread": -3}, "nthread must be a whole number from 0 to .*, not -3"),
         ({"model": "hoper.xml"}, "no model file 'hoper.xml' in .*; it has hopper.xml"),
         ({"model": "/nowhere/hopper.xml"}, "no model file '/nowhere/hopper.xml'"),
     ],

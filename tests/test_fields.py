@@ -59,8 +59,6 @@ def test_a_field_has_mujocos_shape_with_vectors_as_elements(
 def test_an_unknown_field_is_refused_with_similar_ones(model: mujoco.MjModel) -> None:
     with pytest.raises(ValueError, match="there is no field 'site_xpoz': did you mean site_xpos"):
         describe(model, "site_xpoz")
-    with pytest.raises(ValueError, match="there is no field 'site_xpoz': did you mean site_xpos"):
-        lw.make("hopper", fields=["site_xpoz"])
 
 
 @pytest.mark.parametrize("name", ["subtree_linvel"])
@@ -146,7 +144,7 @@ def test_an_element_that_is_not_there_is_refused(name: str, element: str, messag
         elements(model, name, element)
 
 
-def test_inputs_alone_may_be_written_before_a_step(model: mujoco.MjModel) -> None:
+def test_only_inputs_may_be_written_before_a_step(model: mujoco.MjModel) -> None:
     assert describe(model, "ctrl").written
     assert describe(model, "xfrc_applied", written=True).written
     assert not describe(model, "xfrc_applied").written

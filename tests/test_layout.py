@@ -1,4 +1,4 @@
-"""Who may import whom, what is private to whom, and where tests lie."""
+"""Modules import only from lower rooms, private names stay private, and every room has tests."""
 
 import ast
 import importlib
@@ -234,7 +234,7 @@ def test_no_submodule_has_a_public_name() -> None:
     assert not {room(name) for name in MODULES} & set(lw.__all__)
 
 
-def test_the_import_alone_loads_neither_torch_nor_warp_nor_mujoco() -> None:
+def test_importing_the_package_loads_neither_torch_nor_warp_nor_mujoco() -> None:
     program = """
         import sys, lyceum_warp
         print([name for name in ("torch", "warp", "mujoco", "numpy") if name in sys.modules])

@@ -174,7 +174,7 @@ def rollouts(task: str | type[lw.Task], steps: int, *, engine: str, nworld: int 
 
 
 def random_actions(env: lw.Env, steps: int, seed: int) -> torch.Tensor:
-    """Actions of which many lie beyond the bounds, or beyond -1 and 1 where there are none."""
+    """Actions of which many lie beyond the bounds, or beyond -1 and 1 if there are no bounds."""
     generator = torch.Generator().manual_seed(seed)
     bounds = (torch.from_numpy(bound) for bound in (env.action_space.low, env.action_space.high))
     low, high = (bound.nan_to_num(neginf=-1.0, posinf=1.0) for bound in bounds)
@@ -222,7 +222,7 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
 
 
 def on_engines(task: str) -> list[object]:
-    """A task on both engines; on the Warp engine a few tasks cover most of what a model can have."""
+    """A task on both engines; on the Warp engine a few tasks cover most elements of a model."""
     few = task in ("hopper", "humanoid", "adroit_pen", "soft_ball", "reach")
     return [pytest.param(task, "mujoco"), pytest.param(task, "warp", marks=[] if few else [pytest.mark.long])]
 
@@ -278,7 +278,7 @@ def test_every_kind_of_task_gives_the_numbers_of_stepping(
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_parameters_may_change_between_rollouts(engine: str) -> None:
-    """Also from one number to one a world, after graphs were captured."""
+    """Also from one number to one per world, after graphs were captured."""
     loop, env = rollouts(Forgetful, 3, engine=engine), lw.make(Forgetful, engine=engine, nworld=4, autoreset=False)
     check_against_stepping(loop, env)
     for params in ({"cost": 5.0}, {"gain": np.array([1.0, 2.0, 3.0, 4.0]), "bound": -1.0}):
@@ -290,7 +290,7 @@ def test_parameters_may_change_between_rollouts(engine: str) -> None:
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Forgetful, Servo])
 def test_worlds_draw_from_keys_of_their_own_if_given(task: type[lw.Task], engine: str) -> None:
-    """What they draw is what stepping draws from states with these keys."""
+    """They draw the same numbers as steps from states with these keys."""
     env = lw.make(task, engine=engine, nworld=4, autoreset=False)
     numbers = np.array([5, 2**32 - 1, 77, 1234567890], dtype=np.uint32)
     keys = wp.zeros(4, dtype=wp.uint32, device="cpu")
@@ -316,7 +316,7 @@ def test_keys_that_do_not_fit_are_refused(shared_env: SharedEnv) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_terminated_is_judged_for_each_state_alone(engine: str) -> None:
+def test_terminated_is_judged_for_each_state_separately(engine: str) -> None:
     """The arm swings out and back in; only the states outside count as ends."""
     loop = rollouts(Forgetful, 40, engine=engine, nworld=2, bound=0.05)
     loop.env.reset()

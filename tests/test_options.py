@@ -20,8 +20,9 @@ from lyceum_warp.options import OPTION_DOCS, OPTIONS, EnvOptions, PhysicsOptions
         ({"autoreset": "no"}, "autoreset must be True or False, not 'no'"),
         ({"graphs": 1}, "graphs must be True or False, not 1"),
         ({"fields": "sensordata"}, r"fields must be names of fields, as in fields=\['sensordata'\], not 'sensordata'"),
-        ({"fields": [3]}, r"fields must be names of fields, .* not \[3\]"),
+        ({"fields": ["qpos", 3]}, r"fields must be names of fields, .* not \['qpos', 3\]"),
         ({"frame_skip": 0}, "frame_skip must be a whole number from 1 .*, not 0"),
+        ({"integrator": 1}, "no integrator 1: use"),
         ({"cone": "round"}, "there is no friction cone 'round': use 'pyramidal' or 'elliptic'"),
         ({"integrator": "rk5"}, "no integrator 'rk5': use 'euler', 'rk4', 'implicit' or 'implicitfast'"),
         ({"solver": 4}, r"solver must be a dict of limits, as solver=\{'iterations': 4\}, not 4"),
@@ -66,7 +67,7 @@ def test_a_replica_has_the_options_of_the_original_except_for_the_changes() -> N
     replica = env.replicate(nworld=3, horizon=6)
     assert replica.options.given() == {
         "nworld": 3, "horizon": 6, "integrator": "euler", "solver": {"iterations": 4},
-        "model": env.task.spec,  # as it was read, whatever became of its file
+        "model": env.task.spec,  # as it was read, even if its file has changed
     }  # fmt: skip
 
 

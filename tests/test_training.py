@@ -126,14 +126,8 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
         lw.load(six, which="worst")
 
 
-def test_the_best_policy_gives_the_best_return_of_the_evaluations(six: Path) -> None:
-    best = max(float(row["mean_return"]) for row in metrics(six) if row["mean_return"])
-    iteration, score = Run.open(six).best_score() or (0, 0.0)
-    assert score == best and metrics(six)[iteration - 1]["mean_return"] == repr(best)
-
-
 def test_without_evaluations_the_best_policy_sampled_the_best_iteration(tmp_path: Path) -> None:
-    """The episodes of an iteration are those of the policy before its step."""
+    """The policy before the step of an iteration samples the episodes of that iteration."""
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)
     returns = [float(row["return_mean"]) for row in metrics(tmp_path / "run")]
@@ -176,7 +170,7 @@ def test_an_error_in_the_callback_leaves_a_whole_run(six: Path, tmp_path: Path) 
 def test_what_ends_an_iteration_leaves_the_last_save(
     error: type[BaseException], six: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where worlds and networks have moved on since."""
+    """Also if worlds and networks have changed since."""
     npg, folder = algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run"
     fit = ValueFit.__call__
 
@@ -211,7 +205,7 @@ class SlowToSave(lw.NPG):
 
 @pytest.fixture
 def sigint() -> Iterator[None]:
-    """Python's own handler of SIGINT, also where a shell made its children ignore it."""
+    """Python's own handler of SIGINT, even if a shell made its children ignore it."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -269,7 +263,7 @@ def test_training_ends_after_its_minutes(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_a_run_continues_from_the_last_complete_state_to_the_same_numbers(six: Path, tmp_path: Path) -> None:
-    """As after kill -9 in iteration 5: the last save is that of iteration 3, the last row that of iteration 4."""
+    """As after kill -9 in iteration 5: iteration 3 was saved last, and iteration 4 wrote the last row."""
     folder = tmp_path / "run"
     states = {}
 
@@ -367,4 +361,4 @@ def test_ppo_trains_by_the_same_loop_from_the_shell(six: Path, tmp_path: Path) -
     assert metrics(tmp_path / "parts") == metrics(tmp_path / "whole")
     config = Run.open(tmp_path / "parts").config
     assert config["algorithm"] == "ppo" and config["ppo"]["hidden"] == [8] and "npg" not in config
-    assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # the settings of NPG are not those of PPO
+    assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # PPO does not take NPG's settings

@@ -72,7 +72,7 @@ QUOTING = {
     "CHANGELOG.md": (r"`[^`]*`",),  # old names
     "CONTRIBUTING.md": (r"(?ms)^```.*?^```", r"\|[^|\n]*\|$", r'"[^"\n]*"'),  # examples of bad style
 }
-"""Parts of documents that quote what was settled against."""
+"""Parts of documents that quote words which were settled against."""
 
 DOCUMENTS = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "bench/README.md")
 OTHERS = ("Makefile", "pyproject.toml", ".ci/run", "CITATION.cff", "constraints.txt")

@@ -1,4 +1,4 @@
-"""Worlds: the phases of a step, a reset and a restored state, and what they leave in the arrays."""
+"""The phases of a step, a reset and a restored state leave the expected numbers in the arrays."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ class Held(PointMass):
 def outcomes_with_faults(
     engine: str, *, judging: int = 1, observing: int = 1
 ) -> tuple[list[torch.Tensor], dict[str, int]]:
-    """What steps of a task with every feature leave, with events and faults of each kind, and the counts of faults."""
+    """All buffers after steps of a task with every feature, with events and faults of each kind, and fault counts."""
     env = lw.make(Full, nworld=4, engine=engine, seed=2)
     own, kept = env.worlds, []
     own._judging, own._observing = judging, observing
@@ -96,7 +96,7 @@ def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.En
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_held_success_needs_its_steps_in_a_row_within_an_episode(engine: str) -> None:
-    """Ends of episodes and a fault start the count again; all other numbers are those of the plain task."""
+    """Ends of episodes and a fault restart the count; all other numbers equal the plain task's."""
     held, plain = held_and_plain(engine, horizon=12)
     rows, rises, falls = torch.zeros(16), 0, 0
     generator = torch.Generator().manual_seed(0)
@@ -141,7 +141,7 @@ def test_a_state_goes_on_with_the_steps_of_a_success_and_a_reset_does_not(engine
     assert env.success.tolist() == [False, True, True]
     env.set_state(full)
     assert env.success.tolist() == [False, True, True]
-    env.set_params(success_distance=0.0)  # a state is a success only where it meets the goal itself
+    env.set_params(success_distance=0.0)  # a state is a success only if it meets the goal itself
     env.set_state(full)
     assert not env.success.any()
 
@@ -162,17 +162,6 @@ def test_rollouts_and_plans_do_not_depend_on_the_steps_of_a_success() -> None:
     assert torch.equal(*rewards)
     for one, other in zip(*plans, strict=True):
         assert torch.equal(one, other) and one.any()
-
-
-def test_configure_takes_effect_with_the_next_step() -> None:
-    env = lw.make("point_mass", nworld=2)
-    env.worlds.configure(horizon=2, autoreset=False, graphs=True)
-    for truncated in (False, True, True):
-        env.step()
-        assert env.truncated.tolist() == [truncated] * 2
-    env.worlds.configure(horizon=2, autoreset=True, graphs=True)
-    env.step()
-    assert env.episode_step.tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -26,7 +26,7 @@ class Tiny(lw.Task):
 
 
 def changed(*changes: tuple[str, str]) -> str:
-    """The text with some passages replaced, each where it first occurs."""
+    """The text with the first occurrence of each passage replaced."""
     source = TINY
     for old, new in changes:
         assert old in source, f"{old!r} is not in the text"

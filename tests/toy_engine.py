@@ -1,4 +1,4 @@
-"""A third engine, written against the contract in ``lyceum_warp.engines.base`` alone: plain MuJoCo, world by world."""
+"""A third engine that only follows the contract in ``lyceum_warp.engines.base``: plain MuJoCo, one world at a time."""
 
 import copy
 from collections.abc import Collection, Iterable

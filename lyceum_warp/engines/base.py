@@ -25,9 +25,9 @@ class Engine(abc.ABC):
     arrays never change, so graphs that read them are captured once.
 
     The order of calls in a step is: write ``ctrl`` and other inputs, ``step``, ``find_faults``, read fields and
-    ``fault``; for worlds that restart, ``reset``, write state fields and model fields, ``commit``, ``apply_model``,
-    optionally ``settle``, and ``refresh``. After construction the arrays hold no state: reset all worlds first. Model
-    fields hold the model's values, and resets do not change them.
+    ``fault``. Worlds that restart continue with ``reset``, writing state fields and model fields, ``commit``,
+    ``apply_model``, optionally ``settle``, and ``refresh``. After construction the arrays hold no state: reset all
+    worlds first. Model fields begin with the model's values, and resets do not change them.
 
     Args:
         model: The compiled model; the engine keeps it and does not change it.
@@ -45,15 +45,14 @@ class Engine(abc.ABC):
     name: str
     """The engine's name, as in ``make(engine=...)``."""
     launch_threads: int = 1
-    """Threads that may have a part of the worlds each in launches around a step.
+    """Threads that share the worlds in launches around a step.
 
-    An engine with several of them makes launches for all worlds through ``lyceum_warp.support.arrays`` alone.
+    An engine with several of them makes its launches only through ``lyceum_warp.support.arrays``.
     """
     capturable: bool
     """Whether every method is made of Warp launches, so that a whole step can be captured as one graph.
 
-    Otherwise only the launches between two calls of ``step``, ``refresh`` and ``set_state`` are captured: the methods
-    whose docstrings say so must be made of launches on every engine, on arrays whose addresses never change.
+    On other engines only methods that are documented as made of launches are captured.
     """
     model: mujoco.MjModel
     """The compiled model."""
@@ -72,13 +71,13 @@ class Engine(abc.ABC):
     arrays: dict[str, wp.array]
     """The live arrays of the fields and model fields, (nworld, ...), by name; filled by each engine's constructor."""
     ctrl: wp.array
-    """Controls of the next step, (nworld, nu), float32: the field of that name, reset and restored with the state."""
+    """Controls of the next step, (nworld, nu), float32; ``arrays["ctrl"]``, reset and restored with the state."""
     fault: wp.array
     """Bits of ``Done`` for each world, (nworld,), int32; set by ``find_faults``."""
     stage: Stage
-    """The stage that must be computed after the substeps, for the fields that belong to the new state."""
+    """The last stage that fields of the new state need after the substeps."""
     reset_stage: Stage
-    """The stage that must be computed for worlds that were reset."""
+    """The last stage that fields need after a reset."""
     snapshots: list[Field]
     """Fields that are not a function of the integration state, in the order of the state vector."""
     integration_size: int
@@ -123,7 +122,7 @@ class Engine(abc.ABC):
     def bytes_per_world(
         cls, model: mujoco.MjModel, fields: Iterable[Field], dynamics: Iterable[ModelField] = (), **options: Any
     ) -> int:
-        """Estimated memory of each world in bytes; the arguments are those of the constructor.
+        """Estimated memory of each world in bytes; takes the arguments of the constructor.
 
         The default counts a float64 state and one float32 array for each field.
         """
@@ -147,12 +146,12 @@ class Engine(abc.ABC):
         """
 
     def step_phases(self, nstep: int) -> list[Phase]:
-        """``step`` as phases, with which an engine that is not ``capturable`` still captures its copies of fields."""
+        """``step`` as phases; an engine that is not ``capturable`` can still capture its copies of fields."""
         return [Phase("physics", partial(self.step, nstep), engine=True)]
 
     @abc.abstractmethod
     def find_faults(self, mask: wp.array) -> None:
-        """Write the masked worlds' ``fault``: a state that is not finite, and overflows and warnings since last time.
+        """Write the masked worlds' ``fault``: states that are not finite, overflows and warnings since the last call.
 
         Made of Warp launches on every engine.
         """
@@ -180,32 +179,26 @@ class Engine(abc.ABC):
     def apply_model(self, mask: wp.array) -> None:
         """Apply the masked worlds' model fields, and recompute the constants that follow from them.
 
-        Worlds with unchanged values cost next to nothing. Fields that follow from the state are not recomputed: see
-        ``refresh`` and ``refresh_current``. An engine that takes ``dynamics`` must implement it.
+        Unchanged values cost almost nothing. Derived fields follow with ``refresh`` or ``refresh_current``. An engine
+        that takes ``dynamics`` must implement it.
         """
         if self.dynamics:
             raise NotImplementedError(f"the {self.name} engine does not let model fields differ between worlds")
 
     def settle(self, mask: wp.array, nstep: int) -> None:
-        """Advance the masked worlds alone by ``nstep`` substeps from their committed states, and update state fields.
+        """Advance only the masked worlds by ``nstep`` substeps from their committed states, and update state fields.
 
-        Their time is 0 afterwards; derived fields follow with ``refresh``. Other worlds keep every bit.
+        Their time is 0 afterwards; derived fields follow with ``refresh``. Other worlds stay equal to the bit.
         """
         raise NotImplementedError(f"the {self.name} engine cannot settle single worlds")
 
     def run_for(self, mask: wp.array, run: Callable[[], None]) -> None:
-        """Run launches that concern the masked worlds alone; an engine may skip them while the mask is empty.
-
-        Only for an engine that is ``capturable``. By default they always run.
-        """
+        """Run launches that affect only the masked worlds; a capturable engine may skip them for an empty mask."""
         run()
 
     @abc.abstractmethod
     def refresh(self, mask: wp.array) -> None:
-        """Compute every derived field of the masked worlds as by a forward pass at their state.
-
-        Worlds outside the mask keep their values.
-        """
+        """Compute all derived fields of the masked worlds from their states; other worlds keep their values."""
 
     @abc.abstractmethod
     def refresh_current(self, mask: wp.array) -> None:
@@ -223,11 +216,10 @@ class Engine(abc.ABC):
         Afterwards the state fields and ``find_faults`` describe the end; derived fields may belong to another time.
 
         Args:
-            state: States to start from, whose leading columns are those of ``get_state``; (nworld, ...) float64.
+            state: States to start from, (nworld, state_size or more) float64, as from ``get_state``.
             controls: Controls of each step, (steps, nworld, nu) float32.
             nstep: Substeps in a step.
-            buffers: Where fields and model fields go, by their names, (steps + 1, nworld, ...): the first row is the
-                start.
+            buffers: Where fields and model fields go, by name, (steps + 1, nworld, ...); row 0 holds the start.
         """
         self.reset(self._everyone)  # clears warnings and warm starts of the last rollout
         self.set_state(state, self._everyone)
@@ -279,7 +271,7 @@ class Engine(abc.ABC):
         self._read_columns(state, mask, self.snapshots, self.integration_size)
 
     def _read_columns(self, state: wp.array, mask: wp.array, fields: Iterable[Field | ModelField], start: int) -> None:
-        """Round the masked worlds' columns of a state from ``start`` on into the arrays of some fields."""
+        """Read fields of the masked worlds from consecutive columns of a state, rounded to float32."""
         for field in fields:
             launch_rows(narrow, mask, state[:, start : start + field.size], flat(self.arrays[field.name]))
             start += field.size
@@ -290,7 +282,7 @@ class Engine(abc.ABC):
 
     @property
     def _dynamics_size(self) -> int:
-        """Number of columns of model fields, the last ones of a state."""
+        """Number of columns of the model fields, which come last in a state."""
         return sum(field.size for field in self.dynamics.values())
 
     @abc.abstractmethod
@@ -301,9 +293,9 @@ class Engine(abc.ABC):
 
 
 EngineFactory = Callable[..., Engine]
-"""Called with (model, nworld, device, fields, dynamics, initial, **options), the options that were given.
+"""Called with (model, nworld, device, fields, dynamics, initial, **options).
 
-An engine class is such a factory. If a factory has ``bytes_per_world``, as a class does, memory is checked first.
+An engine class is such a factory. If a factory has ``bytes_per_world``, as the classes have, memory is checked first.
 """
 
 

@@ -8,7 +8,7 @@ import warp as wp
 from lyceum_warp.support.machine import free_memory
 
 _KEPT_FREE = 0.1
-"""The fraction of the free memory that is left for everything else."""
+"""The fraction of the free memory that stays unused."""
 
 
 class NotEnoughMemoryError(ValueError):
@@ -29,7 +29,7 @@ def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: 
         nworld: Number of worlds.
         device: Where they will run.
         model: The model's name, for the message.
-        held: Bytes of the batch that are allocated already.
+        held: Bytes that the batch has already allocated.
 
     Raises:
         NotEnoughMemoryError: The batch does not fit; the message names the largest number of worlds that does.

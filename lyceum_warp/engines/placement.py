@@ -23,17 +23,17 @@ _ENGINES = {
     "warp": ("lyceum_warp.engines.warp.warp_engine", "WarpEngine"),
 }
 _DETERMINISTIC = "lyceum_warp.engines.deterministic.deterministic_engine", "DeterministicEngine"
-"""The engine that takes the place of "warp" with deterministic=True on a CUDA device."""
+"""The engine that replaces "warp" on a CUDA device with deterministic=True."""
 
 _SAMPLES_PER_CORE = 40
-"""With fewer samples for each CPU core, the C engine plans faster than an H100. Measured with 16 cores: they break even
-at 27 samples a core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah (bench/README.md)."""
+"""With fewer samples for each CPU core, the C engine plans faster than an H100. Measured with 16 cores: they are equal
+with 27 samples a core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah (bench/README.md)."""
 
 _MOST_CORES = 16
-"""More cores were not measured, and a plan's work besides physics runs on one."""
+"""The most cores that count: more were not measured, and the work of a plan besides physics runs on one core."""
 
 _NOSLIP = 6
-"""The factor on the number of samples for a model with the noslip solver, which makes a substep on a GPU slower."""
+"""How many times more samples pay for a GPU if the model uses the noslip solver, which is slow there."""
 
 
 def find_device(device: str | None) -> wp.Device:
@@ -92,8 +92,8 @@ def open_engine(
         dynamics: The model fields that differ between worlds, from ``model_fields.describe_model_field``.
         initial: The state that a reset puts worlds into; None for the model's own.
         reserved: Bytes for each world that the caller allocates.
-        options: The engine's options, the keyword-only arguments of its constructor. None leaves an engine its default.
-            An engine ignores a flag (True or False) that it does not take.
+        options: The engine's options, the keyword-only arguments of its constructor. None stands for the engine's
+            default. An engine ignores a flag (True or False) that it does not take.
 
     Raises:
         ValueError: There is no such engine, the worlds do not fit into memory, or the engine refuses the model, the
@@ -120,8 +120,8 @@ def bytes_per_world(
 def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
     """The options to change for an environment of a few worlds, such as an evaluation's.
 
-    On a GPU a step of a few worlds takes nearly as long as a step of thousands. With engine="auto" a few worlds
-    therefore step on CPU cores, through the C engine, in double precision.
+    On a GPU a step of a few worlds takes nearly as long as a step of thousands. With engine="auto" they therefore run
+    on the C engine, on CPU cores and in double precision.
     """
     return _on_cpu_cores() if engine == "auto" and engine_name(engine, device) == "warp" else {}
 
@@ -129,7 +129,7 @@ def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device 
 def options_for_plant(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
     """The options to change for a world that a planner controls in real time.
 
-    On a GPU its steps would wait for the planner's launches. It therefore steps on a CPU core, through the C engine.
+    On a GPU its steps would wait for the planner's launches. It therefore runs on the C engine, on a CPU core.
     """
     name = device.alias if isinstance(device, wp.Device) else device
     on_gpu = engine in ("auto", "warp") and find_device(name).is_cuda
@@ -143,12 +143,12 @@ def place_samples(
     """The options to change for a planner's worlds; with engine="auto" on a GPU the number of samples decides.
 
     Args:
-        engine: The engine that was asked for.
-        device: The device that was asked for.
-        nthread: Threads that the C engine would have, None for all cores.
-        samples: Number of samples, one a world.
-        spec: Reads the planner's model; only called if its noslip solver decides.
-        solver: The option ``solver`` of its physics.
+        engine: The requested engine.
+        device: The requested device.
+        nthread: Threads that the C engine would have; None for all cores.
+        samples: Number of samples, each in a world.
+        spec: Returns the planner's model; called only if the choice depends on its noslip solver.
+        solver: The option ``solver`` of the planner's physics.
 
     Raises:
         ValueError: This machine has no such device.
@@ -167,7 +167,7 @@ def place_samples(
 
 
 def _on_cpu_cores() -> dict[str, Any]:
-    """The options that move an environment from a GPU to the C engine; options that it does not take become None."""
+    """The options that move an environment to the C engine; options that this engine does not take become None."""
     known = _options_of(_engine_class("mujoco", wp.get_device("cpu"), False)) or []
     defaults = EnvOptions().for_engine()
     others = {name: None for name, default in defaults.items() if default is None and name not in known}

@@ -1,1 +1,1 @@
-"""Host code around Warp launches: capture and replay, rehearsal, compilation ahead of time."""
+"""Capture and replay Warp launches, and compile their kernels ahead of time."""

@@ -1,11 +1,11 @@
-"""Phases, the parts of a step, a reset or a plan, and graphs of their launches.
+"""Capture the phases of a step, a reset or a plan as graphs, and replay them.
 
-Code with launches lists them as phases, in order. ``Graphs.sequence`` turns the list into calls: phases that
-follow one another and are made of Warp launches become one graph, captured once and replayed. On an engine whose own
-calls are launches a whole step is one graph; on others the engine's calls stay between the graphs.
+``Graphs.sequence`` turns a list of phases into calls: consecutive phases that are made of Warp launches become one
+graph, captured once and replayed. If the engine's calls are launches too, a whole step is one graph; otherwise they
+stay between the graphs.
 
-Warp runs a launch on the CPU in one thread. Beside an engine that steps on all cores, phases that treat every world
-apart become several graphs, each for a part of the worlds, and threads replay them side by side.
+On the CPU, Warp runs a launch in one thread. Phases that process every world independently therefore become several
+graphs, each for a part of the worlds, which threads replay in parallel.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ Calls = tuple[Callable[[], None], ...]
 class Phase:
     """One entry of a list of phases.
 
-    A phase launches the same kernels on the same arrays each time, because a graph holds their addresses and scalar
+    It must launch the same kernels on the same arrays each time, because a graph holds their addresses and scalar
     arguments.
     """
 
@@ -41,21 +41,21 @@ class Phase:
     run: Callable[[], object]
     """Takes no arguments."""
     engine: bool = False
-    """True for an engine call, which consists of Warp launches on some engines only."""
+    """True for an engine call, which consists of Warp launches only on some engines."""
     by_world: bool = False
-    """Whether all that happens are launches through ``arrays.launch_worlds`` and its relatives, in which no world
-    depends on another one, so that several threads may have a part of the worlds each."""
+    """Whether it only makes launches through functions like ``arrays.launch_worlds``, in which no world depends on
+    another one, so that threads can share the worlds."""
 
 
 class Graphs:
-    """Makes sequences of calls out of phases, and can drop all their graphs.
+    """Turns phases into sequences of calls, and can drop all their graphs.
 
     Args:
         device: Where the launches run; Warp captures graphs on the CPU, too.
         enabled: False calls every phase directly.
         capture_engine: Whether calls into the engine are made of launches.
         nvtx: Whether to mark each phase as a range for NVIDIA's profilers.
-        workers: Threads that replay the graphs of phases with ``by_world``; by default the caller's alone.
+        workers: Threads that replay the graphs of phases with ``by_world``; by default only the caller's.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Graphs:
         return tuple(calls)  # type: ignore[arg-type]
 
     def forget(self) -> None:
-        """Drop all graphs, after arrays behind them were replaced; they are captured again when next called."""
+        """Drop all graphs after arrays were replaced; the next calls capture them again."""
         for graph in self._graphs:
             graph.forget()
 
@@ -105,21 +105,20 @@ class Graphs:
 
 
 SECONDS_A_THREAD = 5e-4
-"""Seconds of work that pay for one more thread; to wake it takes some 20 microseconds."""
+"""Seconds of work for each thread; waking a thread takes about 20 microseconds."""
 TIMED = 8
-"""Calls of which the shortest counts: other programs interrupt some."""
+"""Number of timed calls, of which the shortest counts, because other programs interrupt some."""
 _CAPTURING = threading.RLock()
-"""One capture at a time: controllers and viewers have environments in threads of their own."""
+"""Allows one capture at a time: controllers and viewers have environments in separate threads."""
 separate_captures()
 separate_tiles()
 
 
 @contextlib.contextmanager
 def capturing() -> Iterator[None]:
-    """Keep other captures and Python's garbage collection away from a capture.
+    """Context of a capture, without other captures and without Python's garbage collection.
 
-    A collection may delete graphs of torch that are no longer used. CUDA forbids that while a stream is captured, and
-    the capture fails.
+    A collection may delete unused graphs of torch, which makes a CUDA capture fail.
     """
     with _CAPTURING:
         collects = gc.isenabled()
@@ -132,10 +131,10 @@ def capturing() -> Iterator[None]:
 
 
 class _Graph:
-    """Functions made of launches as one graph, or as one for each thread where they take long.
+    """Functions made of launches as one graph, or as one for each thread if they take long.
 
-    The first call runs them directly, which loads every module that they need; the second captures and replays; all
-    further calls replay. Where there are workers, the first of these are timed, and the shortest time decides.
+    The first call runs them directly, which loads their modules; the second captures and replays; all further calls
+    replay. With workers, the first replays are timed, and the shortest time decides how many threads share the work.
     """
 
     def __init__(
@@ -155,7 +154,7 @@ class _Graph:
                 self._loaded = True
                 self._run()
                 return
-            if self._device.is_cuda:  # a capture may clear memory that earlier launches still work in
+            if self._device.is_cuda:  # a capture may clear memory that running launches still use
                 wp.synchronize_device(self._device)
             self._replay = self._capture_part(0, 1)
         if self._times is None:
@@ -169,7 +168,7 @@ class _Graph:
             self._share(shortest)
 
     def _share(self, seconds: float) -> None:
-        """Let workers share the graph, which takes some time alone, as far as that pays off."""
+        """Split the graph among workers if its duration on one thread makes that worthwhile."""
         assert self._workers is not None
         parts = min(self._workers.nthread, int(seconds / SECONDS_A_THREAD))
         if parts > 1:
@@ -193,7 +192,7 @@ def _alone(replay: Callable[[], object]) -> None:
 
 
 class _Range:
-    """A call marked as a range for NVIDIA's profilers."""
+    """A call that is marked as a range for NVIDIA's profilers."""
 
     def __init__(self, name: str, call: Callable[[], object]) -> None:
         self._name, self._call = name, call

@@ -1,8 +1,8 @@
-"""Kernels compiled ahead of time, on all cores, with progress on stderr.
+"""Compile kernels ahead of time, on all cores, with progress on stderr.
 
-Warp compiles a module when the first of its kernels is launched, one after another and silently. On a new GPU that
-takes a minute or more for a task. Here the launches of a step are rehearsed, the modules that Warp's cache lacks are
-compiled side by side, and each is reported. Modules that are in the cache cost nothing, and nothing is printed.
+Warp compiles a module silently at the first launch of one of its kernels. On a new GPU that takes a minute or more for
+a task. ``compile_ahead`` rehearses the launches of a step and compiles the modules that are not in Warp's cache in
+parallel.
 """
 
 import concurrent.futures
@@ -30,17 +30,17 @@ class Built:
     modules: int = 0
     """Number of modules that were compiled."""
     known: int = 0
-    """Number of further modules, which were in the cache."""
+    """Number of modules that were already in the cache."""
     seconds: float = 0.0
-    """Seconds that compiling took, all modules together."""
+    """Duration of compiling all modules."""
 
 
 def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str) -> Built:
-    """Compile every kernel that a function would launch and that is not in the cache, and report it on stderr.
+    """Compile every kernel that a function launches and that is not in the cache, and report progress on stderr.
 
     Args:
-        function: Made of launches. It is called without launching anything, and may overwrite its arrays with
-            meaningless numbers.
+        function: Made of launches. It is called while launches do nothing, and may fill its arrays with meaningless
+            numbers.
         device: Where the kernels will run.
         purpose: The kernels' purpose, for the report, as "hopper".
     """
@@ -81,7 +81,7 @@ def cached() -> dict[Path, int]:
 
 
 class _Report:
-    """A progress bar on a terminal, and a line for each module elsewhere."""
+    """A progress bar on a terminal; elsewhere a line for each module."""
 
     def __init__(self, total: int, purpose: str, device: wp.Device) -> None:
         self._text = f"compiling kernels of {purpose} for {device.alias}"

@@ -13,11 +13,11 @@ _lock = threading.RLock()
 
 
 class Rehearsal:
-    """The kernels that a function would launch."""
+    """Replaces Warp's launches, and notes the kernels."""
 
     def __init__(self) -> None:
         self.modules: dict[tuple[Any, int | None], None] = {}
-        """Modules and block sizes (None where the launch names none), in the order of the launches."""
+        """Modules and block sizes (None for the default), in the order of the launches."""
 
     def launch(self, kernel: Any, dim: Any = None, *args: Any, block_dim: int | None = None, **kwargs: Any) -> None:
         """Note a launch."""
@@ -30,8 +30,8 @@ class Rehearsal:
 def rehearse() -> Iterator[Rehearsal]:
     """Note the launches of this thread instead of making them; branches and loops in graphs run once.
 
-    Copies and allocations do happen, so the called function may overwrite its arrays with meaningless numbers. Other
-    threads launch as usual, and wait here for their own rehearsal.
+    Copies and allocations do happen, so the called function may fill its arrays with meaningless numbers. Other threads
+    launch as usual; their own rehearsals wait.
     """
     rehearsal = Rehearsal()
     functions: dict[str, Callable[..., None]] = {"launch": rehearsal.launch, "launch_tiled": rehearsal.launch}

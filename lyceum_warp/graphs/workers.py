@@ -1,14 +1,14 @@
-"""Threads that replay graphs of launches side by side."""
+"""Replay graphs of launches in parallel threads."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 
 class Workers:
-    """Threads that start with the first calls that need them, and end once this object is garbage-collected.
+    """A pool of threads that start on demand and end once this object is garbage-collected.
 
     Args:
-        nthread: The most threads that work, the caller's among them.
+        nthread: The largest number of threads, including the caller's.
     """
 
     def __init__(self, nthread: int) -> None:
@@ -16,13 +16,13 @@ class Workers:
         self._pool = ThreadPoolExecutor(max(nthread - 1, 1), "lyceum_warp")
 
     def run(self, calls: Sequence[Callable[[], object]]) -> None:
-        """Call functions that release Python's lock while they work, and wait until all have returned.
+        """Call functions that release Python's global lock, in parallel, and wait until all have returned.
 
         Args:
-            calls: The functions, one for each thread at most; the caller's takes the first one.
+            calls: The functions, at most ``nthread``; the caller's thread runs the first one.
 
         Raises:
-            BaseException: That of a function, once all of them have ended.
+            BaseException: A function raised it; the others have ended.
         """
         others: list[Future[object]] = []
         try:
@@ -36,7 +36,7 @@ class Workers:
 
 
 def _wait(futures: Sequence[Future[object]]) -> None:
-    """Wait until all have ended, after an interrupt, too: they work on arrays that the caller reads next."""
+    """Wait until all have ended, even after an interrupt, because they write arrays that the caller reads next."""
     interrupt: KeyboardInterrupt | None = None
     while not all(future.done() for future in futures):
         try:

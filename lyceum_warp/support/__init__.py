@@ -1,1 +1,1 @@
-"""Small helpers that know nothing of worlds."""
+"""Provide helpers that depend on no other room."""

@@ -1,4 +1,4 @@
-"""Host code for Warp arrays: views under another shape or in torch, and launches over worlds and their rows."""
+"""Make views of Warp arrays, also in torch, and launch kernels over worlds and their rows."""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -10,36 +10,36 @@ import torch
 import warp as wp
 
 WORLDS_A_BLOCK = 32
-"""Threads of a CUDA block where each thread has a world. Threads read the rows of their own worlds, of which a
-multiprocessor serves few at a time; larger blocks would leave most multiprocessors without worlds."""
+"""Threads of a CUDA block if each thread processes a world. Larger blocks would leave most multiprocessors without
+worlds."""
 
 _SPARE = 256
 """Elements behind an array without elements."""
 
 
 def alias(array: wp.array, dtype: type, shape: tuple[int, ...], strides: tuple[int, ...] | None = None) -> wp.array:
-    """The same memory under another type, shape or strides; it stays allocated as long as the alias lives."""
+    """An alias of an array's memory with another type, shape or strides, which keeps the memory alive."""
     view: Any = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device)
     view.owner = array
     return view
 
 
 def flat(array: wp.array) -> wp.array:
-    """The same memory as a (nworld, n) array of float32, for copies that do not depend on types."""
+    """The same memory as a (nworld, n) array of float32, for copies regardless of type."""
     n = array.size * wp.types.type_size_in_bytes(array.dtype) // 4 // max(array.shape[0], 1)
     return alias(array, wp.float32, (array.shape[0], n))
 
 
 def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> wp.array:
-    """One row as an array of many equal rows, (count, ...), that all lie in the same memory; only for reading."""
+    """An array of many equal rows, (count, ...), which share the memory of one row (stride 0); read-only."""
     single: Any = wp.array(row[None], dtype=dtype, device=device)
     return alias(single, dtype, (count, *single.shape[1:]), (0, *single.strides[1:]))
 
 
 def with_memory(array: wp.array) -> wp.array:
-    """The array, or, if it has no elements, one of the same shape with memory behind it.
+    """The array, or, if it has no elements, one of the same shape with allocated memory.
 
-    A kernel that reads an element of an array without elements by mistake would end the process.
+    Otherwise a task that reads an element of it by mistake would crash the process.
     """
     if array.size:
         return array
@@ -52,15 +52,15 @@ def torch_view(array: wp.array) -> torch.Tensor:
 
 
 _PART: ContextVar[tuple[int, int]] = ContextVar("_PART", default=(0, 1))
-"""Which part of the worlds the functions below launch for, and of how many."""
+"""The part of the worlds for which the functions below launch, and the number of parts."""
 
 
 @contextlib.contextmanager
 def part_of_worlds(part: int, parts: int) -> Iterator[None]:
-    """Let the functions below launch their kernels for one part of the worlds, or of the rows that stand for them.
+    """Context in which the functions below launch their kernels only for one part of the worlds.
 
     Args:
-        part: Which part, from 0 on.
+        part: Index of the part.
         parts: Number of parts, of about equal size.
     """
     token = _PART.set((part, parts))
@@ -71,7 +71,7 @@ def part_of_worlds(part: int, parts: int) -> Iterator[None]:
 
 
 def _launch(kernel: wp.Kernel, dim: Sequence[int], axis: int, args: Sequence[Any], device: Any, **options: Any) -> None:
-    """Launch a kernel for the part of the worlds that is asked for; ``axis`` of ``dim`` counts them.
+    """Launch a kernel for the current part of the worlds, which ``axis`` of ``dim`` counts.
 
     The kernel's last argument is the first world of the part.
     """
@@ -99,8 +99,7 @@ def launch_parts(kernel: wp.Kernel, parts: int, nworld: int, args: Sequence[Any]
 def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device) -> None:
     """Launch a kernel over (nworld, lanes), whose last arguments are the number of lanes and the first world.
 
-    The lanes are threads that share a world's rows: 1 on the CPU and a warp on a GPU, whose threads read and write
-    neighbouring places of a row together.
+    The lanes are threads that share a world's rows: 1 on the CPU and a warp on a GPU, for coalesced access.
     """
     lanes = 32 if device.is_cuda else 1
     _launch(kernel, (nworld, lanes), 0, [*args, lanes], device)

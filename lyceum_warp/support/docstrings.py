@@ -1,8 +1,7 @@
 """Show the docstrings of attributes and of overloaded Warp functions in ``help()``.
 
-Python discards a string that follows an attribute. Editors and documentation tools read it from the source; ``help``
-does not, so ``document_attributes`` appends these strings to the docstring of the class. An overloaded Warp function
-has no docstring at all, and ``help`` would show its class.
+Python discards a string after an attribute, so ``help`` does not show it: ``document_attributes`` reads these strings
+from the source and appends them to the docstring of the class. An overloaded Warp function has no docstring at all.
 """
 
 import ast
@@ -17,7 +16,7 @@ Class = TypeVar("Class", bound=type)
 
 
 def attribute_docs(cls: type) -> dict[str, str]:
-    """The docstrings of a class's attributes by name, in the order of the source; empty where there is no source."""
+    """The docstrings of a class's attributes by name, in the order of the source; empty without source."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))
     except (OSError, TypeError, SyntaxError):
@@ -42,10 +41,7 @@ def listed(docs: dict[str, str]) -> str:
 
 
 def document_attributes(cls: Class) -> Class:
-    """Class decorator: append the attributes' docstrings to the class's own, where ``help`` shows them.
-
-    Those of a dataclass include the attributes of the dataclasses that it extends.
-    """
+    """Class decorator: append the docstrings of attributes, including inherited dataclass fields, to the class's."""
     docs: dict[str, str] = {}
     for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__[1:])):
         docs |= attribute_docs(base)

@@ -1,4 +1,4 @@
-"""Files that are replaced whole, and formats that a newer release may have changed."""
+"""Replace files atomically, and refuse formats of newer releases."""
 
 import contextlib
 import os
@@ -9,15 +9,15 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def replaced(path: Path, *, durable: bool = False, previous: Path | None = None) -> Iterator[Path]:
-    """Replace a file in one go: a reader finds the old file or the whole new one.
+    """Replace a file atomically: a reader finds the old file or the complete new one.
 
-    The block writes into the path that it is given, a temporary file beside the target. If the block raises, the target
-    stays as it is and the temporary file is deleted.
+    The block writes into the yielded path, a temporary file beside the target. If the block raises, the target stays
+    unchanged and the temporary file is deleted.
 
     Args:
         path: The file.
-        durable: Whether the new content must reach the disk before the old file is given up, for a loss of power.
-        previous: Where the old file is kept, in place of another one. It exists under ``path``, too, until the end.
+        durable: Whether to flush the new content to the disk before the old file is replaced, in case of a power loss.
+        previous: Where to keep the old file.
     """
     temporary = path.with_name(path.name + ".tmp")
     try:
@@ -42,7 +42,7 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
 
 
 def _moved(source: Path, target: Path) -> None:
-    """Move a file, with a second attempt: on a network or while another program reads the file, one may fail."""
+    """Move a file, and retry once: on a network drive, or while another program reads the file, it may fail."""
     try:
         os.replace(source, target)
     except OSError:

@@ -1,4 +1,4 @@
-"""Forked children: what they cannot use raises an error, instead of waiting for threads that stayed in the parent."""
+"""Let environments raise an error in forked children, which would wait for threads of the parent forever."""
 
 import os
 import weakref
@@ -10,22 +10,22 @@ _kept: list[object] = []
 
 
 class LeftInParent:
-    """Stands in for an attribute that a forked child cannot use."""
+    """Placeholder for an attribute that a forked child cannot use."""
 
     def __getattr__(self, name: str) -> Any:
         raise RuntimeError(
-            "this environment was made before the process was forked, and its engine's threads stayed in the parent: "
-            "make it in the child, or start children with multiprocessing.get_context('spawn')"
+            "this environment was made before the process was forked, and its engine's threads exist only in the "
+            "parent: make it in the child, or start children with multiprocessing.get_context('spawn')"
         )
 
 
 def leave_in_parent(thing: Any, *attributes: str) -> None:
-    """Replace attributes of an object in every child that is forked from now on, where they raise RuntimeError."""
+    """Replace attributes of an object in all children forked later; there they raise RuntimeError."""
     _watched[thing] = attributes
 
 
 def call_once_gone(thing: Any, function: Callable[[], object]) -> None:
-    """Call a function when an object is deleted, but not in forked children, nor at the end of the process."""
+    """Call a function when an object is deleted, except in forked children and at the end of the process."""
     weakref.finalize(thing, _call_in, os.getpid(), function).atexit = False
 
 
@@ -37,7 +37,7 @@ def _call_in(process: int, function: Callable[[], object]) -> None:
 def _after_fork() -> None:
     for thing, attributes in _watched.items():
         for name in attributes:
-            _kept.append(getattr(thing, name))  # an engine that is destroyed here would wait for its threads, too
+            _kept.append(getattr(thing, name))  # destroying an engine would wait for its threads, too
             setattr(thing, name, LeftInParent())
 
 

@@ -10,7 +10,7 @@ _NUMBERS = [int(getattr(signal, name)) for name in ("SIGINT", "SIGTERM", "SIGHUP
 
 
 class Interrupted(BaseException):
-    """A signal asks the program to end."""
+    """A signal requested the end of the program."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -35,14 +35,14 @@ def _leave(number: int, frame: Any) -> None:
 
 @contextlib.contextmanager
 def _handling(handler: Callable[[int, Any], None], replaces: Callable[[Any], bool]) -> Iterator[dict[int, Any]]:
-    """Within the context a handler takes the place of some others.
+    """Within the context a handler replaces others.
 
     Args:
         handler: The handler.
-        replaces: Whether the handler replaces another one.
+        replaces: Called with a current handler; whether to replace it.
 
     Yields:
-        The replaced handlers by their signals; they are restored at the end.
+        The replaced handlers by signal, to be restored at the end.
     """
     previous: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # only the main thread may set handlers
@@ -59,7 +59,7 @@ def _handling(handler: Callable[[int, Any], None], replaces: Callable[[Any], boo
 def _is_active(handler: Any) -> bool:
     """Whether a signal with this handler reaches the program.
 
-    A shell that starts a program in the background makes it ignore SIGINT on purpose, and nohup SIGHUP.
+    A shell makes background programs ignore SIGINT, and nohup makes programs ignore SIGHUP.
     """
     return handler not in (signal.SIG_IGN, _ignore)
 
@@ -83,9 +83,9 @@ def ending() -> Iterator[None]:
 
 @contextlib.contextmanager
 def obeyed() -> Iterator[None]:
-    """Within the context a second Ctrl-C, SIGTERM or SIGHUP raises Interrupted, after the first in ``signals``.
+    """Within the context another Ctrl-C, SIGTERM or SIGHUP raises Interrupted after the first one of ``signals``.
 
-    It is for work at the end of a program that may take long, so that a second Ctrl-C cancels it.
+    Long work at the end of a program can thus be cancelled.
     """
     with _handling(_interrupt, lambda handler: handler is _ignore):
         yield

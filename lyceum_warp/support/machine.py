@@ -1,4 +1,4 @@
-"""What this process may use of the machine: CPU cores and memory."""
+"""Count the CPU cores and the free memory that this process may use."""
 
 import os
 from pathlib import Path
@@ -12,7 +12,7 @@ def cpu_cores() -> int:
 
 
 def free_memory(device: wp.Device) -> int | None:
-    """Free bytes on a device, or None where the system does not report them."""
+    """Free bytes on a device, or None if the system does not report them."""
     if device.is_cuda:
         return int(device.free_memory)
     try:

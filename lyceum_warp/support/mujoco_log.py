@@ -1,4 +1,4 @@
-"""MuJoCo's warnings in Python's log."""
+"""Send MuJoCo's warnings to Python's log."""
 
 import logging
 
@@ -10,8 +10,8 @@ log = logging.getLogger(__name__)
 def quiet() -> None:
     """Send MuJoCo's warnings to the log, for the whole process.
 
-    By default MuJoCo prints each warning and appends it to MUJOCO_LOG.TXT in the current folder, from any thread. The
-    engines count the warnings of each world and report them as a done reason.
+    By default MuJoCo prints each warning and appends it to MUJOCO_LOG.TXT in the current folder. The engines report a
+    world's warnings as a done reason.
     """
     mujoco.set_mju_user_warning(_log)
 

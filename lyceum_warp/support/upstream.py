@@ -1,6 +1,6 @@
 """Access and patch internals of Warp and MuJoCo Warp.
 
-No other file does either, so that a new version of them is checked here alone.
+No other module does, so that only this one depends on their versions.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ def builtin_functions() -> Mapping[str, Any]:
 def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
     """Whether a module of kernels is loaded or in Warp's cache, for a block size.
 
-    If Warp's internals have changed the answer is no, which costs time only.
+    False if Warp's internals have changed, which only costs time.
     """
     if (device.context, block) in module.execs:
         return True
@@ -34,22 +34,22 @@ def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
         return False
 
 
-# the C engine does without MuJoCo Warp: its modules are loaded when they are used
+# MuJoCo Warp is imported on demand, because the C engine does not need it
 
 
 def forward_functions() -> Mapping[str, Any]:
-    """MuJoCo Warp's functions of a forward pass and a step by name, and the modules that they use."""
+    """The namespace of MuJoCo Warp's forward pass and step: functions and imported modules by name."""
     return vars(importlib.import_module("mujoco_warp._src.forward"))
 
 
 def has_sdf_functions() -> bool:
-    """Whether a distance function of SDF plugins was registered with MuJoCo Warp, whose own one only fails."""
+    """Whether a distance function of SDF plugins was registered with MuJoCo Warp, whose default only fails."""
     collision_sdf = importlib.import_module("mujoco_warp._src.collision_sdf")
     return bool(collision_sdf.user_sdf.func.__module__ != collision_sdf.__name__)
 
 
 class _PerThread(threading.local):
-    """An attribute of Warp's runtime that each thread has for itself, None at first."""
+    """A thread-local attribute of Warp's runtime, initially None."""
 
     value: Any = None
 
@@ -61,30 +61,29 @@ class _PerThread(threading.local):
 
 
 def separate_captures() -> None:
-    """Keep a capture of launches on the CPU to the thread that began it.
+    """Make captures of launches on the CPU thread-local.
 
-    Warp's library captures launches for the thread that began a capture, but its Python code takes the capture for one
-    of every thread: loops of other threads would become part of the graph, and their launches would replace the
-    arguments of its own.
+    Warp's library captures only launches of the thread that began a capture, but its Python code applies a capture to
+    all threads: loops of other threads would enter the graph, and their launches would overwrite its arguments.
     """
     for name in ("_apic_capture", "_apic_graph"):
         setattr(wp._src.context.Runtime, name, _PerThread())
 
 
 class _Tiles(threading.local):
-    """Whether this thread has launched a kernel with tiles since the flag was last cleared."""
+    """Thread-local flag: a kernel with tiles was launched."""
 
     launched = False
 
 
 tiles = _Tiles()
 TILES_ON_CPU = threading.RLock()
-"""Held while kernels with tiles run on the CPU. A module that Warp compiles for x86 keeps the address of its tiles in a
-variable that all threads share, so that two threads in one such kernel would write each other's tiles."""
+"""Lock held while kernels with tiles run on the CPU: compiled for x86, they keep the address of their tiles in a static
+variable, so two threads would overwrite each other's tiles."""
 
 
 def separate_tiles() -> None:
-    """Let one thread at a time launch kernels with tiles on the CPU, and note the launches in ``tiles``."""
+    """Serialise launches of kernels with tiles on the CPU, and note the launches in ``tiles``."""
     launch_tiled = wp.launch_tiled
 
     def launch(*args: Any, **options: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Checks of values that users pass, shared by several rooms."""
+"""Check values that users pass."""
 
 import math
 import numbers
@@ -67,7 +67,7 @@ def check_flag(name: str, value: Any) -> None:
 
 
 def check_word(name: str, value: Any, words: Sequence[str], others: str = "") -> None:
-    """Check that a value is one of a few words; ``others`` names what else the caller accepts.
+    """Check that a value is one of a few words; the message appends ``others``, further accepted values.
 
     Raises:
         ValueError: The value is something else.
@@ -103,7 +103,7 @@ def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:
     """Check that a value has the shape, the type and the device of a buffer.
 
     Raises:
-        ValueError: The value is not a tensor, or differs from the buffer in one of them.
+        ValueError: The value is not a tensor, or differs from the buffer.
     """
     if not isinstance(value, torch.Tensor) or value.shape != like.shape or value.dtype != like.dtype:
         raise ValueError(f"{name} must be {described(like)}, not {described(value)}")
@@ -112,7 +112,7 @@ def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:
 
 
 def described(value: Any) -> str:
-    """Describe a value in a few words, for error messages."""
+    """A short description of a value, for error messages."""
     if isinstance(value, torch.Tensor):
         return f"a {str(value.dtype).removeprefix('torch.')} tensor of shape {tuple(value.shape)}"
     if hasattr(value, "shape"):

@@ -1,4 +1,4 @@
-"""The versions and the machine that a run's numbers depend on."""
+"""Collect the versions and the machine data that a run's numbers depend on."""
 
 import functools
 import importlib.metadata
@@ -53,7 +53,7 @@ def _cpu_name() -> str:
 def _commit() -> str | None:
     root = Path(__file__).resolve().parent.parent.parent
     git = shutil.which("git")
-    # an installed package may lie inside the checkout of another project, whose commit would be wrong
+    # an installed package may lie inside another project's checkout, whose commit would be wrong
     if git is None or not (root / ".git").exists():
         return None
     command = [git, "describe", "--always", "--dirty", "--abbrev=40"]

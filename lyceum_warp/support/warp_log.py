@@ -1,4 +1,4 @@
-"""Start Warp without its greeting, and send its remarks on the CUDA driver to Python's log."""
+"""Initialise Warp without its greeting, and send its messages about the CUDA driver to Python's log."""
 
 import contextlib
 import logging
@@ -17,22 +17,20 @@ _remarks: list[str] | None = None
 
 
 def start_warp() -> list[str]:
-    """Initialise Warp quietly, and log its complaints about the CUDA driver.
+    """Initialise Warp quietly, and log its messages about the CUDA driver.
 
-    At its default log level Warp prints a greeting and a line for every module that it loads: the level becomes that of
-    warnings. A level that the user has set stays.
-
-    Warp's library prints such remarks to stderr on every machine without a GPU, also where only CPUs are used. Other
-    output is printed as usual.
+    At its default log level Warp prints a greeting and a line for every module that it loads, so the level is raised to
+    warnings; a level set by the user stays. Without a GPU, Warp's library prints messages about the driver to stderr:
+    these are logged instead, and all other output is printed.
 
     Returns:
-        The remarks, for the error message of a caller that wants a CUDA device.
+        The messages about the driver, for errors of callers that need a CUDA device.
     """
     global _remarks
     with _lock:
         if _remarks is None:
             level = wp.LOG_WARNING if wp.config.log_level == wp.LOG_INFO else wp.config.log_level
-            wp.config.log_level = max(level, wp.LOG_ERROR)  # Python code of Warp repeats one of them
+            wp.config.log_level = max(level, wp.LOG_ERROR)  # Warp's Python code repeats one of the messages
             try:
                 printed = _stderr_of_start()
             finally:
@@ -46,7 +44,7 @@ def start_warp() -> list[str]:
 
 
 def _stderr_of_start() -> list[str]:
-    """The lines that reach the process's stderr while Warp is initialised."""
+    """The lines that Warp writes to stderr while it is initialised."""
     with contextlib.ExitStack() as restored:
         try:
             stderr = os.dup(2)

@@ -8,7 +8,7 @@ import pytest
 
 import lyceum_warp as lw
 
-TASK = Path(__file__).parents[1] / "out_of_range_task.py"
+TASK = Path(__file__).with_name("out_of_range_task.py")
 
 ROWS = {
     "observe": (1, 1, "", "obs declares 1"),

@@ -45,7 +45,7 @@ PLACES = {
     "site": 'site="tip" gear="0 0 .3 0 .1 0"',
     "refsite": 'site="tip" refsite="here" gear="0 0 .3 0 0 0"',
 }
-"""What actuators pull at; bodies follow with adhesion."""
+"""Transmissions of actuators; adhesion is a separate factor."""
 
 EQUALITIES = {
     "none": "",
@@ -310,7 +310,7 @@ def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
     while missing:
         first = next(iter(missing))
         if (case := _completed(dict(first), rng, missing, strength)) is None:
-            del missing[first]  # refused, in these levels or in what they leave to others
+            del missing[first]  # refused with any levels of the other factors
             continue
         for part in itertools.combinations(((name, case[name]) for name in FACTORS), strength):
             missing.pop(part, None)

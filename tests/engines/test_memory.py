@@ -41,7 +41,7 @@ def test_check_fit_first_frees_what_torch_keeps_on_a_gpu(monkeypatch: pytest.Mon
 
 
 def test_the_warp_engine_s_estimate_covers_its_arrays() -> None:
-    """Those of MuJoCo Warp's data, and with them the group's and temporary arrays."""
+    """The arrays of MuJoCo Warp's data, of the group, and temporary ones."""
     for task in ("hopper", "humanoid"):
         env = lw.make(task, engine="warp", nworld=64)
         engine: Any = env.engine

@@ -1,4 +1,4 @@
-"""One place decides where worlds run: devices, "auto", options of engines, few worlds, a planner's samples."""
+"""Devices by name, engine="auto", options of engines, and the placement of few worlds and of a planner's samples."""
 
 import types
 from typing import Any
@@ -99,7 +99,7 @@ def test_options_are_read_from_the_signature_of_an_engine(model: mujoco.MjModel)
 def test_worlds_that_do_not_fit_are_refused_before_the_engine_is_made(
     engine: Any, model: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What the caller allocates beside the engine counts, too."""
+    """Memory that the caller allocates counts, too."""
     cpu = wp.get_device("cpu")
     each = placement.bytes_per_world(engine, model, cpu, [])
     assert each > 8 * mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION.value)
@@ -119,7 +119,7 @@ def test_few_worlds_move_from_a_gpu_to_cpu_cores_with_auto_only() -> None:
 
 
 def test_a_plant_moves_from_a_gpu_to_a_cpu_core(gpu: Any) -> None:
-    """Also where the engine was chosen: beside a planner its steps would wait for the GPU."""
+    """Also with engine="warp": beside a planner its steps would wait for the GPU."""
     for engine, device in (("auto", "cuda:0"), ("warp", "cuda:0")):
         assert options_for_plant(engine, device) == ON_CPU
     for engine, device in (("auto", None), ("warp", "cpu"), ("mujoco", "cpu"), (ToyEngine, "cuda:0")):

@@ -1,4 +1,4 @@
-"""Room for contacts and constraints: for what a task may turn on, and a warning where that is unknown."""
+"""Room for contacts and constraints covers those that a task may turn on, or a warning is logged."""
 
 import mujoco
 import pytest

@@ -146,7 +146,7 @@ LADEN = table.PLAIN | {
 
 @pytest.mark.parametrize("asked", table.STAGES)
 def test_a_step_goes_on_from_the_fields_of_any_stage(asked: str, device: wp.Device) -> None:
-    """Each alone: the parts that it needs are computed, and those of them that a step begins with are not repeated."""
+    """The step computes the parts that the field needs, and does not repeat parts that are already computed."""
     check(LADEN | {"asked": asked}, device)
 
 
@@ -159,7 +159,7 @@ OF_ANOTHER_MODEL = {
     "tendon_solref_fri": {"tendons": "friction"}, "tendon_solimp_fri": {"tendons": "friction"},
     "pair_solreffriction": {"cone": "elliptic"},
 }  # fmt: skip
-"""What a model needs beside ``DRAWN``, so that a field matters."""
+"""Levels that a model needs beside ``DRAWN``, so that a field has an effect."""
 
 
 def touching(model: mujoco.MjModel) -> np.ndarray:
@@ -181,7 +181,7 @@ def drawn_fields() -> list[Any]:
 
 @pytest.mark.parametrize("name", drawn_fields())
 def test_a_drawn_field_acts_as_in_an_edited_model(name: str, device: wp.Device) -> None:
-    """Also where it is zero in the model. To the bit, unless constants follow from it, in single precision."""
+    """Also if it is zero in the model. Equal to the bit, unless constants follow from the field."""
     case = DRAWN | OF_ANOTHER_MODEL.get(name, {})
     spec = mujoco.MjSpec.from_string(table.xml(case))
     for body in spec.bodies[1:]:

@@ -1,4 +1,4 @@
-"""Phases become graphs: the same numbers, the same order, captured where they are made of launches."""
+"""Phases that are made of launches become graphs, with the same numbers in the same order."""
 
 import gc
 import threading
@@ -53,7 +53,7 @@ def test_consecutive_phases_become_one_graph_that_is_replayed_from_the_third_cal
     assert digits.calls == 6  # the first call runs, the second captures
 
 
-def test_engine_calls_stay_between_graphs_where_they_are_not_made_of_launches() -> None:
+def test_engine_calls_stay_between_graphs_if_they_are_not_made_of_launches() -> None:
     digits = Digits()
     phases = [digits.phase(1), digits.phase(2), digits.phase(3, engine=True), digits.phase(4)]
     calls = graphs(capture_engine=False).sequence(phases)
@@ -92,7 +92,7 @@ def test_threads_have_a_part_of_the_worlds_each_in_phases_that_allow_it(monkeypa
         for call in calls:
             call()
         assert digits.numpy().tolist() == [1234] * 5
-    # the first calls launch for all worlds, the second ones capture that, and later ones two parts where they may
+    # the first calls launch for all worlds, the second calls capture that, and later calls capture two parts if allowed
     assert sizes == [5, 5, 5, 5, 5, 5, 5, 5, *(2, 2, 3, 3), *(2, 3)]
 
 
@@ -102,8 +102,8 @@ def count_down(number_inout: wp.array[int], turns_inout: wp.array[int]):
     turns_inout[0] = turns_inout[0] + 1
 
 
-def test_a_graph_holds_the_launches_of_its_own_thread_alone() -> None:
-    """Others launch, copy, loop and capture graphs meanwhile, and each gets its own numbers at once."""
+def test_a_graph_holds_only_the_launches_of_its_own_thread() -> None:
+    """Another thread launches, copies, loops and captures graphs meanwhile, and gets its own numbers."""
     mine, captured = Digits(), []
     cpu, number, turns, copied = wp.get_device("cpu"), *(wp.full(1, 3, dtype=int, device="cpu") for _ in range(3))
     own = Digits()
@@ -124,7 +124,7 @@ def test_a_graph_holds_the_launches_of_its_own_thread_alone() -> None:
         thread.start()
         thread.join()
 
-    # the lock keeps captures of the package apart, so that this one must be Warp's own
+    # captures of the package take a lock, so this one must be Warp's own
     mine.phase(1).run()
     with wp.ScopedCapture(device=cpu) as capture:
         mine.phase(1).run()
@@ -187,7 +187,7 @@ def test_forget_captures_again_what_the_phases_launch_now() -> None:
 
 
 def test_what_is_no_longer_used_is_deleted_after_a_capture() -> None:
-    """To delete a graph of torch during a capture would end it with an error."""
+    """Deleting a graph of torch during a capture would make the capture fail."""
     digits, captures, deleted = Digits(), 0, []
 
     class Unused:

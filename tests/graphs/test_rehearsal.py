@@ -1,4 +1,4 @@
-"""A rehearsal finds the kernels that a function would launch, and leans on names of Warp that must not change."""
+"""A rehearsal finds the kernels that a function would launch, by names of Warp that must not change."""
 
 import inspect
 import subprocess
@@ -55,7 +55,7 @@ def test_a_rehearsal_notes_launches_instead_of_making_them(arrays: tuple[wp.arra
     flag = wp.zeros(1, dtype=int, device="cpu")
     with rehearse() as rehearsal:
         launch(*arrays)
-        wp.capture_if(flag, on_true=lambda: launch(*arrays))  # whatever the flag is
+        wp.capture_if(flag, on_true=lambda: launch(*arrays))  # for any flag
         wp.capture_while(flag, while_body=lambda: launch(*arrays))
     assert list(rehearsal.modules) == [(fill_rows64.module, None)]
     assert not arrays[2].numpy().any()

@@ -1,4 +1,4 @@
-"""Environments that threads make, step and drop side by side have the numbers that each of them has alone."""
+"""Environments that are made, stepped and dropped in parallel threads produce the same numbers as in one thread."""
 
 import threading
 from collections.abc import Callable
@@ -30,7 +30,7 @@ def numbers(engine: str, task: str, seed: int, envs: int) -> list[torch.Tensor]:
 
 
 def in_threads(*functions: Callable[[], list[torch.Tensor]]) -> list[list[torch.Tensor] | Exception]:
-    """Results of functions that run side by side, or their errors."""
+    """Results or errors of functions that run in parallel."""
     results: list[list[torch.Tensor] | Exception] = [RuntimeError("did not end")] * len(functions)
 
     def call(i: int) -> None:
@@ -56,10 +56,10 @@ def check(times: int, envs: int) -> None:
             assert all(map(torch.equal, own, alone)), case
 
 
-def test_environments_in_threads_have_the_numbers_that_each_has_alone() -> None:
+def test_environments_in_threads_have_the_numbers_of_one_thread() -> None:
     check(times=1, envs=1)
 
 
 @pytest.mark.long
-def test_environments_in_threads_have_the_numbers_that_each_has_alone_every_time() -> None:
+def test_environments_in_threads_have_the_numbers_of_one_thread_every_time() -> None:
     check(times=20, envs=2)

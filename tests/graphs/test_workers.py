@@ -1,4 +1,4 @@
-"""Threads that replay parts of a graph: all parts, side by side, with the errors of any, and no thread that stays."""
+"""Threads run all parts of a graph in parallel, raise the error of any, and end with their pool."""
 
 import gc
 import signal
@@ -19,7 +19,7 @@ def test_calls_run_side_by_side_on_the_threads() -> None:
     together, threads = threading.Barrier(3), []
 
     def call() -> None:
-        together.wait(10)  # ends only where three threads come together
+        together.wait(10)  # returns only once three threads have called it
         threads.append(threading.current_thread())
 
     workers = Workers(3)
@@ -29,7 +29,7 @@ def test_calls_run_side_by_side_on_the_threads() -> None:
 
 
 def test_calls_start_the_threads_that_they_need_and_the_last_reference_ends_them() -> None:
-    before = own_threads()  # those of other tests' engines, which may end meanwhile
+    before = own_threads()  # threads of other tests' engines, which may end meanwhile
     workers = Workers(3)
     assert not own_threads() - before
     for calls in (1, 2, 3, 2):

@@ -1,4 +1,4 @@
-"""``help`` shows what a user needs, attributes included."""
+"""``help`` shows functions, arguments and attributes with their docstrings."""
 
 import pydoc
 import re

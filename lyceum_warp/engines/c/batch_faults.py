@@ -8,14 +8,14 @@ from mujoco.batch import Batch, SimulationError
 log = logging.getLogger(__name__)
 
 _COUNTED_AS = mujoco.mjtWarning.mjWARN_INERTIA.value
-"""The kind of warning under which errors are counted."""
+"""The type of warning as which errors are counted."""
 
 
 class ErrorsAsWarnings:
     """Context that counts errors of single worlds as warnings, which ``find_faults`` reads, instead of raising them.
 
-    After an error MuJoCo restores the state that the world had before the call, and finishes the other worlds. Every
-    step enters the same instance; a class takes a quarter of the time of a generator.
+    After an error MuJoCo restores the world's state from before the call, and finishes the other worlds. All steps
+    enter the same instance: a class takes a quarter of the time of a generator.
 
     Args:
         batch: The worlds.

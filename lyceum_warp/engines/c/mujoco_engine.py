@@ -1,7 +1,6 @@
-"""The C engine: MuJoCo itself, many worlds on a pool of threads (mujoco.batch), float64 inside."""
+"""Step worlds by MuJoCo itself on a pool of threads (mujoco.batch), float64 inside: the C engine."""
 
 import copy
-import enum
 from collections.abc import Collection, Iterable, Mapping
 from functools import partial
 from typing import Any
@@ -49,28 +48,14 @@ _MOST_MASKS = 16
 """Masks whose views are kept; an environment has fewer."""
 
 
-class _Copied(enum.Enum):
-    """When a step copies a field from the engine, where the stage after the substeps is a call of its own."""
-
-    BEFORE_STAGE = enum.auto()
-    """Fields that the stage does not compute, or computes in part: its MjData may be one that another world used."""
-    AFTER_STAGE = enum.auto()
-    """The parts of fields that the stage computes: sensors of its own and earlier stages."""
-    LAST = enum.auto()
-    """All others, by launches; without such a stage all fields."""
-
-
 class MujocoEngine(Engine):
     """Worlds as rows of float64 state in ``mujoco.batch.Batch``, with float32 copies of the fields.
 
     Args:
-        model: The compiled model.
-        nworld: Number of worlds.
+        model, nworld, fields, dynamics: As for ``Engine``.
         device: Must be the CPU.
-        fields: The fields to keep.
-        dynamics: The model fields that differ between worlds.
-        initial: The state that ``reset`` puts worlds into, shown as float32 fields show it; None for the model's own.
-        nthread: Threads of the pool; 0 takes all cores.
+        initial: The state that ``reset`` puts worlds into, rounded to float32; None for the model's own.
+        nthread: Threads of the pool; 0 for all cores.
 
     Raises:
         ValueError: The device is not the CPU, or ``nthread`` is negative.
@@ -97,15 +82,15 @@ class MujocoEngine(Engine):
         super().__init__(model, nworld, device, fields, dynamics, initial)
         quiet()
         self.nthread = whole_number("nthread", nthread, low=0)
-        # launches that a derived engine adds may be for all worlds, which every thread would repeat
+        # launches that a subclass adds may be for all worlds, which every thread would repeat
         self.launch_threads = (self.nthread or cpu_cores()) if type(self) is MujocoEngine else 1
         self.native_model = copy.copy(model)
         """The model as the batch runs it."""
         # a world with a fault must be reported, not silently reset in the middle of a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        # Not persistent: that would let a step go on from the stages computed after the last one, but an MjData for
-        # every world does not fit into the caches, and the six tasks that need such stages were slower by 4 to 33 %
-        # (128 and 1,024 worlds on two cores)
+        # Not persistent: a step could then reuse the stages computed after the last one, but an MjData for every world
+        # does not fit into the CPU's caches. The six tasks that need such stages became slower by 4 to 33 % (128 and
+        # 1,024 worlds on two cores).
         self.batch = Batch(self.native_model, nworld, self.nthread)
         self._errors_as_warnings = ErrorsAsWarnings(self.batch)
         self._rows = self._alias(self.batch.state)
@@ -122,11 +107,15 @@ class MujocoEngine(Engine):
         computed = [field for field in self._derived if field.refresh > Stage.NONE]
         positions = all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in computed)
         self._apart = bool(computed) and (positions or any(field.lagged for field in kept))
-        """Whether the stage after the substeps is a call of its own."""
-        self._copied: dict[_Copied, list[Field]] = {moment: [] for moment in _Copied}
-        for field in kept:
-            for moment in self._moments(field):
-                self._copied[moment].append(field)
+        """Whether the stage after the substeps is a separate call."""
+        shown = [field for field in kept if field.name != "ctrl"]  # which is an input
+        late = [field for field in shown if field not in computed or field.snapshot] if self._apart else []
+        self._before_stage = [field for field in late if field.name not in STATE_FIELDS]
+        """Fields to copy before that call, which may use the MjData of another world."""
+        self._after_stage = [field for field in self._before_stage if field in computed]
+        """Fields of which the call computes a part: sensors up to its stage."""
+        self._last = [field for field in shown if field not in self._before_stage]
+        """Fields to copy at the end of a step, by launches."""
         # positions do not depend on contacts, whose search takes most of their stage
         without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if positions and computed else 0
         self._disabled = self.batch.expand("opt.disableflags") if without else np.zeros(0, dtype=int)
@@ -144,18 +133,9 @@ class MujocoEngine(Engine):
         self._models = WorldModels(self.batch, self.dynamics.values())
         self._models.apply(self._values)
 
-    def _moments(self, field: Field) -> tuple[_Copied, ...]:
-        """When a step copies a field; an input never."""
-        if field.name == "ctrl":
-            return ()
-        computed = field.refresh > Stage.NONE
-        if not self._apart or field.name in STATE_FIELDS or (computed and not field.snapshot):
-            return (_Copied.LAST,)
-        return (_Copied.BEFORE_STAGE, _Copied.AFTER_STAGE) if computed else (_Copied.BEFORE_STAGE,)
-
     def _on_host(self, mask: wp.array) -> np.ndarray:
         """A mask's memory as a NumPy array. The view is kept, because making it takes longer than reading it."""
-        if (kept := self._masks.get(id(mask))) is not None:  # the dict keeps the mask, so that no other has its id
+        if (kept := self._masks.get(id(mask))) is not None:  # the dict keeps the mask alive, so the id stays unique
             return kept[1]
         view: np.ndarray = mask.numpy()
         if len(self._masks) < _MOST_MASKS:
@@ -170,7 +150,7 @@ class MujocoEngine(Engine):
         initial = self.initial.copy()
         for name in STATE_FIELDS:
             if name in READ_ONLY:
-                continue  # rounded, the times of delayed samples would differ from the engine's own
+                continue  # rounding would shift the time stamps of delayed sensor samples
             columns = state_columns(self.model, name)
             initial[columns] = initial[columns].astype(np.float32)
         return wp.array(initial, dtype=wp.float64, device=self.device)
@@ -207,7 +187,7 @@ class MujocoEngine(Engine):
             call()
 
     def step_phases(self, nstep: int) -> list[Phase]:
-        # a derived engine may have a step of its own around this one
+        # a subclass may override step
         own = type(self).step is MujocoEngine.step
         return self._own_phases(nstep) if own else super().step_phases(nstep)
 
@@ -226,21 +206,17 @@ class MujocoEngine(Engine):
         with self._errors_as_warnings:
             self.batch.step(nstep=nstep, stage=Stage.NONE if self._apart else self.stage)
         if self._apart:
-            self._copy(self._copied[_Copied.BEFORE_STAGE])
-            self.compute_stage()
-            self._copy(self._copied[_Copied.AFTER_STAGE], early=True)
-
-    def compute_stage(self) -> None:
-        """Compute the stage of the fields that belong to the current state, in every world."""
-        self._disabled[...] = self._stage_flags
-        try:
-            with self._errors_as_warnings:
-                self.batch.forward(stage=self.stage)
-        finally:
-            self._disabled[...] = self._step_flags
+            self._copy(self._before_stage)
+            self._disabled[...] = self._stage_flags
+            try:
+                with self._errors_as_warnings:
+                    self.batch.forward(stage=self.stage)
+            finally:
+                self._disabled[...] = self._step_flags
+            self._copy(self._after_stage, early=True)
 
     def _show_fields(self) -> None:
-        self._read(self._copied[_Copied.LAST], self._everyone)
+        self._read(self._last, self._everyone)
 
     def _copy(self, fields: list[Field], mask: np.ndarray | None = None, *, early: bool = False) -> None:
         """Copy fields of the masked worlds from the engine's float64 arrays into their float32 arrays.

@@ -14,7 +14,7 @@ from lyceum_warp.model_fields import ModelField
 
 
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
-    """Whether the rows of ``Batch.rollout`` hold the same values as a call of ``Batch.step`` for each step.
+    """Whether ``Batch.rollout`` returns the same values as a call of ``Batch.step`` for each step.
 
     A row holds values as ``mj_step`` leaves them. Its state is the new one, but quantities of the position and velocity
     stages belong to the state before the last substep; the next row has the values of the new state. With RK4 they
@@ -27,15 +27,15 @@ def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
 
 
 class NativeRollout:
-    """Rolls out the worlds of a batch, and leaves them at the ends of their rollouts.
+    """Rolls out the worlds of a batch, which then hold the last states.
 
     Args:
-        batch: The worlds; no field of it is bound yet.
+        batch: The worlds, without bound fields.
         steps: Steps of the horizon.
         nstep: Substeps in a step.
         fields: The fields to copy into buffers.
         snapshots: The fields that follow the integration state in a state vector, in order.
-        dynamics: The model fields that follow those.
+        dynamics: The model fields that follow the snapshots.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class NativeRollout:
         """
         if self._given is None or any(a is not b for a, b in zip(given, self._given, strict=True)):
             self._given, (start, held, arrays) = given, given
-            # views of Warp's arrays take longer to make than to fill
+            # making views of Warp's arrays takes longer than filling them
             self._views = start.numpy(), held.numpy(), {name: buffer.numpy() for name, buffer in arrays.items()}
         state, controls, buffers = self._views
         batch = self.batch
@@ -101,7 +101,7 @@ class NativeRollout:
         if self.model_columns:
             self.models.apply({name: state[:, part].astype(np.float32) for name, part in self.model_columns.items()})
         np.copyto(self.by_step, controls.transpose(1, 0, 2)[:, :, None])
-        # a world with a warning stops there and repeats its last row: only the warning shows it
+        # a world with a warning stops and repeats its last row: only the warning reveals this
         with ErrorsAsWarnings(batch):
             batch.rollout(nstep=self.control.shape[1], control=self.control, **self._outputs)
         if self.stage > Stage.NONE:
@@ -115,7 +115,7 @@ class NativeRollout:
         key = STATE_FIELDS[field.name].value if field.name in STATE_FIELDS else field.name
         rows, nstep = self.rows[key], self.nstep
         if field.name in self.final:
-            # the row after a step's first substep belongs to the state that the step began with
+            # the row of a step's first substep holds values of the state before the step
             values, end = rows[:, ::nstep], self.final[field.name]
             np.copyto(target[:-1], values.swapaxes(0, 1).reshape(target[:-1].shape), "unsafe")
             np.copyto(target[-1], end.reshape(target[-1].shape), "unsafe")

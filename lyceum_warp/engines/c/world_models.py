@@ -13,8 +13,8 @@ from lyceum_warp.model_fields import ModelField
 class WorldModels:
     """Writes values of model fields into a batch, and recomputes the constants that follow from them.
 
-    The batch is a function of the float32 values alone: a value that equals the rounded value of the model becomes the
-    model's own float64 value; all others are taken as they are.
+    The batch depends only on the float32 values: a value that equals the model's rounded value becomes the model's
+    float64 value, and all others are written unchanged.
 
     Args:
         batch: The worlds.
@@ -36,7 +36,7 @@ class WorldModels:
             self._rounded[field.name] = self._own[field.name].astype(np.float32)
             if field.name in self._follows:
                 self._applied[field.name] = self._rows[field.name].astype(np.float32)
-        # the same code computes constants for every value, including the model's own
+        # also constants of the model's own values come from set_const, not from the compiler
         self._stale = np.full(batch.nsim, bool(self._follows))
 
     def apply(self, values: Mapping[str, np.ndarray], mask: np.ndarray | None = None) -> None:
@@ -64,7 +64,7 @@ class WorldModels:
             self._set_const(chosen)
 
     def _set_const(self, worlds: np.ndarray) -> None:
-        """Recompute constants; a world where MuJoCo refuses to gets a warning, and is tried again next time."""
+        """Recompute constants; a world whose values MuJoCo refuses gets a warning, and is tried again next time."""
         counted = self.batch.warning[:, :, 1].sum(axis=1)
         with ErrorsAsWarnings(self.batch):
             self.batch.set_const(worlds)
@@ -77,6 +77,6 @@ def bytes_per_world(model: mujoco.MjModel, fields: Iterable[ModelField]) -> int:
     batch = Batch(model, 1, 1)
     models = WorldModels(batch, fields)
     moved = {field.name: 1.001 * field.value(model).reshape(1, -1).astype(np.float32) for field in models.fields}
-    models.apply(moved)  # constants that differ between worlds take memory, too
+    models.apply(moved)  # only constants that differ take memory
     expanded = [rows for name in MODEL_FIELDS if (rows := batch.expanded(name)) is not None]
     return sum(rows.nbytes for rows in expanded) + 4 * sum(field.size for field in fields)

@@ -1,4 +1,4 @@
-"""The order of contacts and constraint rows, which MuJoCo Warp 4.0 does not fix on a GPU; see ``order_kernels``."""
+"""Sort contacts and constraint rows, whose order MuJoCo Warp 4.0 does not fix on a GPU; see ``order_kernels``."""
 
 import dataclasses
 from collections.abc import Callable
@@ -13,16 +13,15 @@ _LANES = 8
 
 
 class CanonicalOrder:
-    """Sorts contacts and constraint rows of a model and its data within every forward pass.
+    """Sorts the contacts and constraint rows of a data within every forward pass, through MuJoCo Warp's callbacks.
 
-    ``mujoco_warp``'s own deterministic mode makes sums of atomic additions repeatable, but does not sort contacts and
-    rows yet. It calls back after the collisions, and again in the velocity stage, after the constraints are made and
-    before they are solved.
+    MuJoCo Warp's own deterministic mode makes sums of atomic additions repeatable, but does not sort contacts and rows.
+    Its callbacks run after the collisions, and between the making and the solving of constraints.
 
     Args:
         model: MuJoCo Warp's model, whose callbacks are set.
         data: MuJoCo Warp's data.
-        between: Called between launches, twice in a forward pass.
+        between: Called at the beginning of both callbacks.
 
     Raises:
         ValueError: The model has flexes, or MuJoCo Warp's contacts have a field that is not sorted.
@@ -46,7 +45,7 @@ class CanonicalOrder:
         for name in order.Rows.vars:  # type: ignore[attr-defined]
             array = getattr(data.efc, name)
             setattr(self._rows, name, array)
-            if name == "J" and model.is_sparse:  # its entries keep their places
+            if name == "J" and model.is_sparse:  # entries of a sparse Jacobian are not moved
                 array = wp.empty((0, 0, 0), dtype=float)
             elif name != "jtdaj_nblock":
                 array = wp.empty_like(array)

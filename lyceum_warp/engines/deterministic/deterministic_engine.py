@@ -1,4 +1,4 @@
-"""The Warp engine with steps that are equal to the bit on a CUDA device."""
+"""Step worlds by MuJoCo Warp with numbers that repeat to the bit on a CUDA device."""
 
 import contextlib
 import inspect
@@ -7,7 +7,6 @@ from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
-import numpy as np
 import warp as wp
 
 from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
@@ -20,36 +19,27 @@ from lyceum_warp.graphs.capture import capturing
 from lyceum_warp.model_fields import ModelField
 
 _TIMES_THE_MEMORY = 5
-"""A world's memory relative to the estimate for the plain Warp engine: measured as 4.9 on humanoid, 6.1 on half_cheetah
-and 6.3 on hopper. ``prepare_capture`` measures it for the model at hand."""
+"""A world's memory relative to the estimate for the plain Warp engine: 4.9 on humanoid, 6.1 on half_cheetah and 6.3 on
+hopper (measured). ``prepare_capture`` measures it for the actual model."""
 
 _FEW = 256
-"""Up to so many worlds fit into any memory: their scratch is not measured, and allocated when it is needed."""
+"""Below this number of worlds scratch memory is allocated on demand: it fits on any device."""
 
 
 class DeterministicEngine(WarpEngine):
-    """A Warp engine whose steps on a CUDA device repeat to the bit, as those of every engine do on the CPU.
+    """A Warp engine whose steps repeat to the bit on a CUDA device; on the CPU every engine's do.
 
     It sorts contacts and constraint rows, makes MuJoCo Warp sum in a fixed order, and shares the memory for this among
-    all launches. Its arguments are those of ``WarpEngine``.
+    all launches. It takes the arguments of ``WarpEngine``.
     """
 
-    __signature__ = inspect.signature(WarpEngine)  # from which placement reads the options that an engine takes
+    __signature__ = inspect.signature(WarpEngine)  # placement reads the names of the options from it
 
     partial_refresh = False
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        nworld: int,
-        device: wp.Device,
-        fields: Iterable[Field],
-        dynamics: Iterable[ModelField] = (),
-        initial: np.ndarray | None = None,
-        **options: Any,
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device, *rest: Any, **options: Any) -> None:
         self._scratch = Scratch(device)
-        super().__init__(model, nworld, device, fields, dynamics, initial, **options)
+        super().__init__(model, nworld, device, *rest, **options)
         with wp.ScopedDevice(device):
             self._order = CanonicalOrder(self.m, self.d, self._scratch.open)
 
@@ -60,17 +50,17 @@ class DeterministicEngine(WarpEngine):
         return _TIMES_THE_MEMORY * super().bytes_per_world(model, fields, dynamics, **options)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
-        """Another model and data of MuJoCo Warp with the same options and sizes, to measure it alone.
+        """Another model and data with the same options and sizes, for measurements of bare MuJoCo Warp.
 
-        Their graphs take about a hundred times the memory, as no scratch is shared.
+        Graphs of their steps take about a hundred times the memory, because they share no scratch.
         """
         model, data = super().bare()
         with wp.ScopedDevice(self.device):
-            CanonicalOrder(model, data)  # lives on in the model's callbacks
+            CanonicalOrder(model, data)  # the model's callbacks keep it alive
         return model, data
 
     def prepare_capture(self) -> None:
-        """Measure the scratch that graphs need, and allocate it; this compiles the kernels of a step."""
+        """Measure the scratch memory that graphs need, and allocate it; compiles the kernels of a step."""
         if self.nworld < _FEW:
             return
         sizes = ScratchSizes.probe(self._captured_step)

@@ -1,8 +1,8 @@
-"""Kernels that sort contacts and constraint rows, so that their order does not depend on the order of threads.
+"""Sort contacts and constraint rows into an order that does not depend on the order of threads: kernels.
 
-MuJoCo Warp assigns places to contacts and to constraint rows with atomic counters. Sums over them are then rounded
-in another order each time, and on a GPU two runs drift apart. These kernels sort contacts by (world, geoms, place
-within the pair), and each world's rows by (kind, object, place within the constraint).
+MuJoCo Warp assigns indices to contacts and constraint rows by atomic counters. On a GPU, sums over them are therefore
+rounded in another order in each run, and two runs diverge. These kernels sort contacts by (world, geoms, index within
+the pair), and each world's rows by (type, object, index within the constraint).
 """
 
 import warp as wp
@@ -42,7 +42,7 @@ def contact_keys(
 ):
     """Compute the contacts' keys for sorting; launched over (naconmax,).
 
-    A key has 24 bits for the world, 14 for each geom, and 11 for the place within the pair. Unused places come last.
+    A key has 24 bits for the world, 14 for each geom, and 11 for the index within the pair. Unused slots come last.
     """
     c = wp.tid()
     place_out[c] = c
@@ -116,7 +116,7 @@ class Rows:
 
 @wp.func
 def _kind(rows: Rows, w: int, r: int):
-    # a contact's rows stay together whatever its friction is
+    # all contact types are one type here, so that the rows of a contact stay together
     return wp.min(rows.type[w, r], _FIRST_CONTACT)
 
 
@@ -131,7 +131,7 @@ def _object(rows: Rows, eq_type: wp.array[int], w: int, r: int) -> int:
 
 @wp.kernel(enable_backward=False)
 def rank_rows(nrow_in: wp.array[int], eq_type_in: wp.array[int], rows: Rows, rank_out: wp.array2d[int]):
-    """Find the new place of each row; launched over (nworld, njmax)."""
+    """Find the new index of each row; launched over (nworld, njmax)."""
     w, r = wp.tid()
     n = int(wp.min(nrow_in[w], rank_out.shape[1]))
     if r >= n:
@@ -160,7 +160,7 @@ def move_rows(
     source: Rows,
     target: Rows,
 ):
-    """Copy rows to their new places, or unchanged without ``sort``; launched over (nworld, njmax, lanes)."""
+    """Copy rows to their new indices, or unchanged without ``sort``; launched over (nworld, njmax, lanes)."""
     w, r, lane = wp.tid()
     if r >= int(wp.min(nrow_in[w], rank_in.shape[1])):
         return
@@ -180,7 +180,7 @@ def move_rows(
     target.vel[w, to] = source.vel[w, r]
     target.aref[w, to] = source.aref[w, r]
     target.frictionloss[w, to] = source.frictionloss[w, r]
-    if sparse:  # the entries keep their places
+    if sparse:  # the entries are not moved
         target.J_rownnz[w, to] = source.J_rownnz[w, r]
         target.J_rowadr[w, to] = source.J_rowadr[w, r]
         if source.jtdaj_adr.shape[1] > 0 and r < source.jtdaj_nblock[w]:
@@ -198,7 +198,7 @@ def move_rows(
 
 @wp.kernel(enable_backward=False)
 def move_addresses(ncontact_in: wp.array[int], rank_in: wp.array2d[int], nmax: int, contacts: Contacts):
-    """Write the new places of their rows into contacts; launched over (naconmax, rows of a contact)."""
+    """Write the new indices of rows into their contacts; launched over (naconmax, rows of a contact)."""
     c, i = wp.tid()
     if c < wp.min(ncontact_in[0], nmax):
         row = contacts.efc_address[c, i]

@@ -1,4 +1,4 @@
-"""Memory for the buffers in which Warp's deterministic launches sort their atomic additions."""
+"""Allocate the buffers in which Warp's deterministic launches sort their atomic additions."""
 
 import contextlib
 import dataclasses
@@ -9,18 +9,18 @@ import warp as wp
 from lyceum_warp.engines.warp.group import Reserve, aligned
 
 LARGEST_BUFFER = 2**31 - 1
-"""Bytes of the largest array of bytes that Warp makes: an axis may be no longer."""
+"""Bytes of the largest array of bytes that Warp can make: an axis has fewer than 2**31 elements."""
 
 _PROBED = 1024, 2048
-"""Numbers of worlds from which any other is extrapolated: large enough that Warp makes no buffer of a minimum size."""
+"""Numbers of worlds to extrapolate from: large enough that no buffer of Warp has its minimum size."""
 
 
 class Scratch(Reserve):
-    """An allocator for those buffers.
+    """An allocator that gives the buffers of all launches the same memory.
 
-    Warp lets a graph keep the buffers of each of its launches, which takes about a hundred times a world's own memory.
-    But launches follow one another, and each begins by clearing its buffers, so all of them may have the same memory.
-    Warp clears them during a capture, too: no graph may run then.
+    In Warp a graph keeps separate buffers for each of its launches, which take about a hundred times the memory of the
+    worlds. But launches run one after another and clear their buffers first, so they can share them. Warp also clears
+    them during a capture: no graph may run then.
 
     Args:
         device: A CUDA device.
@@ -30,24 +30,24 @@ class Scratch(Reserve):
         super().__init__(device)
         self._block, self._used, self._now = 0, 0, 0
         self.peak = 0
-        """The most bytes that were handed out between one ``open`` and the next."""
+        """The most bytes that were allocated between two calls of ``open``."""
         self.largest = 0
-        """The most bytes that were handed out at once."""
+        """The most bytes of one allocation."""
 
     def open(self) -> None:
-        """Reuse the memory from its start: earlier launches are over when later ones run."""
+        """Reuse the memory from its start, for the launches that follow."""
         self._block, self._used, self._now = 0, 0, 0
 
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
-        """Hand out the reserve to launches that are being captured; nothing changes for others."""
+        """Serve launches within the context from the reserve while they are captured."""
         self.open()
         with wp.ScopedAllocator(self.device, self):
             yield
 
     def allocate(self, size_in_bytes: int) -> int:
-        """The address of so many free bytes, from a new block once the reserve is used up."""
-        # Warp makes these buffers on a stream of their own, outside the capture; everything else belongs to the graph
+        """Allocate memory, from a new block once the reserve is used up, and return its address."""
+        # Warp allocates these buffers on a separate stream, outside the capture; all other memory belongs to the graph
         if not self.device.is_capturing or self.device.stream.is_capturing:
             return int(self.below.allocate(size_in_bytes))
         size = aligned(size_in_bytes)
@@ -63,21 +63,21 @@ class Scratch(Reserve):
 
 @dataclasses.dataclass(frozen=True)
 class ScratchSizes:
-    """How many bytes of scratch a number of worlds needs, and how many worlds there can be."""
+    """Bytes of scratch that worlds need, and the largest number of worlds."""
 
     fixed: int
-    """Bytes for any number of worlds."""
+    """Bytes beside those for each world."""
     each: int
     """Bytes for each world."""
     most: int
-    """The number of worlds for which Warp can still make its largest buffer."""
+    """The largest number of worlds whose buffers Warp can make."""
 
     @classmethod
     def probe(cls, capture: Callable[[int], Scratch]) -> "ScratchSizes":
-        """Extrapolate from the scratch that few worlds need.
+        """Extrapolate from the scratch memory of two numbers of worlds.
 
         Args:
-            capture: Captures a step of a number of worlds and returns the scratch that served it.
+            capture: Captures a step of a number of worlds and returns the scratch memory that it used.
         """
         few, more = (capture(nworld) for nworld in _PROBED)
         fixed, each = _line(few.peak, more.peak)
@@ -85,11 +85,11 @@ class ScratchSizes:
         return cls(fixed, each, (LARGEST_BUFFER - fixed_buffer) // max(1, each_buffer))
 
     def bytes_of(self, nworld: int) -> int:
-        """Bytes that so many worlds need."""
+        """Bytes for a number of worlds."""
         return self.fixed + nworld * self.each
 
 
 def _line(few: int, more: int) -> tuple[int, int]:
-    """Bytes in any case and bytes for each world, from the bytes of the two numbers of worlds."""
+    """The fixed bytes and the bytes for each world, from the bytes of the two numbers of worlds."""
     each = -(-(more - few) // (_PROBED[1] - _PROBED[0]))
     return max(0, few - _PROBED[0] * each), each

@@ -1,4 +1,4 @@
-"""Compute forward passes and substeps: whole ones, the parts that fields need, and those of a few worlds."""
+"""Compute substeps and forward passes, whole or in parts, of all worlds or of a few."""
 
 import functools
 import inspect
@@ -22,7 +22,7 @@ Part = Callable[[mjw.Model, mjw.Data], None]
 """A part of a forward pass, in every world of a data."""
 
 POSITION: tuple[Part, ...] = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex, mjw.tendon)
-"""The parts that a substep and a forward pass begin with; they are functions of positions alone."""
+"""The first parts of a substep and of a forward pass, which depend only on positions."""
 
 
 def step(model: mjw.Model, data: mjw.Data, done: Collection[Part] = ()) -> None:
@@ -37,26 +37,26 @@ def step(model: mjw.Model, data: mjw.Data, done: Collection[Part] = ()) -> None:
 
 
 def forward(model: mjw.Model, data: mjw.Data) -> None:
-    """Compute everything that follows from the states of a data."""
+    """Compute everything that follows from the states of all worlds in a data."""
     _without(frozenset())["forward"](model, data)
 
 
 def inertia(model: mjw.Model, data: mjw.Data) -> None:
-    """Compute the inertia matrix, with the armature of tendons and of the actuators that pull at them."""
+    """Compute the inertia matrix, including the armature of tendons and of their actuators."""
     mjw.crb(model, data)
     forward_functions()["smooth"].tendon_armature(model, data)
 
 
 @functools.cache
 def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
-    """MuJoCo Warp's own functions, in whose first forward pass some parts are left out.
+    """MuJoCo Warp's own functions, whose first forward pass leaves out some parts.
 
-    They are copies whose global names stand for other functions, so that whatever else MuJoCo Warp does in a step is
-    done here, too, and so that nothing changes for other users of its module.
+    They are copies with some global names replaced. So a step does everything that MuJoCo Warp's does, and other users
+    of its module are not affected.
 
-    ``mjw.make_constraint`` reads the velocities of bodies for connect and weld constraints, and MuJoCo Warp computes
-    them only later: it finds the last forward pass's, of another state, or, after a fault, not-a-number. Here they
-    follow the positions, in every stage of a Runge-Kutta step.
+    ``mjw.make_constraint`` reads the velocities of bodies for connect and weld constraints, but MuJoCo Warp computes
+    them only later: it reads values of the last forward pass, from another state or, after a fault, not-a-number. Here
+    ``com_vel`` follows the positions, in every stage of a Runge-Kutta step.
     """
     own_smooth = vars(forward_functions()["smooth"])
     smooth = types.SimpleNamespace(**own_smooth | {part.__name__: _nothing for part in done})
@@ -76,7 +76,7 @@ def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
 
 
 def _copy(function: str, **names: Any) -> Callable[..., Any]:
-    """A copy of a function of MuJoCo Warp's, in which some of its global names stand for other objects."""
+    """A copy of a function of MuJoCo Warp with some of its global names replaced."""
     inner: Any = inspect.unwrap(forward_functions()[function])
     if unknown := names.keys() - set(inner.__code__.co_names):
         raise ImportError(f"{function} of this mujoco_warp uses no {min(unknown)}: use mujoco-warp 4.0")
@@ -84,7 +84,7 @@ def _copy(function: str, **names: Any) -> Callable[..., Any]:
 
 
 def _nothing(model: mjw.Model, data: mjw.Data) -> None:
-    """Do nothing: the part is already done."""
+    """No-op, in place of a part that is already computed."""
 
 
 _NEEDS: dict[Part, tuple[Part, ...]] = {
@@ -99,8 +99,8 @@ _NEEDS: dict[Part, tuple[Part, ...]] = {
     mjw.fwd_velocity: (mjw.com_pos, mjw.flex, mjw.tendon, mjw.transmission),
     mjw.subtree_vel: (mjw.com_vel,),
 }
-"""The parts without collisions and constraints, in their order, and what each needs; ``fwd_velocity`` has ``com_vel``
-in it."""
+"""The parts without collisions and constraints, in order, and the parts that each needs; ``fwd_velocity`` includes
+``com_vel``."""
 
 _FIELDS: dict[Part, str] = {
     mjw.kinematics: "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat",
@@ -132,7 +132,7 @@ _SENSORS: dict[str, tuple[Part, ...]] = {
     "VELOCIMETER GYRO FRAMELINVEL FRAMEANGVEL SUBTREELINVEL SUBTREEANGMOM": (mjw.com_vel,),
     "TENDONVEL ACTUATORVEL": (mjw.fwd_velocity,),
 }
-"""What sensors of the position and velocity stages need, by their types; those of other types need a forward pass."""
+"""The parts that sensors of the position and velocity stages need, by type; all other types need a forward pass."""
 
 _PARTS_OF_SENSOR = {
     int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}")): parts
@@ -144,7 +144,7 @@ _PARTS_OF_SENSOR = {
 def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, ...] | None:
     """The parts of a forward pass that compute the named fields, in order, without collisions and constraints.
 
-    Of ``sensordata`` the parts compute the sensors of the position and velocity stages.
+    For ``sensordata`` they compute the sensors of the position and velocity stages.
 
     Args:
         model: The compiled model.
@@ -198,7 +198,7 @@ def _last_stage(model: mujoco.MjModel) -> Stage:
 
 
 def _touching(model: mujoco.MjModel) -> bool:
-    """Whether contacts act on actuators or passive forces: adhesion, and contacts of a flex that are springs."""
+    """Whether contacts affect actuators or passive forces, as adhesion and passive contacts of a flex do."""
     by_body = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()
     return bool(by_body or model.flg_adhesion or model.flex_passive.any())
 
@@ -207,16 +207,16 @@ _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
 class PartialForward:
-    """Computes fields of the masked worlds in a group of other worlds, and copies them back.
+    """Computes fields of the masked worlds in a small group of scratch worlds, and copies them back.
 
-    Few worlds restart in a step, none in most steps of a small batch, and a forward pass of all worlds costs as much
-    as a substep. So the masked worlds' states are copied into a small group, in as many turns as it takes.
+    A forward pass of all worlds costs as much as a substep, and few worlds restart in a step. So the masked worlds'
+    states are copied into the group, in as many turns as needed.
 
     Args:
-        rows: The group's view of MuJoCo Warp's model.
+        rows: MuJoCo Warp's model for the group.
         data: MuJoCo Warp's data of all worlds.
-        group: The same of the group.
-        states: Room for the integration states of all worlds, (nworld, integration size), float32.
+        group: MuJoCo Warp's data of the group.
+        states: A buffer for the integration states of all worlds, (nworld, integration size), float32.
         static: Geoms whose poses a forward pass does not compute.
     """
 
@@ -239,43 +239,43 @@ class PartialForward:
             forward: Computes the fields of a data.
             targets: Where the fields go, (nworld, ...), by their names in MuJoCo Warp's data.
         """
-        data, group = self._data, self._group
+        group = self._group
 
-        def turn() -> None:
-            self._enter()
+        def work() -> None:
             forward(self._rows.model, group)
             report_pool_overflow(group, self._everyone)
-            results = {name: (getattr(group, name), target) for name, target in targets.items()}
-            for source, target in results.values():
-                self._turns.give(source, target)
-            self._turns.give_bits(group.overflow, data.overflow)
+            for name, target in targets.items():
+                self._turns.give(getattr(group, name), target)
 
         with wp.ScopedDevice(self._device):
-            mjw.get_state(self._rows.whole, data, self._states, _SPEC, mask)
-            self._turns.run(mask, turn)
+            self._run(mask, work)
 
     def settle(self, mask: wp.array, nstep: int) -> None:
         """Advance the masked worlds' states by some substeps, and set their time to 0; made of launches."""
-        data, group = self._data, self._group
 
-        def turn() -> None:
-            self._enter()
+        def work() -> None:
             for _ in range(nstep):
-                step(self._rows.model, group)
-            mjw.get_state(self._rows.model, group, self._group_states, _SPEC)
+                step(self._rows.model, self._group)
+            mjw.get_state(self._rows.model, self._group, self._group_states, _SPEC)
             self._turns.give(self._group_states, self._states)
-            self._turns.give_bits(group.overflow, data.overflow)
 
         with wp.ScopedDevice(self._device):
-            mjw.get_state(self._rows.whole, data, self._states, _SPEC, mask)
-            self._turns.run(mask, turn)
+            self._run(mask, work)
             launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # time is the first number of a state
-            mjw.set_state(self._rows.whole, data, self._states, _SPEC, mask)
+            mjw.set_state(self._rows.whole, self._data, self._states, _SPEC, mask)
 
-    def _enter(self) -> None:
-        """Put the group into the models and states of its worlds."""
-        self._rows.take(self._turns)
-        self._static.place(self._rows.model, self._group, self._everyone)
-        self._turns.take(self._states, self._group_states)
-        mjw.set_state(self._rows.model, self._group, self._group_states, _SPEC)
-        self._group.overflow.zero_()
+    def _run(self, mask: wp.array, work: Callable[[], None]) -> None:
+        """Do some work with the group in the models and states of the masked worlds, in turns."""
+        model, group = self._rows.model, self._group
+
+        def turn() -> None:
+            self._rows.take(self._turns)
+            self._static.place(model, group, self._everyone)
+            self._turns.take(self._states, self._group_states)
+            mjw.set_state(model, group, self._group_states, _SPEC)
+            group.overflow.zero_()
+            work()
+            self._turns.give_bits(group.overflow, self._data.overflow)
+
+        mjw.get_state(self._rows.whole, self._data, self._states, _SPEC, mask)
+        self._turns.run(mask, turn)

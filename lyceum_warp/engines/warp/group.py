@@ -1,4 +1,4 @@
-"""Move masked worlds through a small group of worlds, in turns, with memory that graphs may use."""
+"""Process masked worlds in a small group, in turns, and reserve memory for launches within graphs."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -12,9 +12,9 @@ _ALIGNED = 512
 
 
 class Reserve:
-    """Blocks of memory on a device, with that part of Warp's protocol for allocators which frees memory.
+    """Blocks of memory that live as long as this object, because graphs hold their addresses.
 
-    Blocks stay allocated as long as the reserve, because graphs hold their addresses.
+    Subclasses add ``allocate``, and so become allocators of Warp.
 
     Args:
         device: The device.
@@ -27,8 +27,8 @@ class Reserve:
         self.blocks: list[wp.array] = []
 
     def add_block(self, size: int) -> None:
-        """Allocate a block of at least so many bytes."""
-        rows = aligned(max(size, 1)) // _ALIGNED  # an axis may be no longer than 2**31
+        """Allocate a block of at least ``size`` bytes."""
+        rows = aligned(max(size, 1)) // _ALIGNED  # an axis has fewer than 2**31 elements
         with wp.ScopedAllocator(self.device, self.below):
             self.blocks.append(wp.empty((rows, _ALIGNED), dtype=wp.uint8, device=self.device))
 
@@ -39,26 +39,26 @@ class Reserve:
 
 
 def aligned(size: int) -> int:
-    """A number of bytes, rounded up to a multiple of the alignment of addresses."""
+    """Round a number of bytes up to a multiple of the alignment."""
     return -(-size // _ALIGNED) * _ALIGNED
 
 
 def group_size(nworld: int, device: wp.Device) -> int:
-    """Worlds of a group: more than usually restart in one step, and few enough for a cheap forward pass."""
+    """Worlds in a group: more than usually restart in one step, and few enough for a cheap forward pass."""
     return min(nworld, max(1 if device.is_cpu else 64, nworld // 16))
 
 
 class Turns:
-    """Takes the masked worlds into a group and back, a group at a time; made of launches.
+    """Copies the masked worlds into a group and back, one group at a time; made of launches.
 
-    No turn is taken where no world is masked.
+    Without masked worlds there is no turn.
 
     Args:
         nworld: Number of worlds.
         size: Places in the group.
         device: Where they live.
-        loop: Whether turns are taken in a loop; if not, the group has a place for every world, and one turn is taken
-            whatever the mask. Deterministic launches need this: within a loop of a CUDA graph they find no memory.
+        loop: Whether turns are taken in a loop. If not, the group must have a place for every world, and there is one
+            turn for any mask. Deterministic launches need this, because they cannot allocate within a loop of a graph.
     """
 
     def __init__(self, nworld: int, size: int, device: wp.Device, *, loop: bool = True) -> None:
@@ -66,10 +66,10 @@ class Turns:
         with wp.ScopedDevice(device):
             self._rank, self._world = wp.zeros(nworld, dtype=int), wp.zeros(size, dtype=int)
             self._count, self._first, self._left = (wp.zeros(1, dtype=int) for _ in range(3))
-        self._memory = TemporaryMemory(device)
+        self._memory = Arena(device)
 
     def run(self, mask: wp.array, turn: Callable[[], None]) -> None:
-        """Call ``turn`` for one group after another; it may use ``take`` and ``give``."""
+        """Call ``turn`` for each group; it may use ``take`` and ``give``."""
         with wp.ScopedDevice(self.device):
             self._count.zero_()
             self._first.zero_()
@@ -95,24 +95,24 @@ class Turns:
             wp.launch(kernels.take_rows, rows.shape, [self._world, self._left, flat(source), rows])
 
     def give(self, source: wp.array, target: wp.array) -> None:
-        """Copy the group's rows, (size, ...), back into those of its worlds, (nworld, ...)."""
+        """Copy the group's rows, (size, ...), back to the rows of its worlds, (nworld, ...)."""
         rows = flat(source)
         if rows.size:
             wp.launch(kernels.return_rows, rows.shape, [self._world, self._left, rows, flat(target)])
 
     def give_bits(self, source: wp.array, target: wp.array) -> None:
-        """Add the group's bits, (size,), to those of its worlds, (nworld,)."""
+        """Add the group's bits, (size,), to the bits of its worlds, (nworld,)."""
         wp.launch(kernels.return_bits, self.size, [self._world, self._left, source, target])
 
 
 class Arena(Reserve):
-    """An allocator for graphs, which may not allocate: it counts the bytes of a run outside a graph and reserves them.
+    """An allocator for a loop or a branch of a CUDA graph, in which Warp cannot allocate.
 
-    While it counts, memory comes from the device. Graphs are served from the reserve; they never run at the same time,
-    so all of them may use the same memory.
+    A run outside a graph takes memory from the device, counts the bytes, and reserves them. Graphs then use the
+    reserve. They never run at the same time, so all of them share it.
 
     Args:
-        device: A CUDA device.
+        device: Where the launches run; on the CPU nothing is reserved.
     """
 
     def __init__(self, device: wp.Device) -> None:
@@ -125,26 +125,22 @@ class Arena(Reserve):
         self._used = 0
 
     @contextlib.contextmanager
-    def counting(self) -> Iterator[None]:
-        """Count the bytes that are allocated between one ``open`` and the next, and reserve the most at the end."""
-        self._serving = False
-        with wp.ScopedAllocator(self.device, self):
+    def __call__(self) -> Iterator[None]:
+        """The context of the launches: use the reserve during a capture, else count bytes and reserve them."""
+        if self.device.is_cpu:
             yield
-        if not self.blocks or self.blocks[-1].size < self._size:
-            self.add_block(self._size)
-
-    @contextlib.contextmanager
-    def serving(self) -> Iterator[None]:
-        """Hand out the reserve."""
-        self._serving = True
+            return
+        self._serving = self.device.is_capturing
         try:
             with wp.ScopedAllocator(self.device, self):
                 yield
         finally:
-            self._serving = False
+            counted, self._serving = not self._serving, False
+        if counted and (not self.blocks or self.blocks[-1].size < self._size):
+            self.add_block(self._size)
 
     def allocate(self, size_in_bytes: int) -> int:
-        """The address of so many free bytes."""
+        """Allocate memory, and return its address."""
         start = self._used
         self._used += aligned(size_in_bytes)
         if not self._serving:
@@ -155,32 +151,10 @@ class Arena(Reserve):
         return int(self.blocks[-1].ptr) + start
 
 
-class TemporaryMemory:
-    """Memory for temporary arrays within a loop or a branch of a CUDA graph, which may allocate nothing.
-
-    Args:
-        device: Where the launches run; on the CPU nothing is reserved.
-    """
-
-    def __init__(self, device: wp.Device) -> None:
-        self._device, self._arena = device, None if device.is_cpu else Arena(device)
-
-    def open(self) -> None:
-        """Reuse the reserve from its start."""
-        if self._arena is not None:
-            self._arena.open()
-
-    def __call__(self) -> contextlib.AbstractContextManager[object]:
-        """The context of the launches: it counts what they allocate, or, during a capture, serves the reserve."""
-        if self._arena is None:
-            return contextlib.nullcontext()
-        return self._arena.serving() if self._device.is_capturing else self._arena.counting()
-
-
 class Conditional:
-    """Runs launches if a mask holds a world, and costs next to nothing in a graph if it holds none.
+    """Runs launches in a graph only if a mask holds a world.
 
-    Outside a graph it always runs them, without a look at the mask, which may still be in the making.
+    Outside a graph it always runs them, because reading the mask would wait for the device.
 
     Args:
         device: Where the launches run.
@@ -189,14 +163,11 @@ class Conditional:
     def __init__(self, device: wp.Device) -> None:
         self._device = device
         self._any = wp.zeros(1, dtype=int, device=device)
-        self._memory = TemporaryMemory(device)
+        self._memory = Arena(device)
         self._inside = False
 
     def __call__(self, mask: wp.array, run: Callable[[], None]) -> None:
-        """Run launches for the masked worlds, (nworld,) bool, which may not matter to any other world.
-
-        Within such launches, others run unconditionally.
-        """
+        """Run launches that affect only the masked worlds, (nworld,) bool; nested calls run unconditionally."""
         if self._inside:
             run()
             return

@@ -1,4 +1,4 @@
-"""Find the sizes of MuJoCo Warp's data, the memory that it takes, and the overflows of what it has room for."""
+"""Probe how many contacts and constraints MuJoCo Warp needs room for, and estimate its memory."""
 
 import contextlib
 import copy
@@ -22,11 +22,11 @@ log = logging.getLogger(__name__)
 _WORLDS, _HOLDS, _SUBSTEPS = 32, 25, 20
 
 _LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
-"""The smallest sizes. Contacts of a flex come in bursts that a probe may miss: a geom that is pressed into it touches
-up to 50 of its elements. Those with a flex are MuJoCo Warp's own defaults."""
+"""The smallest sizes, without and with a flex. A probe may miss bursts of contacts: a geom that is pressed into a flex
+touches up to 50 of its elements. The sizes with a flex are MuJoCo Warp's defaults."""
 
 _FIRST = 32
-"""The most worlds whose first states are looked at."""
+"""The most worlds whose first states are checked."""
 
 _FRICTION = {"dof_frictionloss", "tendon_frictionloss"}
 _LIMITS = {"jnt_range", "jnt_margin", "tendon_range", "tendon_margin", "qpos0"}
@@ -39,10 +39,10 @@ _known: dict[str, tuple[int, int]] = {}
 def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[int, int]:
     """Contacts and constraints to make room for in each world.
 
-    Twice the peak of random rollouts, and constraints that a task may turn on: equality constraints that are not
-    active in the model, friction losses where they are drawn, and all limits where their ranges are drawn. In the
-    rollouts 32 worlds start in the model's initial state or a keyframe, half of them with random velocities, and take
-    500 substeps on the C engine under random controls held for 20. Their result is remembered for each model.
+    These are twice the peak of random rollouts, and room for constraints that a task may turn on: inactive equality
+    constraints, friction losses if they are drawn, and all limits if their ranges are drawn. In the rollouts 32 worlds
+    start in the model's initial state or a keyframe, half of them with random velocities, and take 500 substeps on the
+    C engine under random controls, each held for 20 substeps. The result is cached for each model.
 
     Args:
         model: The compiled model.
@@ -59,7 +59,7 @@ def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[in
 
 
 def warn_of_unknown_sizes(varied: Collection[str], nconmax: int, njmax: int) -> None:
-    """Log a warning if the contacts depend on drawn fields, of which a probe knows nothing."""
+    """Log a warning if contacts depend on drawn fields, whose values a probe does not know."""
     if names := sorted(_CONTACTS.intersection(varied)):
         log.warning(
             "nconmax=%d and njmax=%d were measured on the model's own %s, which the task draws: give make() both if "
@@ -76,11 +76,11 @@ def warn_of_little_room(
     nconmax: float,
     njmax: int,
 ) -> None:
-    """Log a warning if worlds begin with more contacts or constraints than there is room for.
+    """Log a warning if worlds begin with more contacts or constraints than fit.
 
     Args:
         model: The compiled model.
-        states: Integration states of worlds, (n, integration size); the first 32 are looked at.
+        states: Integration states of worlds, (n, integration size); the first 32 are checked.
         fields: The model fields that differ between worlds.
         values: Their values, (n, ...).
         nconmax: Contacts that a world has room for, on average.
@@ -112,7 +112,7 @@ def warn_of_little_room(
 
 
 def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> mujoco.MjModel:
-    """The model with a constraint for every friction loss that may become one in a world."""
+    """The model with every friction loss that a world may have switched on."""
     if names := _FRICTION.intersection(varied):
         model = copy.copy(model)
         for name in names:
@@ -122,7 +122,7 @@ def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> muj
 
 
 def _inactive(model: mujoco.MjModel) -> int:
-    """The number of constraints that come with the equality constraints that are not active in the model."""
+    """The number of constraint rows that inactive equality constraints would add."""
     every = copy.copy(model)
     every.eq_active0[:] = True
     return _equalities(every) - _equalities(model)
@@ -135,7 +135,7 @@ def _equalities(model: mujoco.MjModel) -> int:
 
 
 def _limits(model: mujoco.MjModel, varied: Collection[str]) -> int:
-    """The number of limits, if it depends on drawn fields how many are reached at once."""
+    """The number of all limits if drawn fields decide which are reached, else 0."""
     drawn = not _LIMITS.isdisjoint(varied)
     return int(model.jnt_limited.sum() + model.tendon_limited.sum()) if drawn else 0
 
@@ -151,7 +151,7 @@ def _probe_once(model: mujoco.MjModel) -> tuple[int, int]:
 
 def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     with wp.ScopedDevice("cpu"):
-        mjw.put_model(model)  # a model that is refused is not worth a probe, which may take a minute
+        mjw.put_model(model)  # raises now if it refuses the model: a probe may take a minute
     batch = Batch(model, _WORLDS)
     rng = np.random.default_rng(0)
     ncon, nefc = batch.bind("ncon"), batch.bind("nefc")
@@ -163,7 +163,7 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     for _ in range(_HOLDS):
         batch.ctrl[:] = rng.uniform(low, high, size=(_WORLDS, model.nu))
         for _ in range(_SUBSTEPS):
-            # a world that fails because memory is short has shown how much it needs
+            # an error from too little memory leaves the counts intact
             with contextlib.suppress(SimulationError):
                 batch.step()
             contacts, constraints = max(contacts, int(ncon.max())), max(constraints, int(nefc.max()))
@@ -174,20 +174,20 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 _TEMPORARIES = 1.25
-"""Ratio of a world's memory to that of MuJoCo Warp's data. The temporary arrays of a step were measured at 1 to 9 % of
-it; the rest is for graphs and for the group of a partial forward pass. Graphs on the CPU, where this engine is for
-tests, keep all temporary arrays and take up to three times as much."""
+"""A world's memory relative to MuJoCo Warp's data. The temporary arrays of a step take 1 to 9 % (measured); the rest
+is for graphs and for the group of a partial forward pass. Graphs on the CPU keep all temporary arrays and take up to
+three times as much."""
 
 _TEMPORARIES_CONVEX = 3.5
-"""The same with convex collisions or the noslip solver: on adroit_pen the temporary arrays take 1.5 to 2.4 times the
-memory of the data."""
+"""With convex collisions or the noslip solver: on adroit_pen the temporary arrays take 1.5 to 2.4 times the memory of
+the data."""
 
 _CONVEX = {mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_MESH,
            mujoco.mjtGeom.mjGEOM_HFIELD}  # fmt: skip
 
 
 def data_bytes(model: mujoco.MjModel, nconmax: int, njmax: int) -> int:
-    """Bytes of each world's data, temporary arrays included, for so many contacts and constraints in each world."""
+    """Bytes of each world's data for given numbers of contacts and constraints, temporary arrays included."""
     sizes = []
     for nworld in (1, 2):
         with wp.ScopedDevice("cpu"):
@@ -197,7 +197,7 @@ def data_bytes(model: mujoco.MjModel, nconmax: int, njmax: int) -> int:
 
 
 def _bytes_of(data: Any) -> int:
-    """Bytes of all arrays in a data class and in those within it."""
+    """Bytes of all arrays in a dataclass, nested dataclasses included."""
     total = 0
     for field in dataclasses.fields(data):
         value = getattr(data, field.name)
@@ -209,7 +209,7 @@ def _bytes_of(data: Any) -> int:
 
 
 def _margin(model: mujoco.MjModel) -> float:
-    """Ratio of a world's memory to that of its data; larger with convex collisions or the noslip solver."""
+    """A world's memory relative to its data."""
     collides = (model.geom_contype | model.geom_conaffinity) != 0
     kinds = [int(kind) for kind in model.geom_type[collides]]
     convex = not _CONVEX.isdisjoint(kinds) or kinds.count(int(mujoco.mjtGeom.mjGEOM_BOX)) > 1
@@ -225,9 +225,9 @@ IGNORED_BITS = int(_BITS.ITERATIONS | _BITS.LS_ITERATIONS)
 
 
 def report_pool_overflow(data: mjw.Data, mask: wp.array) -> None:
-    """Set the masked worlds' bit of an overflow where a forward pass found no room for contacts.
+    """Set the masked worlds' overflow bit if a forward pass found no room for contacts.
 
-    ``mujoco_warp.step`` sets it; ``mujoco_warp.forward`` does not.
+    ``mujoco_warp.step`` sets the bit itself; ``mujoco_warp.forward`` does not.
     """
     pool = [data.ncollision, data.nacon, data.naconmax, int(_BITS.NARROWPHASE)]
     wp.launch(faults.pool_overflow, data.nworld, [mask, *pool, data.overflow], device=mask.device)

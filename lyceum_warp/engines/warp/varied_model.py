@@ -1,4 +1,4 @@
-"""Keep MuJoCo Warp's model fields with a row for each world, and what follows from them."""
+"""Give MuJoCo Warp's model fields a row for each world, and recompute constants that follow from them."""
 
 import copy
 from collections.abc import Collection, Iterable
@@ -17,7 +17,7 @@ _POSED_BY = {"geom_pos", "geom_quat", "body_pos", "body_quat"}
 
 
 class StaticGeoms:
-    """The geoms that cannot move, where model fields that place them differ between worlds.
+    """Poses of the geoms that cannot move, if model fields that place them differ between worlds.
 
     Args:
         model: The compiled model.
@@ -32,10 +32,10 @@ class StaticGeoms:
         self._geoms: wp.array = wp.array(np.flatnonzero(fixed), dtype=int, device=device)
 
     def place(self, model: mjw.Model, data: mjw.Data, mask: wp.array) -> None:
-        """Compute their poses in the masked worlds of a data; made of launches."""
+        """Compute the poses in the masked worlds of a data; made of launches."""
         if self._geoms.size:
             fields = [model.geom_bodyid, model.body_parentid]
-            # quaternions as numbers in MuJoCo's order, which Warp's type would take for another
+            # MuJoCo stores a quaternion as (w, x, y, z), unlike Warp's type
             geom_quat, body_quat = model.geom_quat.view(wp.vec4), model.body_quat.view(wp.vec4)
             fields += [model.geom_pos, geom_quat, model.body_pos, body_quat]
             args = [mask, self._geoms, *fields, data.geom_xpos, data.geom_xmat]
@@ -78,8 +78,8 @@ def owner(model: mjw.Model, name: str) -> mjw.Model | mjw.Option:
 def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nworld: int) -> mjw.Model:
     """MuJoCo Warp's model with a row for each world in some fields and in the constants that follow from them.
 
-    MuJoCo Warp looks at some fields of the model as it is put on the device, and leaves a part of the physics out
-    where all of them are zero; that part is kept in for fields that may become non-zero in a world.
+    ``mjw.put_model`` leaves out parts of the physics whose fields are all zero. Parts whose fields may become non-zero
+    in a world are included here.
     """
     fields = [field for field in fields if field.size]
     names = [field.name for field in fields if not field.option]
@@ -112,15 +112,15 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
 
 
 class ModelRows:
-    """A model for a group of worlds: the rows of these worlds in fields that differ, and all else shared.
+    """A model for a group of worlds: it has its own rows of fields that differ, and shares all others.
 
-    MuJoCo Warp takes row ``world % rows`` of a field, which in a group is another world's.
+    In the whole model, MuJoCo Warp would read row ``world % rows`` of a field, which belongs to another world.
 
     Args:
         whole: The model of all worlds.
         names: The fields with a row for each world.
-        size: Places in the group.
-        own: Fields that the group needs an array of its own for, because it writes them.
+        size: Number of worlds in the group.
+        own: Further fields to copy, because the group writes them.
     """
 
     def __init__(self, whole: mjw.Model, names: Iterable[str], size: int, own: Iterable[str] = ()) -> None:
@@ -148,7 +148,7 @@ class ModelRows:
                 turns.take(source, group)
 
     def give(self, turns: Turns, names: Iterable[str]) -> None:
-        """Copy the group's rows of some fields back into those of its worlds."""
+        """Copy the group's rows of some fields back to its worlds."""
         for name in names:
             if name in self._pairs:
                 source, group = self._pairs[name]
@@ -163,16 +163,16 @@ _GROUPS = {
 
 
 class ModelConstants:
-    """Recomputes constants in the worlds where fields changed since last time.
+    """Recomputes constants in the worlds whose fields changed since the last call.
 
-    The constants are a function of the fields alone. They are computed in a small group of worlds with data of its own,
-    because this overwrites kinematics.
+    They are computed in a small group of worlds with separate data, because ``mujoco_warp.set_const`` overwrites the
+    kinematics.
 
     Args:
         model: The compiled model.
         put: MuJoCo Warp's model, with a row for each world in the fields and in the constants that follow.
         fields: The fields that differ between worlds, with constants that follow.
-        static: Geoms whose poses ``mujoco_warp.set_const`` does not compute, and around which tendons may be wrapped.
+        static: Geoms whose poses ``mujoco_warp.set_const`` does not compute; tendons may wrap around them.
         nworld: Number of worlds.
         device: Where they live.
         loop: As for ``Turns``.
@@ -200,11 +200,11 @@ class ModelConstants:
             self._rows = ModelRows(put, [*names, *self._outputs], size, written - set(self._outputs))
             self._scratch = mjw.make_data(model, nworld=size, nconmax=1, njmax=1)
             self._given = [flat(getattr(owner(put, name), name)).view(wp.int32) for name in names]
-            # the bits of a NaN, from which every value differs
+            # the bits of a NaN that no value has
             self._applied = [wp.full_like(given, -1) for given in self._given]
             self._changed = wp.zeros(nworld, dtype=bool)
             self._everyone = wp.full(size, True, dtype=bool)
-            # weights that are 0 in MuJoCo stay 0, and bodies with sliders only have those of their mass
+            # see correct_weights
             self._weighs: wp.array = wp.array(model.body_invweight0 > 0, dtype=wp.vec2)
             self._sliding: wp.array = wp.array(model.body_simple == 2, dtype=bool)
         self._turns = Turns(nworld, size, device, loop=loop)

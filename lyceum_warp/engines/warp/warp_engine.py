@@ -1,4 +1,4 @@
-"""The Warp engine: MuJoCo Warp, float32, on a CUDA device or on the CPU."""
+"""Step worlds by MuJoCo Warp, float32, on a CUDA device or on the CPU: the Warp engine."""
 
 import contextlib
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -41,18 +41,16 @@ class WarpEngine(Engine):
     """Worlds in ``mujoco_warp``'s own arrays, shown without a copy.
 
     Args:
-        model: The compiled model.
-        nworld: Number of worlds.
+        model, nworld, fields: As for ``Engine``.
         device: A CUDA device, or the CPU (single-threaded: for tests).
-        fields: The fields to keep.
-        dynamics: The model fields that differ between worlds; the arrays are MuJoCo Warp's own. Room for
-            contacts and constraints is probed on the model's own values; see ``sizes.probe_sizes``.
+        dynamics: The model fields that differ between worlds. Room for contacts and constraints is probed with the
+            model's own values; see ``sizes.probe_sizes``.
         initial: The state that ``reset`` puts worlds into, rounded to float32; None for the model's own.
-        nconmax: Contacts that each world has room for, on average. None probes the model, and gives all worlds
-            together additional room for a single one in which everything touches.
+        nconmax: Contacts that each world has room for, on average. None probes the model, and reserves additional room
+            for one world in which everything touches.
         njmax: Constraints that each world has room for; None probes the model.
-        unroll: Whether graphs hold all iterations of the solver, instead of a loop that ends with the last world's.
-            Iterations that a world does not need leave it unchanged.
+        unroll: Whether graphs hold all iterations of the solver, instead of a loop that ends once every world has
+            converged. Iterations that a world does not need leave it unchanged.
 
     Raises:
         ValueError: MuJoCo Warp refuses the model, or an option is out of range.
@@ -62,8 +60,7 @@ class WarpEngine(Engine):
     capturable = True
 
     partial_refresh = True
-    """Whether restarting worlds get a separate forward pass if its cheap parts are not enough, and no pass at all if
-    there are none."""
+    """Whether the forward pass of restarting worlds covers only them, and is skipped if there are none."""
 
     def __init__(
         self,
@@ -102,7 +99,7 @@ class WarpEngine(Engine):
             self.arrays[varied.name] = self._alias_model(varied)
         self._static = StaticGeoms(model, self.dynamics, device)
         self._constants = self._model_constants()
-        # the initial state that MuJoCo Warp knows follows model fields, which may differ between worlds
+        # MuJoCo Warp's own initial state follows from model fields, which may differ between worlds
         self._start: wp.array | None = None
         if initial is not None or self.dynamics.keys() & {"qpos0", "body_pos", "body_quat"}:
             self._start = wp.array(self.initial, dtype=float, device=device)
@@ -113,12 +110,12 @@ class WarpEngine(Engine):
         if self.reset_stage < Stage.ACCELERATION:
             self._reset_parts = forward_parts(model, self._reset)
         self._columns: wp.array = wp.array(early_sensor_columns(model), dtype=int, device=device)
-        # a step goes on from the parts that were computed for its state, whether a world stepped there or restarted
+        # a step reuses the parts that were computed for its first state, after a step or a restart
         moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
         current_parts = () if moved else self._current_parts or ()
         self._shared = tuple(part for part in current_parts if part in forward.POSITION)
-        # A geom at a place that is not-a-number has contacts with every element of a flex. Their rows of the Jacobian
-        # would outlast a reset, because the solver multiplies unused rows by zero: a reset clears them.
+        # A geom whose position is not-a-number has contacts with every element of a flex. Their rows of the Jacobian
+        # would outlast a reset, because the solver multiplies unused rows by zero. So a reset clears the rows.
         self._jacobian = flat(self.d.efc.J if model.nflex else wp.zeros((nworld, 0), dtype=float, device=device))
         self._zeros = wp.zeros(self._jacobian.shape[1], dtype=float, device=device)
         self._conditional = Conditional(device)
@@ -132,7 +129,7 @@ class WarpEngine(Engine):
         """MuJoCo Warp's model with the engine's options."""
         with wp.ScopedDevice(self.device):
             model = put_varied_model(self.model, list(self.dynamics.values()), self.nworld)
-        # overflows are reported per world; printed from a kernel they would fill the disk
+        # overflows are reported per world; prints from a kernel would fill the disk
         model.opt.warn_overflow = 0
         model.opt.graph_conditional = not self.unroll
         return model
@@ -142,7 +139,7 @@ class WarpEngine(Engine):
         return wp.ScopedDevice(self.device)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
-        """Another model and data of MuJoCo Warp with the same options and sizes, to measure it alone."""
+        """Another model and data with the same options and sizes, for measurements of bare MuJoCo Warp."""
         return self._put_model(), self._make_data(self.nworld)
 
     # memory
@@ -175,7 +172,7 @@ class WarpEngine(Engine):
         return alias(source, field.dtype, (self.nworld, *field.shape))
 
     def _model_constants(self) -> ModelConstants | None:
-        """What keeps constants up to date, or None where none follow from the model fields."""
+        """The constants that follow from the model fields, or None if there are none."""
         fields = [field for field in self.dynamics.values() if field.size and constants_of([field])]
         if not fields:
             return None
@@ -183,7 +180,7 @@ class WarpEngine(Engine):
         return ModelConstants(self.model, self.m, fields, self._static, self.nworld, self.device, loop=loop)
 
     def _alias(self, field: Field) -> wp.array:
-        """The memory of a field under the types of ``fields``, which differ from MuJoCo Warp's in name alone."""
+        """The memory of a field under the types of ``fields``, which differ from MuJoCo Warp's only in name."""
         return alias(getattr(self.d, field.name), field.dtype, (self.nworld, *field.shape))
 
     def _copy_snapshots(self, mask: wp.array, fields: Iterable[Field]) -> None:
@@ -215,7 +212,7 @@ class WarpEngine(Engine):
             elif stage == Stage.ACCELERATION:
                 forward.forward(m, d)
             else:
-                # sensors of limits and contacts are written only where there is one; the others stay as they are
+                # MuJoCo Warp writes sensors of limits and contacts only while the limit or contact is active
                 wp.launch(zero_columns, (d.nworld, len(self._columns)), [self._columns, d.sensordata])
                 mjw.fwd_position(m, d, factorize=False)
                 mjw.sensor_pos(m, d)
@@ -253,7 +250,7 @@ class WarpEngine(Engine):
         self._settle_among_all(mask, nstep)
 
     def _settle_among_all(self, mask: wp.array, nstep: int) -> None:
-        """Step all worlds, and put those that are not masked back."""
+        """Step all worlds, and restore the worlds outside the mask."""
         states, bits = wp.empty_like(self._state), wp.clone(self.d.overflow)
         with self._on_device():
             mjw.get_state(self.m, self.d, states, _SPEC)
@@ -288,7 +285,7 @@ class WarpEngine(Engine):
                 mjw.set_state(self.m, self.d, self._state, _SPEC, mask)
 
     def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
-        """Nothing to do: the fields are the engine's own arrays."""
+        """No-op: the fields are the engine's own arrays."""
 
     def run_for(self, mask: wp.array, run: Callable[[], None]) -> None:
         if self.partial_refresh:
@@ -304,7 +301,7 @@ class WarpEngine(Engine):
 
     def _forward_group(self, model: mjw.Model, group: mjw.Data) -> None:
         self._forward(None, self.reset_stage, group, model)
-        self._forward(self._shared, self.reset_stage)  # from which the next step goes on
+        self._forward(self._shared, self.reset_stage)  # the next step reuses these parts
 
     def _refresh(self, mask: wp.array) -> None:
         """A forward pass of all worlds; those outside the mask stay as they are."""
@@ -315,12 +312,12 @@ class WarpEngine(Engine):
             sizes.report_pool_overflow(self.d, mask)
 
     def _is_partial(self) -> bool:
-        """Whether a group of worlds can be stepped alone."""
-        # sorting pairs of geoms, as for large models, takes memory that can't be reserved
+        """Whether a group of worlds can be stepped without the others."""
+        # with sweep-and-prune, the broadphase of large models, a graph needs memory that cannot be reserved
         return self.partial_refresh and self.m.opt.broadphase == mjw.BroadphaseType.NXN
 
     def _partial_forward(self) -> PartialForward | None:
-        """A forward pass of restarting worlds alone, or None where it gains nothing or is not possible."""
+        """A forward pass of only the restarting worlds, or None if it saves nothing or is not possible."""
         return self._group_of_worlds() if self._is_partial() and self._reset_parts is None else None
 
     def _group_of_worlds(self) -> PartialForward:
@@ -333,7 +330,7 @@ class WarpEngine(Engine):
 
     @contextlib.contextmanager
     def _histories_kept(self) -> Iterator[None]:
-        """A forward pass adds samples to the sensors' histories; the step that follows adds the same ones."""
+        """Restore the sensors' histories after a forward pass, because the next step adds the same samples."""
         if self.d.history.size:
             wp.copy(self._history, self.d.history)
         yield
@@ -355,7 +352,7 @@ class WarpEngine(Engine):
 
 @contextlib.contextmanager
 def _refusals() -> Iterator[None]:
-    """Add the remedy to the error of a model that MuJoCo Warp refuses."""
+    """Explain how to fix a model that MuJoCo Warp refuses."""
     try:
         yield
     except (NotImplementedError, ValueError) as error:
@@ -366,7 +363,7 @@ def _refusals() -> Iterator[None]:
 
 
 def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied: Collection[str]) -> tuple[int, int]:
-    """Contacts and constraints that each world has room for: those given, and probed ones for those that are not."""
+    """Contacts and constraints that each world has room for: the given numbers, else probed ones."""
     given = {"nconmax": nconmax, "njmax": njmax}
     sizes = [size if size is None else whole_number(name, size, low=1) for name, size in given.items()]
     with _refusals():
@@ -377,7 +374,7 @@ def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied
 
 
 def _check_sdf_plugins(model: mujoco.MjModel) -> None:
-    """Refuse SDF plugins unless their distance function was registered with MuJoCo Warp, which has none itself."""
+    """Refuse SDF plugins unless a distance function was registered with MuJoCo Warp, which has none itself."""
     if (model.geom_plugin >= 0).any() and not has_sdf_functions():
         raise NotImplementedError("it has no functions of SDF plugins")
 

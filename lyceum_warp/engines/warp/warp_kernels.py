@@ -1,4 +1,4 @@
-"""Kernels that place geoms, and that move the masked worlds into a small group and back, a few at a time.
+"""Copy masked worlds into a small group and back, place static geoms, and correct constants: kernels.
 
 Each masked world has a rank; a group holds the worlds from rank ``first`` on.
 """
@@ -56,7 +56,7 @@ def rank_worlds(mask_in: wp.array[bool], rank_out: wp.array[int], count_inout: w
 
 @wp.kernel(enable_backward=False)
 def next_group(count_in: wp.array[int], step: int, first_inout: wp.array[int], left_out: wp.array[int]):
-    """Advance by ``step`` worlds, and count how many are left from there on; launched over (1,)."""
+    """Advance by ``step`` worlds, and count the remaining ones; launched over (1,)."""
     first = first_inout[0] + step
     first_inout[0] = first
     left_out[0] = wp.max(0, count_in[0] - first)
@@ -86,7 +86,7 @@ def take_rows(
 def return_rows(
     world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array2d[float], target_out: wp.array2d[float]
 ):
-    """Copy rows of a group into the worlds that they belong to; launched over (places, width of a row)."""
+    """Copy rows of a group back to its worlds; launched over (places, width of a row)."""
     place, i = wp.tid()
     if place < left_in[0]:
         target_out[world_in[place], i] = source_in[place, i]
@@ -94,7 +94,7 @@ def return_rows(
 
 @wp.kernel(enable_backward=False)
 def return_bits(world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array[int], target_inout: wp.array[int]):
-    """Add bits of a group to those of the worlds that they belong to; launched over (places,)."""
+    """Add bits of a group to the bits of its worlds; launched over (places,)."""
     place = wp.tid()
     if place < left_in[0]:
         world = world_in[place]
@@ -105,7 +105,7 @@ def return_bits(world_in: wp.array[int], left_in: wp.array[int], source_in: wp.a
 def mark_changed(
     mask_in: wp.array[bool], given_in: wp.array2d[int], applied_inout: wp.array2d[int], changed_inout: wp.array[bool]
 ):
-    """Mark the masked worlds whose bits differ from those taken last, and take them; launched over (nworld,)."""
+    """Mark the masked worlds whose bits have changed, and remember the new bits; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
         for i in range(given_in.shape[1]):
@@ -125,10 +125,10 @@ def correct_weights(
     body_inout: wp.array2d[wp.vec2],
     dof_inout: wp.array2d[float],
 ):
-    """Give inverse weights the values of mj_setConst where MuJoCo Warp's differ; launched over (nworld, nbody).
+    """Replace inverse weights that differ from mj_setConst's; launched over (nworld, nbody).
 
-    MuJoCo Warp replaces a weight of 0, of the translation or of the rotation, by the other one, and does not set apart
-    simple bodies that only slide.
+    MuJoCo Warp replaces a translational or rotational weight of 0 by the other one, and does not treat simple bodies
+    that only slide separately: their weight is the inverse of their mass.
     """
     w, body = wp.tid()
     if sliding_in[body]:
