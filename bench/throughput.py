@@ -57,6 +57,8 @@ class Options(experiment.Options):
     """Duration of each measurement."""
     worlds: int | None = None
     """Number of worlds of lyceum_warp and of native C; by default 64 for each thread, and 16,384 on a GPU."""
+    policy: str | None = None
+    """Folder of a run whose policy acts in the part kept; by default actions are random."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +74,8 @@ class Case:
     seconds: float
     warm: int
     """Steps before the clock starts."""
+    policy: str | None = None
+    """Folder of the run whose policy acts; None for random actions."""
 
 
 def cases(options: Options) -> list[Case]:
@@ -99,7 +103,8 @@ def cases(options: Options) -> list[Case]:
 
     return [
         Case(part, task, repeat, name, worlds, cores, options.device if name == "warp" else "cpu", seconds,
-             0 if part == "kept" else warm if worlds <= contestants.GPU_WORLDS else 20)
+             0 if part == "kept" else warm if worlds <= contestants.GPU_WORLDS else 20,
+             options.policy if part == "kept" else None)
         for part in choose(options.parts, PARTS, what="part")
         for task in (SCALED if part in ("cores", "worlds") and not options.tasks else given)
         for repeat in range(1 if part == "kept" else repeats)
@@ -121,7 +126,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
         place = {"engine": "warp", "device": case.device} if case.contestant == "warp" else {
             "engine": "mujoco", "nthread": case.threads}  # fmt: skip
         with experiment.cores(case.threads):
-            return kept.measure(case.task, case.worlds, max(5, int(30 * case.seconds)), **place)
+            return kept.measure(case.task, case.worlds, max(5, int(30 * case.seconds)), case.policy, **place)
     return contestants.measure(
         case.contestant, case.task, worlds=case.worlds, threads=case.threads, device=case.device, seed=case.repeat,
         seconds=case.seconds, warm=case.warm,
@@ -139,7 +144,7 @@ def grouped(rows: Sequence[Row], part: str, *by: str) -> dict[tuple[Any, ...], l
     mine.sort(key=lambda row: (order.get(row.case["task"], len(order)), row.case["task"], row.case["threads"],
                                row.case["worlds"]))  # fmt: skip
     for row in mine:
-        found.setdefault(tuple(row.case[name] for name in by), []).append(row)
+        found.setdefault(tuple(row.case.get(name) for name in by), []).append(row)
     return found
 
 
@@ -167,7 +172,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         explained = "Medians over the repeats; ratios of the same repeat: median (smallest to largest)."
         if lines:
             made.append(Table(f"{title} {explained}", [*by, *(LABELS[name] for name in names)], lines))
-    if lines := [kept_line(row) for (row,) in grouped(rows, "kept", "task", "contestant", "worlds").values()]:
+    if lines := [kept_line(row) for (row,) in grouped(rows, "kept", "task", "contestant", "worlds", "policy").values()]:
         header = ["task", "engine", "worlds", "env steps/s", "of the bare engine's", "added to a step", "kB a world"]
         made.append(
             Table("Environment and bare engine on the same states, alternating every ten steps.", header, lines)
@@ -179,8 +184,9 @@ def kept_line(row: Row) -> list[str]:
     case, found = row.case, row.result
     step = case["worlds"] / found["env_steps_per_second"]
     memory = found["bytes_per_world"]
+    task = case["task"] + (", trained policy" if case.get("policy") else "")
     return [
-        case["task"], "Warp" if case["contestant"] == "warp" else "C", f"{case['worlds']:,}",
+        task, "Warp" if case["contestant"] == "warp" else "C", f"{case['worlds']:,}",
         f"{found['env_steps_per_second']:,.0f}", f"{found['kept']:.1%}",
         f"{found['added_microseconds']:,.0f} µs of {step * 1e3:.2f} ms",
         "" if memory is None else f"{memory / 1e3:,.1f}",
