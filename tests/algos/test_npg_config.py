@@ -1,4 +1,4 @@
-"""Hyperparameters of NPG: every wrong value is refused with its name."""
+"""Hyperparameters of NPG: an error names every invalid value."""
 
 import dataclasses
 import math

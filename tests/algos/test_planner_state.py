@@ -1,4 +1,4 @@
-"""States that a planner is given: made from their parts, and checked."""
+"""The states that a planner accepts: assembled from parts, and checked."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Gaussian policies, against torch's own distribution."""
+"""Compare Gaussian policies with torch's own distribution."""
 
 import pytest
 import torch

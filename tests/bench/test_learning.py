@@ -1,4 +1,4 @@
-"""Test the experiment on the seconds until a return is reached."""
+"""Test the experiment that measures the seconds until a return is reached."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Test the learning curves of NPG and of its peers, in the short mode."""
+"""Test the learning curves of NPG and its peers, in the short mode."""
 
 import contextlib
 import dataclasses
@@ -15,7 +15,7 @@ from lyceum_warp.algos.rollout_buffer import Rollout
 
 
 def case(contestant: str, **changes: Any) -> Any:
-    """The short mode's, with fewer samples."""
+    """Return the short mode's case with fewer samples."""
     found = npg.cases(npg.Options(short=True, contestants=(contestant,), threads=1))[0]
     return dataclasses.replace(found, samples=500, nworld=found.nworld and 4, **changes)
 
@@ -48,11 +48,11 @@ def test_gymnasium_fills_the_buffer_with_the_numbers_of_our_environments() -> No
     for world in range(nworld):
         ends = ours.done[:, world].nonzero()
         assert len(ends), "no episode ended in these steps, so that this test shows too little"
-        until = int(ends[0]) + 1  # the next episode begins elsewhere
+        until = int(ends[0]) + 1  # the next episode begins in a different state
         for name in ("obs", "action", "final_obs", "reward", "step", "terminated", "done", "episode_length"):
             mine, theirs = (getattr(rollout, name)[:until, world] for rollout in (ours, fed))
             assert torch.allclose(mine.float(), theirs.float(), atol=1e-4), name
-        # the first, shortened episodes count in neither
+        # the first, shortened episodes count in neither buffer
         assert torch.equal(ours.episode_return[:until, world].isnan(), fed.episode_return[:until, world].isnan())
     later = fed.done.cumsum(0).roll(1, 0) > 0
     assert not fed.episode_return[1:][later[1:]].isnan().any()
