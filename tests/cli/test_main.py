@@ -1,4 +1,4 @@
-"""The program: help texts, unknown commands, what it loads, and its version."""
+"""The program: help texts, unknown commands, loaded modules, and version."""
 
 import subprocess
 import sys

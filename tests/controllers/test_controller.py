@@ -1,4 +1,4 @@
-"""The protocols of a controller."""
+"""Controller protocols."""
 
 import ast
 import inspect

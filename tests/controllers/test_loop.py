@@ -1,4 +1,4 @@
-"""The synchronous loop."""
+"""The synchronous control loop."""
 
 import pytest
 import torch
