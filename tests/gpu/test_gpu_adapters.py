@@ -1,4 +1,4 @@
-"""Adapters on a GPU: tensors without waiting for the device, and the same numbers under NumPy."""
+"""Adapters on a GPU: tensors without synchronization, and the same numbers as with NumPy."""
 
 from typing import Any
 
