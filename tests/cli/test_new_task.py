@@ -77,9 +77,8 @@ def test_a_new_task_observes_the_state_and_those_sensors_that_measure_it(folder:
     assert (task.frame_skip, task.horizon, task.keyframe, task.action_range) == (4, 500, "home", (-1.0, 1.0))
     assert env.field("qpos", "hinge")[0] == pytest.approx(0.3)
     state = [env.field(name)[0].float() for name in ("qpos", "qvel", "act")]
-    measured = env.field("sensordata")[
-        0
-    ]  # the gyro's three numbers, the clock, the touch sensor, and two of the user sensor
+    # gyro (3 numbers), clock, touch sensor, user sensor (2 numbers)
+    measured = env.field("sensordata")[0]
     wanted = [*(value for field in state for value in field.tolist()), *measured[:3].tolist(), measured[4].item()]
     assert env.obs[0].tolist() == pytest.approx(wanted)
     assert env.obs[0, 13:24].abs().max() > 0  # worlds start with different velocities

@@ -298,8 +298,8 @@ def singles() -> Iterator[Case]:
 def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
     """Return cases that together contain each combination of two (or three, ...) levels of different factors.
 
-    A greedy search: each case starts with a combination that is still missing, and the other factors take the level that
-    adds the most missing combinations. Refused combinations are omitted.
+    A greedy search: each case starts with a combination that is still missing, and the other factors take the level
+    that adds the most missing combinations. Refused combinations are omitted.
     """
     rng = random.Random(seed)
     missing: dict[tuple[tuple[str, str], ...], None] = {}

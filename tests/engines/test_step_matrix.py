@@ -60,8 +60,8 @@ def state_of(engine: WarpEngine, m: mjw.Model, d: mjw.Data) -> np.ndarray:
 def plain(function: Callable[[mjw.Model, mjw.Data], None], m: mjw.Model, d: mjw.Data) -> None:
     """Run MuJoCo Warp's own step or forward pass, but let constraints read the current velocities.
 
-    MuJoCo Warp's ``make_constraint`` reads the bodies' velocities of the last forward pass. The engine recomputes them, so
-    that a step depends only on the state.
+    MuJoCo Warp's ``make_constraint`` reads the bodies' velocities of the last forward pass. The engine recomputes them,
+    so that a step depends only on the state.
     """
 
     def make_constraint(m: mjw.Model, d: mjw.Data) -> None:

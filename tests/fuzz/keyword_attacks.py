@@ -1,7 +1,7 @@
 """Call public functions with random values for each of their arguments.
 
-A case is "CALL SEED", or the name of a minimal case in ``minimal_cases.py``. The arguments are read from the signatures,
-so new ones are included.
+A case is "CALL SEED", or the name of a minimal case in ``minimal_cases.py``. The arguments are read from the
+signatures, so new ones are included.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""The types of a configuration's entries, and errors of settings that name the file."""
+"""Check the types of a configuration's entries; errors name the file."""
 
 import json
 from pathlib import Path
