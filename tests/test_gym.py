@@ -1,4 +1,4 @@
-"""Gymnasium's ids of tasks."""
+"""Register tasks under Gymnasium ids."""
 
 import subprocess
 import sys
@@ -55,7 +55,7 @@ def test_an_unknown_task_gets_no_id(tmp_path: Path) -> None:
 
 def test_a_task_whose_package_is_missing_says_so_when_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     class Missing(Full):
-        """A task with the model of a package that is not installed."""
+        """A task with a model from a package that is not installed."""
 
         model = lw.package_model("package_that_is_missing", "arm.xml", install="lyceum-warp[arm]")
 

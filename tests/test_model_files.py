@@ -1,4 +1,4 @@
-"""Model files of packages and of a local folder: found when they are needed, never imported."""
+"""Find model files of packages and of a local folder when they are needed, without importing the packages."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ from lyceum_warp.binding.registry import find_task
 
 @pytest.fixture
 def menagerie(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A checkout with one robot."""
+    """Make a checkout with one robot."""
     (tmp_path / "leg").mkdir()
     (tmp_path / "leg" / "scene.xml").write_text(lw.gymnasium_model("hopper.xml").spec().to_xml())
     monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))

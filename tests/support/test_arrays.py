@@ -1,4 +1,4 @@
-"""Views of the same memory under another shape or in torch."""
+"""Zero-copy views with a different shape, or as torch tensors."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""CPU cores and memory that this process may use."""
+"""CPU cores and memory that are available to this process."""
 
 import os
 

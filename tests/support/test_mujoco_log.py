@@ -1,4 +1,4 @@
-"""MuJoCo's warnings in Python's log."""
+"""Route MuJoCo's warnings to Python's log."""
 
 import logging
 from pathlib import Path

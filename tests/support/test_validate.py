@@ -1,4 +1,4 @@
-"""Checks of values that users pass."""
+"""Check values that users pass."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The point_mass task: Lyceum's formulas, its physics and its resets."""
+"""The point_mass task: Lyceum's formulas, physics and resets."""
 
 import numpy as np
 import torch
