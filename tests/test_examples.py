@@ -1,5 +1,3 @@
-"""The programs in examples/ run and print the expected results."""
-
 import ast
 import os
 import re
@@ -20,8 +18,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture):
-    """Run an example in this process, in an empty folder, as in ``run("train.py", "--nworld", "4")``; return its
-    lines."""
+    """Run an example in an empty folder, as in ``run("train.py", "--nworld", "4")``; return its lines."""
 
     def lines(name: str, *args: str) -> list[str]:
         monkeypatch.chdir(tmp_path)

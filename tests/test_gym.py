@@ -1,5 +1,3 @@
-"""Register tasks under Gymnasium ids."""
-
 import subprocess
 import sys
 from pathlib import Path

@@ -78,9 +78,6 @@ def imported_modules(name: str) -> set[str]:
 IMPORTS = {name: imported_modules(name) for name in MODULES}
 
 
-# imports
-
-
 def test_imports_point_to_lower_rooms() -> None:
     assert set(LEVELS) == {room(name) for name in MODULES} - {"__init__", "tasks"}
     for name in MODULES:
@@ -128,9 +125,6 @@ def test_module_names_are_unique() -> None:
     for name in MODULES:
         places[name.rpartition(".")[2]].append(name)
     assert not {last: names for last, names in places.items() if len(names) > 1 and last != "__main__"}
-
-
-# private names
 
 
 def is_private(name: str) -> bool:
@@ -189,8 +183,8 @@ UPSTREAM = "lyceum_warp.support.upstream"
 
 
 def private_names_of_others(tree: ast.AST) -> Iterator[str]:
-    """Yield the private modules that a module imports from other packages, and the private attributes that it reads
-    there."""
+    """Yield the private modules that a module imports from other packages, and their private attributes that it
+    reads."""
     modules = set()
     for node in ast.walk(tree):
         found = []
@@ -252,9 +246,6 @@ def test_warp_is_quiet_in_whatever_order_a_task_file_imports(first: str) -> None
         print(lw.make("point_mass", nworld=1).nworld)
     """
     assert in_new_process(program) == "1\n"
-
-
-# tests
 
 
 def test_every_room_has_tests_of_its_name() -> None:

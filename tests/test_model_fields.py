@@ -1,5 +1,3 @@
-"""Model fields that can differ between worlds: types, errors, and derived constants."""
-
 import mujoco
 import pytest
 import warp as wp

@@ -1,5 +1,3 @@
-"""The README's Python runs unchanged."""
-
 import re
 from pathlib import Path
 

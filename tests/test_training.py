@@ -1,5 +1,3 @@
-"""Training with a run folder: finished, continued and warm-started."""
-
 import os
 import shutil
 import signal
@@ -276,8 +274,7 @@ def test_a_run_continues_from_the_last_complete_state_to_the_same_numbers(six: P
 def test_a_command_begins_with_the_policy_of_a_run(
     six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It uses the run's settings on the same task with a changed parameter; its first iteration samples with that
-    policy."""
+    """It uses the run's settings with a changed parameter; its first iteration samples with the run's policy."""
     out = tmp_path / "out"
     arguments = ["train", "--from", str(six), "--which", "4", "--param", "success_distance=0.5", "--iterations", "1"]
     assert cli.main([*arguments, "--out", str(out), "--keep-every", "1", *QUIET]) == 0

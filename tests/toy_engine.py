@@ -1,5 +1,4 @@
-"""A third engine that implements only the contract in ``lyceum_warp.engines.base``: plain MuJoCo, one world at a
-time."""
+"""A third engine that implements only the contract in ``engines/base.py``: plain MuJoCo, one world at a time."""
 
 import copy
 from collections.abc import Collection, Iterable

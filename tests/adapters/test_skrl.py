@@ -1,5 +1,3 @@
-"""Use skrl's own wrappers and PPO on the Gymnasium vector environment."""
-
 from pathlib import Path
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""Use TorchRL's own GymWrapper on the Gymnasium vector environment."""
-
 from typing import Any
 
 import pytest

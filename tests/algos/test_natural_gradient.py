@@ -1,5 +1,3 @@
-"""Fisher-vector products and conjugate gradient."""
-
 import math
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Networks and the observation normaliser."""
-
 from typing import get_args
 
 import pytest

@@ -395,8 +395,7 @@ def test_gpu_a_resumed_run_continues() -> None:
 
 @pytest.mark.parametrize("kl_limit", [1.0, 1.5])  # with 1.0 many steps are shortened
 def test_written_out_and_parallel_iterations_equal_plain_ones(kl_limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plain version uses autograd, runs all rounds of the line search, and fits the value function after the
-    step."""
+    """The plain version uses autograd, all rounds of the line search, and a value fit after the step."""
     threads, learned = torch.get_num_threads(), []
     torch.set_num_threads(2)
     try:

@@ -1,5 +1,3 @@
-"""Hyperparameters of NPG: an error names every invalid value."""
-
 import dataclasses
 import math
 

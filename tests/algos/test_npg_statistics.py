@@ -1,5 +1,3 @@
-"""Compare the statistics of an iteration with plain ones."""
-
 import math
 from types import SimpleNamespace
 from typing import Any

@@ -1,5 +1,3 @@
-"""The states that a planner accepts: assembled from parts, and checked."""
-
 import re
 
 import numpy as np

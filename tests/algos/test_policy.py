@@ -1,5 +1,3 @@
-"""Compare Gaussian policies with torch's own distribution."""
-
 import pytest
 import torch
 

@@ -1,5 +1,3 @@
-"""Exported policies run without the package and give the same actions."""
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import get_args

@@ -1,5 +1,3 @@
-"""The rollout buffer of NPG and PPO."""
-
 import math
 
 import pytest

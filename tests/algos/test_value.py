@@ -1,5 +1,3 @@
-"""Value functions."""
-
 from pathlib import Path
 
 import torch

@@ -1,5 +1,3 @@
-"""Test the runner of experiments."""
-
 import dataclasses
 import json
 import os

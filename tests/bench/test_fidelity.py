@@ -1,5 +1,3 @@
-"""Test the experiment that compares the engines."""
-
 import json
 import math
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Test the experiment that measures the seconds until a return is reached."""
-
 import json
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Test MPPI's experiment, in the short mode."""
-
 from pathlib import Path
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""Test the learning curves of NPG and its peers, in the short mode."""
-
 import contextlib
 import dataclasses
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Test the experiment of very long runs."""
-
 import json
 import re
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Test the experiment throughput, with the smallest cases."""
-
 import json
 from pathlib import Path
 from typing import Any

@@ -153,8 +153,7 @@ def test_a_model_that_mujoco_refuses_is_named() -> None:
 
 
 def test_a_replica_has_the_model_of_its_original(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Later edits of the MjSpec have no effect, nor does a ``model`` function that returns a different model each
-    time."""
+    """Later edits of the MjSpec, or a ``model`` that returns a different model at each call, have no effect."""
     spec = lw.gymnasium_model("hopper.xml").spec()
     env = lw.make("hopper", model=spec)
     spec.geom("torso_geom").density = 5000

@@ -1,5 +1,3 @@
-"""Tasks are found by name, by file and by class, and registered."""
-
 import importlib.util
 import sys
 from collections.abc import Callable

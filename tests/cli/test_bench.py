@@ -1,5 +1,3 @@
-"""lyceum-warp bench."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""Progress and tables on the terminal."""
-
 import contextlib
 import dataclasses
 import io

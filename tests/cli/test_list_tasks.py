@@ -1,5 +1,3 @@
-"""lyceum-warp tasks."""
-
 import importlib.util
 import subprocess
 import sys

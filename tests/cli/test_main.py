@@ -1,5 +1,3 @@
-"""The program: help texts, unknown commands, loaded modules, and version."""
-
 import subprocess
 import sys
 

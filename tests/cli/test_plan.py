@@ -1,5 +1,3 @@
-"""lyceum-warp plan, called as a shell would."""
-
 import dataclasses
 import inspect
 import json

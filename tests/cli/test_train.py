@@ -1,5 +1,3 @@
-"""Test lyceum-warp train: new, resumed, refused and interrupted runs."""
-
 import inspect
 import json
 import os

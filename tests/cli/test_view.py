@@ -1,5 +1,3 @@
-"""Test lyceum-warp view as called from a shell, with a window in memory."""
-
 from pathlib import Path
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""lyceum-warp warmup."""
-
 import re
 
 import mujoco

@@ -1,5 +1,4 @@
-"""Tasks of arbitrary models obey the rules on every engine that supports the model; other engines refuse it in one
-line."""
+"""Tasks of arbitrary models obey the rules on every engine that supports the model; others refuse it in one line."""
 
 from typing import Any
 

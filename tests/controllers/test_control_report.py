@@ -1,5 +1,3 @@
-"""Reports of controlled episodes: numbers, JSON and rows."""
-
 import dataclasses
 import json
 import math

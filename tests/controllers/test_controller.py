@@ -1,5 +1,3 @@
-"""Controller protocols."""
-
 import ast
 import inspect
 

@@ -1,5 +1,3 @@
-"""Save and load trajectories."""
-
 import dataclasses
 import json
 import zipfile

@@ -74,8 +74,7 @@ def test_scratch_is_reserved_before_graphs_are_captured(monkeypatch: pytest.Monk
 
 @pytest.fixture(scope="module", params=["dense", "sparse"])
 def forwarded(request: pytest.FixtureRequest) -> tuple[WarpEngine, CanonicalOrder]:
-    """Return an engine with humanoids on the ground, in contact and at limits, and the canonical order for its
-    model."""
+    """Return an engine with humanoids on the ground, in contact and at limits, and the model's canonical order."""
     model = copy.copy(lw.make("humanoid").model)
     model.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{request.param.upper()}")
     engine = WarpEngine(model, 3, wp.get_device("cpu"), [describe(model, "qpos")])

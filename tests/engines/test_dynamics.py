@@ -109,9 +109,6 @@ def state_of(engine: Engine) -> wp.array:
     return state
 
 
-# physics
-
-
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
 def test_constants_equal_those_of_a_recompiled_model(engine: type[Engine]) -> None:
     made = make(engine, "body_mass", "body_inertia", "body_ipos", "dof_armature", "actuator_gear", "geom_size")
@@ -206,9 +203,6 @@ def test_a_mass_that_is_not_positive_is_a_fault_of_its_world() -> None:
         np.testing.assert_array_equal(made.fault.numpy() != 0, [False, True, False])
 
 
-# states
-
-
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_restored_state_brings_its_model(engine: type[Engine]) -> None:
     made, other = make(engine, *DRAWN), make(engine, *DRAWN)
@@ -261,9 +255,6 @@ def test_a_rollout_honours_the_model_of_each_state(engine: type[Engine], integra
                 np.testing.assert_array_equal(planner.arrays[name].numpy(), source.arrays[name].numpy())
         source.reset(worlds())
         source.set_state(state, worlds())
-
-
-# settling
 
 
 class WholeWarpEngine(WarpEngine):
@@ -319,9 +310,6 @@ def test_models_are_applied_and_worlds_settled_within_graphs() -> None:
     np.testing.assert_array_equal(shown(captured), shown(direct))
 
 
-# inputs and initial states
-
-
 @pytest.mark.parametrize("name", ["xfrc_applied", "qfrc_applied", "mocap_pos"])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_written_inputs_act_from_the_next_step_on(engine: type[Engine], name: str) -> None:
@@ -361,9 +349,6 @@ def test_worlds_reset_to_the_given_initial_state(engine: type[Engine], varied: t
 def test_an_initial_state_of_another_size_is_refused() -> None:
     with pytest.raises(ValueError, match=r"an initial state has the shape .*, not \(3,\)"):
         make(MujocoEngine, initial=np.zeros(3))
-
-
-# placement
 
 
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])

@@ -1,5 +1,3 @@
-"""Estimate whether worlds fit into memory, before anything is allocated."""
-
 import os
 import types
 from pathlib import Path

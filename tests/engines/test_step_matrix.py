@@ -175,15 +175,13 @@ def touching(model: mujoco.MjModel) -> np.ndarray:
 
 
 def drawn_fields() -> list[Any]:
-    """Return all fields; those without derived constants are marked long, because MuJoCo Warp reads their rows
-    directly."""
+    """Return all fields; those without derived constants are long tests, because MuJoCo Warp reads their rows."""
     return [name if constants else pytest.param(name, marks=pytest.mark.long) for name, constants in _FIELDS.items()]
 
 
 @pytest.mark.parametrize("name", drawn_fields())
 def test_a_drawn_field_acts_as_in_an_edited_model(name: str, device: wp.Device) -> None:
-    """Fields that are zero in the model count, too. Results are equal to the bit unless constants follow from the
-    field."""
+    """This includes fields that are zero in the model. Results are equal to the bit if no constants are derived."""
     case = DRAWN | OF_ANOTHER_MODEL.get(name, {})
     spec = mujoco.MjSpec.from_string(table.xml(case))
     for body in spec.bodies[1:]:

@@ -116,7 +116,6 @@ def words(command: str, random: Random) -> list[str]:
 
 
 def attack(case: str) -> str:
-    """Run a case."""
     from minimal_cases import COMMANDS
 
     if case in COMMANDS:

@@ -173,7 +173,6 @@ def command(*words: object) -> None:
 
 
 def attack(case: str) -> str:
-    """Run a case."""
     from minimal_cases import FILES
 
     if case in FILES:

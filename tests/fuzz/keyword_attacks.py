@@ -101,7 +101,6 @@ CALLS = {
 
 
 def attack(case: str) -> str:
-    """Run a case."""
     from minimal_cases import KEYWORDS
 
     if case in KEYWORDS:

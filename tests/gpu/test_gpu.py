@@ -1,5 +1,4 @@
-"""Tests that need a GPU: steps never wait for the host, replayed graphs equal direct launches, runs are
-reproducible."""
+"""Tests that need a GPU: no step waits for the host, graphs equal direct launches, runs are reproducible."""
 
 import contextlib
 import gc

@@ -1,5 +1,3 @@
-"""Adapters on a GPU: tensors without synchronization, and the same numbers as with NumPy."""
-
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Planning on a GPU."""
-
 from typing import Any
 
 import pytest

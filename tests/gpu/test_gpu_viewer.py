@@ -1,5 +1,3 @@
-"""The viewer's session with worlds on a GPU."""
-
 import numpy as np
 import pytest
 import torch

@@ -1,5 +1,3 @@
-"""Compare advantages and returns with their definitions."""
-
 import numpy as np
 import warp as wp
 

@@ -170,8 +170,6 @@ def test_random_rotations_are_uniform_and_independent() -> None:
         check_uniform(np.stack(columns, axis=1))
 
 
-# in a task
-
 FREE = """
 <mujoco>
   <worldbody>

@@ -1,5 +1,3 @@
-"""Compare shared terms with their published definitions."""
-
 import mujoco
 import numpy as np
 import pytest

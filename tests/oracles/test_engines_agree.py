@@ -33,8 +33,7 @@ PARAMS = {"go1_velocity": {"fall_angle": 0.5}, "soft_ball": {"reach": 0.15}}
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """Bounds of the difference between the engines after one substep: maximum over coordinates, quantiles over
-    worlds."""
+    """Bounds of the engines' difference after one substep: maximum over coordinates, quantiles over worlds."""
 
     qpos_median: float
     qpos_p95: float

@@ -460,8 +460,7 @@ class Numbers:
     steps: list[tuple[float, float, bool]]
 
     def changed(self, default: "Numbers") -> float:
-        """Return the share of terminal steps if terminations differ from the default's, or else the share of changed
-        steps."""
+        """Return the share of terminal steps if terminations differ from the default's, or else of changed steps."""
         ends, default_ends = ([step[2] for step in numbers.steps] for numbers in (self, default))
         if ends != default_ends:
             return float(np.mean(ends))

@@ -1,5 +1,3 @@
-"""Damaged, foreign and missing files of policies and states."""
-
 from pathlib import Path
 from random import Random
 from typing import Any

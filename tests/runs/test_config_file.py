@@ -1,5 +1,3 @@
-"""Check the types of a configuration's entries; errors name the file."""
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,3 @@
-"""Convert a learner to config.json and back."""
-
 import json
 from pathlib import Path
 from typing import Any

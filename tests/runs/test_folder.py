@@ -1,5 +1,3 @@
-"""The folder of a run: creation, files, and refused input."""
-
 import json
 import resource
 import subprocess

@@ -1,5 +1,3 @@
-"""Only one process writes a run: locks, when they are taken over, and what the previous holder does."""
-
 import contextlib
 import json
 import os

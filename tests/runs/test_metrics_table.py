@@ -1,5 +1,3 @@
-"""The metrics table of a run."""
-
 import csv
 from pathlib import Path
 

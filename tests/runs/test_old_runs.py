@@ -1,5 +1,3 @@
-"""Runs of earlier releases load, can be evaluated, and resume."""
-
 import shutil
 from pathlib import Path
 

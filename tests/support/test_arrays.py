@@ -1,5 +1,3 @@
-"""Zero-copy views with a different shape, or as torch tensors."""
-
 import pytest
 import torch
 import warp as wp

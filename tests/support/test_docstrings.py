@@ -1,5 +1,3 @@
-"""``help`` shows the docstrings of functions, arguments and attributes."""
-
 import pydoc
 import re
 

@@ -1,5 +1,3 @@
-"""Files are replaced atomically."""
-
 import os
 from pathlib import Path
 from typing import Any

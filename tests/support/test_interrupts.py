@@ -1,5 +1,3 @@
-"""Handle Ctrl-C and SIGTERM in a program."""
-
 import signal
 from collections.abc import Iterator
 

@@ -1,5 +1,3 @@
-"""CPU cores and memory that are available to this process."""
-
 import os
 
 import pytest

@@ -1,5 +1,3 @@
-"""Route MuJoCo's warnings to Python's log."""
-
 import logging
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Check values that users pass."""
-
 from typing import Any
 
 import numpy as np

@@ -25,8 +25,7 @@ def test_simple_shapes_replace_the_meshes_and_keep_the_masses(shared_env: Shared
 
 
 def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv) -> None:
-    """The grippers go to the handles, close and rise: the lift succeeds within an episode, with a reward of nearly
-    6.5."""
+    """The grippers go to the handles, close and rise; success within an episode, with a reward of nearly 6.5."""
     env = shared_env("aloha_lift", nworld=3, autoreset=False)
     model, start = env.model, positions(env)[0]
     waypoints = np.zeros((3, 3, 14))

@@ -26,9 +26,6 @@ def roll_out(env: lw.Env, steps: int, size: float = 1.0) -> torch.Tensor:
     return actions[-1]
 
 
-# observations
-
-
 def observation(s: State, bias: np.ndarray | float) -> np.ndarray:
     joints = s.qpos[:, 7:] + bias - HOME
     return np.hstack([s.imu_velocity, s.gyro, s.gravity, joints, s.qvel[:, 6:], s.last_action, s.command()])
@@ -55,9 +52,7 @@ def test_forces_are_zero_until_the_first_substep(shared_env: SharedEnv) -> None:
     assert not env.field("sensordata").any() and not env.obs_groups["critic"][:, -12:].any()
     for _ in range(10):
         roll_out(env, 1, 0.0)
-    assert (env.field("sensordata")[:, 2::3].abs() > 1.0).any(
-        dim=1
-    ).float().mean() > 0.9  # the robots stand on their feet
+    assert (env.field("sensordata")[:, 2::3].abs() > 1.0).any(dim=1).float().mean() > 0.9  # the robots stand
 
 
 def test_noise_of_the_policys_observations_is_uniform_and_the_critic_has_none(shared_env: SharedEnv) -> None:
@@ -70,9 +65,6 @@ def test_noise_of_the_policys_observations_is_uniform_and_the_critic_has_none(sh
     assert not noise[:, 33:].any()
     sizes = np.repeat([0.5, 0.2, 0.05, 0.01, 1.5], [3, 3, 3, 12, 12])
     check_uniform(noise[:, :33] / (sizes * (1 + 1e-3)))
-
-
-# rewards
 
 
 def test_every_term_of_the_reward_equals_its_formula(shared_env: SharedEnv) -> None:
@@ -95,9 +87,6 @@ def test_every_term_of_the_reward_equals_its_formula(shared_env: SharedEnv) -> N
         now = np.linalg.norm((s1.command() - np.hstack([s1.v[:, :2], s1.w[:, 2:]]))[:, :2], axis=1)
         np.testing.assert_allclose(env.eval.numpy(), now, atol=1e-5)
     assert min(seen[name] for name in terms) > 20
-
-
-# contacts
 
 
 def test_clocks_count_substeps_of_contact_and_of_flight(shared_env: SharedEnv) -> None:
@@ -146,9 +135,6 @@ def test_peak_heights_grow_in_the_air_and_end_at_landings_not_at_resets(shared_e
     s = State(env)
     assert np.array_equal(s.peak, before.peak) and s.peak.max() > 0.02
     assert not s.contact_time.any() and not s.air_time.any() and not s.last_action.any()
-
-
-# commands
 
 
 @pytest.mark.usefixtures("freed")
@@ -216,9 +202,6 @@ def test_the_curriculum_widens_commands_at_each_stage() -> None:
             values, width = memory[free, column], bounds[1] - bounds[0]
             assert bounds[0] <= values.min() < bounds[0] + 0.02 * width
             assert bounds[1] >= values.max() > bounds[1] - 0.02 * width
-
-
-# events, ends, draws
 
 
 def test_pushes_add_velocity_in_the_worlds_axes(shared_env: SharedEnv) -> None:

@@ -1,5 +1,3 @@
-"""Curves for TensorBoard, read back with TensorBoard's own reader."""
-
 import dataclasses
 import io
 import math

@@ -1,5 +1,3 @@
-"""Videos."""
-
 import os
 import signal
 import subprocess

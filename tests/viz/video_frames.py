@@ -24,7 +24,7 @@ with imageio.get_reader(sys.argv[1]) as reader:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Return the rate, shape and number of frames; for each frame the brightest pixel, and count and mean column of red
-    ones."""
+    """Return rate, shape and number of frames; per frame the brightest pixel, and the red pixels' count and mean
+    column."""
     done = subprocess.run([sys.executable, "-c", PROGRAM, str(path)], capture_output=True, text=True, check=True)
     return dict(json.loads(done.stdout))

@@ -110,8 +110,7 @@ def get(
     proxy: Proxy, path: str = "/PATH/", *headers: str, host: str = "HOST", cookie: str = "lyceum-warp=VALUE",
     method: str = "GET", rest: bytes = b"",
 ) -> bytes:  # fmt: skip
-    """Return the response to a request, in which words in capitals stand for the proxy's port, path, cookie and
-    token."""
+    """Return the response to a request; words in capitals stand for the proxy's port, path, cookie and token."""
     own, below = entered(proxy)
     words = {"HOST": "127.0.0.1:PORT", "PORT": str(proxy.port), "PATH": below.strip("/"), "TOKEN": token(proxy),
              "VALUE": own.partition("=")[2]}  # fmt: skip
@@ -301,9 +300,7 @@ def test_a_slow_head_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
         socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client,
         pytest.raises(ConnectionError),
     ):
-        for byte in (
-            b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + 600 * b"a"
-        ):  # each byte is in time, the whole head is not
+        for byte in b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + 600 * b"a":  # all bytes take too long
             client.send(bytes([byte]))
             time.sleep(0.02)
 
