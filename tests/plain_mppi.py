@@ -151,7 +151,6 @@ class Plain:
             self.deviation = np.maximum(fitted, self.min_noise)
 
     def add_up(self, rewards: np.ndarray, ended: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the returns of all worlds."""
         result = np.zeros(rewards.shape[1])
         for k in range(len(result)):
             weight, going = 1.0, True

@@ -150,7 +150,6 @@ def test_the_page_on_a_task_of_your_own_keeps_its_promises(empty_folder: Path, m
 
 
 def anchors(document: Path) -> set[str]:
-    """Return a document's headings in the form that links use."""
     headings = re.findall(r"^#+ (.+)$", document.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 

@@ -73,8 +73,6 @@ def test_a_python_on_which_an_extra_installs_nothing_is_named_with_a_command_tha
 
 
 class Light(find_task("hopper")):  # type: ignore[misc]
-    """A hopper of half the weight."""
-
     @staticmethod
     def edit_model(spec):
         for body in spec.bodies[1:]:

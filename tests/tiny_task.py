@@ -40,7 +40,6 @@ def with_function(function: str) -> str:
 
 
 def write(folder: Path, source: str, name: str = "tiny.py") -> Path:
-    """Write a task file."""
     file = folder / name
     file.write_text(source)
     return file

@@ -17,7 +17,6 @@ QUIET = ["--no-video", "--no-plot"]
 
 
 def train(out: Path, *options: str, task: str = "point_mass") -> int:
-    """Start a short run, and return its exit code."""
     return cli.main(["train", task, "--out", str(out), *TINY, *QUIET, *options])
 
 
@@ -52,12 +51,10 @@ CONFIG = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=2,
 
 
 def algorithm(env: lw.Env, **options: Any) -> lw.NPG:
-    """Make NPG with the settings of ``TINY``."""
     return lw.NPG(env, config=CONFIG, **options)
 
 
 def six_iterations(folder: Path) -> Path:
-    """Train a run of six iterations in a new folder."""
     lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, keep_every=2)
     return folder
 

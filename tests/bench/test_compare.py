@@ -18,7 +18,6 @@ PROGRAM = ROOT / "bench" / "compare.py"
 
 
 def copied(folder: Path, changes: dict[str, tuple[str, str]]) -> Path:
-    """Copy the package, and replace text in some files."""
     shutil.copytree(ROOT / "lyceum_warp", folder / "lyceum_warp", ignore=shutil.ignore_patterns("__pycache__"))
     for name, (old, new) in changes.items():
         file = folder / "lyceum_warp" / name

@@ -24,7 +24,6 @@ def work(request: pytest.FixtureRequest, pytestconfig: pytest.Config, tmp_path: 
 
 
 def run(out: Path, *words: str) -> list[dict[str, Any]]:
-    """Run the experiment and return its results."""
     assert experiment.main(soak.EXPERIMENT, ["--out", str(out), *words]) == 0
     return [json.loads(line)["result"] for line in out.read_text().splitlines()]
 

@@ -112,8 +112,6 @@ class WatchedWindow(Window):
 
 
 class Viewer:
-    """A session in a thread, with its window."""
-
     def __init__(self, session: Session) -> None:
         self.session, self.window = session, WatchedWindow(session.stage.scene)
         self.thread = threading.Thread(target=session.run, args=(self.window,), daemon=True)
@@ -133,8 +131,6 @@ class Viewer:
 
 
 class Tab:
-    """A page of a viewer."""
-
     def __init__(self, page: Page, viewer: Viewer, address: str | None = None) -> None:
         self.page, self.viewer = page, viewer
         self.log: list[str] = []
@@ -197,7 +193,6 @@ class Tab:
         self.repeat(lambda attempt: self.click(x, y + (0, 0, 20, -20, 0, 40, -40)[attempt % 7]), until)
 
     def release(self) -> None:
-        """Release the mouse and Control."""
         self.page.mouse.up(button="left")
         self.page.mouse.up(button="right")
         self.page.keyboard.up("Control")

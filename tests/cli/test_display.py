@@ -28,7 +28,7 @@ def first(npg: lw.NPG) -> lw.Iteration:
 
 @contextlib.contextmanager
 def shown_on(console: Console, npg: lw.NPG, total: int = 10) -> Iterator[display.Display]:
-    """The display of a run, after its first line."""
+    """Show the display of a run after its first line."""
     shown = display.Display(console)
     with shown.training(Run(Path("run"), {}), npg, total):
         console.file.truncate(0)

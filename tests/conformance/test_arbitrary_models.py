@@ -56,8 +56,6 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 
 class Moving(lw.Task):
-    """Move, and observe positions and velocities."""
-
     horizon = 15
 
 
@@ -87,8 +85,6 @@ def start_sensing(s: SensingWorld, p: Params, rng: Row[wp.uint32]):
 
 
 class Sensing(lw.Task):
-    """Move, and observe the sensors."""
-
     horizon = 15
 
 
@@ -100,7 +96,6 @@ def moving(model: str) -> type[lw.Task]:
 
 
 def sensing(model: str) -> type[lw.Task]:
-    """Return a task of a model that observes its sensors."""
     spec = mujoco.MjSpec.from_string(model)
     obs = {"velocity": 1, "sensors": spec.copy().compile().nsensordata}
     own = {"World": SensingWorld, "observe": sense, "reward": judge, "randomize": start_sensing}

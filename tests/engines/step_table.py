@@ -198,7 +198,6 @@ UNKNOWN = {
 
 
 def xml(case: Case) -> str:
-    """Return the XML of a case's model."""
     delay = "" if case["delay"] == "none" else f'delay=".005" nsample="4" interp="{case["delay"]}"'
     actuators = []
     for drive, (name, place) in itertools.product(DRIVE_GROUPS[case["drives"]], PLACES.items()):
@@ -264,7 +263,6 @@ def xml(case: Case) -> str:
 
 
 def fields_of(case: Case) -> list[str]:
-    """Return the fields that a case's World requests."""
     names = (FIELDS | STAGES)[case["asked"]].split()
     if SENSORS[case["sensors"]] and case["flags"] != "no constraints":
         names.append("sensordata")
@@ -272,7 +270,6 @@ def fields_of(case: Case) -> list[str]:
 
 
 def model_of(case: Case) -> mujoco.MjModel:
-    """Return the compiled model of a case."""
     spec = mujoco.MjSpec.from_string(xml(case))
     if "energy" in fields_of(case):
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY

@@ -61,7 +61,6 @@ def arrays_in(data: Any) -> list[wp.array]:
 
 
 def resident() -> int:
-    """Return this process's resident memory in bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 

@@ -265,7 +265,6 @@ def test_a_refresh_uses_the_equality_constraints_of_each_world(kind: type[Engine
 
 
 def test_the_sensor_of_a_limit_that_ended_is_zero(kind: type[Engine]) -> None:
-    """The state is set, not reached by a step."""
     engine = make(kind, "limits")
     knee = int(engine.model.joint("knee").qposadr[0])
     column = state_columns(engine.model, "qpos").start + knee

@@ -89,7 +89,6 @@ def _line(command: str, first: str, flags: dict[str, tuple[str, ...]]) -> list[s
 
 
 def words(command: str, random: Random) -> list[str]:
-    """Return a random command line."""
     given = dict(SMALL[command])
     first = FIRST.get(command, "point_mass")
     others = []

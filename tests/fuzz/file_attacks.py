@@ -78,8 +78,6 @@ SIZES = "--samples 16 --nworld 2 --hidden 4 --value-hidden 4 --mean-every 2 --me
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A kind of file."""
-
     file: str
     mutate: Callable[[bytes, Random], bytes]
     readers: tuple[str, ...]
@@ -226,7 +224,6 @@ def _check_refusal(where: str, kind: Kind, error: BaseException, before: Mapping
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    """Return the files of a folder by their paths."""
     files = [path for path in folder.rglob("*") if path.is_file() and path.suffix != ".pyc"]
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 

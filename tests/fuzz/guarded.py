@@ -138,5 +138,4 @@ def attacks(program: str, cases: Sequence[str], folder: Path) -> dict[str, Outco
 
 
 def replay(program: str, case: str) -> str:
-    """Return the command that repeats a case."""
     return f"in an empty folder: PYTHONPATH={ROOT} {sys.executable} {Path(__file__).parent / program} {case!r}"

@@ -15,7 +15,6 @@ NAMES = [name for _, name, _ in pkgutil.iter_modules(kernels.__path__, f"{kernel
 
 
 def kernels_of(values: object) -> list[wp.Kernel]:
-    """Return the kernels among an object's values."""
     return [value for value in vars(values).values() if isinstance(value, wp.Kernel)]
 
 
@@ -23,7 +22,6 @@ SHARED = [made for name in NAMES if (made := [k for k in kernels_of(import_modul
 
 
 def compiled(module: wp.Module, folder: Path) -> str:
-    """Return a module's PTX code."""
     if not (archs := wp.get_cuda_supported_archs()):
         pytest.skip("this build of Warp does not compile for GPUs")
     (made,) = wp.compile_aot_module(module, arch=archs[0], module_dir=folder, use_ptx=True)

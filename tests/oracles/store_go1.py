@@ -158,7 +158,6 @@ def noiseless(env: ManagerBasedRlEnv, group: str) -> torch.Tensor:
 
 
 def main(path: str) -> None:
-    """Store everything in a file."""
     cfg = load_env_cfg(TASK)
     cfg.scene.num_envs, cfg.seed = 3, 0
     env = ManagerBasedRlEnv(cfg, device="cpu")

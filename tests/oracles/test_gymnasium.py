@@ -35,7 +35,6 @@ TASKS = [name for name, id in IDS.items() if id in OWN]
 
 
 def fields(task: str) -> set[str]:
-    """Return the fields that a task reads."""
     return set(find_task(task).scope["World"].vars)
 
 
@@ -94,8 +93,6 @@ def relative_error(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 @dataclasses.dataclass
 class Step:
-    """One step of both environments."""
-
     obs: np.ndarray
     gym_obs: np.ndarray
     reward: float

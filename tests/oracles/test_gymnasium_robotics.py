@@ -46,7 +46,6 @@ def relative_error(ours: np.ndarray | float, theirs: np.ndarray | float) -> floa
 
 
 def geoms(pair: mujoco.MjsPair) -> set[str]:
-    """Return the names of the two geoms of a pair."""
     return {pair.geomname1, pair.geomname2}
 
 
@@ -158,7 +157,6 @@ class Pair:
 
 
 def mocap_bodies(model: mujoco.MjModel) -> dict[str, int]:
-    """Return the indices of the mocap bodies by name."""
     return {model.body(i).name: int(mocap) for i, mocap in enumerate(model.body_mocapid) if mocap >= 0}
 
 
@@ -244,7 +242,6 @@ def test_random_actions_lead_to_the_same_numbers(make_pair: MakePair) -> None:
 
 
 def pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Return the pairs of geoms that the model lists."""
     return list(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
 
 

@@ -37,7 +37,6 @@ def held(folder: Path, *, seconds: float = 0.0, **changes: Any) -> None:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """A run of two iterations."""
     lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run", iterations=2)
     return tmp_path / "run"
 

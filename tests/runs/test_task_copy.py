@@ -80,7 +80,6 @@ def folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
 
 
 def trained(folder: Path) -> Path:
-    """A run of two iterations."""
     out, table = folder / "run", folder / "mine" / "goal.npy"
     arguments = ["train", str(folder / "mine" / "slide.py"), "--out", str(out), "--param", f"goal={table}", *TINY]
     assert cli.main([*arguments, *QUIET, "--iterations", "2"]) == 0
@@ -88,7 +87,6 @@ def trained(folder: Path) -> Path:
 
 
 def env_of(folder: Path) -> Env:
-    """Make the environment of a run."""
     run = Run.open(folder)
     saved = Configuration.of(run)
     return run_env(run, saved.options, saved.params)

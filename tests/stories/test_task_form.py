@@ -70,7 +70,6 @@ def random_actions(env: lw.Env, steps: int, seed: int = 0) -> torch.Tensor:
 
 
 def mass(env: lw.Env, state: torch.Tensor | None = None) -> torch.Tensor:
-    """Return the puck's mass in every world."""
     if state is None:
         return env.field("body_mass")[:, 1].clone()
     return state[:, env.state_space.parts["body_mass"]][:, 1]

@@ -7,7 +7,6 @@ import lyceum_warp as lw
 
 
 def formula(obs: np.ndarray, near: float, goal: float, reach: np.ndarray | float, drop: float) -> np.ndarray:
-    """Return the reward, computed from the observation."""
     distance = np.linalg.norm(obs[:, 39:42], axis=1)
     similarity = (obs[:, 33:36] * obs[:, 36:39]).sum(axis=1)
     reward = similarity - distance

@@ -118,7 +118,7 @@ def test_palms_are_where_the_published_chain_puts_them(shared_env: SharedEnv) ->
 
 
 def test_arms_stay_where_they_are_without_torque(shared_env: SharedEnv) -> None:
-    """Gravity is compensated; actions add torque."""
+    """Gravity is compensated."""
     env = shared_env("herb_reach", nworld=2, autoreset=False)
     before = positions(env)[0]
     for _ in range(50):
@@ -151,7 +151,6 @@ def palms(env: lw.Env, qpos: np.ndarray) -> np.ndarray:
 
 
 def targets(env: lw.Env) -> np.ndarray:
-    """Return both targets in each world, (nworld, 2, 3)."""
     return env.state_space.split(env.get_state())["mocap_pos"].numpy().reshape(-1, 2, 3).copy()
 
 

@@ -14,7 +14,6 @@ ARM = [f"joint{i}" for i in range(1, 8)]
 
 
 def cube(env: lw.Env) -> np.ndarray:
-    """Return the cube's position and quaternion in each world."""
     return positions(env)[0][:, 9:]
 
 

@@ -29,7 +29,6 @@ def env() -> lw.Env:
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    """Return a red ball on a rail, seen from the front."""
     return ball().compile()
 
 
