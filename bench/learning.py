@@ -201,7 +201,7 @@ def figure(rows: Sequence[Row]) -> Any:
 
 
 EXPERIMENT = Experiment(
-    name="learning", summary="Seconds of learning until NPG or PPO reaches a return.",
+    name="learning", summary="Seconds of learning until NPG or PPO reaches a target return.",
     cases=cases, estimate=lambda case: 0.3 * case.seconds, measure=measure, tables=tables, figure=figure,
     options=Options,
 )  # fmt: skip

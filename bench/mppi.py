@@ -314,7 +314,7 @@ def plan_table(found: dict[str, dict[str, list[Row]]]) -> Table:
 
 
 EXPERIMENT = experiment.Experiment(
-    name="mppi", summary="MPPI in episodes and in planning time, beside Python.",
+    name="mppi", summary="MPPI and a Python planner: episode results and planning time.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
     packages=("gymnasium-robotics",), parallel=True,
 )  # fmt: skip

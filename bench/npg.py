@@ -432,7 +432,8 @@ def agreement(task: str, same: dict[str, list[Row]]) -> Table | None:
     ]
     title = (
         f"{task}: the curves on lyceum_warp's and on Gymnasium's environments differ at {int((p < 0.05).sum())} of "
-        f"{len(lines)} points (permutation of whole curves, adjusted for all points, level 5 %; least p {p.min():.3f})."
+        f"{len(lines)} points (permutation of whole curves, adjusted for all points, level 5 %; "
+        f"smallest p {p.min():.3f})."
     )
     header = ["samples", "lyceum_warp", "Gymnasium", "adjusted p"]
     return Table(title, header, lines)
@@ -486,7 +487,7 @@ def draw(axes: Any, group: Sequence[Row], name: str, x: int) -> None:
 
 
 EXPERIMENT = experiment.Experiment(
-    name="npg", summary="NPG's learning curves on lyceum_warp's and on Gymnasium's environments, beside PPO and TRPO.",
+    name="npg", summary="NPG's learning curves on lyceum_warp's and Gymnasium's environments, with PPO and TRPO.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, figure=figure, options=Options,
     packages=("stable-baselines3", "sb3-contrib"), apart=True,
 )  # fmt: skip

@@ -52,7 +52,7 @@ KINDS = {"state": Done.NAN, "speed": Done.NAN, "action": Done.ACTION, "reward": 
 """Kinds of faults by the place of injection, numbered from 1, with the reasons that must be reported."""
 NBIT = len(Done)
 EVERY = 16
-"""Steps between two changes of states; a change affects as many times more worlds."""
+"""Number of steps between changes of states; each change affects this many times more worlds."""
 SAMPLES = 5
 """Memory samples per chunk."""
 TASKS = {
@@ -511,24 +511,24 @@ def tables(rows: Sequence[Row]) -> list[Table]:
                               experiment.median_and_range(slopes, ",.0f")])  # fmt: skip
     return [
         Table(
-            "Faults found where they were injected (one number if all were), other bits beside them, and faults where "
-            "none was injected; whether fault_counts agrees; steps whose numbers are not finite; steps of worlds "
-            "without faults that were compared to the bit with those of an environment without faults, and how many "
-            "differ.",
+            "Faults reported where they were injected (one number if all were), other bits reported with them, and "
+            "faults reported elsewhere; whether fault_counts agrees; steps with numbers that are not finite; steps of "
+            "worlds without faults that were compared to the bit with an environment without faults, and the number "
+            "of differences.",
             ["task", "worlds", "steps", *KINDS, "beside", "others", "counts agree", "not finite", "compared", "differ"],
             faults,
         ),
         Table("Memory, MiB, and its growth, bytes per million steps: median over chunks and range.",
               ["task", "memory", "first", "most", "last", "growth"], grown),
-        Table("Bytes that stay for each environment that is made and deleted.",
+        Table("Bytes that remain allocated per environment that was made and deleted.",
               ["task", "device", "worlds", "made", "resident", "GPU"], made),
-        Table("Trainings that were killed and resumed, beside one that was not interrupted.",
+        Table("Trainings that were killed and resumed, compared with an uninterrupted one.",
               ["training", "kills", "iterations", "equal metrics", "equal policy"], kills),
     ]  # fmt: skip
 
 
 EXPERIMENT = Experiment(
-    name="soak", summary="Very long runs with injected faults, memory, and trainings that are killed and resumed.",
+    name="soak", summary="Very long runs with injected faults, memory growth, and killed and resumed trainings.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
 )  # fmt: skip
 

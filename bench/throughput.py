@@ -223,7 +223,7 @@ def figure(rows: Sequence[Row]) -> Any:
 
 
 EXPERIMENT = Experiment(
-    name="throughput", summary="Environment steps per second, beside native C and other libraries.",
+    name="throughput", summary="Environment steps per second, compared with native C and other libraries.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, figure=figure, options=Options,
     packages=("envpool",),
 )  # fmt: skip
