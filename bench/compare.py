@@ -65,8 +65,7 @@ class Options:
     new: tyro.conf.Positional[str] = str(ROOT)
     """The revision or folder to compare with; by default this working tree."""
     tasks: tuple[str, ...] = ()
-    """Tasks; by default all. Learners and commands run on a few tasks by default. With --tasks they run on those of the
-    given tasks, or on all given tasks if none is among them."""
+    """Tasks; by default all. Of these, learners and commands use a few, or all if none of the few is given."""
     engines: tuple[Literal["mujoco", "warp"], ...] = ENGINES
     """Engines."""
     device: str = "cpu"
