@@ -224,7 +224,7 @@ def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
 
 
 class Side:
-    """The subprocess of a checkout. It starts with the first request, and again if it has died.
+    """The subprocess of a checkout. It starts with the first request, and restarts if it has died.
 
     Args:
         name: "old" or "new".
@@ -347,7 +347,7 @@ class Report:
     """Number of names that a pattern excluded."""
 
     def kept(self, name: str) -> bool:
-        """Return whether no pattern excludes a name."""
+        """Return whether a name is compared, and count it as ignored otherwise."""
         if any(fnmatch.fnmatchcase(name, pattern) for pattern in self.ignore):
             self.ignored += 1
             return False

@@ -6,8 +6,9 @@
 The time includes graph captures, sampling and updates, and excludes kernel compilation and evaluations. The mean
 return is taken over the last 100 episodes, without each world's first episode, which starts at a random step. If
 iterations are too short for whole episodes, it is taken over 16 separate episodes of the stochastic policy every few
-iterations. On go1_velocity a robot that stands still reaches high returns, too. There the mean policy therefore walks
-for 10 s in new worlds, with noise and pushes, and its tracking errors and falls are measured.
+iterations. On go1_velocity a robot that stands still reaches high returns, too. For that
+task the mean policy therefore also walks for 10 s in new worlds, with noise and pushes, and its tracking errors and
+falls are measured.
 """
 
 import collections
@@ -102,7 +103,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     seconds, curve, mean = 0.0, [], -math.inf
     while seconds < case.seconds and mean < case.target:
         began = time.perf_counter()
-        it = next(made)  # it ends with a copy to the host, so the device has finished
+        it = next(made)  # an iteration ends with a copy to the host: the device has finished
         seconds += time.perf_counter() - began
         if judge is None:
             returns = made.rollout.episode_return[made.rollout.done]

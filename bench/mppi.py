@@ -56,7 +56,7 @@ class Options(experiment.Options):
     episodes: int = 100
     """Number of episodes per set of seeds."""
     sets: tuple[int, ...] = (1, 2, 3)
-    """Numbers of the sets of seeds; set i begins at seed 1000 i."""
+    """Sets of seeds to run; set i begins at seed 1000 i."""
     block: int = 10
     """Number of episodes that a contestant runs per turn."""
     seconds: float = 20.0
@@ -65,7 +65,7 @@ class Options(experiment.Options):
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A block of episodes, or some plans, of one contestant."""
+    """A block of episodes or a series of plans of one contestant."""
 
     part: str
     task: str

@@ -1,4 +1,4 @@
-"""Plan with MPPI in Python, over single environments with Gymnasium's step in subprocesses.
+"""Plan with MPPI in Python, with single Gymnasium environments in subprocesses.
 
 ``PythonMPPI`` does not use this package's worlds: each subprocess has an environment and gets one message per plan;
 NumPy computes noise and weights. It has the settings of an ``lw.MPPI`` and controls the same plant.
@@ -46,7 +46,7 @@ class GymnasiumEnv:
     Args:
         name: Gymnasium's name.
         model: Our model, which defines the states.
-        target: A body whose orientation is a constant in Gymnasium's model and that is a mocap body in ours.
+        target: A body with a constant orientation in Gymnasium's model, and a mocap body in ours.
     """
 
     def __init__(self, name: str, model: mujoco.MjModel, target: str | None = None) -> None:

@@ -2,7 +2,7 @@
 
     lyceum-warp bench solver --tasks hopper half_cheetah humanoid --nworld 4096 --engine warp --device cuda
 
-Every setting makes the same steps: one step with the saved action from each saved state, including states at the start
+Every setting takes the same steps: one step with the saved action from each saved state, including states at the start
 of episodes. The error of a step is a world's largest difference of velocities, relative to the larger of 1 and the
 largest velocity. Its scale is the difference between two passes with the model's own options ("own, again"), because a
 GPU adds in any order. Settings take turns, under the same load.

@@ -30,7 +30,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureF
 
 
 def numbers(pattern: str, lines: list[str]) -> list[float]:
-    """Return the group of a pattern as a number, for each matching line."""
+    """Return the number that a pattern captures in each matching line."""
     return [float(match[1]) for line in lines if (match := re.search(pattern, line))]
 
 

@@ -63,7 +63,7 @@ def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
 def test_too_little_memory_of_the_c_engine_is_a_fault() -> None:
     """As memory shrinks, MuJoCo drops constraints, then contacts; in between it raises an error.
 
-    Which of these a size causes depends on the version; all three must occur and be reported.
+    The version determines which size causes which of these; all three must occur and be reported.
     """
     found = Done(0)
     for memory in range(3000, 14_000, 1000):

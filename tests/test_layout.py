@@ -62,7 +62,7 @@ def room(module: str) -> str:
 
 
 def imported_modules(name: str) -> set[str]:
-    """Return the package's modules that a module imports, including those under TYPE_CHECKING and in functions."""
+    """Return the package's modules that a module imports, including imports under TYPE_CHECKING and in functions."""
     found = set()
     for node in ast.walk(TREES[name]):
         if isinstance(node, ast.Import):

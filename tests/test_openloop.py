@@ -172,7 +172,7 @@ def rollouts(task: str | type[lw.Task], steps: int, *, engine: str, nworld: int 
 
 
 def random_actions(env: lw.Env, steps: int, seed: int) -> torch.Tensor:
-    """Return actions, many of which exceed the bounds, or -1 and 1 where there are none."""
+    """Return actions, many of which exceed the bounds (-1 and 1 if there are none)."""
     generator = torch.Generator().manual_seed(seed)
     bounds = (torch.from_numpy(bound) for bound in (env.action_space.low, env.action_space.high))
     low, high = (bound.nan_to_num(neginf=-1.0, posinf=1.0) for bound in bounds)

@@ -1,4 +1,4 @@
-"""Helpers for short training runs, by the command and in Python."""
+"""Helpers for short training runs, from the command line and in Python."""
 
 import csv
 import signal

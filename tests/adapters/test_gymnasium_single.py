@@ -37,7 +37,7 @@ def draws() -> bool:
 
 
 THEIRS = ("is -infinity. This is probably too low", "is infinity. This is probably too high")
-"""The checker's warnings about unbounded observations; Gymnasium's own robots get them, too."""
+"""The checker's warnings about unbounded observations, which Gymnasium's own robots cause, too."""
 
 
 def test_gymnasiums_checker_has_no_complaint(hopper: gymnasium.Env, draws: bool) -> None:

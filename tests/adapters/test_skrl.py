@@ -41,7 +41,7 @@ class Value(DeterministicMixin, Model):
 
 
 def wrapped(*, tensors: bool) -> Any:
-    """Wrap for Gymnasium, or for tensors with the wrapper that skrl made for Isaac Lab."""
+    """Wrap an environment for skrl; tensors use the wrapper that skrl provides for Isaac Lab."""
     if not tensors:
         return wrap_env(GymnasiumVectorEnv("hopper", N), verbose=False)
     env = GymnasiumVectorEnv(Full, N, torch=True, dict_obs=True)

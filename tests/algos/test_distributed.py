@@ -64,7 +64,7 @@ def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
     """Compare the tables' last rows and the checkpoints, up to rounding."""
     row, expected = table(one)[-1], table(other)[-1]
     for name in expected:
-        bound = tolerance * (10.0 if name.startswith("mean_") else 1.0)  # whole episodes after the update
+        bound = tolerance * (10.0 if name.startswith("mean_") else 1.0)  # of whole episodes after the update
         np.testing.assert_allclose(row[name], expected[name], rtol=bound, atol=bound, err_msg=name)
     state, wanted = (Run.open(folder).read()["state"] for folder in (one, other))
     assert torch.equal(state["generator"], wanted["generator"])

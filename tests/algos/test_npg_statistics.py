@@ -41,7 +41,7 @@ def rollout() -> lw.Rollout:
 
 
 def part_of(rollout: lw.Rollout, worlds: slice) -> Any:
-    """Return the samples of some worlds, as one process would have them."""
+    """Return the samples of some worlds in the form in which a process has them."""
     return SimpleNamespace(
         **{name: getattr(rollout, name)[:, worlds] for name in NAMES},
         episode_metrics={name: sums[:, worlds] for name, sums in rollout.episode_metrics.items()},

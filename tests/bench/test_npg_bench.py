@@ -100,5 +100,5 @@ def test_tables_and_figure_come_from_results_alone(tmp_path: Path) -> None:
     assert found["NPG, Gymnasium's environments (sync)"][7] == "3.00 (3.00 to 3.00)"
     assert len(agreement.rows) == 10 and "differ at 0 of 10 points" in agreement.title
     npg.figure(rows).savefig(tmp_path / "npg.png")
-    # a run that was stopped early is drawn, too
+    # runs that were stopped early are plotted, too
     npg.figure([rows[0], row("npg", 1, [[0, 0.0, 5.0], [50_000, 2.0, 9.0]])])

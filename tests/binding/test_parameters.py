@@ -236,7 +236,7 @@ def test_other_environments_get_the_tables() -> None:
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("found", ["number", "nan"])
 def test_check_task_finds_a_read_out_of_a_table(task_file: Any, found: str, engine: str) -> None:
-    """A NaN behind the table is found, too, although it ends the episode with a fault."""
+    """The read is reported even if it returns NaN, which ends the episode with a fault."""
     source = (Path(__file__).parent.parent / "table_task.py").read_text()
     wrong = source.replace("p.motion.shape[0] - 1)", "p.motion.shape[0])")
     value = {"number": "0.0", "nan": "wp.nan"}[found]

@@ -198,7 +198,7 @@ def test_a_field_of_no_numbers_rolls_out(engine: str) -> None:
     assert rollout.reward.abs().min() > 0
 
 
-# models without actuators, in tasks with actions of their own
+# models without actuators, in tasks that define actions
 
 
 @wp.struct

@@ -1,4 +1,4 @@
-"""Every task of the package obeys an environment's rules on both engines, and some tasks on a toy engine."""
+"""Every task of the package obeys the rules on both engines, and some tasks also on a toy engine."""
 
 import pytest
 from conftest import settle

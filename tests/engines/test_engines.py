@@ -226,7 +226,7 @@ def test_fields_that_the_task_does_not_read_are_kept_if_listed(engine: str) -> N
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_a_rollout_leaves_the_state_fields_at_its_end(engine: str) -> None:
-    """This holds, too, if the C engine rolls out a whole horizon in one native call."""
+    """The C engine rolls out the horizon in one native call."""
     env = lw.make("hopper", engine=engine, nworld=2, autoreset=False, frame_skip=2)
     state = wp.from_torch(env.get_state())
     controls = wp.full((3, 2, env.model.nu), 0.5, dtype=float, device="cpu")

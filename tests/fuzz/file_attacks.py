@@ -251,7 +251,7 @@ def _make(folder: Path) -> None:
     command("train", "point_mass", "--horizon", "8", "--out", folder / "run", *options)
     motion = f"motion={folder / 'table.npy'}"
     command("train", folder / "slide.py", "--out", folder / "kept", "--param", motion, *options)
-    for run in ("run", "kept"):  # keep the files at a constant length
+    for run in ("run", "kept"):  # gives the files a constant length
         path = folder / run / "metrics.csv"
         path.write_text(re.sub(r"\d+\.\d{9,}", lambda found: found[0][:8], path.read_text()))
     config = json.loads((folder / "kept/config.json").read_text())

@@ -24,7 +24,7 @@ CUDA = "cuda:0"
 
 @contextlib.contextmanager
 def nothing_waits() -> Iterator[None]:
-    """Make every call raise that waits for the device."""
+    """Make every call that waits for the device raise an exception."""
     patch = pytest.MonkeyPatch()
 
     def forbid(name: str) -> Callable[..., None]:

@@ -92,7 +92,7 @@ def test_threads_have_a_part_of_the_worlds_each_in_phases_that_allow_it(monkeypa
         for call in calls:
             call()
         assert digits.numpy().tolist() == [1234] * 5
-    # the first calls launch for all worlds, the second ones capture that, and later ones capture two parts if allowed
+    # the first calls launch for all worlds, the second ones capture them, later ones capture two parts if possible
     assert sizes == [5, 5, 5, 5, 5, 5, 5, 5, *(2, 2, 3, 3), *(2, 3)]
 
 

@@ -28,7 +28,7 @@ FORCE_PARTS = ("contact_force",)
 
 
 PARAMS = {"go1_velocity": {"fall_angle": 0.5}, "soft_ball": {"reach": 0.15}}
-"""Parameters for which random field values end some episodes."""
+"""Parameters with which random field values terminate some episodes."""
 
 
 @dataclasses.dataclass(frozen=True)

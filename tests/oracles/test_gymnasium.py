@@ -131,7 +131,7 @@ class Pair:
         self.held = self.action()
 
     def put(self, change: Callable[[mujoco.MjData], None] = lambda data: None) -> None:
-        """Put both into a changed state of Gymnasium's reset, with a warm start, all rounded to float32."""
+        """Reset Gymnasium, apply a change, and copy the state with a warm start to both, rounded to float32."""
         data = self.theirs.data
         mujoco.mj_resetData(self.theirs.model, data)
         self.theirs.reset_model()
@@ -174,7 +174,7 @@ class Pair:
         )
 
     def run(self, nstep: int, restart: int = 200) -> list[Step]:
-        """Step both from a shared state; they restart from another one after a termination or ``restart`` steps."""
+        """Step both from a shared state; after a termination or ``restart`` steps, restart from a new one."""
         steps: list[Step] = []
         since = restart
         for _ in range(nstep):
@@ -442,7 +442,7 @@ def cases() -> list[Any]:
     for task in TASKS:
         for name, default in keywords(task).items():
             if name == "reset_noise_scale":
-                continue  # compared by the distributions above
+                continue  # the tests of distributions above cover it
             for i, variant in enumerate(variants(default)):
                 marks = pytest.mark.long if i and not isinstance(default, tuple) else ()
                 found.append(pytest.param(task, name, variant, marks=marks))

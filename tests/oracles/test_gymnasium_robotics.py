@@ -246,7 +246,7 @@ def pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 def test_the_registered_environment_agrees_until_contacts_differ(make_pair: MakePair, task: str) -> None:
-    """Compare with their unchanged model until it has a contact that ours lacks, or counts one twice."""
+    """Compare with their unchanged model until a contact occurs that ours lacks or that theirs counts twice."""
     pair = make_pair(registered(task))
     ours, theirs = pair.ours.model, pair.theirs.model
     ghosts = set(np.flatnonzero(ours.geom_contype != theirs.geom_contype))

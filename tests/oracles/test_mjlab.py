@@ -75,7 +75,7 @@ def stored(name: str) -> torch.Tensor:
 
 
 def mjlabs_states(env: lw.Env, *, heading: bool) -> torch.Tensor:
-    """Return the stored states with their commands, or with ``heading`` with headings that determine the commands."""
+    """Return the stored states with their commands or, with ``heading``, with headings that determine the commands."""
     state = env.get_state()
     parts = env.state_space.split(state)
     parts["qpos"].copy_(stored("qpos"))

@@ -145,7 +145,7 @@ URDF = """<robot name="arm"><mujoco><compiler meshdir="../meshes" strippath="tru
 
 @pytest.mark.parametrize("kind", ["attached", "urdf", "python"])
 def test_all_files_of_a_model_are_copied(kind: str, folder: Path) -> None:
-    """One model attaches another one, one is a URDF, and one is made in Python."""
+    """The models attach another model, are a URDF, or are made in Python."""
     robot = folder / "mine" / "robot"
     (robot / "arm.urdf").write_text(URDF)
     (robot / "whole.xml").write_text(
@@ -267,7 +267,7 @@ def test_a_run_of_python_keeps_a_model_that_was_made_there(tmp_path: Path, capsy
 
 
 def test_python_names_a_task_and_a_model_that_have_changed(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """The algorithm was made from the changed files, so they are used."""
+    """The changed files are used, because the algorithm was made from them."""
     file, table, out = folder / "mine" / "slide.py", folder / "mine" / "goal.npy", folder / "run"
 
     def train(iterations: int, **words: Any) -> None:

@@ -100,7 +100,7 @@ def reward(error: np.ndarray) -> np.ndarray:
 
 
 def test_reward_evaluation_and_observation_equal_lyceums_formulas(shared_env: SharedEnv) -> None:
-    """The states are given or follow steps; each world has a different target."""
+    """The test compares states after steps and states that are set; each world has a different target."""
     env = shared_env("reach", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     assert env.obs.shape == (NWORLD, 20)

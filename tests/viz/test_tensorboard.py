@@ -114,7 +114,7 @@ def test_a_video_becomes_an_animated_picture(first: lw.Iteration, tmp_path: Path
         board.video(mp4, 96)
         with pytest.raises(ValueError, match=r"nothing.mp4 is not a video that ffmpeg reads \(.*\)$"):
             board.video(tmp_path / "nothing.mp4", 96)
-    assert curve(tmp_path / "run", "policy/kl") == [(96, 0.01)]  # the video's file, which is later, keeps the curve
+    assert curve(tmp_path / "run", "policy/kl") == [(96, 0.01)]  # the later file, of the video, does not hide the curve
     (video,) = read(tmp_path / "run").Images("video")
     assert (video.step, video.width, video.height) == (96, 320, 240)
     animation = image.open(io.BytesIO(video.encoded_image_string))

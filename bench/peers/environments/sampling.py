@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 KEPT_ACTIONS = 4096
-"""Number of actions, over all environments, that are drawn before the clock starts; at least 16 steps are drawn."""
+"""Total number of actions that are drawn before the clock starts; they cover at least 16 steps."""
 
 ENVPOOL = {
     "hopper": "Hopper-v5",
