@@ -1,4 +1,4 @@
-"""Compute statistics of learning curves: means with intervals, and a test for differences between two sets of curves."""
+"""Compute statistics of learning curves: means with intervals, and a test that compares two sets of curves."""
 
 import itertools
 import math

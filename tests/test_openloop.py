@@ -270,7 +270,7 @@ def test_every_kind_of_task_gives_the_numbers_of_stepping(
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_parameters_may_change_between_rollouts(engine: str) -> None:
-    """They may change from one number to one per world, after graphs were captured."""
+    """After graphs were captured, a parameter may change from one number to one per world."""
     loop, env = rollouts(Forgetful, 3, engine=engine), lw.make(Forgetful, engine=engine, nworld=4, autoreset=False)
     check_against_stepping(loop, env)
     for params in ({"cost": 5.0}, {"gain": np.array([1.0, 2.0, 3.0, 4.0]), "bound": -1.0}):
@@ -282,7 +282,7 @@ def test_parameters_may_change_between_rollouts(engine: str) -> None:
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Forgetful, Servo])
 def test_worlds_draw_from_keys_of_their_own_if_given(task: type[lw.Task], engine: str) -> None:
-    """They draw the same numbers as steps from states with these keys."""
+    """The draws equal those of steps from states with these keys."""
     env = lw.make(task, engine=engine, nworld=4, autoreset=False)
     numbers = np.array([5, 2**32 - 1, 77, 1234567890], dtype=np.uint32)
     keys = wp.zeros(4, dtype=wp.uint32, device="cpu")

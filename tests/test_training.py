@@ -274,7 +274,7 @@ def test_a_run_continues_from_the_last_complete_state_to_the_same_numbers(six: P
 def test_a_command_begins_with_the_policy_of_a_run(
     six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It uses the run's settings with a changed parameter; its first iteration samples with the run's policy."""
+    """The new run has the old run's settings except one parameter; its first samples come from the old policy."""
     out = tmp_path / "out"
     arguments = ["train", "--from", str(six), "--which", "4", "--param", "success_distance=0.5", "--iterations", "1"]
     assert cli.main([*arguments, "--out", str(out), "--keep-every", "1", *QUIET]) == 0
@@ -335,7 +335,7 @@ def test_evaluations_and_training_with_one_seed_draw_other_states(env: lw.Env) -
 
 
 def test_ppo_trains_by_the_same_loop_from_the_shell(six: Path, tmp_path: Path) -> None:
-    """It starts with the networks of an NPG run, and resumes to the same numbers."""
+    """PPO starts with the networks of an NPG run, and resumes to the same numbers."""
     options = ["--num-steps", "16", "--minibatches", "2", "--epochs", "2", "--nworld", "4", *QUIET]
     begin = ["train", "--from", str(six), "--algorithm", "ppo", *options, "--out"]
     assert cli.main([*begin, str(tmp_path / "whole"), "--iterations", "4"]) == 0

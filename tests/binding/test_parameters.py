@@ -214,7 +214,7 @@ def test_functions_read_tables_which_change_in_place(engine: str) -> None:
 
 
 def test_other_environments_get_the_tables() -> None:
-    """These are a larger replica, scratch worlds, followers, a planner, and the evaluation of a trained policy."""
+    """A larger replica, scratch worlds, followers, a planner, and the evaluation of a policy get the tables."""
     motion = np.array([[0.25, 0.0]])
     env = lw.make(Follow, motion=motion, gain=[1.0, 2.0], nworld=2)
     motion[:] = 9.0  # the environment has a copy

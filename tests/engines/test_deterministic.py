@@ -69,7 +69,7 @@ def test_scratch_is_reserved_before_graphs_are_captured(monkeypatch: pytest.Monk
     assert 100_010 <= block.size < 100_010 + 512
 
 
-# on a GPU the order of contacts and rows is random; these tests shuffle it, and expect it to be restored
+# on a GPU the order of contacts and rows is random; these tests shuffle them, and check that sorting restores the order
 
 
 @pytest.fixture(scope="module", params=["dense", "sparse"])

@@ -181,7 +181,7 @@ def drawn_fields() -> list[Any]:
 
 @pytest.mark.parametrize("name", drawn_fields())
 def test_a_drawn_field_acts_as_in_an_edited_model(name: str, device: wp.Device) -> None:
-    """This includes fields that are zero in the model. Results are equal to the bit if no constants are derived."""
+    """Some fields are zero in the model. Results are equal to the bit if no constants are derived."""
     case = DRAWN | OF_ANOTHER_MODEL.get(name, {})
     spec = mujoco.MjSpec.from_string(table.xml(case))
     for body in spec.bodies[1:]:

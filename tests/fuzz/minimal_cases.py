@@ -88,7 +88,7 @@ FILES: dict[str, tuple[str, str, Change]] = {
     "a table whose header asks for 40 GB": ("table.npy", "table", _header),
     "a table whose header does not end": ("table.npy", "table", lambda data: data.replace(b"}", b"(", 1)),
 }  # fmt: skip
-"""A kind of file, a reader and a change. The file must be refused, or read correctly if the change does not matter."""
+"""Cases as (kind of file, reader, change). The file must be refused, or read if the change does not matter."""
 
 KEYWORDS: dict[str, tuple[str, dict[str, Any]]] = {
     "fields that are a tensor": ("make", {"fields": torch.tensor(3)}),
@@ -107,7 +107,7 @@ KEYWORDS: dict[str, tuple[str, dict[str, Any]]] = {
     "a run that is a list": ("load", {"run": []}),
     "resume that is a number": ("train", {"resume": 7}),
 }
-"""A call, and arguments that it must refuse by name or value."""
+"""Cases as (call, arguments); the error must name an argument or its value."""
 
 COMMANDS = {
     "a negative number of steps": "check point_mass --steps -5",

@@ -363,7 +363,7 @@ RESETS = [
 
 @pytest.mark.parametrize(("task", "times"), RESETS)
 def test_random_resets_have_the_distribution_of_gymnasiums(task: str, times: float) -> None:
-    """Each makes 2,000 resets, with Gymnasium's noise scale and with three times this scale."""
+    """Each side resets 2,000 times, with Gymnasium's noise scale and with three times this scale."""
     option = {} if times == 1.0 else {"reset_noise_scale": keywords(task)["reset_noise_scale"] * times}
     theirs, ours = make_theirs(task, **option), make_ours(task, nworld=250, **option)
     theirs.reset(seed=0)

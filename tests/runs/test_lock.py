@@ -111,7 +111,7 @@ def test_a_lock_is_touched_while_it_is_held(tmp_path: Path, monkeypatch: pytest.
 def test_the_lock_of_another_host_is_only_taken_over_on_request(
     content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its age does not matter, because clocks of hosts differ."""
+    """The lock's age does not matter, because the clocks of hosts differ."""
     held(tmp_path, seconds=1e6)
     if content == "damaged":
         (tmp_path / "lock").write_text("half a li")

@@ -42,7 +42,7 @@ def test_an_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.
 
 @pytest.mark.parametrize("gamma", [0.9, 0.995])
 def test_the_value_function_of_an_old_run_keeps_its_scale(gamma: float, old_run: Path) -> None:
-    """Its file lacks the scale, which used to be 1 / (1 - gamma)."""
+    """The checkpoint lacks the scale, which used to be 1 / (1 - gamma)."""
     content = torch.load(old_run / "checkpoint.pt", weights_only=True)
     content["value"]["shape"] |= {"scale": 1.0 / (1.0 - gamma), "discount": gamma}
     torch.save(content, old_run / "checkpoint.pt")
