@@ -45,7 +45,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 """Options of ``lw.make``."""
 
 ON_A_GPU = ("unroll", "deterministic")
-"""Options that only have an effect on a GPU."""
+"""Options with an effect on a GPU only."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,3 +1,5 @@
+"""lyceum-warp warmup."""
+
 import re
 
 import mujoco
@@ -21,7 +23,7 @@ def test_warmup_applies_the_options_of_physics(made_envs: list[lw.Env], capsys: 
     warmup = ["warmup", "point_mass", "--nworld", "8", "--plan"]
     options = ["--integrator", "implicitfast", "--solver", "ls_iterations=9", "--deterministic"]
     assert main([*warmup, *options]) == 0
-    assert len(made_envs) == 2  # one for the command and one for the planner
+    assert len(made_envs) == 2  # the environment's and the planner's
     for env in made_envs:
         opt = env.model.opt
         assert (opt.integrator, opt.ls_iterations) == (mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 9)

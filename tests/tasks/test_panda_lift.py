@@ -98,7 +98,7 @@ def test_reward_weighs_terms_between_0_and_1(
 
 
 def test_success_needs_ten_steps_in_a_row_above_the_goal() -> None:
-    """A cube is above the goal for 7 steps if it falls from 0.5 m, and for 13 from 1.6 m. The state includes the count."""
+    """A falling cube is above the goal for 7 steps from 0.5 m and 13 from 1.6 m; the state includes the count."""
     env = lw.make("panda_lift", engine="mujoco", nworld=1, autoreset=False, horizon=0)
     for height, steps in ((0.5, 0), (1.6, 4)):
         env.rand_reset(0)

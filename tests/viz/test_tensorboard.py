@@ -1,3 +1,5 @@
+"""Curves for TensorBoard, read back with TensorBoard's own reader."""
+
 import dataclasses
 import io
 import math
@@ -71,7 +73,7 @@ def test_a_resumed_run_replaces_later_points_and_repeats_none(first: lw.Iteratio
     with TensorBoard(tmp_path, CONFIG) as board:
         for i in (1, 2, 3, 4):
             board(numbered(first, i))
-    with TensorBoard(tmp_path, CONFIG) as board:  # the checkpoint was saved at iteration 2
+    with TensorBoard(tmp_path, CONFIG) as board:  # the checkpoint was of iteration 2
         for i in (3, 4, 5):
             board(numbered(first, i, return_mean=100.0))
     assert curve(tmp_path, "policy/kl") == [(96 * i, 0.01 * i) for i in (1, 2, 3, 4, 5)]
@@ -114,11 +116,11 @@ def test_a_video_becomes_an_animated_picture(first: lw.Iteration, tmp_path: Path
         board.video(mp4, 96)
         with pytest.raises(ValueError, match=r"nothing.mp4 is not a video that ffmpeg reads \(.*\)$"):
             board.video(tmp_path / "nothing.mp4", 96)
-    assert curve(tmp_path / "run", "policy/kl") == [(96, 0.01)]  # the later file, of the video, does not hide the curve
+    assert curve(tmp_path / "run", "policy/kl") == [(96, 0.01)]  # the later file of the video leaves it
     (video,) = read(tmp_path / "run").Images("video")
     assert (video.step, video.width, video.height) == (96, 320, 240)
     animation = image.open(io.BytesIO(video.encoded_image_string))
-    assert animation.format == "GIF" and animation.n_frames == 30  # 2 seconds at 15 frames per second
+    assert animation.format == "GIF" and animation.n_frames == 30  # 2 seconds of 15 frames
 
 
 def test_a_full_disk_is_an_error_of_the_call(first: lw.Iteration, tmp_path: Path) -> None:

@@ -1,3 +1,5 @@
+"""Videos."""
+
 import os
 import signal
 import subprocess
@@ -29,11 +31,12 @@ def env() -> lw.Env:
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
+    """A red ball on a rail, seen from the front."""
     return ball().compile()
 
 
 def drawable(make: Callable[[], Path]) -> Path:
-    """Return the result of a function that renders; skip the test on a machine that cannot render."""
+    """The result of a function that draws; skips the test on a machine that cannot draw."""
     pytest.importorskip("imageio_ffmpeg")
     try:
         return make()
@@ -78,7 +81,7 @@ def test_a_video_has_the_model_fields_of_its_states(tmp_path: Path) -> None:
     assert sizes.unique().numel() == 2
     out = tmp_path / "video.mp4"
     path = drawable(lambda: video.write_video(env, states, out, size=(160, 120), speed=0.01))
-    areas = np.array(video_frames.read(path)["red"], dtype=float)  # the red ball's area, seen from a fixed camera
+    areas = np.array(video_frames.read(path)["red"], dtype=float)  # of the red ball, which is seen from a fixed place
     assert len(areas) == len(states) and areas.min() > 0
     ratio = areas[len(first) :].mean() / areas[: len(first)].mean()
     assert ratio == pytest.approx((sizes[-1] / sizes[0]).item() ** 2, rel=0.25)
@@ -137,7 +140,7 @@ def test_poses_are_drawn_one_by_one(model: mujoco.MjModel, tmp_path: Path) -> No
         mp4 = video.Recorder(model, out, size=SMALL, fps=25)
         for i in range(8):
             mp4.add([0.1 * i])
-        assert mp4.added == 8 and not mp4.finished  # no pose has waited for the subprocess
+        assert mp4.added == 8 and not mp4.finished  # no pose has waited for the process
         mp4.end()
         return mp4.close(progress=lambda *counts: shown.append(counts))
 
@@ -169,7 +172,7 @@ def test_a_pose_has_its_own_model_camera_ghosts_and_lines(model: mujoco.MjModel,
 
 
 def slow_drawing(monkeypatch: pytest.MonkeyPatch, seconds: float) -> threading.Event:
-    """Slow the rendering of each pose; return an event that is set once the first pose is drawn."""
+    """Make every pose take some seconds; returns an event that is set once the first one is drawn."""
     drawn, draw = threading.Event(), drawing.Drawing.draw
 
     def slow(self: drawing.Drawing, shot: Any) -> None:
@@ -188,7 +191,7 @@ def test_poses_that_come_too_fast_are_dropped_and_the_video_keeps_its_length(
         with video.Recorder(model, tmp_path / "video.mp4", size=SMALL, most_waiting=2) as mp4:
             for i in range(10):
                 mp4.add([0.1 * i])
-            assert mp4.added == 10 and mp4.dropped in (7, 8)  # the subprocess may have taken one
+            assert mp4.added == 10 and mp4.dropped in (7, 8)  # the process may have taken one
         assert mp4.drawn == 10
         return mp4.out
 

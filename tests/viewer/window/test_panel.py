@@ -20,7 +20,7 @@ def bench() -> Bench:
 
 
 def pressed(bench: Bench, key: str, **status: object) -> list[object]:
-    """Return the commands that a key causes."""
+    """The commands that follow from a key."""
     bench.show(status_of(**status))
     KEYS[key].action(bench.panel.actions)
     return list(bench.sent)
@@ -129,7 +129,7 @@ def test_the_first_camera_tracks_the_body_of_a_tracking_camera_and_takes_videos(
 
 def test_fixed_camera_of_the_model_can_be_chosen(bench: Bench) -> None:
     bench.show(status_of())
-    for _ in range(3):  # from studio's tracking camera to the model's second one, and back
+    for _ in range(3):  # from studio's tracking camera to the second one of the model, and back
         KEYS["PageDown"].action(bench.panel.actions)
     KEYS["PageUp"].action(bench.panel.actions)
     KEYS["PageUp"].action(bench.panel.actions)
