@@ -248,7 +248,7 @@ def test_the_deterministic_option_changes_nothing_on_the_cpu() -> None:
 
 
 def test_an_unrolled_solver_gives_the_same_numbers() -> None:
-    """An additional solver iteration leaves a converged world unchanged."""
+    """Iterations that a world does not need leave it unchanged."""
     looped, unrolled = (
         lw.make("half_cheetah", nworld=3, engine="warp", solver={"iterations": 6}, unroll=unroll)
         for unroll in (False, True)

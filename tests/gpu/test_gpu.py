@@ -149,7 +149,7 @@ def test_deterministic_graphs_equal_direct_launches(task: str) -> None:
 
 @pytest.mark.parametrize("nvtx", [False, True])
 def test_a_capture_leaves_running_graphs_unharmed(nvtx: bool) -> None:
-    """Graphs share memory, which a capture clears; the test does not synchronize in between."""
+    """Graphs share memory, which a capture clears; nothing else waits for the device in between."""
     replayed, direct = (
         lw.make("humanoid", nworld=1024, device=CUDA, deterministic=True, graphs=graphs, nvtx=nvtx and graphs)
         for graphs in (True, False)

@@ -1,4 +1,4 @@
-"""Compile kernels before the first step, with progress, and by ``lyceum-warp warmup``."""
+"""Kernels are compiled ahead of the first step, with progress, and by ``lyceum-warp warmup``."""
 
 import os
 import runpy
