@@ -1,9 +1,9 @@
-"""Measure the cost of an environment's step beside the bare engine on the same states.
+"""Compare the cost of an environment's step with the bare engine's, on the same states.
 
-Environment and bare engine alternate every ten steps. The states from which the environment steps are copied to the
-bare engine, outside the clock, so that both step the same states, resets included, under the same load of the machine.
-The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the same model, controls and
-substeps. ``kept`` is bare time divided by environment time; ``added`` is the difference.
+Environment and bare engine alternate every ten steps. The states before the environment's steps are copied to the bare
+engine, outside the clock, so that both step the same states, resets included, under the same machine load. The bare
+engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with the same model, controls and substeps.
+``kept`` is bare time divided by environment time; ``added`` is the difference.
 """
 
 import statistics
@@ -25,7 +25,7 @@ from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.support.arrays import launch_worlds
 
 BLOCK = 10
-"""Steps after which environment and bare engine change places."""
+"""Steps after which environment and bare engine alternate."""
 
 
 def next_controls(env: lw.Env) -> torch.Tensor:

@@ -1,12 +1,12 @@
-"""Measure environment steps per second, beside native C and other libraries (the paper's figure 1).
+"""Compare environment steps per second with native C and other libraries (the paper's figure 1).
 
     lyceum-warp bench throughput --short
     lyceum-warp bench throughput --parts worlds kept --device cuda
 
 Five parts. ``sampling``: many worlds on all threads, relative to native C, which is ``mujoco.rollout`` with the same
 substeps on all threads. ``single``: one world on one thread, relative to Gymnasium. ``cores``: as ``sampling``, on 1,
-2, 4, ... cores. ``worlds``: lyceum_warp with 1 to 131,072 worlds. ``kept``: an environment beside its bare engine
-(kept.py). contestants.py defines a sample, and how each contestant makes it.
+2, 4, ... cores. ``worlds``: lyceum_warp with 1 to 131,072 worlds. ``kept``: an environment compared with its bare
+engine (kept.py). contestants.py defines a sample, and how each contestant takes it.
 """
 
 import dataclasses
@@ -39,12 +39,12 @@ PARTS = {
     "worlds": ("warp", "c"),
     "kept": ("c", "warp"),
 }
-"""Contestants of each part. The Warp engine takes part on a GPU, or if it is named."""
+"""Contestants of each part. The Warp engine takes part on a GPU, or if it is requested by name."""
 UNITS = {"sampling": "native", "single": "gymnasium", "cores": "native"}
-"""Contestant that counts as 1."""
+"""The reference contestant of each part."""
 WORLDS = {"warp": (1, 8, 64, 512, 2_048, 8_192, 16_384, 32_768, 65_536, 131_072), "c": (1, 8, 64, 512, 4_096)}
 CPU_WORLDS = 512
-"""Most worlds of the Warp engine on the CPU."""
+"""Maximum number of worlds of the Warp engine on the CPU."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,9 +54,9 @@ class Options(experiment.Options):
     parts: tuple[str, ...] = ()
     """Parts: sampling, single, cores, worlds, kept; by default all."""
     seconds: float = 1.0
-    """Duration of each measurement."""
+    """Duration of each measurement in seconds."""
     worlds: int | None = None
-    """Number of worlds of lyceum_warp and of native C; by default 64 for each thread, and 16,384 on a GPU."""
+    """Number of worlds of lyceum_warp and of native C; by default 64 per thread, and 16,384 on a GPU."""
     policy: str | None = None
     """Folder of a run whose policy acts in the part kept; by default actions are random."""
 
@@ -66,14 +66,14 @@ class Case:
     part: str
     task: str
     repeat: int
-    """Also the seed of actions and initial states."""
+    """Number of the repeat, which is also the seed of actions and initial states."""
     contestant: str
     worlds: int
     threads: int
     device: str
     seconds: float
     warm: int
-    """Steps before the clock starts."""
+    """Number of steps before the clock starts."""
     policy: str | None = None
     """Folder of the run whose policy acts; None for random actions."""
 
@@ -92,7 +92,7 @@ def cases(options: Options) -> list[Case]:
         return 1 if part == "single" else own or contestants.worlds(name, cores, options.device)
 
     def sizes(part: str, name: str) -> list[tuple[int, int]]:
-        """Numbers of worlds and threads."""
+        """Return the numbers of worlds and threads."""
         if part == "cores":
             doubled = [1 << k for k in range(threads.bit_length()) if 1 << k < threads]
             return [(size(part, name, cores), cores) for cores in (*doubled, threads)]
@@ -194,7 +194,7 @@ def kept_line(row: Row) -> list[str]:
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    """Draw the ratios of the part sampling to native C, as points on a logarithmic axis."""
+    """Draw the part sampling's ratios to native C as points on a logarithmic axis."""
     groups = grouped(rows, "sampling", "task")
     ratios = {task: experiment.paired(same, "env_steps_per_second", "native") for (task,), same in groups.items()}
     names = [name for name in PARTS["sampling"][1:] if any(found.get(name) for found in ratios.values())]
@@ -229,7 +229,7 @@ def figure(rows: Sequence[Row]) -> Any:
 
 
 EXPERIMENT = Experiment(
-    name="throughput", summary="Environment steps per second, beside native C and other libraries.",
+    name="throughput", summary="Environment steps per second, compared with native C and other libraries.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, figure=figure, options=Options,
     packages=("envpool",),
 )  # fmt: skip

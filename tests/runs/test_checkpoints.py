@@ -1,5 +1,3 @@
-"""Broken, foreign and missing files of policies and states."""
-
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -21,7 +19,7 @@ def run(tmp_path: Path) -> Run:
 
 
 class Mine(torch.nn.Module):
-    """A policy of a user's own, which has no shape."""
+    """A user-defined policy without a shape."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -32,7 +30,7 @@ class Mine(torch.nn.Module):
 
 
 class Foreign:
-    """A class whose instances a checkpoint must not contain."""
+    """A class whose instances must not appear in a checkpoint."""
 
 
 @pytest.mark.parametrize("kind", ["empty", "truncated", "text", "foreign", "code", "list", "newer", "partial", "shape"])
@@ -69,7 +67,7 @@ def test_broken_and_foreign_checkpoints_are_refused_in_one_line(run: Run, kind: 
 
 
 def read_or_refused(path: Path, data: bytes, bit: int) -> dict[str, Any] | None:
-    """The content of a file after one bit was flipped; None if the file is refused."""
+    """Return the content of a file after flipping one bit, or None if the file is refused."""
     damaged = bytearray(data)
     damaged[bit // 8] ^= 1 << bit % 8
     path.write_bytes(damaged)
@@ -89,7 +87,7 @@ def test_every_flipped_bit_of_a_tensor_is_refused(run: Run) -> None:
 
 
 def test_a_file_with_a_flipped_bit_has_the_same_content_or_is_refused(run: Run) -> None:
-    """Every seventh bit of the file; among them is the mark of a folder, after which torch reads no numbers."""
+    """Every seventh bit is flipped in turn; one flip marks a zip entry as a folder, so that torch reads no numbers."""
     data = run.checkpoint.read_bytes()
     saved = read_checkpoint(run.checkpoint)
     weights = saved["policy"].pop("state")
@@ -119,7 +117,7 @@ def test_a_policy_of_any_class_is_saved_without_a_value_function(tmp_path: Path)
 
 
 def test_a_module_of_the_package_is_made_again_by_its_class_and_its_shape(tmp_path: Path) -> None:
-    """A value function in place of a policy represents policies of later releases."""
+    """A value function stands for policy classes of later releases."""
     run = Run.create(tmp_path / "run", {})
     run.save(policy_content(1, ValueFunction(3, (4,))), {})
     loaded = load(run)

@@ -1,5 +1,3 @@
-"""Runs of earlier releases load, are evaluated and resume."""
-
 import shutil
 from pathlib import Path
 
@@ -44,7 +42,7 @@ def test_an_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.
 
 @pytest.mark.parametrize("gamma", [0.9, 0.995])
 def test_the_value_function_of_an_old_run_keeps_its_scale(gamma: float, old_run: Path) -> None:
-    """Its file lacks the scale, which was 1 / (1 - gamma)."""
+    """The checkpoint lacks the scale, which used to be 1 / (1 - gamma)."""
     content = torch.load(old_run / "checkpoint.pt", weights_only=True)
     content["value"]["shape"] |= {"scale": 1.0 / (1.0 - gamma), "discount": gamma}
     torch.save(content, old_run / "checkpoint.pt")
@@ -55,15 +53,14 @@ def test_the_value_function_of_an_old_run_keeps_its_scale(gamma: float, old_run:
     npg.load_state_dict(run.read()["state"])
     obs, step = torch.linspace(-1.0, 1.0, 22).view(2, 11), torch.zeros(2)
     torch.testing.assert_close(npg.value(obs, step), lw.load_value(old_run)(obs, step))
-    # before the release that scales to the returns, a prediction was the network's output times this factor
+    # earlier releases multiplied the network's output by this factor
     plain = npg.value.network(obs).squeeze(-1) / (1.0 - gamma)
     torch.testing.assert_close(npg.value(obs, step), plain)
 
 
 @pytest.fixture(params=["command", "python", "task_file"])
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A run of two iterations of release 0.1: of the command, of Python with a model of its own, and of a task's file
-    with a model, a mesh and a table, which are only in the run's copy."""
+    """Copy a run of release 0.1; with a task file, its model, mesh and table exist only in the run's copy."""
     return Path(shutil.copytree(DATA / "runs_0_1" / request.param, tmp_path / "run"))
 
 
@@ -89,7 +86,7 @@ def test_a_run_of_0_1_resumes_and_another_begins_with_it(run: Path, tmp_path: Pa
 
 @pytest.fixture
 def rsl_rl_run(tmp_path: Path) -> Path:
-    """A run of the former algorithm rsl-rl, by rsl_rl's PPO."""
+    """Copy a run of the former algorithm rsl-rl."""
     return Path(shutil.copytree(RSL_RL, tmp_path / "rsl_rl"))
 
 
@@ -106,7 +103,7 @@ def test_a_run_of_rsl_rl_loads_is_evaluated_and_exported(rsl_rl_run: Path, capsy
 
 
 def test_ppo_begins_with_a_run_of_rsl_rl(rsl_rl_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With its settings, by their new names."""
+    """The settings keep their values under new names."""
     out = tmp_path / "new"
     assert main(["train", "--from", str(rsl_rl_run), "--iterations", "1", "--out", str(out), *QUIET]) == 0
     run = Run.open(out)
