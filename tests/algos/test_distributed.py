@@ -1,6 +1,5 @@
 """NPG in several processes: the same worlds, the same update, and a run that any number of them can continue."""
 
-import contextlib
 import csv
 import os
 import signal
@@ -218,18 +217,6 @@ def test_an_error_in_one_process_ends_all_and_two_processes_continue_the_run_of_
     assert_equal_runs(run, other, tolerance=2e-3)
 
 
-def test_locate_finds_samples_among_those_of_a_processs_own_worlds() -> None:
-    """Of 4 steps of 6 worlds, shared by 3 processes."""
-    index = torch.arange(24)
-    samples = index.view(4, 6)
-    for rank in range(3):
-        places, own = Team(rank, 3).locate(index, 2)
-        mine = samples[:, 2 * rank : 2 * rank + 2]
-        assert torch.equal(index[own], mine.flatten())
-        assert torch.equal(mine.flatten()[places[own]], index[own])
-        assert not places[~own].any()
-
-
 def test_worlds_that_cannot_be_shared_evenly_are_refused() -> None:
     assert Team(0, 3).share(9) == 3
     with pytest.raises(ValueError, match="3 processes cannot share 8 worlds evenly: use a multiple of 3"):
@@ -243,28 +230,3 @@ def test_fewer_gpus_than_processes_are_refused(monkeypatch: pytest.MonkeyPatch) 
     refused = pytest.raises(ValueError, match="2 processes on this machine need a GPU each, and it has 1")
     with refused, distributed.join("cuda"):
         pass
-
-
-@pytest.mark.parametrize("fails", [False, True])
-def test_graphs_are_reset_before_the_process_group_is_destroyed(fails: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """NCCL would wait for the graphs; after an error it may wait for other processes, too, and is not destroyed."""
-    order = []
-
-    class Graph:
-        def reset(self) -> None:
-            order.append("graph")
-
-    group = torch.distributed
-    for name, answer in {"init_process_group": None, "get_rank": 0, "get_backend": "nccl"}.items():
-        monkeypatch.setattr(group, name, lambda *args, answer=answer, **options: answer)
-    monkeypatch.setattr(group, "destroy_process_group", lambda: order.append("group"))
-    for name in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"):
-        monkeypatch.setenv(name, "2")
-    monkeypatch.setenv("MASTER_ADDR", "127.0.0.1")
-    graph = Graph()
-    with contextlib.suppress(KeyError), distributed.join("cpu") as team:
-        team.keep(graph)  # type: ignore[arg-type]
-        team.keep(Graph())  # type: ignore[arg-type]  # nothing refers to it any more
-        if fails:
-            raise KeyError
-    assert order == (["graph"] if fails else ["graph", "group"])

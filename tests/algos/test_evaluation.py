@@ -82,17 +82,6 @@ def test_each_episode_has_dynamics_of_its_own() -> None:
     assert torch.equal(lw.evaluate(env, policy, 6, seed=3).metrics["mass"], got.metrics["mass"])
 
 
-def test_the_mean_policy_is_evaluated_under_dynamics_of_its_own() -> None:
-    env = lw.make(Varied, nworld=2)
-    config = lw.NPGConfig(samples=20, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=3)
-    npg = lw.NPG(env, config=config)
-    before = env.field("body_mass").clone()
-    next(npg)
-    few = npg._evaluate_mean._few
-    assert few is not None and few.field("body_mass")[:, 1].unique().numel() == 3
-    assert not torch.isin(few.field("body_mass")[:, 1], torch.cat([before, env.field("body_mass")])).any()
-
-
 def test_the_mean_policy_of_a_task_that_never_ends_is_evaluated_over_1000_steps() -> None:
     env = lw.make("half_cheetah", nworld=2, horizon=0)
     config = lw.NPGConfig(samples=20, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2)

@@ -14,11 +14,6 @@ from lyceum_warp.binding.registry import find_task
 from lyceum_warp.spaces import Space
 
 
-def test_help_shows_every_setting() -> None:
-    text = str(MPPIConfig.__doc__)
-    assert all(f"    {field.name}: " in text for field in dataclasses.fields(MPPIConfig))
-
-
 @pytest.mark.parametrize(
     ("name", "wrong", "message"),
     [
@@ -91,15 +86,6 @@ def test_arrays_and_tensors_become_tuples_of_floats() -> None:
 def test_settings_for_another_number_of_actions_are_refused(name: str, value: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         MPPI("point_mass", horizon=3, samples=4, **{name: value})
-
-
-def test_the_factor_of_the_noise_is_its_lower_cholesky_factor() -> None:
-    covariance = np.array([[0.3, -0.2], [-0.2, 0.25]])
-    np.testing.assert_array_equal(MPPIConfig(noise=0.5).noise_factor(2), np.diag([0.5, 0.5]))
-    np.testing.assert_array_equal(MPPIConfig(noise=[0.5, 0.1]).noise_factor(2), np.diag([0.5, 0.1]))
-    factor = MPPIConfig(noise=covariance).noise_factor(2)
-    np.testing.assert_allclose(factor @ factor.T, covariance)
-    assert not np.triu(factor, 1).any()
 
 
 def test_the_action_of_a_fill_is_within_the_bounds() -> None:

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 import warp as wp
@@ -141,14 +140,6 @@ def test_a_plan_for_each_world_controls_an_environment() -> None:
         plan.reset(100, where=env.done)
     now = (env.obs[:, :2] - env.obs[:, 4:6]).norm(dim=1)
     assert (now < 0.3 * far)[[0, 2, 3]].all()
-
-
-@pytest.mark.parametrize("seeds", [[4, 9], torch.tensor([4, 9]), np.array([4, 9])])
-def test_every_plant_can_have_a_seed_of_its_own(seeds: Any) -> None:
-    plan = lw.MPPI("point_mass", horizon=3, samples=4, plants=2, seed=seeds)
-    assert plan.seeds == [4, 9]
-    plan.reset(3)
-    assert plan.seeds == [3, 4]
 
 
 def test_bad_input_gets_one_line() -> None:

@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import math
-import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -155,14 +154,6 @@ def test_a_value_function_follows_returns_of_another_scale(factor: float) -> Non
     assert value.shift.item() == pytest.approx(factor * 50.0, rel=0.1)
 
 
-def test_the_fisher_information_takes_other_samples_each_time(env: lw.Env) -> None:
-    env.rand_reset(0)
-    npg = lw.NPG(env, config=dataclasses.replace(SMALL, fisher_fraction=1 / 16), seed=0)
-    next(npg)
-    means = [npg.fisher(npg.rollout.obs.flatten(0, 1)).mean.clone() for _ in range(2)]
-    assert means[0].shape == (20, 2) and not torch.equal(*means)
-
-
 def test_the_value_function_gets_the_group_critic_where_the_task_has_one() -> None:
     env = lw.make(Full, nworld=4)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=40))
@@ -179,14 +170,6 @@ def test_a_state_of_another_number_of_worlds_is_refused(env: lw.Env) -> None:
     npg = lw.NPG(env, config=SMALL)
     with pytest.raises(ValueError, match="the state has 16 worlds, but the environment has 3"):
         lw.NPG(lw.make("point_mass", nworld=3), config=SMALL).load_state_dict(npg.state_dict())
-
-
-def test_samples_are_rounded_up_to_whole_steps_and_mini_batches_grow_with_them(env: lw.Env) -> None:
-    def made(samples: int, batch: int | None = None) -> tuple[int, int]:
-        npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=samples, value_batch=batch))
-        return npg.count, npg.fit.batch
-
-    assert [made(310), made(16 * 2048), made(320, 10)] == [(320, 64), (16 * 2048, 128), (320, 10)]
 
 
 def test_segments_continue_where_the_last_ones_ended(env: lw.Env) -> None:
@@ -363,19 +346,6 @@ def test_a_value_function_that_became_not_finite_is_restored(task_file: TaskFile
     assert (it.skipped_updates, it.faults) == (1, 0) and it.kl > 0.01
     assert parameters(npg).isfinite().all() and parameters(npg)[-1].item() == pytest.approx(good, rel=1e-3)
     assert next(npg).skipped_updates == 0
-
-
-def test_what_is_not_finite_is_named() -> None:
-    """Only a caller can write such an observation: a task's own is a fault."""
-    env = lw.make("hopper", nworld=4)
-    rollout = lw.Rollout(env, 3)
-    smaller = r"Rewards and observations are finite: make the step \(delta\) or .* \(value_rate\) smaller"
-    assert re.fullmatch(smaller, rollout.explain_not_finite())
-    rollout.action[0, 0, 0] = math.inf
-    assert "actions are not: make the step (delta) smaller" in rollout.explain_not_finite()
-    rollout.obs[1, 2, 6] = math.nan
-    found = "The observation of the task 'hopper' is nan in 'velocity' in step 2 of world 2"
-    assert rollout.explain_not_finite() == f"{found}, and not finite in 1 of 12 samples"
 
 
 def on_gpu(**changes: object) -> lw.NPG:

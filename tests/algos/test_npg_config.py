@@ -1,13 +1,12 @@
 """Hyperparameters of NPG: every wrong value is refused with its name."""
 
 import dataclasses
-import json
 import math
 
 import pytest
 
 import lyceum_warp as lw
-from lyceum_warp.algos.npg_config import enough_samples, least_restarts
+from lyceum_warp.algos.npg_config import enough_samples
 
 
 @pytest.mark.parametrize(
@@ -46,26 +45,6 @@ def test_numbers_of_other_types_and_lists_are_converted() -> None:
     assert (type(config.samples), type(config.gamma)) == (int, float)
 
 
-def test_a_configuration_survives_json() -> None:
-    config = lw.NPGConfig(samples=500, hidden=(8,), rollout="segments")
-    assert lw.NPGConfig(**json.loads(json.dumps(dataclasses.asdict(config)))) == config
-
-
-def test_help_lists_every_hyperparameter() -> None:
-    assert all(f"    {field.name}: " in (lw.NPGConfig.__doc__ or "") for field in dataclasses.fields(lw.NPGConfig))
-
-
 def test_default_samples_are_the_papers_or_16_steps_of_every_world() -> None:
     assert [enough_samples(lw.NPGConfig(), n) for n in (10, 64, 1000)] == [10_000, 10_000, 16_000]
     assert enough_samples(lw.NPGConfig(samples=5), 1000) == 5
-
-
-def test_default_least_restarts_are_half_the_even_number_in_long_episodes() -> None:
-    def least(steps: int, horizon: int = 1000, nworld: int = 2000, **changes: float) -> int:
-        return least_restarts(lw.NPGConfig(**changes), nworld, steps, horizon)  # type: ignore[arg-type]
-
-    assert [least(steps) for steps in (16, 49, 50, 200)] == [16, 49, 0, 0]
-    assert [least(steps, min_restarts=1) for steps in (16, 200)] == [32, 400]
-    assert least(16, min_restarts=0) == 0
-    assert least(16, min_restarts=1e9) == 2000
-    assert least(16, horizon=0, min_restarts=1) == 0

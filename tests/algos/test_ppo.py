@@ -203,26 +203,6 @@ def test_it_goes_on_with_given_networks_and_a_network_of_the_users_own(env: lw.E
     assert not torch.equal(own.network.weight, before)
 
 
-def test_what_a_graph_reads_and_writes_stays_in_its_place(env: lw.Env) -> None:
-    ppo = made(env)
-    kept: list[dict[str, int]] = []
-    learn = ppo.minibatches.learn
-
-    def keep(samples: Any, weight: torch.Tensor) -> None:
-        learn(samples, weight)
-        entries = enumerate(ppo.optimizer.state.values())
-        tensors = weights(ppo) | {f"{i}/{name}": part for i, entry in entries for name, part in entry.items()}
-        kept.append({name: part.data_ptr() for name, part in (tensors | dict(samples) | {"rate": ppo.rate}).items()})
-
-    ppo.minibatches.learn = keep
-    for _ in range(2):
-        next(ppo)
-    ppo.minibatches.learn = learn
-    each = SMALL.epochs * SMALL.minibatches
-    assert len(kept) == 2 * each and all(kept[i] == kept[i % SMALL.minibatches] for i in range(2 * each))
-    assert {"rate", "obs", "normalizer.scale", "0/exp_avg", "0/step"} <= kept[0].keys()
-
-
 # runs and errors
 
 

@@ -39,11 +39,6 @@ def test_collect_stores_inputs_and_results_of_each_step(graphs: bool) -> None:
     torch.testing.assert_close(rollout.episode_metrics["effort"][5], rollout.action.square().sum(-1)[4:].sum(0))
 
 
-def test_an_unknown_group_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"'metered' has no group 'actor' of observations: it has policy, critic"):
-        lw.Rollout(lw.make(Metered), 2, groups=("actor",))
-
-
 def test_only_the_first_episode_of_each_world_counts_on_request() -> None:
     env = lw.make("hopper", nworld=8)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
@@ -57,38 +52,6 @@ def test_only_the_first_episode_of_each_world_counts_on_request() -> None:
     every, first = counted
     assert (every.sum(0) > 1).all() and (first.sum(0) == 1).all()
     assert torch.equal(first.int().argmax(0), every.int().argmax(0))
-
-
-def test_restart_some_restarts_as_many_random_worlds_as_lack() -> None:
-    env = lw.make("point_mass", nworld=16, horizon=100)
-    rollout = lw.Rollout(env, 5)
-    rollout.restart()
-    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
-    for _ in range(2):
-        rollout.collect(policy, torch.zeros(rollout.action.shape))
-    env.rand_reset(mask=torch.arange(16) == 3)  # one world that began lately
-    before, returns = env.get_state(), rollout.running_return.clone()
-
-    def chosen(seed: int) -> torch.Tensor:
-        env.set_state(before)
-        rollout.running_return.copy_(returns)
-        rollout.restart_some(5, torch.Generator().manual_seed(seed))
-        began = env.episode_step == 0
-        assert began.sum() == 5 and began[3]
-        restarted = began & (torch.arange(16) != 3)
-        assert torch.equal(env.get_state()[~restarted], before[~restarted])
-        assert torch.equal(rollout.running_return, returns.masked_fill(restarted, 0.0))
-        return began
-
-    assert torch.equal(chosen(0), chosen(0))
-    assert not torch.equal(chosen(0), chosen(1))
-    after = env.get_state()
-    rollout.restart_some(5, torch.Generator().manual_seed(2))  # none lacks
-    assert torch.equal(env.get_state(), after)
-    env.step()
-    began = env.episode_step < rollout.steps
-    rollout.restart_some(20, torch.Generator().manual_seed(2))  # more than there are: those that just began go on
-    assert torch.equal(env.episode_step, began.int())
 
 
 def test_faults_within_a_rollout_are_counted() -> None:

@@ -16,27 +16,6 @@ def threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def call() -> tuple[int, int]:
-    return threading.get_ident(), torch.get_num_threads()
-
-
-def test_two_threads_are_shared() -> None:
-    torch.set_num_threads(2)
-    with beside(call, allowed=True) as result:
-        assert torch.get_num_threads() == 1
-    thread, count = result()
-    assert thread != threading.get_ident() and count == 1
-    assert torch.get_num_threads() == 2
-
-
-@pytest.mark.parametrize(("count", "allowed"), [(1, True), (3, True), (2, False)])
-def test_otherwise_one_call_follows_the_other(count: int, allowed: bool) -> None:
-    torch.set_num_threads(count)
-    with beside(call, allowed=allowed) as result:
-        assert torch.get_num_threads() == count
-        assert result() == (threading.get_ident(), count)
-
-
 def test_an_error_in_either_waits_for_the_other() -> None:
     torch.set_num_threads(2)
     go, done = threading.Event(), threading.Event()

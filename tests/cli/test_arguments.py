@@ -48,13 +48,10 @@ def test_a_parameter_written_in_another_way_is_refused(text: str, message: str) 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Options:
     size: int = 3
-    """Size of it,
-    in metres."""
     name: str | None = None
     fast: bool = False
     safe: bool = True
     limits: tuple[float, ...] = (1.0,)
-    """Limits."""
 
 
 @optional_flags(Options, default="(default: the best)")
@@ -70,14 +67,6 @@ def test_flags_are_the_fields_of_the_options_and_none_unless_given() -> None:
     argv = ["--size", "5", "--name", "a", "--fast", "--no-safe", "--limits", "1", "--limits", "2"]
     found = tyro.cli(Flags, args=argv)
     assert given(found) == {"size": 5, "name": "a", "fast": True, "safe": False, "limits": ("1", "2")}
-
-
-def test_help_texts_of_flags_are_the_docstrings_of_the_options(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        tyro.cli(Flags, args=["--help"])
-    out = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "--size INT Size of it, in metres. (default: the best)" in out
-    assert "--name STR (default: the best)" in out and "--limits NUMBER Limits." in out
 
 
 def test_every_option_of_the_physics_has_a_flag() -> None:
@@ -106,15 +95,3 @@ def test_parameters_are_read_in_order_and_name_the_flag_that_stands_for_an_optio
     assert parameters(["mass=1", "size=1,2", "mass=3"], Train()) == {"mass": 3, "size": [1, 2]}
     with pytest.raises(ValueError, match="horizon is an option, not a parameter of the task: use --steps"):
         parameters(["horizon=9"], Train(), instead={"horizon": "--steps"})
-
-
-def test_physics_flags_become_checked_options() -> None:
-    argv = ["--frame-skip", "2", "--cone", "elliptic", "--integrator", "euler", "--solver", "iterations=4",
-            "--solver", "ls_iterations=9", "--njmax", "40", "--deterministic"]  # fmt: skip
-    assert tyro.cli(Physics, args=argv).options() == PhysicsOptions(
-        frame_skip=2, cone="elliptic", integrator="euler", solver={"iterations": 4, "ls_iterations": 9}, njmax=40,
-        deterministic=True,
-    )  # fmt: skip
-    assert tyro.cli(Physics, args=["--no-deterministic"]).given() == {"deterministic": False}
-    with pytest.raises(ValueError, match="no integrator 'rk5'"):
-        tyro.cli(Physics, args=["--integrator", "rk5"]).options()

@@ -1,6 +1,7 @@
 """lyceum-warp check: the rules of an environment from a shell."""
 
 import pytest
+import tiny_task
 from conftest import TaskFile
 from training_runs import refused
 
@@ -23,40 +24,11 @@ def test_single_rules_are_checked_by_name(capsys: pytest.CaptureFixture[str]) ->
     refused(capsys, "no rule 'space'", "did you mean spaces")
 
 
-ALIKE = """
-import warp as wp
-import lyceum_warp as lw
-
-
-@wp.struct
-class World:
-    qpos: lw.Row[float]
-
-
-@wp.struct
-class Params:
-    dt: float
-
-
-@wp.func
-def observe(s: World, p: Params, obs: lw.Row[float]):
-    obs[0] = s.qpos[0]
-
-
-@wp.func
-def randomize(s: World, p: Params, rng: lw.Row[wp.uint32]):
-    s.qpos[0] = 0.5
-
-
-class Alike(lw.Task):
-    model, obs = "hopper.xml", {"position": 1}
-"""
-"""Its initial states are not random."""
-
-
 def test_a_broken_rule_is_named_and_the_exit_code_is_1(task_file: TaskFile, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["check", str(task_file("alike.py", ALIKE)), "--rule", "spaces", "--rule", "rand_reset"]) == 1
+    fixed = "def randomize(s: World, p: Params, rng: Row[wp.uint32]):\n    s.qpos[0] = 0.5"
+    file = task_file("alike.py", tiny_task.with_function(fixed))
+    assert cli.main(["check", str(file), "--rule", "spaces", "--rule", "rand_reset"]) == 1
     out = capsys.readouterr().out
     broken, state = out.splitlines()
-    assert broken == "alike on the mujoco engine breaks the rule 'rand_reset': two consecutive draws are the same"
+    assert broken == "tiny on the mujoco engine breaks the rule 'rand_reset': two consecutive draws are the same"
     assert state.startswith("  with seed 0, world 0 in step 0 of its episode: time [0.0], qpos [0.5, ")

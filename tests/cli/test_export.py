@@ -48,8 +48,3 @@ def test_export_refuses_in_one_line(
     assert main(["export", str(run), *options]) == 2
     refused(capsys, *words)
     assert not (run / "policy.onnx").exists()
-
-
-def test_export_needs_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", str(tmp_path / "absent")]) == 2
-    refused(capsys, "there is no run in")
