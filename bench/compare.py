@@ -48,7 +48,7 @@ ENGINES = ("mujoco", "warp")
 
 EVERY_VARIANT = ("MPPI", "CEM", "PredictiveSampling", "knots", "plants", "control")
 MANY_PLANNERS = ("point_mass", "reach", "hopper")
-"""Tasks on which every planner is compared; on the others it is MPPI alone."""
+"""Tasks on which every planner is compared; on the others only MPPI is."""
 LEARNING = {"mujoco": ("point_mass", "hopper", "go1_velocity"), "warp": ("hopper",)}
 """Tasks on which learners are compared, by engine."""
 COMMANDS = {"mujoco": ("hopper",), "warp": ("point_mass",)}
@@ -63,7 +63,7 @@ class Options:
     old: tyro.conf.Positional[str]
     """A revision of git, or a folder with a checkout."""
     new: tyro.conf.Positional[str] = str(ROOT)
-    """Another one; this working tree by default."""
+    """The revision or folder to compare it with; this working tree by default."""
     tasks: tuple[str, ...] = ()
     """Tasks; by default all. Learners and commands by default run on few; of given tasks on those among them, or on
     all if none is."""
@@ -86,7 +86,7 @@ class Options:
     ignore: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="PATTERN")] = ()
     """Names to leave out, as '*/metrics.csv/*' or 'plans/hopper/*'; may be given several times."""
     short: bool = False
-    """Compare four tasks, and plans and commands on the C engine alone: about three minutes on two busy cores with a
+    """Compare four tasks, and plans and commands only on the C engine: about three minutes on two busy cores with a
     warm cache of kernels, where everything takes sixteen."""
 
 

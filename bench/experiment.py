@@ -33,7 +33,7 @@ import tyro
 
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
-NAMES = ("throughput", "npg", "learning", "mppi", "fidelity")
+NAMES = ("throughput", "npg", "learning", "mppi", "fidelity", "soak")
 """The experiments."""
 
 SOFTWARE = ("python", "mujoco", "mujoco_warp", "warp_lang", "torch", "numpy", "gymnasium")
@@ -279,7 +279,7 @@ def key(case: Mapping[str, Any]) -> str:
 
 
 def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[float]]:
-    """Return ratios of a quantity to the unit's in the same repeat, by contestant.
+    """Return, by contestant, ratios of a quantity to the quantity of the reference in the same repeat.
 
     Args:
         rows: Rows of otherwise equal cases, which have a ``repeat``.

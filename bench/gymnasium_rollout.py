@@ -19,10 +19,10 @@ TASKS = {"swimmer": "Swimmer-v5", "hopper": "Hopper-v5", "walker2d": "Walker2d-v
 
 
 class GymnasiumRollout(Rollout):
-    """Fill NPG's buffer from a vector environment of Gymnasium, as ``Rollout`` does from ours.
+    """Fill NPG's buffer from a vector environment of Gymnasium, as ``Rollout`` does from an ``Env``.
 
-    A world that ends begins its next episode within the same step. The first episodes begin at our environment's
-    episode steps.
+    A world that ends begins its next episode within the same step. The first episodes begin at the
+    episode steps of ``env``.
     """
 
     def __init__(self, env: lw.Env, steps: int, envs: VectorEnv, seed: int, *, segments: bool) -> None:

@@ -27,7 +27,7 @@ import torch
 from experiment import Row, Table, choose, installed, median_and_range
 
 import lyceum_warp as lw
-from lyceum_warp.controllers.control_statistics import wilson
+from lyceum_warp.controllers.control_report import wilson
 
 EPISODES = {"reach": 75, "adroit_pen": 75, "herb_reach": 150, "panda_lift": 150, "aloha_lift": 150,
             "arm_hand_pickup": 300}  # fmt: skip
@@ -58,7 +58,7 @@ class Options(experiment.Options):
     sets: tuple[int, ...] = (1, 2, 3)
     """Numbers of the sets of seeds. Set i begins at seed 1000 i."""
     block: int = 10
-    """Episodes of a contestant before the next one's turn."""
+    """Episodes that a contestant runs in each turn."""
     seconds: float = 20.0
     """Time for the plans of a case, at least ten plans."""
 
@@ -230,7 +230,7 @@ RUN = {"plans": run_plans, "episodes": run_episodes}
 def measure(case: Case, options: Options) -> dict[str, Any]:
     if case.task.startswith("adroit"):
         installed("gymnasium_robotics", "gymnasium-robotics")
-    # threads and processes that start now use these cores alone
+    # threads and processes that start now use only these cores
     with experiment.cores(case.threads):
         return RUN[case.part](case, options)
 

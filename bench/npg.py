@@ -207,7 +207,7 @@ class Curve:
         return (2 if self.case.short else EVALUATIONS) * progress
 
     def add(self, samples: int, act: Act) -> None:
-        """Evaluate a policy, unless its number of samples is that of the last point."""
+        """Evaluate a policy, unless the last point has the same number of samples."""
         if self.points and self.points[-1][0] == samples:
             return
         seconds, self._next = self.seconds(), int(self._evaluations(samples)) + 1

@@ -1,4 +1,4 @@
-"""A cheetah that runs at a commanded speed: most of the task form in one file.
+"""Define a cheetah that runs at a commanded speed; this task uses most of the task form.
 
 ``python examples/commanded_speed.py`` checks and steps it; ``lyceum-warp train examples/commanded_speed.py`` trains it.
 """
@@ -30,7 +30,7 @@ class World:
     qpos: Row[float]
     qvel: Row[float]
     sensordata: Row[float]
-    gravity: Row[float]  # these four belong to the model; what startup and randomize write differs between worlds
+    gravity: Row[float]  # this and the next three are model fields; startup and randomize write them in each world
     body_mass: Row[float]
     geom_friction: Row[wp.vec3]
     actuator_gainprm: Row[lw.vec10]
@@ -48,12 +48,12 @@ class Params:
     gait: wp.array2d[float] = GAIT  # joint angles to imitate, a row for each phase
     period: float = 0.4  # of the gait, s
     weights: wp.vec4 = wp.vec4(1.0, 0.3, -0.02, -0.5)  # of the reward's terms
-    feet: int = lw.sensor("bfoot")  # the other foot's sensor follows
+    feet: int = lw.sensor("bfoot")  # the next sensor is the other foot's
     floor: int = lw.geom("floor")
 
 
 @wp.func
-def observe(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):  # what the robot measures
+def observe(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):  # noisy measurements of the robot
     for i in range(8):
         obs[i] = s.qpos[i + 1] + p.noise * lw.normal(rng)
     for i in range(9):
@@ -64,7 +64,7 @@ def observe(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):  # what 
 
 
 @wp.func
-def observe_critic(s: World, p: Params, obs: Row[float]):  # what only a simulator knows
+def observe_critic(s: World, p: Params, obs: Row[float]):  # privileged observations, available in simulation only
     for i in range(8):
         obs[i] = s.qpos[i + 1]
     for i in range(9):
@@ -115,7 +115,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):  # at every reset, from
 
 
 @wp.func
-def event(s: World, p: Params, rng: Row[wp.uint32]):  # between two steps, every 2 s and every second on average
+def event(s: World, p: Params, rng: Row[wp.uint32]):  # on average a new command every 2 s, a push every second
     if lw.uniform(rng, 0.0, 2.0) < p.dt:
         s.memory[0] = lw.uniform(rng, 0.0, 1.0 + s.lasting_memory[0] * (p.fastest - 1.0))
     if lw.uniform(rng, 0.0, 1.0) < p.dt:
@@ -130,7 +130,7 @@ def substep(s: World, p: Params):
 
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    well = terms(s0, action, s1, p)[0] > 0.7 * p.weights[0]  # then faster commands come
+    well = terms(s0, action, s1, p)[0] > 0.7 * p.weights[0]  # the level, and with it the commands, rises
     s1.lasting_memory[0] = wp.clamp(s0.lasting_memory[0] + wp.where(well, 1e-3, -1e-3), 0.0, 1.0)
 
 

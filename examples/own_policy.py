@@ -1,10 +1,10 @@
-"""A policy with a network of your own, learned by NPG: linear feedback plus a correction, within the actions' range.
+"""Train a policy with a custom network by NPG: linear feedback plus a correction, within the action range.
 
     python examples/own_policy.py
     python examples/own_policy.py --task half_cheetah --iterations 100
 
-The network is any torch module from observations (..., nobs) to mean actions (..., nact). Noise, log-probabilities and
-the normaliser of observations come from ``lw.GaussianPolicy``.
+The network is any torch module from observations (..., nobs) to mean actions (..., nact). ``lw.GaussianPolicy`` adds
+noise, log-probabilities and the normaliser of observations.
 """
 
 import torch
@@ -23,7 +23,7 @@ class Feedback(nn.Module):
         self.gains = nn.Linear(nobs, nact)
         self.correction = nn.Sequential(nn.Linear(nobs, 32), nn.LayerNorm(32), nn.ELU(), nn.Linear(32, nact))
         for last in (self.gains, self.correction[-1]):
-            nn.init.normal_(last.weight, std=0.01)  # the first mean actions lie near the middle of the range
+            nn.init.normal_(last.weight, std=0.01)  # initial mean actions are near the middle of the range
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         return self.middle + self.extent * torch.tanh(self.gains(obs) + self.correction(obs))

@@ -1,6 +1,6 @@
-"""A task and its model in one Python file: swing up a pendulum whose motor is too weak to lift it directly.
+"""Define a task and its model in one file: swing up a pendulum whose motor is too weak to lift it directly.
 
-``python examples/own_task.py`` checks and steps it; docs/own_task.md shows the command line, and a model in a file.
+``python examples/own_task.py`` checks and steps it. docs/own_task.md shows the command line, and a model in a file.
 """
 
 import mujoco

@@ -24,8 +24,8 @@ def main(
         task: Name of a task, or a file with one.
         episodes: Number of episodes.
         steps: Steps of an episode; by default the task's horizon.
-        samples: Rolled-out plans that each plan averages; by default what the task suggests.
-        seed: Seed of the first episode; the next ones count up.
+        samples: Samples per plan; by default the task's own setting.
+        seed: Seed of the first episode; each further episode adds 1.
     """
     plant = lw.make(task, autoreset=False)  # the controlled world
     # the planner has its own worlds, one for each sample

@@ -1,9 +1,9 @@
-"""A learner of your own that lw.train trains: augmented random search with a linear policy (Mania et al. 2018).
+"""Write a learner for lw.train: augmented random search with a linear policy (Mania et al. 2018).
 
     python examples/random_search.py
     python examples/random_search.py --task hopper --nworld 64 --iterations 300 --video-every 100
 
-The class has no code for files: lw.train writes the folder, with metrics, the best policy, checkpoints and videos.
+The class contains no code for files: lw.train writes the run folder, with metrics, policies, checkpoints and videos.
 """
 
 import dataclasses
@@ -20,13 +20,13 @@ class SearchConfig:
     """Hyperparameters."""
 
     step: float = 1.0
-    """Length of a step along a direction whose two returns differ by a standard deviation of the returns."""
+    """Step size along a direction whose two returns differ by one standard deviation of all returns."""
     noise: float = 0.5
-    """Standard deviation of the weights' changes that are tried."""
+    """Standard deviation of the perturbations of the weights."""
 
 
 class RandomSearch(lw.Learner):
-    """Tries changes of a linear policy's weights in pairs of worlds, one change with both signs in each pair."""
+    """Evaluates perturbations of a linear policy's weights; each pair of worlds tries one of them with both signs."""
 
     algorithm = "random-search"
 
@@ -47,7 +47,7 @@ class RandomSearch(lw.Learner):
         returns, going = torch.zeros_like(env.reward), torch.ones_like(env.done)
         for _ in range(env.horizon):
             env.step(torch.einsum("wao,wo->wa", tried, normalizer(env.obs)))
-            returns += env.reward * going  # the first episode of each world counts
+            returns += env.reward * going  # only the first episode of each world counts
             going &= ~env.done
         self.policy.observe(env.obs)
         plus, minus = returns.chunk(2)

@@ -1,9 +1,9 @@
-"""A learner of your own: an actor and a critic in plain torch, on the environment's own buffers.
+"""Write a learner in plain torch, an actor and a critic, on the environment's own buffers.
 
     python examples/torch_loop.py
     python examples/torch_loop.py --device cuda --nworld 4096
 
-The environment's tensors change in place and stay the same objects: a copy is made only of what must outlive a step.
+The environment updates its tensors in place. Clone a tensor to keep its values beyond the next step.
 """
 
 import torch
@@ -26,20 +26,20 @@ def main(nworld: int = 256, iterations: int = 100, steps: int = 32, device: str 
     for iteration in range(1, iterations + 1):
         samples = []
         for _ in range(steps):
-            obs = env.obs.clone()  # env.obs changes in place, so keep a copy of what the step starts from
+            obs = env.obs.clone()  # env.obs changes in place
             with torch.no_grad():
                 action = torch.normal(actor(obs), log_std.exp())
             env.step(action)  # copies the action into env.action; a world that is done begins a new episode
             with torch.no_grad():
-                # env.obs may already show a new episode; env.final_obs is the state that this step led to.
-                # Its value counts unless the task terminated: at a time limit the episode was only cut off.
+                # env.obs may already belong to a new episode; env.final_obs is the observation after this step.
+                # Bootstrap from its value unless the task terminated: a time limit only truncates the episode.
                 next_value = critic(env.final_obs) * ~env.terminated
             outcome = env.reward.clone(), env.done.clone(), env.eval.clone()
             samples.append((obs, action, next_value, *outcome))
 
         obs, action, next_value, reward, done, distance = map(torch.stack, zip(*samples, strict=True))
         target = reward + gamma * next_value
-        for t in reversed(range(steps - 1)):  # returns within these samples, up to the end of the episode
+        for t in reversed(range(steps - 1)):  # returns within these samples, up to the end of each episode
             target[t] = torch.where(done[t], target[t], reward[t] + gamma * target[t + 1])
         value = critic(obs.flatten(0, 1))
         advantage = target.flatten() - value.detach()

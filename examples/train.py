@@ -27,9 +27,9 @@ def main(
 
     Args:
         task: Name of a task, or a file with one.
-        nworld: Number of worlds; a GPU wants thousands.
-        iterations: Updates of the policy.
-        samples: Transitions in each iteration.
+        nworld: Number of worlds; use thousands on a GPU.
+        iterations: Number of updates of the policy.
+        samples: Transitions per iteration.
         device: cpu, or a CUDA device such as cuda:0.
         seed: Seed of the worlds, the networks and the noise.
         out: File for the policy's weights.
@@ -37,7 +37,7 @@ def main(
     env = lw.make(task, nworld=nworld, device=device, seed=seed)
     npg = lw.NPG(env, config=lw.NPGConfig(samples=samples), seed=seed)
 
-    for it in npg:  # endless: each turn samples, updates the policy, and yields the statistics
+    for it in npg:  # endless: each iteration samples, updates the policy, and yields statistics
         print(f"iteration {it.iteration:3d}  return {it.return_mean:7.1f}  {it.samples_per_second:8,.0f} samples/s")
         if it.iteration == iterations:
             break

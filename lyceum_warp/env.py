@@ -11,8 +11,10 @@ import torch
 import warp as wp
 
 from lyceum_warp.binding.bound_task import BoundTask, check_field_name
+from lyceum_warp.binding.compile_errors import explained
 from lyceum_warp.binding.read_only_model import read_only
 from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding.write_probe import Probe
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.placement import bytes_per_world, find_device, open_engine, options_for_few_worlds
@@ -184,7 +186,7 @@ class Env:
             if self.engine.capturable and options.graphs:
                 self.engine.prepare_capture()
             self.engine.reset(worlds.everyone)
-            probe = self.task.probe(worlds.after, worlds.params, self.device)
+            probe = Probe(self.task, worlds.after, worlds.params, self.device)
             probe.check_bounds()  # before a function writes into an array
             self.rand_reset(options.seed)
             if self.task.dynamics and not _replica:  # later, and in a replica, a bad draw is a fault of its world
@@ -193,9 +195,9 @@ class Env:
             if not _replica:
                 self.engine.check_room()
         except Exception as error:
-            if (explained := self.task.explained(error)) is error:
+            if (clear := explained(error, self.task.name)) is error:
                 raise
-            raise explained from None
+            raise clear from None
         leave_in_parent(self, "worlds", "engine")
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -211,10 +213,11 @@ class Env:
 
     @functools.cached_property
     def model(self) -> mujoco.MjModel:
-        """The compiled model, read-only; ``copy.copy(env.model)`` can be edited.
+        """The compiled model. It is read-only, because the engine has a copy of its own.
 
-        To change the physics, write model fields in the task's ``startup`` or ``randomize``, or pass an edited MjSpec
-        as ``model=``.
+        An edit raises an error; an edit of an array raises NumPy's "assignment destination is read-only". To change
+        the physics, list model fields in the task's ``World`` and write them in ``startup`` or ``randomize``, or pass
+        an edited MjSpec as ``model=``. ``copy.copy(env.model)`` is an ordinary MjModel that can be edited.
         """
         return read_only(self.task.model)
 

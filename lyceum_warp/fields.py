@@ -1,4 +1,4 @@
-"""The simulator's fields: the stage that computes each, its Warp type, and how it stays current."""
+"""Describe the fields of MjData: the stage that computes each, its Warp type, and how it stays current."""
 
 import dataclasses
 import difflib
@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 quat = wp.vec4
-"""A quaternion in MuJoCo's order w, x, y, z. Functions of Warp that expect x, y, z, w do not take it."""
+"""A quaternion in MuJoCo's order w, x, y, z. Warp's functions that expect x, y, z, w refuse it."""
 
 vec10 = wp.types.vector(length=10, dtype=wp.float32)
 
@@ -42,13 +42,13 @@ STATE_FIELDS = {
 """Fields that are part of the integration state, with their mjtState component."""
 
 INPUTS = ("ctrl", "xfrc_applied", "qfrc_applied", "mocap_pos", "mocap_quat", "userdata")
-"""State fields that physics reads and does not change: a task may write them before a step."""
+"""State fields that the physics reads and never changes. A task may write them before a step."""
 
 INITIAL = ("qpos", "qvel", "act", "eq_active", *INPUTS)
 """Fields that make up an initial state."""
 
 READ_ONLY = ("history", "plastic")
-"""Fields of the integration state that the physics alone writes: delayed samples and deformations."""
+"""Fields of the integration state that only the physics writes: delayed samples and deformations."""
 
 _POSITION = (
     "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat cam_xpos cam_xmat "
@@ -103,7 +103,7 @@ _KINDS = {
     "subtree_angmom".split(),
     _Kind.mjOBJ_BODY,
 ) | dict.fromkeys(("xanchor", "xaxis"), _Kind.mjOBJ_JOINT)  # fmt: skip
-"""The kind of object that has one row in a field, by the field's name or its prefix."""
+"""The kind of object with one row per object in a field, by the field's name or prefix."""
 
 _QPOS = (_Kind.mjOBJ_JOINT, "jnt_qposadr", "nq")
 _DOFS = (_Kind.mjOBJ_JOINT, "jnt_dofadr", "nv")
@@ -127,8 +127,8 @@ _RANGES = (
     | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
     | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
 )  # fmt: skip
-"""Fields in which an object has several rows, by name or by what it begins with: the kind of object, the array of
-their first rows, and the array of their numbers of rows, or the size of the field where there is no such array."""
+"""Fields in which an object has several rows, by name or prefix: the kind of object, the array of first rows, and the
+array of numbers of rows, or else the size of the field."""
 
 _COUNTS = {
     _Kind.mjOBJ_ACTUATOR: "nactuator",
@@ -159,13 +159,13 @@ class Field:
     refresh: Stage
     """The stage that must be computed after a step for this field to belong to the new state."""
     reset: Stage
-    """The stage that must be computed after a reset; none for a field that a reset clears."""
+    """The stage that must be computed after a reset; NONE for a field that a reset clears."""
     lagged: bool
-    """Whether the field stays as ``mj_step`` leaves it, one substep behind the state."""
+    """Whether the field keeps the value that ``mj_step`` leaves, one substep behind the state."""
     snapshot: bool
-    """Whether the field is not a function of the integration state, so that it is saved and restored with it."""
+    """Whether the field is saved with the integration state, because it is not a function of it."""
     written: bool = False
-    """Whether the task writes the field before a step, which then takes it over: one of ``INPUTS``."""
+    """Whether the task writes the field, one of ``INPUTS``, before a step."""
 
     @property
     def size(self) -> int:
@@ -183,7 +183,7 @@ def similar_data_fields(name: str) -> list[str]:
 
 
 def is_data_field(name: str) -> bool:
-    """Whether a name is that of a field of MjData that can be kept."""
+    """Whether MjData has a field of this name that an environment can keep."""
     return name in STATE_FIELDS or name in DERIVED_FIELDS or name in SENSED
 
 
@@ -194,20 +194,20 @@ def describe(
 
     Positions, velocities and functions of them belong to the current state: after a step, after a restart and after
     an event that changed a world. Fields of the acceleration stage, such as ``qacc``, ``cfrc_ext`` or the forces of
-    actuators, are what the last substep left, and belong to the state that it started from; in a world that begins an
-    episode, to its first state. ``sensordata`` may hold both: each sensor follows the stage that it belongs to.
+    actuators, come from the last substep and belong to the state before it; in a world that begins an episode, to the
+    first state. In ``sensordata`` each sensor follows its own stage.
 
     Args:
         model: The compiled model.
         name: MuJoCo's name of the field, an attribute of MjData.
-        lagged: Whether to keep the field as ``mj_step`` leaves it, one substep behind the state. Fields of the
-            acceleration stage are always kept so; for a field of the integration state it has no effect.
-        cleared: Whether the field is 0 at the beginning of an episode, instead of belonging to its first state.
+        lagged: Whether to keep the value that ``mj_step`` leaves, one substep behind the state. Fields of the
+            acceleration stage always lag; fields of the integration state never do.
+        cleared: Whether the field is 0 at the start of an episode, instead of being computed for its first state.
         written: Whether the task writes the field before a step. Controls are always written.
 
     Raises:
-        ValueError: There is no such field, the model has no enabled sensor that makes MuJoCo compute it, it is
-            written and not one of ``INPUTS``, or it is cleared and belongs to the current state.
+        ValueError: There is no such field; or no enabled sensor makes MuJoCo compute it; or it is written, but not one
+            of ``INPUTS``; or it is cleared, but belongs to the current state.
     """
     if written and name not in INPUTS:
         raise ValueError(f"the field {name!r} cannot be written before a step: the inputs are {', '.join(INPUTS)}")
@@ -237,7 +237,7 @@ def describe(
     if cleared:
         if not snapshot or refresh > Stage.NONE:
             raise ValueError(
-                f"the field {name!r} cannot be cleared: it belongs to the current state, also when an episode begins"
+                f"the field {name!r} cannot be cleared: it belongs to the current state, so take it out of cleared"
             )
         reset = Stage.NONE
     shape: tuple[int, ...] = np.shape(getattr(mujoco.MjData(model), name))
@@ -248,7 +248,7 @@ def describe(
 
 
 def early_sensor_columns(model: mujoco.MjModel) -> np.ndarray:
-    """The columns of ``sensordata`` that hold sensors of the position and velocity stages, (n,) int."""
+    """The columns of ``sensordata`` with sensors of the position and velocity stages, (n,) int."""
     early = np.flatnonzero(model.sensor_needstage < Stage.ACCELERATION)
     ranges = [np.arange(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i]) for i in early]
     return np.concatenate([np.zeros(0, int), *ranges])
@@ -277,7 +277,7 @@ def _sensed(model: mujoco.MjModel, name: str) -> bool:
 
 
 def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
-    """The place of a named element of the model in a field of MjData or MjModel, along its first axis.
+    """The rows of a named element of the model in a field of MjData or MjModel.
 
     A joint has its coordinates in ``qpos`` and its degrees of freedom in ``qvel``, ``dof_damping`` and other fields of
     that size, a sensor its numbers in ``sensordata``, an actuator its controls in ``ctrl``, its activations in ``act``
@@ -285,7 +285,7 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
     other field each object has one row.
 
     Raises:
-        ValueError: The model has no such element, or it has no place in the field.
+        ValueError: The model has no such element, or the element has no rows in the field.
     """
     if name in ("mocap_pos", "mocap_quat"):
         i = int(model.body_mocapid[_find(model, _Kind.mjOBJ_BODY, element)])
@@ -311,7 +311,7 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
 
 
 def has_several_rows(name: str) -> bool:
-    """Whether an object may have several rows in a field, as a joint's degrees of freedom in ``cdof``."""
+    """Whether an object may have several rows in a field, such as a joint's degrees of freedom in ``cdof``."""
     return name in _RANGES or name.partition("_")[0] in _RANGES
 
 
@@ -329,6 +329,6 @@ def _find(model: mujoco.MjModel, kind: mujoco.mjtObj, element: str) -> int:
     index = mujoco.mj_name2id(model, kind, element)
     if index < 0:
         names = [mujoco.mj_id2name(model, kind, i) for i in range(getattr(model, _COUNTS[kind]))]
-        known = ", ".join(sorted(n for n in names if n)) or "none that are named"
+        known = ", ".join(sorted(n for n in names if n)) or "none with names"
         raise ValueError(f"the model has no {_called(kind)} {element!r}; it has: {known}")
     return index

@@ -242,9 +242,7 @@ class OpenLoop:
 
     def _end_of_horizon(self) -> None:
         """Count the steps, collect faults, and observe the last states."""
-        wp.launch(
-            planning.add_steps, self.env.nworld, [self.horizon, self.worlds.counters.step], device=self.env.device
-        )
+        wp.launch(planning.add_to, self.env.nworld, [self.horizon, self.worlds.counters.step], device=self.env.device)
         self._end(self._last)
 
     def _act(self, t: int) -> None:

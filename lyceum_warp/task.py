@@ -1,4 +1,4 @@
-"""Task, the base class of every task, and the one table of a task's functions."""
+"""Define the base class of tasks, and the table of the functions that a task may have."""
 
 import dataclasses
 import inspect
@@ -33,19 +33,18 @@ class TaskFunction:
 
     name: str
     arguments: str
-    """The arguments as they are written in a task's file."""
+    """The arguments as in a task's file."""
     result: type | None
     """The type of its result: float, bool, or None for a function that writes into its arguments."""
     about: str
     """Its purpose and its default, for the documentation."""
     default: str | None = None
-    """The body of the function that stands in for it; None where it is required."""
+    """The body of the default function; None if the task must have the function."""
     optional: str = ""
-    """Arguments at the end that a task's function may leave out, as they are written in its file."""
+    """Optional arguments at the end, as in a task's file."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Which fields of its arguments of type World it may write: "inputs", "memory", "lasting" (lasting memory and the
-    model), or "start" (all that a reset may write). Rows among its arguments that are results, such as ``obs``, may
-    always be written."""
+    """The fields that it may write, by argument: "inputs", "memory", "lasting" (lasting memory and the model), or
+    "start" (all that a reset may write). Rows for results, such as ``obs``, may always be written."""
 
     @property
     def signature(self) -> str:
@@ -54,18 +53,18 @@ class TaskFunction:
 
     @property
     def argument_names(self) -> tuple[str, ...]:
-        """The names of its arguments, in order, with those that may be left out."""
+        """The names of all its arguments, in order."""
         arguments = ", ".join(filter(None, (self.arguments, self.optional)))
         return tuple(argument.partition(": ")[0] for argument in arguments.split(", "))
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The annotations of its arguments, in order."""
+        """The annotations of its required arguments, in order."""
         return _kinds(self.arguments)
 
     @property
     def all_kinds(self) -> tuple[str, ...]:
-        """The same with the arguments that may be left out."""
+        """The annotations of all its arguments, in order."""
         return self.kinds + _kinds(self.optional)
 
 
@@ -81,13 +80,13 @@ FUNCTIONS = {
     function.name: function
     for function in (
         TaskFunction("observe", "s: World, p: Params, obs: Row[float]", None,
-                     "Writes the observation. The only function that is required. With ``rng`` as a last argument it "
-                     "may draw noise.", optional=_RNG),
+                     "Writes the observation. Every task needs this function. With ``rng`` as a last argument it may "
+                     "draw noise.", optional=_RNG),
         TaskFunction("control", "s: World, action: Row[float], p: Params, ctrl: Row[float]", None,
                      "Turns an action into controls, and writes further inputs. Default: copies it, or scales it (see "
                      "``action_range``).", "pass", writes={"s": "inputs"}),
         TaskFunction("reward", _TRANSITION, float,
-                     "Reward of one transition. ``s1.memory`` is already that of ``advance``. Default: 0.",
+                     "Reward of one transition. ``advance`` has already written ``s1.memory``. Default: 0.",
                      "return 0.0"),
         TaskFunction("measure", f"{_TRANSITION}, metrics: Row[float]", None,
                      "Writes the metrics of one transition, in the order of the attribute ``metrics``. Default: none.",
@@ -103,7 +102,7 @@ FUNCTIONS = {
                      "Draws model fields and lasting memory once for each world, when its random stream starts. "
                      "Default: keeps them.", "pass", writes={"s": "lasting"}),
         TaskFunction("initialize", "s: World, p: Params", None,
-                     "Changes the fixed initial state, the model's own. Default: keeps it.", "pass",
+                     "Changes the fixed initial state, which is the model's. Default: keeps it.", "pass",
                      writes={"s": "start"}),
         TaskFunction("randomize", f"s: World, p: Params, {_RNG}", None,
                      "Turns the fixed initial state into a random one. Default: keeps it.", "pass",
@@ -125,10 +124,10 @@ FUNCTIONS = {
 
 
 RESULTS = ("obs", "ctrl", "metrics", "rng")
-"""Rows among the arguments of functions that a function may write."""
+"""Arguments that are rows for results, which a function may write."""
 
 MEMORIES = ("memory", "lasting_memory")
-"""Fields of World that the task itself declares, by the names of its attributes with their sizes."""
+"""Fields of World for a task's memory. The class attributes of the same names are their sizes."""
 
 GROUP_PREFIX = "observe_"
 """``observe_critic`` writes the group ``critic`` of the observations."""
@@ -150,13 +149,13 @@ def _document_functions(cls: type["Task"]) -> type["Task"]:
 
 
 class Element(int):
-    """The place of a named element of the model, found when the model is known. Functions such as ``site`` make it."""
+    """A named element of the model, whose index is looked up in the compiled model. ``site`` and others make it."""
 
     field: str
     name: str
 
     def __new__(cls, field: str, name: str) -> "Element":
-        """An integer that holds the element's name; its own value is never used."""
+        """An integer with the element's name; its own value is not used."""
         element = super().__new__(cls, -1)
         element.field, element.name = field, name
         return element
@@ -198,12 +197,12 @@ def actuator(name: str) -> int:
 
 
 def ctrl(actuator: str) -> int:
-    """As a default in Params: where an actuator's controls begin in ``ctrl``. Most have one."""
+    """As a default in Params: the index of an actuator's first control in ``ctrl``. Most actuators have one."""
     return Element("ctrl", actuator)
 
 
 def act(actuator: str) -> int:
-    """As a default in Params: where an actuator's activations begin in ``act``."""
+    """As a default in Params: the index of an actuator's first activation in ``act``."""
     return Element("act", actuator)
 
 
@@ -213,17 +212,17 @@ def joint(name: str) -> int:
 
 
 def qpos(joint: str) -> int:
-    """As a default in Params: where a joint's coordinates begin in ``qpos``."""
+    """As a default in Params: the index of a joint's first coordinate in ``qpos``."""
     return Element("qpos", joint)
 
 
 def dof(joint: str) -> int:
-    """As a default in Params: where a joint's degrees of freedom begin in ``qvel`` and fields of its size."""
+    """As a default in Params: the index of a joint's first degree of freedom in ``qvel`` and fields of its size."""
     return Element("qvel", joint)
 
 
 def sensor(name: str) -> int:
-    """As a default in Params: where a sensor's numbers begin in ``sensordata``."""
+    """As a default in Params: the index of a sensor's first number in ``sensordata``."""
     return Element("sensordata", name)
 
 
@@ -235,7 +234,7 @@ def mocap(body: str) -> int:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Planning:
-    """A task's settings for MPPI: those of the planner, and options and parameters of its worlds.
+    """A task's settings for MPPI: settings of the planner, and options and parameters of its worlds.
 
     Raises:
         ValueError: A part is not a dict.
@@ -244,10 +243,10 @@ class Planning:
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Settings of the planner, by the names of ``lw.MPPIConfig``."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Options of the planner's worlds, by the names that ``lw.make`` knows, as ``{"integrator": "euler"}``."""
+    """Options of the planner's worlds, by the names of ``lw.make``, such as ``{"integrator": "euler"}``."""
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Parameters of the planner's worlds, by the names of the task's ``Params``. They do not apply where MPPI is given
-    a value function, because that was fitted to the rewards of the task itself."""
+    """Parameters of the planner's worlds, by the names of the task's ``Params``. They are ignored if MPPI has a value
+    function, because that was fitted to the rewards of the unchanged task."""
 
     def __post_init__(self) -> None:
         """Check the type of every part."""
@@ -259,18 +258,18 @@ class Planning:
 @_document_functions
 @document_attributes
 class Task:
-    """A model, the fields that are read, and a few functions of one world.
+    """The base class of tasks: a model, the fields that functions read, and a few functions of one world.
 
-    A subclass names its model and the parts of its observation. Its module holds two Warp structs, ``World`` (the
+    A subclass names its model and the parts of its observation. Its module has two Warp structs, ``World`` (the
     fields that the functions read, by MuJoCo's names) and ``Params`` (the keyword arguments of ``make``, with
     defaults; ``dt`` and ``substep_dt``, the seconds in a step and in a substep, are filled in), and the functions, each
-    a ``wp.func``. Each of these may also be an attribute of the class.
+    a ``wp.func``. Structs and functions may also be attributes of the class.
 
     ``World`` lists fields of MjData, such as ``qpos`` and ``site_xpos``, and fields of MjModel, such as ``body_mass``
     and ``geom_friction``, under MuJoCo's names. Model fields that ``startup``, ``initialize``, ``randomize`` or
-    ``event`` write differ between worlds and belong to the state; all others are the model's own.
+    ``event`` write differ between worlds and belong to the state; all other model fields are the same in all worlds.
 
-    A default in ``Params`` may name an element of the model, as ``tip: int = lw.site("tip")``: the functions then get
+    A default in ``Params`` may name an element of the model, such as ``tip: int = lw.site("tip")``: the functions get
     its index. ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``, ``lw.actuator``,
     ``lw.ctrl``, ``lw.act``, ``lw.tendon``, ``lw.equality``, ``lw.sensor`` and ``lw.mocap`` work likewise. A field of
     type ``wp.array[float]``, ``wp.array2d[wp.vec3]`` or the like is a table that all worlds share, such as a motion to
@@ -280,53 +279,52 @@ class Task:
     {functions}
 
     ``s``, ``s0`` and ``s1`` are one world's fields: now, before the step, and after it. Fields of the position and
-    velocity stages belong to that state; fields of the acceleration stage (forces, accelerations) are those of the last
-    substep. Each sensor follows its own stage; acceleration-stage sensors are those of the last substep. Controls are
-    clipped to the model's ranges; costs see the action as given. ``rng`` is the world's random stream: pass it to
-    ``lw.uniform`` and ``lw.normal``.
+    velocity stages belong to that state; fields of the acceleration stage (forces, accelerations) come from the last
+    substep. Each sensor has the stage of its quantity. Controls are clipped to the model's ranges; ``reward`` sees the
+    action as given. ``rng`` is the world's random stream: pass it to ``lw.uniform`` and ``lw.normal``.
 
-    A function may write the following fields where ``World`` lists them; any other write is refused:
+    A function may write the following fields if ``World`` lists them; any other write is refused:
 
     - ``control``: the inputs xfrc_applied, qfrc_applied, mocap_pos, mocap_quat and userdata. An input keeps its value
       until it is written again; a reset clears it.
     - ``initialize``, ``randomize`` and ``event``: qpos, qvel, act, ctrl, eq_active, the inputs, memory, lasting_memory
-      and model fields. At every reset these model fields get their nominal values back before ``initialize`` runs, so
+      and model fields. Every reset restores the nominal values of these model fields before ``initialize`` runs, so
       that draws never add up. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
-      ``sensordata``): these are computed afterwards.
-    - ``startup``: model fields and lasting_memory, which resets then leave as they are.
-    - ``substep``: memory and lasting_memory. ``advance``: the same of ``s1``.
+      ``sensordata``), which are computed afterwards.
+    - ``startup``: model fields and lasting_memory, which resets then do not change.
+    - ``substep``: memory and lasting_memory. ``advance``: memory and lasting_memory of ``s1``.
 
     ``reject`` sees an initial state before it settles. While a new episode settles, no ``substep`` runs.
 
-    An event belongs to the environment's randomness: the transition that was judged ends before it, the observation
-    that follows shows it. It does not run in worlds that restart. Open-loop rollouts and planners leave events out.
+    An event runs after the transition is judged and before the next observation, and not in worlds that restart.
+    Open-loop rollouts and planners leave events out.
 
     Quaternions in fields are in MuJoCo's order w, x, y, z, and typed ``Row[lw.quat]``. Warp's own quaternion functions
     expect x, y, z, w and refuse them: use ``lw.quat_rotate``, ``lw.quat_mul``, ``lw.quat_from_axis_angle`` and others.
     """
 
     model: ClassVar[Any]
-    """The model: a file (relative to the task's own file, or one that gymnasium ships), a file of another package as
-    ``lw.package_model(...)`` names it, an MjSpec, or a static method without arguments that returns one of these."""
+    """The model: a file (relative to the task's file, or one that gymnasium ships), ``lw.package_model(...)`` for a
+    file of another package, an MjSpec, or a static method without arguments that returns one of these."""
     frame_skip: ClassVar[int] = 1
     """Substeps in a step."""
     obs: ClassVar[Any]
-    """The observation's parts and their sizes, in order, as ``{"position": 5, "velocity": 6}``; or a static method of
-    the Params that returns them. A task may have several groups of observations, as ``{"policy": {"position": 5},
-    "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy``, which is ``env.obs``, and
-    ``observe_critic``, with the same arguments, writes the group ``critic``."""
+    """The observation's parts and their sizes, in order, such as ``{"position": 5, "velocity": 6}``; or a static method
+    of the Params that returns them. A task may have several groups of observations, such as
+    ``{"policy": {"position": 5}, "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy``,
+    which is ``env.obs``, and ``observe_critic``, with the same arguments, writes the group ``critic``."""
     metrics: ClassVar[tuple[str, ...]] = ()
     """Names of the metrics that ``measure`` writes, such as the terms of the reward."""
     horizon: ClassVar[int] = 1000
     """Steps after which an episode is truncated; 0 for never."""
     success_steps: ClassVar[int] = 1
-    """Steps in a row at whose end ``success`` must be True before ``env.success`` is. With more than 1, the steps so
-    far belong to the state, in its part ``success_steps``, where they count up to this number. A reset clears them."""
+    """Number of successive steps that must end with ``success`` before ``env.success`` is True. If it is more than 1,
+    the state has the count so far, in its part ``success_steps``, and a reset clears it."""
     lagged: ClassVar[tuple[str, ...]] = ()
-    """Fields to read as ``mj_step`` leaves them, one substep behind the state, as some Gymnasium tasks do."""
+    """Fields that keep the values that ``mj_step`` leaves, one substep behind the state, as in some Gymnasium tasks."""
     cleared: ClassVar[tuple[str, ...]] = ()
-    """Fields left by the last substep, as forces, that are 0 at the beginning of an episode. Otherwise they are
-    computed there, which takes a forward pass of the worlds that restart. A reset clears them before ``initialize``."""
+    """Fields left by the last substep, such as contact forces, to zero at the start of an episode. Otherwise they are
+    computed then, which takes a forward pass of the worlds that restart. A reset clears them before ``initialize``."""
     memory: ClassVar[int] = 0
     """Number of floats in the field ``memory``, which the task writes in ``advance`` and which belongs to the state.
     ``World`` must list it as ``memory: Row[float]``. A reset clears it."""
@@ -335,7 +333,7 @@ class Task:
     curriculum. It is cleared only when a world's random stream starts, by ``rand_reset(seed=...)``, and ``startup``
     may write it then."""
     actions: ClassVar[Mapping[str, int] | None] = None
-    """The parts of an action and their sizes, as ``{"speed": 1, "turn": 1}``, where actions are not controls;
+    """The parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls;
     ``control`` then turns them into inputs. None: an action has one number for each control."""
     action_range: ClassVar[tuple[float, float] | None] = None
     """The range of an action, which the default ``control`` scales to the model's control ranges; None: actions are
@@ -345,30 +343,29 @@ class Task:
     draws: ClassVar[int] = 10
     """The most random initial states that a reset draws while ``reject`` returns True; the last is kept."""
     settle: ClassVar[int] = 0
-    """Substeps in which a new episode, drawn and not rejected, settles before its first observation, under the
-    controls of its initial state and without ``substep``; its time then starts from 0."""
+    """Substeps in which an initial state settles before the first observation of its episode, under its own controls
+    and without ``substep``. The time then starts from 0."""
     gymnasium: ClassVar[str | None] = None
-    """Id of the Gymnasium environment whose model, observation, reward, termination, reset and parameters the task
-    has, as "Hopper-v5"; None where there is no such environment. Subclasses do not inherit it."""
+    """Id of the Gymnasium environment that the task reimplements, with its model, observation, reward, termination,
+    reset and parameters, such as "Hopper-v5"; None if there is none. Subclasses do not inherit it."""
     trace: ClassVar[str | None] = None
     """Name of the site or body whose path the viewer draws for a planner's samples. None: the centre of mass of a robot
     whose base moves freely, or the end of an arm."""
     planning: ClassVar[Planning] = Planning()
-    """The task's settings for MPPI: those of the planner, and options and parameters of its worlds, as
-    ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
+    """The task's settings for MPPI, such as ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
 
-    # World, Params and functions of the class's module when the class was made; each subclass has its own
+    # World, Params and functions of the module at the time of the class's definition
     scope: ClassVar[dict[str, Any]]
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Change the model before it is compiled; also a model that ``make`` was given. Default: keeps it."""
+        """Change the model before it is compiled, also one that was passed to ``make``. Default: keeps it."""
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
         if "gymnasium" not in vars(cls):
             cls.gymnasium = None
-        # now: another task, in a later cell of the same notebook, has the same names
+        # copied now, because a later cell of a notebook may define another task with the same names
         module = vars(sys.modules[cls.__module__])
         cls.scope = {
             name: value

@@ -4,6 +4,7 @@ import contextlib
 import json
 import logging
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from lyceum_warp.runs.metrics_table import cut_rows
 from lyceum_warp.runs.saving import Saver
 from lyceum_warp.runs.task_copy import note_changes, run_params, task_copy
 from lyceum_warp.support.interrupts import Interrupted, ending, postponed
-from lyceum_warp.support.validate import check_flag, check_function, check_kind, whole_number
+from lyceum_warp.support.validate import check_flag, check_function, check_kind, positive_number, whole_number
 from lyceum_warp.support.versions import versions
 from lyceum_warp.viz.cameras import CameraChoice, find_camera
 from lyceum_warp.viz.policy_videos import Videos
@@ -57,6 +58,7 @@ def train(
     iterations: int = 100,
     callback: Callback | None = None,
     target_return: float | None = None,
+    minutes: float | None = None,
     keep_every: int = 0,
     save_every: int = 0,
     tensorboard: bool = False,
@@ -85,6 +87,7 @@ def train(
         callback: Called with each iteration after its row was written. Training ends if it returns True. If it raises
             an error, the run is saved, and the error is raised again.
         target_return: Training ends once the return that selects the best policy reaches this number.
+        minutes: Training ends with the iteration in which this call has trained for so long; None for no limit.
         keep_every: Iterations between two numbered policies; 0 for none.
         save_every: Iterations between two saves; 0 to save by time.
         tensorboard: Whether to also write the metrics for TensorBoard.
@@ -118,6 +121,7 @@ def train(
     check_flag("tensorboard", tensorboard)
     if target_return is not None and (not isinstance(target_return, (int, float)) or math.isnan(target_return)):
         raise ValueError(f"target_return must be a number, not {target_return!r}")
+    limit = math.inf if minutes is None else 60 * positive_number("minutes", minutes, "minutes")
     settings: dict[str, Any] = {
         "iterations": whole_number("iterations", iterations, low=1),
         "target_return": None if target_return is None else float(target_return),
@@ -160,7 +164,7 @@ def train(
             shown.enter_context(display.training(run, learner, iterations))
             callbacks = [function for function in (board, display, videos, callback) if function is not None]
         try:
-            _learn(learner, saver, iterations, callbacks, target_return)
+            _learn(learner, saver, iterations, callbacks, target_return, limit)
         except Exception as error:
             if leads and saver.saved >= 0:
                 error.add_note(f"the run in {run.folder} is saved up to iteration {saver.saved}")
@@ -169,10 +173,11 @@ def train(
 
 
 def _learn(
-    learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None
-) -> None:
-    """Iterate. All ranks agree on when the run is saved and when it ends."""
-    team, run = learner.team, saver.run
+    learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None,
+    limit: float,
+) -> None:  # fmt: skip
+    """Iterate for at most ``limit`` seconds. All ranks agree on when the run is saved and when it ends."""
+    team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
     with ending(), postponed(insist=team.size == 1) as noted:
         if saver.saved != learner.iteration:
@@ -190,7 +195,7 @@ def _learn(
                     ended = function(iteration) is True or ended
             except Exception as raised:
                 error = raised
-            ended = ended or error is not None or learner.iteration >= iterations
+            ended = ended or error is not None or learner.iteration >= iterations or time.monotonic() >= deadline
             numbers = max(noted, default=0), ended, error is not None, saver.due()
             signal, last, failed, due = team.largest(*map(int, numbers))
             if signal or last or due:

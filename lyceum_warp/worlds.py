@@ -352,7 +352,7 @@ class Worlds(WorldArrays):
         self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)
 
     def _read_state(self) -> None:
-        # with automatic resets an end is over with its step, without them it stays
+        # with automatic resets done_reason belongs to one step only; without them it is part of the state
         self.pack_state(self._no_fault if self.autoreset else self.outcome.done_reason)
 
     # for environments and open-loop rollouts

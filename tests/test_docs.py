@@ -148,12 +148,6 @@ def test_the_page_on_a_task_of_your_own_keeps_its_promises(empty_folder: Path, m
         assert (empty_folder / "runs" / video).stat().st_size > 10_000
 
 
-def test_the_task_of_the_page_has_under_fifty_lines() -> None:
-    blocks = BLOCK.findall((ROOT / "docs" / "own_task.md").read_text())
-    (source,) = (text for _, title, text in blocks if title.endswith(".py"))
-    assert len(source.splitlines()) < 50
-
-
 def anchors(document: Path) -> set[str]:
     """The headings of a document, as links name them."""
     headings = re.findall(r"^#+ (.+)$", document.read_text(), re.MULTILINE)
@@ -192,15 +186,6 @@ def test_the_workflow_runs_the_checks_on_every_supported_python() -> None:
     assert "bash .ci/run" in commands and "make test-all" in commands
     classifiers = re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text())
     assert job["strategy"]["matrix"]["python"] == classifiers
-
-
-@pytest.mark.parametrize("form", sorted((ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml")), ids=name_of)
-def test_issue_forms_have_labelled_fields(form: Path) -> None:
-    content = pytest.importorskip("yaml").safe_load(form.read_text())
-    assert content["name"] and content["description"]
-    fields = [field for field in content["body"] if field["type"] != "markdown"]
-    assert fields and all(field["attributes"]["label"] for field in fields)
-    assert len({field["id"] for field in fields}) == len(fields)
 
 
 def test_the_citation_names_this_release_and_the_paper() -> None:

@@ -5,54 +5,14 @@ import gc
 import multiprocessing
 import pickle
 import sys
-import traceback
 import weakref
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
 import lyceum_warp as lw
-
-PACKAGE = Path(lw.__file__).parent
-
-
-def own_frames() -> list[tuple[str, str]]:
-    """The files and functions of the package on the stack, outermost first."""
-    frames = [(Path(frame.filename), frame.name) for frame in traceback.extract_stack()]
-    return [(str(path.relative_to(PACKAGE)), name) for path, name in frames if path.is_relative_to(PACKAGE)]
-
-
-class Spy:
-    """Passes everything on, and keeps the stack of calls of ``step``."""
-
-    def __init__(self, batch: Any) -> None:
-        self.batch, self.stacks = batch, []
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.batch, name)
-
-    def step(self, *args: Any, **kwargs: Any) -> Any:
-        self.stacks.append(own_frames())
-        return self.batch.step(*args, **kwargs)
-
-
-def test_a_step_reaches_the_c_engine_through_two_functions() -> None:
-    env = lw.make("hopper", nworld=2)
-    env.engine.batch = spy = Spy(env.engine.batch)  # type: ignore[attr-defined]
-    env.step()
-    assert spy.stacks == [[("env.py", "step"), ("engines/c/mujoco_engine.py", "_advance")]]
-
-
-def test_the_phases_of_a_step_are_one_list_in_order() -> None:
-    def names(task: str, engine: str) -> list[str]:
-        return [phase.name for phase in lw.make(task, engine=engine).worlds.step_phases()]
-
-    assert names("reach", "warp") == ["act", "physics", "judge", "restart", "refresh", "observe"]
-    assert names("hopper", "warp") == ["act", "physics", "judge", "restart", "observe"]  # it reads the state alone
-    assert names("hopper", "mujoco") == ["act", "inputs", "physics", "fields", "judge", "restart", "observe"]
 
 
 def test_a_field_that_is_not_kept_is_refused_with_the_way_to_get_it() -> None:

@@ -6,7 +6,6 @@ contacts, so only the Warp engine's contact overflow reaches other worlds.
 """
 
 import gc
-import importlib.util
 import warnings
 from pathlib import Path
 from typing import Any
@@ -183,20 +182,6 @@ def test_only_a_fault_restarts_a_world_without_automatic_resets(engine: str) -> 
     assert env.time[BAD] == 0 and (env.time[[0, 2, 3]] > 0).all()
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_bad_action_is_applied_as_zero(engine: str) -> None:
-    """The controls before the reset that follows are those of a zero action."""
-    env, clean = (lw.make("hopper", engine=engine, nworld=N) for _ in range(2))
-    env.action[:] = 0.5
-    env.action[BAD, 0] = np.nan
-    clean.action[:] = 0.5
-    clean.action[BAD] = 0
-    # the controls as a step sees them, before it resets the world
-    for each in (env, clean):
-        each.worlds.act()
-    assert torch.equal(wp.to_torch(env.engine.ctrl), wp.to_torch(clean.engine.ctrl))
-
-
 # wrong arguments
 
 
@@ -211,20 +196,9 @@ def test_a_bad_action_is_applied_as_zero(engine: str) -> None:
         ({"dt": 1.0}, "no parameter 'dt'"),
         ({"ctrl_cost_weight": float("nan")}, "ctrl_cost_weight=nan of 'hopper' is not a number"),
         ({"ctrl_cost_weight": "much"}, "ctrl_cost_weight='much' of 'hopper' is not a number"),
-        ({"ctrl_cost_weight": [1.0, 2.0]}, r"shape \(2,\); it takes one number, or one a world, \(4,\)"),
+        ({"ctrl_cost_weight": [1.0, 2.0]}, r"shape \(2,\); it takes one number, or one per world, \(4,\)"),
         ({"healthy_z_range": 1.0}, r"healthy_z_range of 'hopper' has shape \(\); it takes \(2,\)"),
         ({"terminate_when_unhealthy": 0.5}, "terminate_when_unhealthy=0.5 of 'hopper' must be a whole number"),
-        ({"nworld": 0}, "nworld must be a whole number from 1 to .*, not 0"),
-        ({"nworld": 2.5}, "nworld .* not 2.5"),
-        ({"nworld": "many"}, "nworld .* not 'many'"),
-        ({"frame_skip": -1}, "frame_skip must be a whole number from 1 to .*, not -1"),
-        ({"frame_skip": float("inf")}, "frame_skip .* not inf"),
-        ({"horizon": -5}, "horizon must be a whole number from 0 to .*, not -5"),
-        ({"horizon": 1.5}, "horizon .* not 1.5"),
-        ({"seed": -1}, "seed must be a whole number from 0 to 2147483647, not -1"),
-        ({"seed": 2**31}, "seed .* not 2147483648"),
-        ({"seed": "lucky"}, "seed .* not 'lucky'"),
-        ({"cone": "round"}, "no friction cone 'round': use 'pyramidal' or 'elliptic'"),
         ({"device": "tpu"}, "no device 'tpu' on this machine; it has 'cpu'"),
         ({"device": "cuda:77"}, "no device 'cuda:77' on this machine; it has 'cpu'.*nvidia-smi"),
         ({"engine": "bullet"}, "no engine 'bullet': use one of 'auto', 'mujoco', 'warp'"),
@@ -266,13 +240,6 @@ def test_a_model_that_mujoco_warp_refuses_runs_on_the_c_engine() -> None:
     with pytest.raises(ValueError, match="MuJoCo Warp refuses the model: .*; change the model, or use engine='mujoco'"):
         lw.make("hopper", engine="warp", model=spec)
     lw.make("hopper", engine="mujoco", model=spec).step()
-
-
-def test_a_missing_gymnasium_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "gymnasium" else find(name, *a))
-    with pytest.raises(FileNotFoundError, match="not installed: pip install 'gymnasium"):
-        lw.gymnasium_model("hopper.xml").spec()
 
 
 @pytest.fixture(scope="module")
@@ -351,3 +318,13 @@ def test_dropped_environments_are_freed() -> None:
         gc.collect()
         made.append(sum(issubclass(type(thing), (lw.Env, wp.array)) for thing in gc.get_objects()))
     assert made[1] == made[2]
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_an_absurd_speed_has_one_reason_on_both_engines(engine: str) -> None:
+    env = lw.make("hopper", nworld=6, engine=engine)
+    state = env.get_state()
+    state[:, env.state_space.parts["qvel"]] += 1e11 * torch.eye(6, dtype=state.dtype)
+    env.set_state(state, check=False)
+    env.step()
+    assert env.done_reason.tolist() == [int(Done.NAN)] * 6

@@ -6,7 +6,7 @@ import pytest
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp.fields import DERIVED_FIELDS, STATE_FIELDS, Stage, describe, elements, rows, vec10
+from lyceum_warp.fields import describe, elements, vec10
 from lyceum_warp.task import Element
 
 XML = """
@@ -54,36 +54,6 @@ def test_a_field_has_mujocos_shape_with_vectors_as_elements(
     field = describe(model, name)
     assert (field.shape, field.dtype) == (shape, dtype)
     assert field.size == np.size(getattr(mujoco.MjData(model), name))
-
-
-@pytest.mark.parametrize(
-    ("name", "lagged", "refresh", "reset", "snapshot"),
-    [
-        ("qpos", False, Stage.NONE, Stage.NONE, False),
-        ("xpos", False, Stage.POSITION, Stage.POSITION, False),
-        ("cvel", False, Stage.VELOCITY, Stage.VELOCITY, False),
-        ("xpos", True, Stage.NONE, Stage.POSITION, True),
-        ("qacc", False, Stage.NONE, Stage.ACCELERATION, True),  # of the last substep, so it is saved with the state
-        ("sensordata", False, Stage.POSITION, Stage.ACCELERATION, True),  # its accelerometer is of the last substep
-    ],
-)
-def test_a_field_names_the_stage_that_makes_it_current(
-    name: str, lagged: bool, refresh: Stage, reset: Stage, snapshot: bool, model: mujoco.MjModel
-) -> None:
-    field = describe(model, name, lagged=lagged)
-    assert (field.refresh, field.reset, field.snapshot) == (refresh, reset, snapshot)
-
-
-def test_a_cleared_field_needs_no_stage_after_a_reset(model: mujoco.MjModel) -> None:
-    assert describe(model, "qacc", cleared=True).reset == Stage.NONE
-    for name in ("qpos", "xpos", "sensordata"):
-        with pytest.raises(ValueError, match=f"the field '{name}' cannot be cleared: it belongs to the current state"):
-            describe(model, name, cleared=True)
-
-
-def test_every_field_is_one_of_mujocos(model: mujoco.MjModel) -> None:
-    for name in (*STATE_FIELDS, *DERIVED_FIELDS):
-        assert hasattr(mujoco.MjData(model), name)
 
 
 def test_an_unknown_field_is_refused_with_similar_ones(model: mujoco.MjModel) -> None:
@@ -157,12 +127,6 @@ def test_a_named_element_has_its_place_in_the_field(
 )
 def test_a_function_for_defaults_names_an_element(element: Element, place: int, model: mujoco.MjModel) -> None:
     assert elements(model, element.field, element.name).start == place
-
-
-def test_an_axis_is_as_long_as_its_field(model: mujoco.MjModel) -> None:
-    assert [rows(model, name) for name in ("xpos", "ctrl", "actuator_force", "actuator_gainprm", "jnt_range")] == [
-        4, 5, 5, 3, 2
-    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ LEVELS = {
 """The floor of every room: a room imports from lower floors, or from itself."""
 
 TESTED_BY = {
-    "done": "test_faults.py", "testing": "conformance",
+    "done": "test_faults.py", "task": "binding", "testing": "conformance",
     "world_arrays": "test_worlds.py",
 }  # fmt: skip
 """Tests of rooms that have none of their own name."""
@@ -268,11 +268,3 @@ def test_every_folder_of_tests_belongs_to_a_room_or_goes_across_rooms() -> None:
     assert folders <= rooms | ACROSS | {"bench"}
     described = (TESTS.parent / "docs" / "architecture.md").read_text()
     assert all(f"`tests/{name}/`" in described for name in ("conformance", "fuzz", "oracles", "stories"))
-
-
-def test_names_of_test_files_are_unique() -> None:
-    """Pytest imports them as modules of one folder."""
-    places = defaultdict(list)
-    for path in TESTS.rglob("*.py"):
-        places[path.name].append(str(path.relative_to(TESTS)))
-    assert not {name: paths for name, paths in places.items() if len(paths) > 1}

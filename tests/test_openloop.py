@@ -12,14 +12,11 @@ from conftest import SharedEnv
 import lyceum_warp as lw
 from lyceum_warp import Done, Row
 from lyceum_warp.binding.registry import find_task
-from lyceum_warp.engines.c import mujoco_engine as c
 from lyceum_warp.engines.c.native_rollout import NativeRollout
 from lyceum_warp.openloop import OpenLoop
 
 ENGINES = ["mujoco", "warp"]
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
-STEPWISE = {"go1_velocity"}
-"""Tasks with a ``control`` or a ``substep``, which must see the state at every step or substep."""
 
 
 # tasks of these tests: an arm of two joints above a floor
@@ -252,22 +249,6 @@ def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return calls
 
 
-@pytest.mark.parametrize("task", [*(name for name in PACKAGE if name not in STEPWISE), Forgetful])
-def test_one_native_call_gives_the_numbers_of_many_steps(
-    task: str | type[lw.Task], monkeypatch: pytest.MonkeyPatch, native_calls: list[int]
-) -> None:
-    loop = rollouts(task, 4, engine="mujoco")
-    state, actions = some_state(loop.env, 3), random_actions(loop.env, 4, 5)
-    fast = run(loop, state, actions)
-    assert len(native_calls) == 1, "the horizon was not one native call"
-    monkeypatch.setattr(c, "is_exact", lambda model, fields: False)
-    loop.env.engine._rollouts.clear()
-    slow = run(loop, state, actions)
-    assert len(native_calls) == 1
-    for name, value in fast.items():
-        assert torch.equal(value, slow[name]), name
-
-
 # everything that a task may do
 
 
@@ -346,23 +327,6 @@ def test_terminated_is_judged_for_each_state_alone(engine: str) -> None:
     changes = found["terminated"][1:, 0] != found["terminated"][:-1, 0]
     assert changes.sum() == 2 and not found["terminated"][[0, -1], 0].any(), "out and back in again"
     assert found["terminated"][-1, 1], "the other world swings the other way first"
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_the_same_state_and_actions_give_the_same_numbers_again(engine: str) -> None:
-    """Whatever was rolled out between; the tensors stay the same objects."""
-    loop = rollouts(Forgetful, 4, engine=engine)
-    state, other = some_state(loop.env, 1), some_state(loop.env, 2)
-    actions = random_actions(loop.env, 4, 0)
-    tensors = [loop.state, loop.actions, loop.reward, loop.terminated, loop.final_obs, loop.fault]
-    first = run(loop, state, actions)
-    changed = run(loop, other, -actions)
-    again = run(loop, state, actions)
-    assert not torch.equal(first["reward"], changed["reward"])
-    for name, value in first.items():
-        assert torch.equal(value, again[name]), name
-    now = [loop.state, loop.actions, loop.reward, loop.terminated, loop.final_obs, loop.fault]
-    assert all(a is b for a, b in zip(tensors, now, strict=True))
 
 
 # failures
@@ -504,13 +468,6 @@ def test_worlds_that_reset_and_bad_horizons_are_refused(shared_env: SharedEnv) -
     for horizon in (0, -1, 2.5, "a"):
         with pytest.raises(ValueError, match="horizon must be a whole number from 1"):
             OpenLoop(env, horizon)  # type: ignore[arg-type]
-
-
-def test_a_rollout_is_a_list_of_phases() -> None:
-    """One call of the engine for the whole horizon of a task whose actions are controls, else one for each step."""
-    names = [[phase.name for phase in rollouts(task, 2, engine="mujoco").phases] for task in (Forgetful, Servo)]
-    assert names[0] == ["start", "physics", "advance", "judge", "end"]
-    assert names[1] == ["start", "reset", "restore", *["act", "inputs", "physics", "fields", "judge"] * 2, "end"]
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])

@@ -48,12 +48,6 @@ def test_a_flat_call_is_split_into_options_physics_and_parameters() -> None:
     assert options.given() == {"nworld": 4, "cone": "elliptic"}
 
 
-def test_changed_keeps_all_other_options() -> None:
-    options = EnvOptions(nworld=4, horizon=7, physics=PhysicsOptions(cone="elliptic", njmax=24))
-    changed = options.changed({"nworld": 2, "njmax": 48})
-    assert changed.given() == {"nworld": 2, "horizon": 7, "cone": "elliptic", "njmax": 48}
-
-
 def test_options_of_another_type_are_refused() -> None:
     for make in (lw.make, lw.Env):
         with pytest.raises(ValueError, match=r"options must be .* as lw.EnvOptions\(nworld=64\), not dict"):

@@ -1,6 +1,5 @@
 """Training with a run's folder: ended, continued and warm-started."""
 
-import contextlib
 import os
 import shutil
 import signal
@@ -18,7 +17,6 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos.value_fit import ValueFit
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.training import Display
 
 
 @pytest.fixture
@@ -256,6 +254,17 @@ def test_training_ends_at_the_target_return(tmp_path: Path, capsys: pytest.Captu
     assert len(run.rows()) == 4
 
 
+def test_training_ends_after_its_minutes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "run"
+    run = lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=1000, minutes=1e-6)
+    assert len(run.rows()) == 1 and run.read()["iteration"] == 1
+    assert cli.main(["train", "--resume", str(folder), "--iterations", "1000", "--minutes", "1e-6", *QUIET]) == 0
+    assert "1e-06 minutes are over after 2 of 1000 iterations; continue with" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="minutes must be a positive number of minutes, not 0"):
+        lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "other", minutes=0)
+    assert not (tmp_path / "other").exists()
+
+
 # a run that was killed
 
 
@@ -283,14 +292,6 @@ def test_a_run_continues_from_the_last_complete_state_to_the_same_numbers(six: P
 
 
 # a new run from the policy of another
-
-
-def test_a_loaded_policy_learns_further(six: Path, env: lw.Env) -> None:
-    policy, value = lw.load(six), lw.load_value(six)
-    before = mean_action(policy)
-    npg = lw.NPG(env, policy, value, CONFIG)
-    next(npg)
-    assert npg.policy is policy and not torch.equal(mean_action(policy), before)
 
 
 def test_a_command_begins_with_the_policy_of_a_run(
@@ -367,22 +368,3 @@ def test_ppo_trains_by_the_same_loop_from_the_shell(six: Path, tmp_path: Path) -
     config = Run.open(tmp_path / "parts").config
     assert config["algorithm"] == "ppo" and config["ppo"]["hidden"] == [8] and "npg" not in config
     assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # the settings of NPG are not those of PPO
-
-
-def test_a_run_notes_what_its_caller_gives_and_shows_its_way(env: lw.Env, tmp_path: Path) -> None:
-    class Seen(Display):
-        def __init__(self) -> None:
-            self.seen: list[object] = []
-
-        @contextlib.contextmanager
-        def training(self, run: Run, learner: lw.Learner, iterations: int) -> Iterator[None]:
-            self.seen.append((run.folder, learner.iteration, iterations))
-            yield
-            self.seen.append("end")
-
-        def __call__(self, iteration: lw.Iteration) -> None:
-            self.seen.append(iteration.iteration)
-
-    display, folder = Seen(), tmp_path / "run"
-    lw.train(algorithm(env), folder, iterations=2, entries={"tag": "mine"}, display=display)
-    assert display.seen == [(folder, 0, 2), 1, 2, "end"] and Run.open(folder).config["tag"] == "mine"

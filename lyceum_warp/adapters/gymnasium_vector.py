@@ -111,7 +111,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
         Args:
             seed: Seed of the worlds' random streams; None continues them.
-            options: ``{"reset_mask": mask}`` resets the worlds in the mask alone, (num_envs,) bool.
+            options: ``{"reset_mask": mask}`` resets only the worlds in the mask, (num_envs,) bool.
 
         Returns:
             The observations and infos of all worlds.

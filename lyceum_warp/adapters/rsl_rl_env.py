@@ -17,7 +17,7 @@ from rsl_rl.env import VecEnv  # noqa: E402 (after the check)
 from tensordict import TensorDict  # noqa: E402
 
 RECENT = 100
-"""Episodes in the means of the log."""
+"""Number of recent episodes over which the logged means are taken."""
 
 
 class RslRlVecEnv(VecEnv):  # type: ignore[misc]
@@ -134,7 +134,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     def _log(self) -> dict[str, torch.Tensor]:
         """Means of the metrics over recent episodes, computed on the device.
 
-        rsl_rl averages the log over the steps of an iteration. Means over the last step alone would give a step with
+        rsl_rl averages the log over the steps of an iteration. Means over only the last step would give a step with
         one ended episode the weight of a step with a thousand.
         """
         env = self.env

@@ -73,7 +73,7 @@ class StableBaselines3VecEnv(VecEnv):
         """Begin new, random episodes in all worlds, and return their first observations.
 
         Raises:
-            ValueError: ``set_options`` gave an option; there is none.
+            ValueError: ``set_options`` set an option, but a reset has no options.
         """
         if options := next(filter(None, self._options), None):
             raise ValueError(f"reset has no option {next(iter(options))!r}: leave set_options out")

@@ -89,7 +89,7 @@ class Learner(abc.ABC):
     Args:
         env: The environment; do not step it between iterations.
         seed: Seed of new networks and of the noise.
-        team: The processes that learn together, each with its share of the worlds; by default this process alone.
+        team: The processes that learn together, each with its share of the worlds; by default only this process.
 
     Raises:
         ValueError: The environment does not reset automatically, its worlds are not this process's share, or the seed

@@ -191,7 +191,7 @@ class MPPIConfig:
 
 
 _OF_CEM = ("elites", "min_noise")
-"""Settings of CEM alone."""
+"""Settings that only CEM has."""
 
 SETTINGS = tuple(field.name for field in dataclasses.fields(MPPIConfig))
 """Names of the settings."""

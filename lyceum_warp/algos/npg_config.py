@@ -22,7 +22,7 @@ stayed low for long with 63 and 31 iterations, but not with 16 (bench/README.md,
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NPGConfig:
-    """Hyperparameters of NPG. The defaults are those of Rajeswaran et al. (2017), except as noted.
+    """Hyperparameters of NPG. The defaults follow Rajeswaran et al. (2017), except as noted.
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.

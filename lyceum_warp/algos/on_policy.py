@@ -117,7 +117,7 @@ class OnPolicyLearner(Learner):
         return self._advantage, self._return
 
     def _with_mean_policy(self, statistics: dict[str, Any]) -> dict[str, Any]:
-        """Add the statistics of the mean policy, evaluated every ``mean_every`` iterations, to those of the samples."""
+        """Add statistics of the mean policy, evaluated every ``mean_every`` iterations, to those of the samples."""
         every = self.config.mean_every
         mean: dict[str, Any] = dict.fromkeys(MEAN_STATISTICS)
         if every and self.iteration % every == 0:

@@ -1,4 +1,4 @@
-"""Planning by random rollouts: model predictive path integral control (MPPI), and two other updates of its plan.
+"""Plan by random rollouts: model predictive path integral control (MPPI), and two other updates of its plan.
 
 Each call improves a plan, a sequence of actions u_t, from the state that it is given:
 
@@ -12,7 +12,7 @@ Each call improves a plan, a sequence of actions u_t, from the state that it is 
 
 The formulation is that of Williams et al. (2017, "Information theoretic MPC for model-based reinforcement learning")
 without a cost on the controls, as in Lyceum (Summers et al. 2020) and in trajopt, which also is the source of the
-smoothing. Returns are divided by the temperature: the 5 of Summers et al. for their arm, an inverse, is 0.2 here.
+smoothing. Returns are divided by the temperature. Summers et al. give inverse temperatures: their 5 is 0.2 here.
 
 With several plants every plant has a plan, and the samples of all plans are rolled out together: a plan of few samples
 leaves most of a GPU, or most threads, without work.
@@ -77,11 +77,11 @@ class Planner:
 
     ``plants=n`` plans for n plants at a time, as ``env.step(plan(env.get_state()))`` in an environment with n worlds.
     Plant i has the noise of the seed ``seed + i``, and so the plan that a planner with this seed makes on the same
-    engine; with ``models``, all plants have those of the first seed. The buffers, except ``model_fields``, then have an
-    axis for the plants: the second one where the first counts steps or knots, otherwise the first.
+    engine; with ``models``, all plants have the models of the first seed. The buffers, except ``model_fields``,
+    then have an axis for the plants: the second one if the first counts steps or knots, otherwise the first.
 
     A task's ``planning`` (see ``lw.Planning``) gives settings of the planner, and options and parameters of its
-    worlds. Arguments replace what the task gives.
+    worlds. Arguments replace the values of the task.
 
     Args:
         task: Name of a task, a file with one, or its class.
@@ -90,7 +90,7 @@ class Planner:
             (nworld, nobs) observations to (nworld,) values, or a Warp function of one observation,
             ``value(obs: Row[float]) -> float``, which becomes part of the graph on the Warp engine. With a value the
             parameters in ``planning`` do not apply, because the value function was fitted to the task's own rewards.
-        seed: Seed of the noise. With several plants, that of the first one, or a list with one for each.
+        seed: Seed of the noise. With several plants, the seed of the first plant, or a list with a seed for each.
         plants: Number of plants to plan for.
         params: Parameters of the task, for names that are also settings.
         words: Single settings, by the names of ``lw.MPPIConfig`` (None leaves one as it is), and ``update`` may be an
@@ -111,8 +111,8 @@ class Planner:
     settings: dict[str, Any]
     """The same settings with the options and parameters of the planner's worlds, as JSON can hold them."""
     actions: torch.Tensor
-    """The plan, (horizon, nact); the first row is what the last call returned. To start from another plan, write into
-    it; with knots, into ``knot_actions``."""
+    """The plan, (horizon, nact); the first row is the action that the last call returned. To start from another
+    plan, write into it; with knots, into ``knot_actions``."""
     nominal: torch.Tensor
     """The plan that the last improvement started from, (horizon, nact)."""
     knot_actions: torch.Tensor
@@ -350,7 +350,7 @@ class Planner:
         dim = (self._nsample, self._plan.shape[2])
         wp.launch(planning.draw_noise, dim, [self._seed, self._count, self._noise], device=device)
         wp.launch(planning.draw_keys, self.env.nworld, [self._seed, self._count, self._keys], device=device)
-        wp.launch(planning.count_up, self.plants, [self._count], device=device)
+        wp.launch(planning.add_to, self.plants, [1, self._count], device=device)
         bounds = [self._smoothing, bool(self.config.include_plan), self._low, self._high, self._samples]
         if self._deviation is not None and self._nominal_deviation is not None:
             self._shifted(first, self._deviation, self._first_deviation, False, self._nominal_deviation)
@@ -537,8 +537,8 @@ class MPPI(Planner):  # noqa: D101
 class CEM(MPPI):
     """The cross-entropy method: ``lw.CEM(task, ...)`` is ``lw.MPPI(task, update="cem", ...)``.
 
-    The new plan is the mean of the best samples, and their standard deviation becomes that of the noise, which is kept
-    between calls and starts again with ``reset``. In the names of other packages:
+    The new plan is the mean of the best samples, and their standard deviation is the new one of the noise. It is kept
+    between calls, and ``reset`` restores the initial one. In the names of other packages:
 
     ============= =============== ========================
     here          hydrax          judo
@@ -551,7 +551,7 @@ class CEM(MPPI):
     ``spline``    spline_type     spline_order
     ============= =============== ========================
 
-    Its arguments are those of ``lw.MPPI``, except ``update``.
+    It takes the arguments of ``lw.MPPI``, except ``update``.
     """
 
     _only_update = "cem"
@@ -561,7 +561,7 @@ class PredictiveSampling(MPPI):
     """Predictive sampling: ``lw.MPPI`` with ``update="predictive_sampling"``.
 
     The best sample is the new plan. Howell et al. (2022), hydrax, judo and MuJoCo MPC plan with knots: give ``knots``
-    and ``spline``. The arguments are those of ``lw.MPPI``, except ``update``.
+    and ``spline``. It takes the arguments of ``lw.MPPI``, except ``update``.
     """
 
     _only_update = "predictive_sampling"

@@ -1,4 +1,4 @@
-"""The states that a planner is given: made from their parts, and checked."""
+"""Make and check the states from which a planner plans."""
 
 import math
 from collections.abc import Mapping
@@ -56,7 +56,7 @@ def checked_state(env: Env, state: torch.Tensor, like: torch.Tensor) -> torch.Te
     if state.device.type != "cpu":  # the check would wait for the device; there every sample fails, and the plan stays
         return state
     values = state.numpy().ravel()
-    # one call, as a plan may take a millisecond; only what is not finite, or beyond 1e150, is looked at again
+    # one call, as a plan may take a millisecond; only values that are not finite, or beyond 1e150, are checked again
     if not math.isfinite(values.dot(values)) and not (finite := np.isfinite(values)).all():
         where = int(np.flatnonzero(~finite)[0])
         plant, column = divmod(where, env.state_space.size)

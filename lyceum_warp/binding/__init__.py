@@ -1,1 +1,1 @@
-"""From a task's functions and model to kernels and a compiled model; the registry of tasks."""
+"""Find tasks, and bind them to their compiled models and kernels."""

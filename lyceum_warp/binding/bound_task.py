@@ -1,9 +1,8 @@
-"""A task bound to its model and its parameters, with its kernels."""
+"""Bind a task to its model and its parameters, and make its kernels."""
 
 import difflib
 import keyword
 import math
-import re
 from collections.abc import Collection, Mapping
 from types import SimpleNamespace
 from typing import Any
@@ -14,9 +13,8 @@ import warp as wp
 
 from lyceum_warp.binding import models
 from lyceum_warp.binding.codegen import kernels_of
-from lyceum_warp.binding.functions import TaskSource
+from lyceum_warp.binding.functions import TaskSource, draws_noise
 from lyceum_warp.binding.parameters import Parameters
-from lyceum_warp.binding.probe import Probe
 from lyceum_warp.binding.registry import task_name
 from lyceum_warp.binding.writes import Rights, check_writes, written_fields
 from lyceum_warp.fields import INITIAL, INPUTS, Field, describe, is_data_field, similar_data_fields, vec10
@@ -31,13 +29,13 @@ _SPELLED = {
 }  # fmt: skip
 
 _MOST_SUCCESS_STEPS = 2**24
-"""Up to here a float32, as counts are kept, holds every whole number."""
+"""Steps are counted in float32, which holds every whole number up to this one."""
 
 _PARTS = 'the parts of its observation, as obs = {"position": 5}'
 
 
 def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSpec:
-    """A task's model, or another one that is given for it, as the task edits it; see ``models.load_spec``."""
+    """The MjSpec of a task's own model or of another one, after the task's ``edit_model``."""
     return _edited(task, _read_spec(task, model))
 
 
@@ -83,10 +81,10 @@ def check_field_name(name: str) -> None:
 
 
 def obs_layouts(task: type[Task], params: Mapping[str, Any]) -> dict[str, dict[str, int]]:
-    """The parts of each group of a task's observations and their sizes, for values of its parameters.
+    """The parts of each group of a task's observations and their sizes, for given values of its parameters.
 
     Raises:
-        ValueError: The task does not say them as it must.
+        ValueError: ``obs`` of the task is not a dict of sizes, or a dict of groups of them.
     """
     name = task_name(task)
     given = task.obs(SimpleNamespace(**params)) if callable(task.obs) else task.obs
@@ -97,14 +95,14 @@ def obs_layouts(task: type[Task], params: Mapping[str, Any]) -> dict[str, dict[s
         given = {"policy": given}
     elif not all(grouped) or "policy" not in given:
         raise ValueError(
-            f"obs of the task {name!r} must name parts with sizes, or groups of them, of which one is 'policy', not "
-            f"{given!r}"
+            f"obs of the task {name!r} must be a dict of parts and sizes, or of groups of them, one of them 'policy', "
+            f"not {given!r}"
         )
     for group in given:
         if not (isinstance(group, str) and group.isidentifier()) or keyword.iskeyword(group):
             raise ValueError(
-                f"obs of the task {name!r} has the group {group!r}: a group's name must be a Python name, as 'critic', "
-                "which observe_critic writes"
+                f"obs of the task {name!r} has the group {group!r}: a group's name must be a Python name, such as "
+                "'critic', which observe_critic writes"
             )
     return {group: _layout(name, layout) for group, layout in given.items()}
 
@@ -121,11 +119,11 @@ class BoundTask:
     Args:
         task: The task's class.
         nworld: Number of worlds, for parameters that differ between them.
-        model: Another model than the task's own.
-        fields: Fields that the engine keeps beside those of the task.
-        dynamics: Model fields that may differ between worlds beside those that the task writes.
-        physics: How the worlds are simulated.
-        params: Values for the fields of ``Params``; for a scalar also one value a world.
+        model: A model to use instead of the task's own.
+        fields: Fields that the engine keeps in addition to those in ``World``.
+        dynamics: Model fields that may differ between worlds in addition to those that the task writes.
+        physics: Options of the simulation.
+        params: Values for the fields of ``Params``; for a scalar, one value or one per world.
 
     Raises:
         ValueError: Parts of the task, the parameters or the options do not fit together.
@@ -158,7 +156,7 @@ class BoundTask:
         own = [name for name in named if is_data_field(name)]
         of_model = [name for name in named if name not in own]
         self.spec = _read_spec(task, model)
-        """The model as it was read: other environments of the same task are made from it, not from its source."""
+        """The model before ``edit_model``. Replicas are made from it, because its source may have changed."""
         self.model = models.compile_model(_edited(task, self.spec), own, physics, varied={*of_model, *dynamics})
         self._check_actions()
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
@@ -169,14 +167,14 @@ class BoundTask:
             describe(self.model, name, lagged=name in task.lagged, cleared=name in task.cleared, written=name in inputs)
             for name in dict.fromkeys([*own, "time", "ctrl"])
         ]
-        """The fields that the engine keeps: the task's own, further ones, time and controls."""
+        """The fields that the engine keeps: those in World, the requested ones, time and controls."""
         self._sort_model_fields(of_model, dynamics)
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
-        """The integration state at which a reset starts, (integration_size,) float64; None for the model's own."""
+        """The integration state at which a reset starts, (integration_size,) float64; None for the model's default."""
         self.parameters = Parameters(
             self.source.params, self.name, self.model, nworld=nworld, timestep=self.timestep, given=params or {}
         )
-        self.obs_layouts = self._layouts()
+        self.obs_layouts = obs_layouts(task, self.params)
         """The parts of each group of observations and their sizes."""
         self.observers = self.source.group_functions(self.obs_layouts)
         """The functions that write the groups of observations, by the groups' names."""
@@ -186,18 +184,13 @@ class BoundTask:
 
     @property
     def params(self) -> dict[str, Any]:
-        """The parameters' values by name; arrays where they differ between worlds."""
+        """The parameters' values by name; an array for a parameter that differs between worlds."""
         return self.parameters.values
 
     @property
-    def has_noise(self) -> bool:
-        """Whether an observation draws random numbers."""
-        return any(len(function.input_types) > len(FUNCTIONS["observe"].kinds) for function in self.observers.values())
-
-    @property
-    def obs_layout(self) -> dict[str, int]:
-        """The parts of the policy's observation and their sizes."""
-        return self.obs_layouts["policy"]
+    def noisy_groups(self) -> list[str]:
+        """The groups of observations whose functions draw random numbers."""
+        return [group for group, function in self.observers.items() if draws_noise(function)]
 
     def _checked_writes(self) -> dict[str, frozenset[str]]:
         written = {name: function for name, function in self.functions.items() if function is not None}
@@ -205,7 +198,7 @@ class BoundTask:
         return {name: written_fields(function) for name, function in written.items()}
 
     def _rights(self, function: TaskFunction) -> Rights:
-        """What a function may write, by its arguments."""
+        """The fields that a function may write, by the names of its arguments."""
         model = [name for name in self.types if is_model_field(name)]
         lasting = ("lasting_memory", *model)
         groups = {"inputs": INPUTS, "memory": MEMORIES, "lasting": lasting, "start": (*INITIAL, *MEMORIES, *model)}
@@ -215,11 +208,11 @@ class BoundTask:
         }
 
     def _sort_model_fields(self, named: list[str], dynamics: Collection[str]) -> None:
-        """Sort the model fields into those that differ between worlds and those that are the model's own."""
+        """Sort the model fields into varied fields and constants."""
         drawn = {name: self.writes.get(name, frozenset()) for name in ("startup", "initialize", "randomize", "event")}
         between = drawn["initialize"] | drawn["randomize"] | drawn["event"]
         self.reset_dynamics = [name for name in named if name in between]
-        """Names of the model fields that resets or events write, which get their nominal values back at a reset."""
+        """Names of the model fields that resets or events write. A reset restores their nominal values first."""
         if both := [name for name in self.reset_dynamics if name in drawn["startup"]]:
             raise ValueError(
                 f"the model field {both[0]!r} of the task {self.name!r} is written by startup and by resets or "
@@ -230,12 +223,12 @@ class BoundTask:
         self.dynamics = [describe_model_field(self.model, name) for name in varied]
         """The model fields that differ between worlds."""
         self.constants = [describe_model_field(self.model, name, varies=False) for name in named if name not in varied]
-        """The model fields that functions read and that are the same in every world."""
+        """The model fields that functions read and that are the same in all worlds."""
         drawn_constants = [field.name for field in self.dynamics if field.constants]
         if drawn_constants and (stale := [field.name for field in self.constants if field.follows]):
             raise ValueError(
-                f"the task {self.name!r} reads {stale[0]!r}, which follows from {drawn_constants[0]!r} and so differs "
-                "between worlds: read the fields that it follows from instead"
+                f"the task {self.name!r} reads {stale[0]!r}, which MuJoCo computes from {drawn_constants[0]!r}, so "
+                "that it differs between worlds: read the fields that it is computed from"
             )
 
     def change_params(self, params: Mapping[str, Any]) -> None:
@@ -247,8 +240,8 @@ class BoundTask:
         previous = self.parameters.values
         self.parameters.values = self.parameters.checked(params)
         try:
-            same = self._layouts() == self.obs_layouts
-        except ValueError:  # one value a world, where the layout needs a single one
+            same = obs_layouts(self.task, self.params) == self.obs_layouts
+        except ValueError:  # one value per world for a parameter that sets a size
             same = False
         if not same:
             self.parameters.values = previous
@@ -259,19 +252,19 @@ class BoundTask:
         for name in MEMORIES:
             size = whole_number(f"{name} of the task {self.name!r}", getattr(task, name), low=0)
             if (name in self.types) != (size > 0):
-                raise ValueError(f"the task {self.name!r} needs both, {name} = ... in the class and {name} in World")
+                raise ValueError(f"the task {self.name!r} needs both {name} = ... in its class and {name} in World")
         whole_number(f"draws of the task {self.name!r}", task.draws, low=1)
         whole_number(f"settle of the task {self.name!r}", task.settle, low=0)
         if not isinstance(task.keyframe, str | None):
             raise ValueError(
-                f"keyframe of the task {self.name!r} must be the name of one of the model's keyframes, as 'home', not "
+                f"keyframe of the task {self.name!r} must be the name of a keyframe of the model, such as 'home', not "
                 f"{task.keyframe!r}"
             )
         self._check_metrics()
         for kind in ("lagged", "cleared"):
             for name in getattr(task, kind):
                 if name not in self.types:
-                    raise ValueError(f"the task {self.name!r} wants {name!r} {kind} but does not list it in World")
+                    raise ValueError(f"{kind} of the task {self.name!r} has {name!r}: list it in World, too")
         if not hasattr(task, "obs"):
             raise ValueError(f"the task {self.name!r} has no obs: add {_PARTS} to its class")
         whole_number(f"horizon of the task {self.name!r}", task.horizon, low=0)
@@ -283,8 +276,8 @@ class BoundTask:
                 low = high = math.nan
             if not -math.inf < low < high < math.inf:
                 raise ValueError(
-                    f"action_range of the task {self.name!r} must be two finite numbers, lowest first, as (-1.0, 1.0), "
-                    f"not {task.action_range!r}"
+                    f"action_range of the task {self.name!r} must be two finite numbers, lowest first, such as (-1.0, "
+                    f"1.0), not {task.action_range!r}"
                 )
 
     def _check_success_steps(self) -> None:
@@ -295,15 +288,15 @@ class BoundTask:
             raise ValueError(f"{name} is {steps}, but the task has no {FUNCTIONS['success'].signature}: add it")
         if steps > task.horizon > 0:
             raise ValueError(
-                f"{name} is {steps}, but its episodes have {task.horizon} steps, so that none could be a success: "
-                "choose a smaller one, or a larger horizon"
+                f"{name} is {steps}, but its episodes have {task.horizon} steps, so that none can succeed: lower it, "
+                "or raise horizon"
             )
 
     def _check_metrics(self) -> None:
         metrics: Any = self.task.metrics
         if not isinstance(metrics, tuple | list) or not all(isinstance(name, str) and name for name in metrics):
             raise ValueError(
-                f"metrics of the task {self.name!r} must be names, as ('forward', 'cost'), not {metrics!r}"
+                f"metrics of the task {self.name!r} must be names, such as ('forward', 'cost'), not {metrics!r}"
             )
         if bad := [name for name in metrics if not name.isprintable() or not set(name).isdisjoint(",'\"")]:
             raise ValueError(
@@ -314,7 +307,7 @@ class BoundTask:
             raise ValueError(f"the task {self.name!r} names the metric {twice[0]!r} twice: give each one name")
         if bool(metrics) != (self.functions["measure"] is not None):
             raise ValueError(
-                f"the task {self.name!r} needs both, metrics = (...) in the class and {FUNCTIONS['measure'].signature}"
+                f"the task {self.name!r} needs both metrics = (...) in its class and {FUNCTIONS['measure'].signature}"
             )
 
     def _check_actions(self) -> None:
@@ -322,13 +315,14 @@ class BoundTask:
         if actions is None:
             if self.model.nu == 0:
                 raise ValueError(
-                    f"the model of the task {self.name!r} has no actuators, so there is nothing to act on: add some, "
-                    "or give the task actions = {...} and a control that writes inputs"
+                    f"the model of the task {self.name!r} has no actuators: add some, or give the task "
+                    "actions = {...} and a control that writes inputs"
                 )
             return
         if not isinstance(actions, Mapping) or not actions:
             raise ValueError(
-                f"actions of the task {self.name!r} must be names with sizes, as {{'speed': 1}}, not {actions!r}"
+                f"actions of the task {self.name!r} must be a dict of names and sizes, such as {{'speed': 1}}, not "
+                f"{actions!r}"
             )
         for name, size in actions.items():
             whole_number(f"the size of the action {name!r} of the task {self.name!r}", size, low=1)
@@ -337,42 +331,11 @@ class BoundTask:
                 f"the task {self.name!r} has actions of its own, so it needs {FUNCTIONS['control'].signature}"
             )
 
-    def _layouts(self) -> dict[str, dict[str, int]]:
-        """The parts of each group of observations and their sizes, for the parameters as they are."""
-        return obs_layouts(self.task, self.params)
-
-    def explained(self, error: Exception) -> Exception:
-        """An error in one line, where Warp could not compile the task's functions; other errors as they are."""
-        text = str(error)
-        if "while parsing function" not in text and not type(error).__module__.startswith("warp"):
-            return error
-        # which kernel is compiled first, and so which of its lines is in the message, differs from run to run
-        flat = " ".join(text.split())
-        # the last function that is named holds the line that fails: where a kernel does not call it, the mistake lies
-        # within a function
-        innermost = flat.rpartition("while parsing function")[2]
-        call = re.search(r"\b(reward|evaluate|terminated|success)\((?:s0|s1|view)\b", innermost)
-        kind = re.search(r"value argument type \((.+?)\) must be|with different type \(<class '[\w.]*?(\w+)'>\)", flat)
-        if call and kind:
-            signature, returned = FUNCTIONS[call.group(1)].signature, kind.group(1) or kind.group(2)
-            return ValueError(
-                f"{call.group(1)} of the task {self.name!r} returns {returned}: it must be written as {signature}"
-            )
-        lines = [line.strip(" ;") for line in text.splitlines() if line.strip(" ;")]
-        hint = ": a function returns one number, not a tuple" if "tuple_t" in text else ""
-        if re.search(r"overload for '(quat\w*|mul)' .*\bvec4f\b", flat):
-            hint = (
-                ": quaternions are w, x, y, z here: use lw.quat_rotate, lw.quat_mul, ... in place of Warp's functions"
-            )
-        if "overload for 'extract'" in flat and re.search(r"\]\s*(\*|/|//|%|\*\*)=", flat):
-            hint = ": Warp has no such assignment to an element of a row: write a[i] = a[i] * x in place of a[i] *= x"
-        return ValueError(f"Warp can't compile the functions of the task {self.name!r}: {' '.join(lines[-3:])}{hint}")
-
     def check_field(self, name: str, array: wp.array) -> None:
-        """Compare the declaration of a field in World with the array that it will be bound to, (nworld, ...).
+        """Compare the type of a field in World with its array, (nworld, ...).
 
         Raises:
-            ValueError: They differ in type or in axes.
+            ValueError: They differ in the type of an element or in the number of axes.
         """
         kind = self.types[name]
         dtype, ndim = (kind.dtype, kind.ndim) if hasattr(kind, "ndim") else (kind, 0)
@@ -380,11 +343,3 @@ class BoundTask:
             element = "lw.vec10" if array.dtype is vec10 else wp.types.type_repr(array.dtype)
             wanted = _SPELLED.get(element, element) if array.ndim == 1 else f"Row[{_SPELLED.get(element, element)}]"
             raise ValueError(f"World.{name} of the task {self.name!r} must be declared as {wanted}")
-
-    def probe(self, batch: Any, params: wp.array, device: wp.Device) -> Probe:
-        """A run of the functions in the first world of a batch, on rows of their own."""
-        return Probe(
-            self.name, self.kernels, self.writes, batch, params, device, layouts=self.obs_layouts, nu=self.model.nu,
-            naction=sum(self.task.actions.values()) if self.task.actions else self.model.nu,
-            metrics=self.task.metrics,
-        )  # fmt: skip

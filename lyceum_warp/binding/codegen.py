@@ -1,12 +1,10 @@
-"""From a task's functions to kernels: the source that Warp needs around them.
+"""Generate the source that turns a task's functions of one world into kernels over a batch of worlds.
 
-The functions of a task see one world. The generated source is the batch around them: a struct of the same fields with
-one more axis, a view of world w in it, and default functions. It is text, because Warp compiles source.
+The generated source has a struct of the fields with one more axis, a view of world w in it, and default functions. It
+is text, because Warp compiles source.
 """
 
 import dataclasses
-import linecache
-import re
 import threading
 from collections.abc import Mapping
 from typing import Any
@@ -14,13 +12,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from lyceum_warp.binding.functions import TaskSource
+from lyceum_warp.binding.functions import TaskSource, draws_noise
+from lyceum_warp.binding.sources import free_module_name, run_source
 from lyceum_warp.binding.writes import written_fields
 from lyceum_warp.fields import is_data_field
 from lyceum_warp.kernels import random, steps
 from lyceum_warp.kernels import rows as kernel_rows
 from lyceum_warp.model_fields import NOT_NEGATIVE
-from lyceum_warp.task import FUNCTIONS, MEMORIES, Row, Task, TaskFunction
+from lyceum_warp.task import FUNCTIONS, MEMORIES, Row, TaskFunction
 
 _BATCH = """
 @wp.struct
@@ -78,15 +77,12 @@ def valid_model(s: World, lane: int, lanes: int) -> bool:
 
 _kernels: dict[Any, steps.Kernels] = {}
 _MAKING = threading.RLock()
-_module_names: list[str] = []
 
 
 def kernels_of(source: TaskSource, groups: Mapping[str, wp.Function]) -> steps.Kernels:
     """The kernels of a task, made once for the same functions and structs; see ``kernels.steps.make_kernels``.
 
-    Args:
-        source: The task's structs and functions.
-        groups: The functions that write its groups of observations.
+    ``groups`` has the functions that write its groups of observations.
     """
     key = (source.world, source.params, tuple(source.functions.values()), tuple(groups.items()))
     with _MAKING:
@@ -94,22 +90,15 @@ def kernels_of(source: TaskSource, groups: Mapping[str, wp.Function]) -> steps.K
             scope = _generated(source, groups)
             functions = {name: function or scope[f"no_{name}"] for name, function in source.functions.items()}
             written = [name for name, function in source.functions.items() if function is not None]
-            given: dict[str, Any] = {"module": _module_name(source.task), "functions": functions, "written": written}
+            module = free_module_name(f"lyceum_warp.generated.{source.path}")
+            given: dict[str, Any] = {"module": module, "functions": functions, "written": written}
             names = [field.name for field in dataclasses.fields(steps.TaskCode) if field.name not in given]
             _kernels[key] = steps.make_kernels(steps.TaskCode(**given, **{name: scope[name] for name in names}))
         return _kernels[key]
 
 
-def _module_name(task: type[Task]) -> str:
-    """The same name in every process, so that Warp finds the module in its cache; with a number if it is taken."""
-    name = f"lyceum_warp.generated.{task.__module__}.{task.__qualname__}"
-    taken = sum(module == name or module.startswith(f"{name}#") for module in _module_names)
-    _module_names.append(f"{name}#{taken}" if taken else name)
-    return re.sub(r"[^\w.]", "_", _module_names[-1])
-
-
 def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[str, Any]:
-    """The scope of the generated source after it has run: structs, functions around the task's, and defaults."""
+    """The names that the generated source defines: structs, functions that call the task's, and defaults."""
     scope: dict[str, Any] = {"wp": wp, "Row": Row, "World": source.world, "Params": source.params}
     batch, rows, state = [], [], []
     for name, variable in source.world.vars.items():
@@ -125,7 +114,7 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
     observe = []
     for number, (group, function) in enumerate(groups.items()):
         scope[f"observe_{number}"] = function
-        noisy = len(function.input_types) > len(FUNCTIONS["observe"].kinds)
+        noisy = draws_noise(function)
         observe.append(f"if group == {number}:")
         if noisy:  # a stream for each group, so that no group's draws depend on another's
             observe.append(f"    rng[0] = substream(base, {number})")
@@ -148,16 +137,13 @@ def _generated(source: TaskSource, groups: Mapping[str, wp.Function]) -> dict[st
     parts = [_BATCH.format(**{name: "\n".join(lines) for name, lines in blocks.items()})]
     parts += [_default(function) for function in FUNCTIONS.values() if function.default is not None]
     text = "\n".join(parts)
-    task = source.task
-    file = f"<lyceum_warp {task.__module__}.{task.__qualname__}>"
-    linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
     scope["__name__"] = f"lyceum_warp.generated.{source.name}"
-    exec(compile(text, file, "exec"), scope)
+    run_source(text, f"<lyceum_warp {source.path}>", scope)
     return scope
 
 
 def _copy(name: str, ndim: int) -> list[str]:
-    """Lines that copy a world's values of a field, (nworld, ...) with some number of axes; the lanes share a row."""
+    """Lines that copy one world's values of a field with ``ndim`` axes, (nworld, ...); the lanes share a row."""
     if ndim == 1:
         return ["    if lane == 0:", f"        target.{name}[w] = source.{name}[w]"]
     lines = [f"    for i1 in range(lane, source.{name}.shape[1], lanes):"]
@@ -168,7 +154,7 @@ def _copy(name: str, ndim: int) -> list[str]:
 
 
 def _memory_checks(source: TaskSource) -> list[str]:
-    """Lines that find memory that is not finite. What outlives episodes is put back; the rest ends with its episode."""
+    """Lines that find memory that is not finite, and restore lasting memory to its value before the step."""
     checks = {
         "memory": "finite_row(s1.memory, lane, lanes)",
         "lasting_memory": "restored_row(s0.lasting_memory, s1.lasting_memory, lane, lanes)",
@@ -178,7 +164,7 @@ def _memory_checks(source: TaskSource) -> list[str]:
 
 
 def _model_checks(source: TaskSource) -> list[str]:
-    """Lines that find a negative number, or not-a-number, in model fields that the task writes."""
+    """Lines that find negative numbers and NaN in model fields that the task writes and that must not be negative."""
     written = frozenset[str]().union(*(written_fields(function) for function in source.functions.values() if function))
     lines = []
     for name, variable in source.world.vars.items():

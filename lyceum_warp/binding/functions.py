@@ -1,4 +1,4 @@
-"""A task's structs and functions: found in its class or module, and checked against the table in ``task.FUNCTIONS``."""
+"""Find a task's structs and functions in its class or module, and check them against ``task.FUNCTIONS``."""
 
 import ast
 import dataclasses
@@ -9,32 +9,33 @@ from typing import Any
 
 import warp as wp
 
-from lyceum_warp.binding.sources import FunctionSource, has_source
+from lyceum_warp.binding.sources import FunctionSource
 from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, Task, TaskFunction, observer_name
 
 
 class TaskSource:
-    """The structs and the functions that a task consists of.
+    """The structs and the functions of a task.
 
     Args:
         task: The task's class.
         name: The task's name, for messages.
 
     Raises:
-        ValueError: A struct or ``observe`` is missing, a function is not written as the table says, or a name looks
-            like a misspelt one of the table.
+        ValueError: A struct or ``observe`` is missing, a function has another signature than in the table, or a name
+            resembles one of the table.
     """
 
     def __init__(self, task: type[Task], name: str) -> None:
         self.task, self.name = task, name
+        self.path = f"{task.__module__}.{task.__qualname__}"
         self.world: Any = self._struct("World")
         self.params: Any = self._struct("Params")
         self.functions: dict[str, wp.Function | None] = {
             name: self._function(wanted) for name, wanted in FUNCTIONS.items()
         }
-        """The task's functions by the names of the table; None for those that it does not have."""
+        """The task's functions by their names in the table; None for a function that the task lacks."""
         if self.functions["observe"] is None:
-            raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), the one function it needs")
+            raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), which every task needs")
         self._check_names()
 
     def group_functions(self, groups: Collection[str]) -> dict[str, wp.Function]:
@@ -53,33 +54,31 @@ class TaskSource:
                     f"{wanted.signature}"
                 )
             found[group] = function
-        for name, value in vars(self.task).items():
-            if name.startswith(GROUP_PREFIX) and isinstance(value, wp.Function | staticmethod):
-                group = name.removeprefix(GROUP_PREFIX)
-                if group not in groups:
-                    raise ValueError(f"obs of the task {self.name!r} has no group {group!r}, which {name} writes")
-        self._check_module_groups(groups)
+        for name in self._observers():
+            if (group := name.removeprefix(GROUP_PREFIX)) not in groups:
+                raise ValueError(f"obs of the task {self.name!r} has no group {group!r}, which {name} writes")
         return found
 
-    def _check_module_groups(self, groups: Collection[str]) -> None:
-        """Refuse a function of the module that looks like that of a group, where nothing in the module uses it."""
+    def _observers(self) -> list[str]:
+        """Names of functions for groups: those in the class, and those in the module that nothing there uses."""
         module = vars(sys.modules[self.task.__module__])
         functions = {name: value for name, value in module.items() if isinstance(value, wp.Function)}
         tasks = [kind for kind in (self.task, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
-        attributes = [value for task in tasks for value in vars(task).values()]
-        codes = [getattr(function.func, "__code__", None) for function in functions.values()]  # Warp's own have none
-        called = {name for code in codes if code is not None for name in code.co_names}
-        for name, function in functions.items():
-            group = name.removeprefix(GROUP_PREFIX)
-            if group == name or group in groups or name in called or any(function is value for value in attributes):
-                continue
-            kinds = tuple(map(self._kind, function.input_types.values()))
-            own = kinds in (FUNCTIONS["observe"].kinds, FUNCTIONS["observe"].all_kinds)  # not another task's
-            if own and not any(_may_list(task, group) for task in tasks):
-                raise ValueError(f"obs of the task {self.name!r} has no group {group!r}, which {name} writes")
+        used = {id(value) for task in tasks for value in vars(task).values()}
+        called = {name for f in functions.values() if f.func is not None for name in f.func.__code__.co_names}
+        forms = (FUNCTIONS["observe"].kinds, FUNCTIONS["observe"].all_kinds)
+        own = [name for name, value in vars(self.task).items() if isinstance(value, wp.Function | staticmethod)]
+        unused = [
+            name
+            for name, function in functions.items()
+            if name not in called and id(function) not in used
+            and tuple(map(self._kind, function.input_types.values())) in forms  # not another task's
+            and not any(_may_list(task, name.removeprefix(GROUP_PREFIX)) for task in tasks)
+        ]  # fmt: skip
+        return [name for name in (*own, *unused) if name.startswith(GROUP_PREFIX)]
 
     def _written(self, name: str) -> Any:
-        """The value of a name in the class, in its module, or in those of the classes that it extends."""
+        """The value of a name in the class, in its module, or in a base class or its module."""
         owners: Any = self.task.__mro__[: self.task.__mro__.index(Task)]
         for owner in owners:
             found = vars(owner).get(name, owner.scope.get(name, vars(sys.modules[owner.__module__]).get(name)))
@@ -106,17 +105,18 @@ class TaskSource:
         structs = [kind for kind in types if hasattr(kind, "vars") and hasattr(kind, "cls")]
         foreign = structs and self.world not in structs and self.params not in structs
         if foreign and function.func.__module__ in {owner.__module__ for owner in self.task.__mro__}:
-            return None  # another task's of the same module
+            return None  # it belongs to another task of the module
         annotations = function.func.__annotations__
         if any(isinstance(annotation, str) for annotation in annotations.values()):
             raise ValueError(
-                f"{name} of the task {self.name!r} has annotations that are text, not types: leave out "
-                "'from __future__ import annotations', and quotes around types"
+                f"{name} of the task {self.name!r} has annotations that are text, not types: remove "
+                "'from __future__ import annotations' and quotes around types"
             )
         returned = annotations.get("return")
-        if wanted.result is not None and not _returns(function):
-            raise ValueError(f"{name} of the task {self.name!r} has no return: it is written as {wanted.signature}")
-        if wanted.result is not None and _returns_tuple(function):
+        values = _return_values(function)
+        if wanted.result is not None and not values:
+            raise ValueError(f"{name} of the task {self.name!r} has no return: write it as {wanted.signature}")
+        if wanted.result is not None and any(isinstance(value, ast.Tuple) for value in values):
             raise ValueError(
                 f"{name} of the task {self.name!r} returns a tuple, and must return a single {wanted.result.__name__}"
             )
@@ -128,7 +128,7 @@ class TaskSource:
         return function
 
     def _check_structs(self, name: str, structs: list[Any]) -> None:
-        """Refuse a function of another file that takes that file's own World or Params."""
+        """Refuse a function that takes the World or the Params of another file."""
         for kind in structs:
             for own_name, own in (("World", self.world), ("Params", self.params)):
                 if kind is not own and kind.key.rpartition(".")[2] == own_name:
@@ -139,7 +139,7 @@ class TaskSource:
                     )
 
     def _kind(self, argument: Any) -> str:
-        """How the table writes the type of an argument."""
+        """The table's annotation for the type of an argument."""
         if argument is self.world:
             return "World"
         if argument is self.params:
@@ -148,7 +148,7 @@ class TaskSource:
         return {wp.float32: "Row[float]", wp.uint32: "Row[wp.uint32]"}.get(element, "?")
 
     def _check_names(self) -> None:
-        """Refuse what looks like a misspelt name of the table: it would never be called."""
+        """Refuse names that resemble one of the table: nothing would ever call such a function."""
         attributes = [name for name in vars(Task) if not name.startswith("_")]
         for name in vars(self.task):
             if name.startswith(("_", GROUP_PREFIX)) or name in (*attributes, "World", "Params", *FUNCTIONS):
@@ -163,30 +163,24 @@ class TaskSource:
                     raise ValueError(f"the task {self.name!r} has a function {name!r}: did you mean {close[0]}?")
 
 
+def draws_noise(observer: wp.Function) -> bool:
+    """Whether the function of a group of observations takes a random stream."""
+    return len(observer.input_types) > len(FUNCTIONS["observe"].kinds)
+
+
 def _may_list(task: type[Task], group: str) -> bool:
-    """Whether a class lists a group of observations, or may do so, where ``obs`` is a method."""
+    """Whether a class lists a group of observations, or may do so, because its ``obs`` is a method."""
     obs = getattr(task, "obs", None)
     return callable(obs) or (isinstance(obs, Mapping) and isinstance(obs.get(group), Mapping))
 
 
 def _origin(struct: Any) -> str:
-    """The file that a struct comes from; its module where there is no file."""
+    """The file that defines a struct, or its module if it has no file."""
     module = struct.cls.__module__
     return str(getattr(sys.modules.get(module), "__file__", None) or module)
 
 
-def _return_values(function: wp.Function) -> list[ast.expr] | None:
-    """The expressions that a function returns; None for a function without a source in Python."""
-    if not has_source(function):
-        return None
+def _return_values(function: wp.Function) -> list[ast.expr]:
+    """The expressions that a function returns."""
     nodes = ast.walk(FunctionSource(function).tree)
     return [node.value for node in nodes if isinstance(node, ast.Return) and node.value is not None]
-
-
-def _returns(function: wp.Function) -> bool:
-    values = _return_values(function)
-    return values is None or bool(values)
-
-
-def _returns_tuple(function: wp.Function) -> bool:
-    return any(isinstance(value, ast.Tuple) for value in _return_values(function) or [])

@@ -1,8 +1,8 @@
-"""Modules that lie beside a task's file and are imported by it, as Python finds those beside a program."""
+"""Find and import the modules beside a task's file, as Python does for a program."""
 
 import ast
 import contextlib
-import importlib
+import importlib.util
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -10,20 +10,17 @@ from types import ModuleType
 from typing import TypeAlias
 
 Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
-"""When files were written, and how long they were; None for one that does not exist."""
+"""Modification times and sizes of files; None for a file that does not exist."""
 
 _taken: dict[str, Stamps] = {}
-"""The modules in ``sys.modules`` that a task's file imported from its folder, by name."""
+"""The modules in ``sys.modules`` that a task's file imported from its folder, with their stamps."""
 
 
 def local_modules(file: Path) -> dict[str, Path]:
-    """The modules beside a file that it imports, and those that they import, by name, without running any of them.
-
-    Args:
-        file: A Python file.
+    """The modules beside a Python file that it imports, directly or through each other. None of them is run.
 
     Returns:
-        The modules' files; of a package without ``__init__.py``, its folder.
+        The modules' files by name; for a package without ``__init__.py``, its folder.
     """
     folder = file.resolve().parent
     found: dict[str, Path] = {}
@@ -47,19 +44,14 @@ def local_modules(file: Path) -> dict[str, Path]:
 
 
 def _imported_names(tree: ast.AST, package: str) -> Iterator[str]:
-    """Names of modules, and of what is imported from them, in a module of this package."""
+    """Full names of the modules, and of the names in modules, that a module of this package imports."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            owner = node.module or ""
-            if node.level:
-                parents = package.split(".") if package else []
-                if node.level > len(parents):
-                    continue
-                owner = ".".join([*parents[: len(parents) - node.level + 1], *filter(None, [node.module])])
-            yield owner
-            yield from (f"{owner}.{alias.name}" for alias in node.names)
+            with contextlib.suppress(ImportError):  # too many dots
+                owner = importlib.util.resolve_name("." * node.level + (node.module or ""), package or None)
+                yield from (owner, *(f"{owner}.{alias.name}" for alias in node.names))
 
 
 def _prefixes(name: str) -> list[str]:
@@ -79,36 +71,30 @@ def _module_file(folder: Path, name: str) -> Path | None:
 
 
 def stamps(files: Iterable[Path]) -> Stamps:
-    """The present state of files, by which a change is found."""
-    found: Stamps = {}
-    for file in files:
+    """The current stamps of files, to find those that changed."""
+    found: Stamps = dict.fromkeys(files)
+    for file in found:
         with contextlib.suppress(OSError):
-            stat = file.stat()
-            found[file] = stat.st_mtime_ns, stat.st_size
-        found.setdefault(file, None)
+            found[file] = (stat := file.stat()).st_mtime_ns, stat.st_size
     return found
 
 
 @contextlib.contextmanager
 def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
-    """A block in which a task's file can import the modules beside it.
+    """Context in which a task's file can import the modules beside it, which ``local_modules`` returned.
 
-    Modules of the same names that another task's file imported from another folder, or that have changed since, are
-    replaced. Where the block fails, all modules are those from before.
-
-    Args:
-        file: The task's file.
-        modules: What ``local_modules`` returned for it.
+    It replaces modules of the same names that have changed, or that a task's file in another folder imported. If the
+    block raises an error, ``sys.modules`` has the previous modules again.
     """
     before = {name: sys.modules.get(name) for name in modules}
     if any(name in _taken and _taken[name] != stamps([path]) for name, path in modules.items()):
-        for name in modules:  # all of them, because they may hold names of each other
+        for name in modules:  # all of them, because they may have imported names from each other
             if name in _taken:
                 sys.modules.pop(name, None)
     folder, bytecode = str(file.resolve().parent), sys.dont_write_bytecode
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
-    sys.dont_write_bytecode = True  # its time stamps count whole seconds, and the folder may be that of a run
+    sys.dont_write_bytecode = True  # the folder may belong to a run, and its time stamps are in whole seconds
     try:
         yield
     except BaseException:
@@ -119,7 +105,7 @@ def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
         sys.path.remove(folder)
         sys.dont_write_bytecode = bytecode
     for name, path in modules.items():
-        if (module := sys.modules.get(name)) is not None and module is not before[name] and _is_at(module, path):
+        if (module := sys.modules.get(name)) is not None and module is not before[name]:
             _taken[name] = stamps([path])
 
 
@@ -128,9 +114,3 @@ def _put(name: str, module: ModuleType | None) -> None:
         sys.modules[name] = module
     else:
         sys.modules.pop(name, None)
-
-
-def _is_at(module: ModuleType, path: Path) -> bool:
-    """Whether a module was imported from a file, or from a folder."""
-    places = [getattr(module, "__file__", None)] if path.is_file() else [*getattr(module, "__path__", [])]
-    return any(place is not None and Path(place).resolve() == path.resolve() for place in places)

@@ -1,8 +1,9 @@
-"""Where a task's model comes from, and what is changed in it so that both engines run the same physics."""
+"""Load a task's model, and change it before it is compiled so that both engines run the same physics."""
 
 import difflib
 import logging
 import sys
+import textwrap
 import warnings
 from collections.abc import Collection
 from pathlib import Path
@@ -20,25 +21,22 @@ log = logging.getLogger(__name__)
 
 
 def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
-    """Read a model, editable.
+    """Load a model as an MjSpec, which can be edited and then compiled from any current folder.
 
     Args:
-        source: A path, absolute or relative to the current folder, or to the file that defines ``owner``;
-            otherwise the name of a model that gymnasium ships; or a ModelFile; or an MjSpec, which is copied.
-        owner: The task class whose own model it is: its path is then relative to the task's file alone.
-
-    Returns:
-        The model, which can be compiled later from any current folder.
+        source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec, which is copied. A path
+            is relative to the file that defines ``owner``, or else to the current folder.
+        owner: The task class whose own model it is.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: MuJoCo can't read the file, or the source is a compiled model or the text of one.
+        ValueError: MuJoCo can't read the file, or the source is a compiled model or XML.
     """
     if isinstance(source, mujoco.MjModel):
         raise ValueError("a task's model must be a file or an MjSpec, not a compiled MjModel: give its MjSpec")
     if isinstance(source, mujoco.MjSpec):
         spec = source.copy()
-        spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # where its meshes are
+        spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # its meshes are relative to it
         return spec
     if isinstance(source, ModelFile):
         return source.spec()
@@ -47,14 +45,15 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
 
 
 def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFile:
-    """The file that a model's path or name stands for, or the model of gymnasium; see ``load_spec``.
+    """The file for a model's path, or gymnasium's model of a name; see ``load_spec``.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The source is the text of a model.
+        ValueError: The source is XML.
     """
     if isinstance(source, str) and source.lstrip().startswith("<"):
-        raise ValueError(f"the model {_start(source)} is XML, not a file: give mujoco.MjSpec.from_string(...) of it")
+        start = textwrap.shorten(source, 24, placeholder=" ...")
+        raise ValueError(f"the model {start!r} is XML, not a file: give mujoco.MjSpec.from_string(...) of it")
     folder = Path()
     if owner is not None and (file := getattr(sys.modules.get(owner.__module__), "__file__", None)):
         folder = Path(file).parent
@@ -73,12 +72,6 @@ def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFil
     return shipped
 
 
-def _start(text: str) -> str:
-    """The beginning of a text, for a message of one line."""
-    flat = " ".join(text.split())
-    return repr(flat if len(flat) <= 24 else f"{flat[:20]} ...")
-
-
 def keyframe_state(model: mujoco.MjModel, name: str) -> np.ndarray:
     """The integration state of one of the model's keyframes at time 0, (integration_size,) float64.
 
@@ -88,7 +81,7 @@ def keyframe_state(model: mujoco.MjModel, name: str) -> np.ndarray:
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name)
     if key < 0:
         names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) for i in range(model.nkey)]
-        known = ", ".join(repr(n) for n in names if n) or "none that is named"
+        known = ", ".join(repr(n) for n in names if n) or "none with a name"
         raise ValueError(f"the model has no keyframe {name!r}; it has {known}")
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, key)
@@ -104,12 +97,12 @@ def compile_model(
 ) -> mujoco.MjModel:
     """Compile a model for either engine.
 
-    MuJoCo Warp has no PGS solver, so a model that asks for it gets Newton on both engines, which converges to
-    the same accelerations. Sleep is turned off, because a saved state does not hold which bodies are asleep. Fields
-    that MuJoCo computes only where a sensor needs them get such a sensor, after the model's own, and the energy is
-    turned on where it is read: without that a task would read zeros. Where no field needs a sensor, the model's own
-    are turned off. Of a pair of geoms that is listed twice under ``contact``, the first entry stays: MuJoCo would make
-    the contact twice, MuJoCo Warp once.
+    - Newton replaces the PGS solver, which MuJoCo Warp lacks. It converges to the same accelerations.
+    - Sleep is turned off, because a saved state does not say which bodies are asleep.
+    - Fields that MuJoCo computes only for a sensor get such a sensor, after the model's own; if no field needs sensors,
+      they are turned off. The energy is turned on if it is read.
+    - If ``contact`` lists a pair of geoms twice, the first entry stays: MuJoCo would make the contact twice, MuJoCo
+      Warp once.
 
     Args:
         spec: The model; changed in place.
@@ -122,10 +115,10 @@ def compile_model(
     """
     if spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
         spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-        log.info("%s asks for the PGS solver, which MuJoCo Warp lacks: both engines use Newton", spec.modelname)
+        log.info("%s asks for the PGS solver, which MuJoCo Warp lacks: Newton is used instead", spec.modelname)
     if spec.option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
         spec.option.enableflags &= ~mujoco.mjtEnableBit.mjENBL_SLEEP.value
-        log.info("%s asks for sleep, which is not part of MuJoCo's state: no body falls asleep", spec.modelname)
+        log.info("%s asks for sleep, which is not part of MuJoCo's state: it is turned off", spec.modelname)
     _remove_repeated_pairs(spec)
     if "energy" in fields:
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
@@ -152,19 +145,17 @@ def compile_model(
             model = spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo refuses the model {spec.modelname!r}: {error}") from error
-    for warning in caught:  # most are about Gymnasium's own XML, where a user can change nothing
+    for warning in caught:  # only logged: most are about Gymnasium's XML, which users cannot change
         log.info("%s: %s", spec.modelname, warning.message)
     return model
 
 
 def _remove_repeated_pairs(spec: mujoco.MjSpec) -> None:
-    """Keep the first of several entries for the same two geoms."""
+    """Remove all but the first contact pair of the same two geoms."""
     known: set[frozenset[str]] = set()
     for pair in list(spec.pairs):
         geoms = frozenset((pair.geomname1, pair.geomname2))
         if geoms in known:
             spec.delete(pair)
-            log.info(
-                "%s lists a pair of %s twice: the second entry is left out", spec.modelname, " and ".join(sorted(geoms))
-            )
+            log.info("%s lists a pair of %s twice: the second is dropped", spec.modelname, " and ".join(sorted(geoms)))
         known.add(geoms)

@@ -1,4 +1,4 @@
-"""The values of a task's parameters, the fields of its ``Params``: defaults, checks, and the array for the kernels."""
+"""Check the values of a task's parameters, the fields of its ``Params``, and make the array for its kernels."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,31 +13,31 @@ from lyceum_warp.options import OPTIONS, suggestion
 from lyceum_warp.task import Element
 
 _FILLED_IN = ("dt", "substep_dt")
-"""Fields of ``Params`` that follow from the model and the task."""
+"""Fields of ``Params`` that are filled in: seconds in a step and in a substep."""
 
 
 def defaults(struct: Any) -> dict[str, Any]:
-    """The defaults of a task's ``Params`` as they are written there; those that are filled in have none."""
-    # Warp's structs ignore defaults: they are read from the class behind the struct
+    """The defaults in a task's ``Params``, by name, without fields that are filled in."""
+    # Warp's structs ignore defaults; the decorated class still has them
     names = [name for name in struct.vars if name not in _FILLED_IN and hasattr(struct.cls, name)]
     return {name: getattr(struct.cls, name) for name in names}
 
 
 class Parameters:
-    """Values for every field of a task's ``Params``: scalars and vectors, arrays with one value a world, or tables.
+    """Values for every field of a task's ``Params``: scalars and vectors, arrays with one value per world, or tables.
 
-    A table is a field that is itself an array, as ``motion: wp.array2d[float]``. All worlds share it.
+    A table is a field that is itself an array, such as ``motion: wp.array2d[float]``. All worlds share it.
 
     Args:
         struct: The task's ``Params``.
         task_name: The task's name, for messages.
-        model: The compiled model, in which named elements are found.
+        model: The compiled model, which gives the indices of named elements.
         nworld: Number of worlds.
         timestep: Seconds in a step, the value of ``dt``.
-        given: Values that differ from the defaults.
+        given: Values that replace defaults.
 
     Raises:
-        ValueError: A field has the name of an option, a name is unknown, a value is missing or does not fit its field.
+        ValueError: A field has the name of an option, a name is unknown, or a value is missing or does not fit.
     """
 
     def __init__(
@@ -58,8 +58,8 @@ class Parameters:
         self._check_tables()
         if taken := [name for name in struct.vars if name in (*OPTIONS, "task", "options")]:
             raise ValueError(
-                f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), so that no "
-                "value would reach it: rename it in Params"
+                f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), which "
+                "would get its value: rename it in Params"
             )
         found = defaults(struct) | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
         self.values: dict[str, Any] = {name: found[name] for name in struct.vars if name in found}
@@ -67,11 +67,11 @@ class Parameters:
 
     @property
     def per_world(self) -> dict[str, np.ndarray]:
-        """The values that differ between worlds, by name, each with a leading ``nworld`` axis."""
+        """The values that differ between worlds, by name, (nworld, ...)."""
         return {name: v for name, v in self.values.items() if isinstance(v, np.ndarray) and name not in self.tables}
 
     def checked(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """The values with some replaced, each converted to what its field holds.
+        """The values with some replaced, each converted to the type of its field.
 
         Raises:
             ValueError: A name is unknown, a value is missing or does not fit its field.
@@ -92,18 +92,17 @@ class Parameters:
         return {name: self._converted(name, value) for name, value in {**self.values, **given}.items()}
 
     def array(self, device: wp.Device) -> wp.array:
-        """The values as the kernels read them: one entry, or one a world where any value differs.
+        """The values for the kernels: one entry for all worlds, or one per world if any value differs.
 
-        Its entries point to the tables, which live on the device as long as these parameters. A table that changed is
-        copied into the memory of the last one where the shape is the same.
+        Entries point to the tables, which stay on the device as long as this object. A table that changed is copied
+        in place if its shape is the same.
         """
         for name, kind in self.tables.items():
-            self._bring(name, kind.dtype, device)
+            self._upload(name, kind.dtype, device)
         instances = [self._instance(w) for w in range(self._nworld if self.per_world else 1)]
         return wp.array(instances, dtype=self._struct, device=device)
 
-    def _bring(self, name: str, dtype: type, device: wp.Device) -> None:
-        """Bring a table to the device."""
+    def _upload(self, name: str, dtype: type, device: wp.Device) -> None:
         value = self.values[name]
         kept = self._arrays.get(name)
         if kept is None or kept[1].device != device or kept[0].shape != value.shape:
@@ -122,7 +121,7 @@ class Parameters:
                 )
 
     def _converted(self, name: str, value: Any) -> Any:
-        """A value as its field holds it: a scalar or vector, or an array with one a world."""
+        """A value in the type of its field: a scalar, a vector, a table, or an array with one value per world."""
         kind = self._struct.vars[name].type
         if name in self.tables:
             return self._table(name, value)
@@ -157,7 +156,7 @@ class Parameters:
         if array.shape == per_world:
             return array
         raise ValueError(
-            f"{what} has shape {array.shape}; it takes {shape or 'one number'}, or one a world, {per_world}"
+            f"{what} has shape {array.shape}; it takes {shape or 'one number'}, or one per world, {per_world}"
         )
 
     def _table(self, name: str, value: Any) -> np.ndarray:
@@ -180,7 +179,7 @@ class Parameters:
         axes = kind.ndim + len(element)
         if table.ndim != axes or table.shape[kind.ndim :] != element or not table.size:
             last = f", the last {element}" if element else ""
-            raise ValueError(f"{what} has shape {table.shape}: it takes {axes} axes{last}, none of them empty")
+            raise ValueError(f"{what} has shape {table.shape}: it takes {axes} axes{last}, none of length 0")
         bad = table != given if whole else ~np.isfinite(table)
         if bad.any():
             place = np.argwhere(bad)[0].tolist()
@@ -214,11 +213,11 @@ class Parameters:
 def _loaded(what: str, path: str | Path) -> np.ndarray:
     """The array in a file that ``numpy.save`` wrote."""
     try:
-        # mapped, because a broken header may ask for any amount of memory
+        # memory-mapped, because a broken header may ask for any amount of memory
         loaded: np.ndarray = np.load(path, allow_pickle=False, mmap_mode="r")
     except FileNotFoundError:
         raise FileNotFoundError(f"{what}: there is no such file") from None
-    except Exception as error:  # of many types, from numpy and tokenize
+    except Exception as error:  # NumPy raises many types
         raise ValueError(f"{what} cannot be read: {error}") from error
     if not isinstance(loaded, np.ndarray):
         raise ValueError(f"{what} must be a single array, a .npy file of numpy.save")

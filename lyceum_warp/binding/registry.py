@@ -1,4 +1,4 @@
-"""Tasks by name: those of the package, and those that a user registers."""
+"""Find tasks by name, by file or by class, and register those of users."""
 
 import difflib
 import importlib
@@ -23,19 +23,21 @@ from lyceum_warp.task import Task
 _tasks: dict[str, type[Task]] = {}
 
 _loaded: dict[str, Stamps] = {}
-"""The files of tasks, and of the modules beside them, as they were when they were last run, by their modules' names."""
+"""Stamps of the files of tasks and of the modules beside them when they were last run, by the tasks' modules."""
 
 _LOADING = threading.RLock()
-"""One file at a time, because imports and linecache belong to the process."""
+"""Held while a file is loaded, because imports and linecache belong to the process."""
+
+_PACKAGE = "lyceum_warp.tasks."
+_FILE = "lyceum_task_"
 
 _sources: "weakref.WeakKeyDictionary[type[Task], Mapping[Path, bytes]]" = weakref.WeakKeyDictionary()
 
 
 def register(task: type[Task]) -> type[Task]:
-    """Class decorator: make a task known by its name, the class name in snake_case.
+    """Class decorator: register a task under its name, the class name in snake_case.
 
-    A class may replace an earlier one of the same file: a notebook runs a file again, or a file is both imported and
-    given as a path.
+    A class may replace an earlier one of the same file, for example if a notebook runs a cell again.
 
     Raises:
         ValueError: Another task has the name, or the class is not a task.
@@ -48,10 +50,7 @@ def register(task: type[Task]) -> type[Task]:
     known = _tasks.get(name)
     if known is None and not task.__module__.startswith(_PACKAGE) and name in package_task_names():
         owner = f"{_PACKAGE}{name}"
-    elif task.__module__.startswith(_FILE) and (known is None or known.__module__.startswith(_FILE)):
-        _tasks[name] = task  # two files may hold tasks of one name
-        return task
-    elif known is not None and known.__module__ != task.__module__ and _file(known) != _file(task):
+    elif known is not None and not _may_replace(task, known):
         owner = f"{known.__module__}.{known.__qualname__}"
     else:
         _tasks[name] = task
@@ -59,8 +58,9 @@ def register(task: type[Task]) -> type[Task]:
     raise ValueError(f"the task name {name!r} is taken by {owner}: rename yours")
 
 
-_PACKAGE = "lyceum_warp.tasks."
-_FILE = "lyceum_task_"
+def _may_replace(task: type[Task], known: type[Task]) -> bool:
+    by_path = task.__module__.startswith(_FILE) and known.__module__.startswith(_FILE)  # files may share a name
+    return by_path or known.__module__ == task.__module__ or _file(known) == _file(task)
 
 
 def package_task_names() -> list[str]:
@@ -75,7 +75,7 @@ def _file(task: type[Task]) -> str | None:
 
 
 def spelled_task(task: type[Task]) -> str | None:
-    """A task as ``find_task`` finds it in another process: a name, a file with a class, or None without a file."""
+    """The name or ``file:Class`` by which ``find_task`` finds a task in another process; None if it has no file."""
     if task.__module__.startswith("lyceum_warp."):
         return task_name(task)
     file = _file(task)
@@ -88,20 +88,20 @@ def task_name(task: type[Task]) -> str:
 
 
 def snake_case(name: str) -> str:
-    """The name of a task from that of its class: HalfCheetah is half_cheetah."""
+    """The name of a task for the name of its class: half_cheetah for HalfCheetah."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
 
 
 def task_names() -> list[str]:
-    """Names of all tasks: those of the package and those registered by the user."""
+    """Names of all tasks, of the package and registered by the user."""
     return sorted({*_tasks, *package_task_names()})
 
 
 def find_task(task: str | Path | type[Task]) -> type[Task]:
-    """The class of a task, by name, by file (``path/to/file.py`` or ``path/to/file.py:Class``), or itself.
+    """The class of a task, given by name, by file (``path/to/file.py`` or ``path/to/file.py:Class``) or as a class.
 
-    A file may import modules that lie beside it. If one of these files has changed since, the file is run again;
-    existing environments keep the task that they were made of.
+    A file may import modules beside it. If one of these files has changed, the task's file is run again; existing
+    environments keep their task.
 
     Raises:
         ValueError: There is no such task, or its file can't be run.
@@ -128,10 +128,10 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
 
 
 def source_files(task: type[Task]) -> Mapping[Path, bytes]:
-    """The file of a task, first, and the modules beside it that it imports, as they were when the task was loaded.
+    """The contents of a task's file, then of the modules beside it that it imports, at the time it was loaded.
 
-    Of a class that was imported or defined in the program itself, as they were when ``find_task`` first returned it.
-    Empty for a class without a file, as in a notebook.
+    A class that the program imports or defines counts as loaded when ``find_task`` first returns it. A class without
+    a file, as in a notebook, has none.
     """
     if task not in _sources:
         file = Path(_file(task) or "")
@@ -145,14 +145,14 @@ def _read(file: Path, modules: Mapping[str, Path]) -> dict[Path, bytes]:
 
 
 def _run(path: Path, name: str, source: bytes) -> None:
-    """Run a file's source as a module, which replaces an earlier one of this name."""
+    """Run a file's source as a module, which replaces the previous module of this name."""
     module = ModuleType(name)
     module.__file__ = file = str(path.resolve())
     before = sys.modules.get(name)
     sys.modules[name] = module
     try:
-        code = compile(source, file, "exec")  # not through an importer, whose bytecode is of the same second
-        # Warp reads the source of each function here, whatever happens to the file meanwhile
+        code = compile(source, file, "exec")  # importers would use bytecode written in the same second
+        # Warp reads the source of functions from the line cache, even if the file changes meanwhile
         text = importlib.util.decode_source(source)
         linecache.cache[file] = (len(text), None, list(io.StringIO(text)), file)
         exec(code, vars(module))
@@ -173,7 +173,7 @@ def _run(path: Path, name: str, source: bytes) -> None:
 
 
 def _explained(error: Exception) -> str:
-    """What is wrong with a task file, where Warp's own words do not say how to fix it."""
+    """The message for an error in a task file, with a fix for Warp's less clear errors."""
     text = str(error).strip()
     if found := re.search(r"argument '(\w+)' of function (\w+): Unrecognized type '<class '[\w.]*?(\w+)'>'", text):
         argument, function, kind = found.groups()
@@ -204,7 +204,7 @@ def _task_of_file(path: Path, attribute: str) -> type[Task]:
 
 
 def _module_of_file(path: Path) -> ModuleType:
-    """The module of a task's file, which is run if it, or a module beside it, has changed since."""
+    """The module of a task's file. The file is run if it is new, or if it or a module beside it has changed."""
     if not path.is_file():
         raise FileNotFoundError(f"there is no task file {str(path)!r}")
     name = f"{_FILE}{path.stem}_{zlib.crc32(str(path.resolve()).encode()):08x}"

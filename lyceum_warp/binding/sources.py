@@ -1,10 +1,12 @@
-"""Parse the source of a Warp function, and resolve its lines in the file and its names."""
+"""Read the source of a Warp function: parse it, resolve its names and its calls, and run generated source."""
 
 import ast
 import builtins
+import linecache
+import re
 import types
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import warp as wp
 
@@ -12,10 +14,7 @@ from lyceum_warp.support.upstream import builtin_functions
 
 
 class FunctionSource:
-    """The source of a ``wp.func`` as it was when the function was made, even if its file has changed since.
-
-    Args:
-        function: A function with a source; see ``has_source``.
+    """The source of a ``wp.func`` when it was defined, even if its file has changed since.
 
     Raises:
         ValueError: The source is not a single function definition.
@@ -32,22 +31,18 @@ class FunctionSource:
         self.file = Path(adj.filename).name
         self._first_line: int = adj.fun_lineno
         self.scope = _scope(function.func)
-        """The values of global names and of those that the function encloses."""
+        """The values of global names and of names from enclosing functions."""
         self.locals = {argument.arg for argument in self.tree.args.args} | {
             node.id for node in ast.walk(self.tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
         }
         """Its arguments, and the names that it assigns."""
 
-    def line(self, node: ast.AST) -> int:
-        """The line of a node in the file."""
-        return self._first_line + getattr(node, "lineno", 1) - 1
-
     def place(self, node: ast.AST) -> str:
         """The file and the line of a node, for messages."""
-        return f"{self.file}, line {self.line(node)}"
+        return f"{self.file}, line {self._first_line + getattr(node, 'lineno', 1) - 1}"
 
     def value(self, node: ast.expr) -> Any:
-        """What a name, a path such as ``module.helper`` or a ``wp.static(...)`` stands for; None if it is not known."""
+        """The value of a name, of a path such as ``module.helper`` or of ``wp.static(...)``; None if unknown."""
         if isinstance(node, ast.Name):
             if node.id in self.locals:
                 return None
@@ -61,7 +56,7 @@ class FunctionSource:
             assert isinstance(node, ast.Call)
             try:
                 return eval(ast.unparse(node.args[0]), dict(self.scope))
-            except Exception:  # it may be anything, such as the counter of a loop that Warp unrolls
+            except Exception:  # it may use other names, such as the counter of a loop that Warp unrolls
                 return None
         return None
 
@@ -74,14 +69,29 @@ class FunctionSource:
             and len(node.args) == 1
         )
 
+    def call(self, node: ast.Call) -> tuple[Literal["static", "helper", "native", "builtin", "other"], Any]:
+        """The kind of a call, and what it calls.
+
+        A helper is a function with a source, a native function a ``wp.func_native``, a builtin one of Warp's own.
+        Others are types and Python's functions, or None if the name stands for no known value.
+        """
+        callee = self.value(node.func)
+        if self.is_static(node):
+            return "static", callee
+        if not isinstance(callee, wp.Function):
+            return "other", callee
+        if callee.func is None:
+            return "builtin", callee
+        return "helper" if has_source(callee) else "native", callee
+
     def condition(self, node: ast.expr) -> bool | None:
-        """The value of a condition ``wp.static(...)``, whose other branch Warp does not compile; None for any other."""
+        """The value of a ``wp.static(...)`` condition, of which Warp compiles one branch; None for any other."""
         found = self.value(node) if self.is_static(node) else None
         return None if found is None else bool(found)
 
 
 def has_source(function: wp.Function) -> bool:
-    """Whether a function's source is Python: not that of a builtin, or of a ``wp.func_native``."""
+    """Whether a function has Python source; a builtin and a ``wp.func_native`` have none."""
     return function.func is not None and function.native_snippet is None
 
 
@@ -101,16 +111,14 @@ def name_of(function: wp.Function) -> str:
 
 
 def builtin(name: str) -> Any:
-    """Warp's builtin of a name, which may not be an attribute of the module, or Python's; None if there is none."""
+    """Warp's builtin of a name, which need not be an attribute of the module, or Python's; None if there is none."""
     return builtin_functions().get(name) or getattr(wp, name, None) or getattr(builtins, name, None)
 
 
 def overloads(function: wp.Function) -> list[wp.Function]:
-    """A function and those of the same name with arguments of other types."""
-    if not has_source(function):
-        return [function]
+    """The overloads of a function with Python source: functions of its name with arguments of other types."""
     found = [*function.user_overloads.values(), *function.user_templates.values()]
-    # without those that Warp made from a generic one
+    # without instances that Warp made from a generic function
     return [overload for overload in found if overload.generic_parent is None] or [function]
 
 
@@ -123,3 +131,23 @@ def _scope(function: Any) -> dict[str, Any]:
         except ValueError:  # not assigned yet
             scope.pop(name, None)
     return scope
+
+
+_module_names: set[str] = set()
+
+
+def free_module_name(name: str) -> str:
+    """A name for a Warp module, the same in every process, so that Warp's cache has it; numbered if it is taken."""
+    free = name = re.sub(r"[^\w.]", "_", name)
+    number = 0
+    while free in _module_names:
+        number += 1
+        free = f"{name}_{number}"
+    _module_names.add(free)
+    return free
+
+
+def run_source(text: str, file: str, scope: dict[str, Any]) -> None:
+    """Run generated source in a scope, and keep it where Warp looks for the source of functions."""
+    linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
+    exec(compile(text, file, "exec"), scope)

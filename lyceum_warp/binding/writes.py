@@ -1,7 +1,8 @@
-"""Find what a Warp function writes into its arguments, from its source and the sources of the functions that it calls.
+"""Find the writes of a Warp function, and of the functions that it calls, into its arguments.
 
-The analysis follows elements, components, calls and local names of a row. A row that is used in any other way
-(returned, put into a tuple or a struct, chosen by ``wp.where``, given to a native function) counts as written.
+The analysis follows elements, components, calls, local names of a row, and rows in the fields of a local struct. A row
+that is used in any other way (returned, put into a tuple, chosen by ``wp.where``, given to a native function) counts as
+written.
 """
 
 import ast
@@ -15,7 +16,7 @@ import warp as wp
 from lyceum_warp.binding.sources import FunctionSource, has_source, is_row, is_struct, name_of, overloads
 
 _READERS = {"len", "lower_bound", "sample_cdf", "print", "printf"}
-"""Builtins that only read the arrays that they get."""
+"""Builtins that only read their arrays."""
 
 _INQUIRIES = {"shape", "ndim", "size", "strides", "dtype", "device"}
 """Attributes of an array that do not refer to its elements."""
@@ -27,23 +28,18 @@ class Write:
 
     position: int
     """Index of the argument."""
-    argument: str
-    """Name of the argument, as in the function's source."""
     field: str | None
     """The field that is written, if the argument is a struct; None if it is a row."""
+    target: str
+    """The argument with its field, such as "s.qpos"."""
     function: str
     """Name of the function whose source contains the write."""
-    file: str
-    line: int
+    place: str
+    """The file and the line of the write."""
     replaced: bool = False
-    """Whether the field itself is assigned, as in ``s.time = 0.0``, not an element of its row."""
+    """Whether the field itself is assigned, as in ``s.time = 0.0``, instead of an element of its row."""
     use: str | None = None
     """The expression that may write the row, if the analysis cannot follow it; None for a definite write."""
-
-    @property
-    def target(self) -> str:
-        """The argument with its field, as in the source."""
-        return self.argument if self.field is None else f"{self.argument}.{self.field}"
 
 
 @functools.cache
@@ -56,7 +52,7 @@ def find_writes(function: wp.Function) -> tuple[Write, ...]:
         _Reader(function, places, arguments, writes, set())
         return tuple(writes)
     name = name_of(function)
-    return tuple(Write(i, argument, None, name, name, 0, use=name) for i, argument in enumerate(arguments) if places[i])
+    return tuple(Write(i, None, argument, name, name, use=name) for i, argument in enumerate(arguments) if places[i])
 
 
 def written_fields(function: wp.Function) -> frozenset[str]:
@@ -65,21 +61,11 @@ def written_fields(function: wp.Function) -> frozenset[str]:
 
 
 Rights = Mapping[str, Collection[str] | None]
-"""What a function may write, by the names of all its arguments in order: the fields of a struct; None for a row that is
-a result; an empty collection for nothing."""
+"""By the name of each argument, in order, the fields that a function may write; None for a row that is a result."""
 
 
 def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mapping[str, Rights]) -> None:
-    """Refuse writes that the task form does not allow.
-
-    Args:
-        task: The task's name, for messages.
-        functions: The task's functions by name.
-        rights: What each of them may write.
-
-    Raises:
-        ValueError: A function writes something else.
-    """
+    """Raise a ValueError if a function of a task writes a field or a row without having the right."""
     for name, function in functions.items():
         allowed = list(rights[name].values())
         for write in find_writes(function):
@@ -87,7 +73,7 @@ def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mappin
             if fields is None or (write.field in fields and not write.replaced):
                 continue
             within = "" if write.function == name_of(function) else f" in {write.function}"
-            place = f"{within} ({write.file}, line {write.line})"
+            place = f"{within} ({write.place})"
             if write.use is not None:
                 raise ValueError(
                     f"{name} of the task {task!r} uses {write.target} as a whole in '{write.use}'{place}, which may "
@@ -98,7 +84,7 @@ def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mappin
 
 
 def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
-    """What the form allows, and which function may write the field."""
+    """The fields that the function may write, and the functions that may write this field."""
     may = [field for fields in rights[name].values() for field in fields or ()]
     results = [argument for argument, fields in rights[name].items() if fields is None and argument != "rng"]
     own = f"{name} may write {', '.join(dict.fromkeys([*results, *may])) or 'nothing'}"
@@ -121,7 +107,7 @@ def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class _Place:
-    """Memory of an argument of the analysed function: all of it, a field, a row of a table, or an element."""
+    """Memory of an argument of the analysed function: the argument, a field, a row of a table, or an element."""
 
     position: int
     field: str | None
@@ -132,7 +118,7 @@ class _Place:
         if is_struct(self.kind):
             variable = self.kind.vars.get(name)
             return _Place(self.position, self.field or name, variable and _kind(variable.type))
-        return None if self.kind is not None and name in _INQUIRIES else self  # a component, or all that a pointer has
+        return None if self.kind is not None and name in _INQUIRIES else self  # a component, or a pointer
 
     def element(self, index: ast.expr) -> "_Place":
         if not isinstance(self.kind, tuple):
@@ -143,7 +129,7 @@ class _Place:
 
 
 def _kind(written: Any) -> Any:
-    """A type as ``_Place.kind`` has it; None for numbers, vectors and matrices."""
+    """The ``_Place.kind`` of a type; None for numbers, vectors and matrices."""
     return written if is_struct(written) else (written.ndim, written.dtype) if is_row(written) else None
 
 
@@ -152,7 +138,7 @@ class _Reader:
 
     Args:
         function: The function.
-        places: For each of its arguments, the memory that it gets; None if that is not memory of ``arguments``.
+        places: For each of its arguments, the memory of the analysed function's arguments that it gets, or None.
         arguments: Names of the arguments of the analysed function.
         writes: Collects the writes.
         seen: The functions that were read, with their places.
@@ -168,31 +154,36 @@ class _Reader:
     ) -> None:
         self.arguments, self.writes, self.seen = arguments, writes, seen
         self.source = FunctionSource(function)
-        self.places = dict(zip(function.input_types, places, strict=True))
-        for statement in self.source.tree.body:
-            self._read(statement)
+        # by name, and "name.field" for a row in a local struct
+        self.places: dict[str, _Place | None] = dict(zip(function.input_types, places, strict=True))
+        for _ in range(2):  # the first round of a loop may use a local struct before the line that puts a row into it
+            for statement in self.source.tree.body:
+                self._read(statement)
 
     def _note(self, place: _Place, node: ast.AST, *, replaced: bool = False, follows: bool = True) -> None:
-        """Note a write; ``follows=False`` says that the analysis ends here."""
+        """Note a write; with ``follows=False`` a use that the analysis cannot follow."""
         use = None if follows else ast.unparse(node).splitlines()[0]
-        argument, line = self.arguments[place.position], self.source.line(node)
-        write = Write(place.position, argument, place.field, self.source.name, self.source.file, line, replaced, use)
-        self.writes[write] = None
+        target = ".".join(filter(None, (self.arguments[place.position], place.field)))
+        where = self.source.place(node)
+        self.writes[Write(place.position, place.field, target, self.source.name, where, replaced, use)] = None
 
     def _read(self, node: ast.AST) -> _Place | None:
         """The memory of an argument that an expression names; notes the writes within an expression or a statement."""
         if isinstance(node, ast.Name):
+            for name, place in self.places.items():
+                if place is not None and name.startswith(f"{node.id}."):  # a local struct is used as a whole
+                    self._note(place, node, follows=False)
             return self.places.get(node.id)
         if isinstance(node, ast.Attribute):
-            owner = self._read(node.value)
-            return owner and owner.attribute(node.attr)
+            named = isinstance(node.value, ast.Name)
+            owner = self.places.get(ast.unparse(node.value)) if named else self._read(node.value)
+            return owner.attribute(node.attr) if owner else self.places.get(ast.unparse(node))
         if isinstance(node, ast.Subscript):
             self._read_all(node, [node.slice])
             owner = self._read(node.value)
             return owner and owner.element(node.slice)
         if isinstance(node, ast.Call):
-            if not self.source.is_static(node):
-                self._call(node)
+            self._call(node)
         elif isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign):
             self._assign(node)
         elif isinstance(node, ast.If) and (chosen := self.source.condition(node.test)) is not None:
@@ -213,12 +204,19 @@ class _Reader:
         whole = place if place is not None and place.kind is not None else None
         for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
             known = None
-            if isinstance(target, ast.Name) and whole is not None:
-                known = self.places[target.id] = self.places.get(target.id) or whole
-            self._store(target)
+            if not self._is_local(target):
+                self._store(target)
+            elif whole is not None:
+                name = ast.unparse(target)
+                known = self.places[name] = self.places.get(name) or whole
             if whole is not None and known != whole:
                 for lost in filter(None, (known, whole)):
                     self._note(lost, node, follows=False)
+
+    def _is_local(self, target: ast.expr) -> bool:
+        """Whether a name is assigned, or a field of a local struct."""
+        owner = target.value if isinstance(target, ast.Attribute) else None
+        return isinstance(target, ast.Name) or (isinstance(owner, ast.Name) and owner.id not in self.places)
 
     def _store(self, target: ast.expr) -> None:
         """Note that an element, a component or a field is assigned."""
@@ -231,21 +229,21 @@ class _Reader:
             self._note(place, target, replaced=replaced)
 
     def _call(self, node: ast.Call) -> None:
-        callee = self.source.value(node.func)
+        kind, callee = self.source.call(node)
         given = [*node.args, *(keyword.value for keyword in node.keywords)]
-        if not isinstance(callee, wp.Function):
-            self._read_all(node, [node.func, *given], elements=callee is wp.address_of)
-        elif has_source(callee):
+        if kind == "helper":
             for overload in overloads(callee):
-                self._call_function(overload, node)
-        elif callee.func is None and callee.key in _READERS:
+                self._call_helper(overload, node)
+        elif kind == "builtin" and callee.key in _READERS:
             for argument in given:
                 self._read(argument)
-        else:
+        elif kind == "other":
+            self._read_all(node, [node.func, *given], elements=callee is wp.address_of)
+        elif kind != "static":
             self._read_all(node, given)
 
-    def _call_function(self, callee: wp.Function, node: ast.Call) -> None:
-        """Note what a function with a source writes into the arguments of a call."""
+    def _call_helper(self, callee: wp.Function, node: ast.Call) -> None:
+        """Note the writes of a helper into the arguments of a call."""
         expressions: dict[str, ast.expr] = dict(zip(callee.input_types, node.args, strict=False))
         expressions |= {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg}
         places = {name: place for name, given in expressions.items() if (place := self._read(given)) is not None}

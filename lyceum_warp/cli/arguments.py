@@ -109,7 +109,7 @@ def given(flags: Any) -> dict[str, Any]:
 
 NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "nvtx", "model", "fields", "dynamics", "physics")
 """Options of an environment without a generated flag. Commands define nworld, seed and the model themselves,
-``Physics`` has the flags of ``physics``, and the others are for Python alone."""
+``Physics`` has the flags of ``physics``, and the others are only for Python."""
 
 
 @optional_flags(EnvOptions, omit=(*NO_FLAGS, "horizon"))

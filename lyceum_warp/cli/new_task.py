@@ -1,4 +1,4 @@
-"""lyceum-warp new."""
+"""Write a task file for a model: lyceum-warp new."""
 
 import dataclasses
 import importlib.util
@@ -24,7 +24,7 @@ _SOURCES: dict[str, Callable[[str], ModelFile]] = {
     "gymnasium": gymnasium_model,
     "gymnasium_robotics": gymnasium_robotics_model,
 }
-"""Functions that name a model, by what stands before the colon of --model."""
+"""Functions that name a model, by the prefix before the colon in --model."""
 
 _TAKEN = ("World", "Params", "Row")
 """Names that the file uses itself."""
@@ -84,7 +84,7 @@ def _class_name(path: Path) -> str:
     """The name of the class in a task file.
 
     Raises:
-        ValueError: The file's name cannot be that of a task, or belongs to another task or module.
+        ValueError: The file's name cannot be the name of a task, or belongs to another task or module.
     """
     name = path.stem
     class_name = "".join(part[:1].upper() + part[1:] for part in name.split("_"))

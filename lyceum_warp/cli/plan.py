@@ -2,7 +2,9 @@
 
 import dataclasses
 import datetime
+import math
 import signal
+import time
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -35,7 +37,7 @@ from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.runs.folder import Run, load_value
 from lyceum_warp.support.interrupts import Interrupted
-from lyceum_warp.support.validate import whole_number
+from lyceum_warp.support.validate import positive_number, whole_number
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.control_plot import control_plot
 
@@ -76,7 +78,7 @@ class Plan:
     """Control a task with a planner that replans at every step, and report rewards, success and planning times.
 
     The planner is MPPI, or with --update the cross-entropy method (cem) or predictive sampling. Its settings come from
-    the task unless they are given. Options of the physics (--integrator, --solver, ...) apply to the planner alone.
+    the task unless they are given. Options of the physics (--integrator, --solver, ...) apply only to the planner.
 
     The folder then holds config.json, versions.json, report.json, plan.png, video.mp4 of the first episode, and a file
     for each episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy). After Ctrl-C the
@@ -93,6 +95,8 @@ class Plan:
     task: TaskWord
     episodes: int = 1
     """Number of episodes."""
+    minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    """Begin no further episode after so long."""
     steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Steps of an episode; by default the task's horizon."""
     replan_every: int = 1
@@ -128,6 +132,8 @@ class Plan:
         whole_number("episodes", self.episodes, low=1)
         whole_number("seed", self.seed, low=0)
         whole_number("seed of the last episode", self.seed + self.episodes - 1, low=0)
+        if self.minutes is not None:
+            positive_number("minutes", self.minutes, "minutes")
         if self.rate is not None and not 0 < self.rate < float("inf"):
             raise ValueError(f"rate must be a positive number of plans per second, not {self.rate}")
         every = whole_number("replan_every", self.replan_every, low=1)
@@ -232,8 +238,12 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
     aborted: list[Trajectory] = []
     method: Any = control_async if options.real_time else partial(control, replan_every=options.replan_every)
     shown: dict[str, Any] = dict(steps=plant.horizon, timestep=plant.timestep, real_time=options.real_time)
+    deadline = math.inf if options.minutes is None else time.monotonic() + 60 * options.minutes
     try:
         for episode in range(options.episodes):
+            if done and time.monotonic() >= deadline:
+                console.print(f"{options.minutes:g} minutes are over after {len(done)} of {options.episodes} episodes")
+                break
             with PlanDisplay(console, episode, options.episodes, **shown) as display:
                 seed = options.seed + episode
                 trajectory = method(plant, planner, seed=seed, on_step=display, on_abort=aborted.append)

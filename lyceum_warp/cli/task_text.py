@@ -1,4 +1,4 @@
-"""The text of a task file for a model: what lyceum-warp new writes."""
+"""Generate the text of a task file for a model, for lyceum-warp new."""
 
 import json
 
@@ -79,7 +79,7 @@ def _has_other_ranges(model: mujoco.MjModel) -> bool:
 def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list[str]]:
     """The fields of World, the parts of the observation with their sizes, and the lines that write it.
 
-    The sensors alone where they measure every joint; otherwise positions and velocities, with the sensors after them.
+    Only the sensors if they measure every joint; otherwise positions and velocities, then the sensors.
     """
     fields = ["qpos: Row[float]", "qvel: Row[float]"]
     sensed = _sensor_places(model)

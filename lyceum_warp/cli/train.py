@@ -106,6 +106,8 @@ class Train:
     """Which policy of --from: last, best, or the number of an iteration that was kept."""
     target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """End the run once the return of the mean policy reaches this number; without --mean-every the mean return."""
+    minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    """End with the iteration in which the training has lasted for so long; --resume goes on."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Iterations between two numbered policies, 0 for none. The last and the best policy are always kept."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
@@ -172,7 +174,8 @@ class Train:
                 with RunViewer(folder) if self.view and leads else contextlib.nullcontext():
                     run = train(
                         learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
-                        take_over=self.take_over, entries=entries, display=Display(console), **settings,
+                        take_over=self.take_over, minutes=self.minutes, entries=entries, display=Display(console),
+                        **settings,
                     )  # fmt: skip
             except Interrupted as signalled:
                 if leads and (path := folder / "policy.pt").exists():
@@ -187,6 +190,10 @@ class Train:
             reached = run.config.get("reached", {})
             if reached.get("iteration") == learner.iteration < total:
                 text = f"the target return is reached: {reached['return']:.6g} in iteration {learner.iteration}"
+                console.print(text, soft_wrap=True, markup=False)
+            elif learner.iteration < total and self.minutes is not None:
+                text = f"{self.minutes:g} minutes are over after {learner.iteration} of {total} iterations; continue "
+                text += f"with\n  lyceum-warp train --resume {folder} --iterations {total}"
                 console.print(text, soft_wrap=True, markup=False)
             return self._report(run, learner, console)
 
@@ -268,7 +275,8 @@ class Train:
         )  # fmt: skip
         paths = {"checkpoint": str(run.checkpoint), "metrics": str(run.metrics)}
         if (best := run.best_score()) is not None:
-            console.print(f"best policy: return {best[1]:.1f} in iteration {best[0]}", soft_wrap=True)
+            every = "" if learner.best_by == "return_mean" else " (of the evaluated ones)"
+            console.print(f"best policy: return {best[1]:.1f} in iteration {best[0]}{every}", soft_wrap=True)
             paths["best"] = str(run.best)
         if self.plot:
             paths["curve"] = tried(learning_curve, run)

@@ -1,4 +1,4 @@
-"""A controller as the loops call it, with its results checked."""
+"""Check the results of controllers, and convert between the time steps of plant and plan."""
 
 import inspect
 import json
@@ -14,7 +14,7 @@ from lyceum_warp.support.validate import described, positive_number
 
 
 class CheckedController:
-    """Calls a controller, checks its actions, and converts the plant's steps to the controller's.
+    """Calls a controller, checks its actions, and converts steps of the plant to steps of the controller.
 
     Args:
         controller: The controller.
@@ -34,14 +34,14 @@ class CheckedController:
             )
         if (plants := getattr(controller, "plants", 1)) != 1:
             raise ValueError(
-                f"the controller plans for {plants} plants, and one is controlled here: make it with plants=1, or "
-                "control the worlds of an environment, as env.step(plan(env.get_state()))"
+                f"the controller plans for {plants} plants, and this loop controls one: make it with plants=1, or "
+                "control the worlds of an environment with env.step(plan(env.get_state()))"
             )
         self._controller: Any = controller
         self._names = env.action_space.columns
         timestep = getattr(controller, "timestep", env.timestep)
         self._ratio = env.timestep / positive_number("the timestep of a controller", timestep, "seconds")
-        self._takes_shift = _takes_argument(controller, "shift")
+        self._takes_shift = (signature := _signature(controller)) is not None and "shift" in signature.parameters
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, shift: int, step: int) -> torch.Tensor:
         """Make a plan for a state.
@@ -53,15 +53,14 @@ class CheckedController:
             step: Step of the plant, for error messages.
 
         Returns:
-            The plan, (horizon, nact) float32, a copy on the CPU. A controller without a plan returns one action, which
-            is a plan of horizon 1.
+            The plan, (horizon, nact) float32, a copy on the CPU. A single action counts as a plan of horizon 1.
 
         Raises:
-            ValueError: The plan has another shape, or is not finite.
+            ValueError: The plan has the wrong shape, or is not finite.
         """
         action = self._controller(state, obs, **({"shift": shift} if self._takes_shift else {}))
         plan = getattr(self._controller, "actions", None)
-        # the plan contains the action: copying both from a GPU would wait for it twice
+        # the plan contains the action; copying both from a GPU would synchronise twice
         return self._checked(action, 1, step)[None] if plan is None else self._checked(plan, 2, step)
 
     def reset(self, seed: int | None) -> None:
@@ -70,12 +69,12 @@ class CheckedController:
             reset(seed)
 
     def quality(self) -> tuple[float, float]:
-        """Number of failed samples of the last plan, and its effective number of samples; NaN where unknown."""
+        """Number of failed samples of the last plan, and its effective sample size; NaN if unknown."""
         summary = getattr(self._controller, "summary", None)
         if not isinstance(summary, Mapping):
             return math.nan, math.nan
         failed, effective = (float(summary.get(name, math.nan)) for name in ("failed_samples", "effective_samples"))
-        # if all samples failed, the weights are not defined: no sample is effective
+        # if all samples failed, the weights are undefined, and the effective sample size is 0
         return failed, 0.0 if failed == getattr(self._controller, "samples", None) else effective
 
     def steps(self, plant_steps: int) -> int:
@@ -83,21 +82,18 @@ class CheckedController:
         return math.floor(plant_steps * self._ratio + 0.5 + 1e-9)
 
     def passed(self, before: int, now: int) -> int:
-        """Steps of the controller between two steps of the plant's episode.
-
-        They add up: those of two intervals are together those of the whole.
-        """
+        """Number of controller steps between two steps of the plant's episode; adjacent intervals add up exactly."""
         return self.steps(now) - self.steps(before)
 
     def index(self, plant_steps: int, horizon: int) -> int:
-        """Index in a plan of the action to apply so many steps of the plant after the plan's state."""
+        """Index of the action to apply when the plant has made this many steps since the plan's state."""
         return min(self.steps(plant_steps), horizon - 1)
 
     def check_horizon(self, horizon: int, steps: int) -> None:
-        """Check that a plan has an action for so many steps of the plant.
+        """Check that a plan covers a number of plant steps.
 
         Raises:
-            ValueError: It ends before.
+            ValueError: The plan is shorter.
         """
         if (needed := self.steps(steps - 1) + 1) > horizon:
             plan = f"a plan of {horizon} actions" if hasattr(self._controller, "actions") else "no plan, but one action"
@@ -116,7 +112,7 @@ class CheckedController:
             found |= settings
         if isinstance(env := getattr(controller, "env", None), Env):
             found |= {"engine": env.engine.name, "device": env.device.alias}
-        # through JSON, so that it equals the content of a saved file; a value that JSON cannot hold becomes text
+        # a round trip through JSON, so that the result equals the content of a saved file; other types become text
         return dict(json.loads(json.dumps(found, default=str)))
 
     def _checked(self, value: Any, ndim: int, step: int) -> torch.Tensor:
@@ -133,36 +129,32 @@ class CheckedController:
 
 
 def _check_call(controller: Any) -> None:
-    """Refuse an object that cannot be called with a state and an observation."""
+    """Reject an object that cannot be called with a state and an observation."""
     if not callable(controller):
         raise ValueError(
             f"a controller must be callable with (state, obs), not {described(controller)}: give a function, or "
             "lw.MPPI(...)"
         )
-    forward = controller.forward if isinstance(controller, torch.nn.Module) else controller
-    if _takes(forward, 1) and not _takes(forward, 2):
+    signature = _signature(controller.forward if isinstance(controller, torch.nn.Module) else controller)
+    if signature is not None and _fits(signature, 1) and not _fits(signature, 2):
         raise ValueError(
             f"a controller is called with (state, obs), and {type(controller).__name__} takes one argument: give "
             "lambda state, obs: policy(obs)"
         )
 
 
-def _takes(function: Callable[..., Any], count: int) -> bool:
-    """Whether a function can be called with so many arguments; True where its signature is unknown."""
+def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
+    """The signature of a function; None if it is unknown, as for some C functions."""
     try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):  # of some functions written in C
-        return True
+        return inspect.signature(function)
+    except (TypeError, ValueError):
+        return None
+
+
+def _fits(signature: inspect.Signature, count: int) -> bool:
+    """Whether ``count`` positional arguments fit a signature."""
     try:
         signature.bind(*[None] * count)
     except TypeError:
         return False
     return True
-
-
-def _takes_argument(function: Callable[..., Any], name: str) -> bool:
-    """Whether a function has an argument of this name; False where its signature is unknown."""
-    try:
-        return name in inspect.signature(function).parameters
-    except (TypeError, ValueError):
-        return False

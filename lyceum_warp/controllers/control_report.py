@@ -1,20 +1,15 @@
-"""Reports on controlled worlds: how the episodes went, and whether the controller kept up with its plant."""
+"""Summarise trajectories in a report: returns, success, planning times, missed deadlines."""
 
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.controllers.control_statistics import (
-    age_statistics,
-    differing_names,
-    outcome_statistics,
-    plan_statistics,
-    sample_statistics,
-    tick_statistics,
-)
+import numpy as np
+import torch
+
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced
@@ -24,11 +19,10 @@ from lyceum_warp.support.validate import positive_number
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class ControlReport:
-    """Statistics of a controller's episodes; ``control_report`` makes it.
+    """Statistics of a controller's episodes, as returned by ``control_report``.
 
-    A value is None if there are too few plans for it, if it does not apply, or if the controller does not report it.
-    The first plan of each trajectory loads kernels and captures graphs. It counts in ``first_plan_ms``, and in no other
-    number about planning times.
+    A value is None if there are too few plans, if it does not apply, or if the controller does not report it. The first
+    plan of each trajectory loads kernels and captures graphs, so only ``first_plan_ms`` includes its planning time.
     """
 
     task: str
@@ -36,31 +30,31 @@ class ControlReport:
     engine: str
     """Name of the plant's engine."""
     mode: str
-    """"sync" if the plant waited for each plan, "async" if it kept its rate."""
+    """"sync" if the plant waited for each plan, "async" if it ran in real time."""
     episodes: int
     """Number of trajectories."""
     steps: int
-    """Number of steps of all trajectories."""
+    """Total number of steps."""
     plans: int
-    """Number of plans, without the first ones."""
+    """Number of plans, without the first plan of each trajectory."""
     first_plan_ms: float | None
-    """Longest planning time of the first plans, milliseconds."""
+    """Longest planning time of a first plan, milliseconds."""
     plan_mean_ms: float | None
     """Mean planning time, milliseconds."""
     plan_p50_ms: float | None
-    """Median of the planning time, milliseconds, interpolated; of at least 2 plans."""
+    """Median planning time, milliseconds; needs 2 plans. This and the other quantiles are interpolated."""
     plan_p90_ms: float | None
-    """90 % quantile of the planning time, milliseconds; of at least 10 plans."""
+    """90 % quantile of the planning time, milliseconds; needs 10 plans."""
     plan_p99_ms: float | None
-    """99 % quantile of the planning time, milliseconds; of at least 100 plans."""
+    """99 % quantile of the planning time, milliseconds; needs 100 plans."""
     plan_p99_9_ms: float | None
-    """99.9 % quantile of the planning time, milliseconds; of at least 1000 plans."""
+    """99.9 % quantile of the planning time, milliseconds; needs 1000 plans."""
     plan_max_ms: float | None
     """Longest planning time, milliseconds."""
     plan_jitter_ms: float | None
     """Standard deviation of the planning time, milliseconds."""
     plans_per_second: float | None
-    """Finished plans per second of the wall clock."""
+    """Finished plans per second of wall time."""
     deadline_ms: float
     """Deadline of a plan, milliseconds: 1 / rate, or the plant's period."""
     misses: int
@@ -68,43 +62,42 @@ class ControlReport:
     miss_share: float | None
     """Share of the plans that took longer than the deadline."""
     blind_plans: int | None
-    """Number of plans whose samples all failed, the first plans included. Such a plan is the plan before it, moved
-    forward."""
+    """Number of plans whose samples all failed, first plans included. Such a plan repeats the previous plan, moved
+    forward in time."""
     known_plans: int
-    """Number of plans for which the failed samples are known, the first plans included."""
+    """Number of plans with a known number of failed samples, first plans included."""
     failed_share: float | None
-    """Share of the samples of these plans that failed."""
+    """Share of failed samples in these plans."""
     effective_samples_mean: float | None
-    """Mean of the effective number of samples of a plan: 1 if a single sample decides, 0 if all failed."""
+    """Mean effective sample size of a plan: 1 if a single sample decides, 0 if all failed."""
     tick_jitter_ms: float | None
-    """Standard deviation of the delay of the plant's steps, milliseconds; None if the plant waits for its plans."""
+    """Standard deviation of the delay of the plant's steps, milliseconds; None in a synchronous run."""
     tick_delay_max_ms: float | None
     """Longest delay of a step, milliseconds."""
     late_ticks: int | None
-    """Number of steps that began late because the step before was not finished in time."""
+    """Number of steps that began late because the previous step was not finished in time."""
     age_mean_ms: float
     """Mean age of the applied actions, milliseconds; see ``Trajectory.ages``."""
     age_max_ms: float
-    """Greatest age of the applied actions, milliseconds."""
+    """Maximum age of the applied actions, milliseconds."""
     age_steps_mean: float
-    """Mean age of the applied actions in steps of the plant; 0 if the plant waits for its plans."""
+    """Mean age of the applied actions, in steps of the plant."""
     age_steps_max: int
-    """Greatest age in steps: 1 if the controller kept up. (In milliseconds it may then be slightly more than a period,
-    because a step begins shortly after it is due.)"""
+    """Maximum age of the applied actions, in steps of the plant: 1 if the controller kept up."""
     real_time_factor: float
-    """Simulated seconds per second of the wall clock, over all episodes."""
+    """Simulated seconds per second of wall time, over all episodes."""
     episode_seconds_mean: float
-    """Mean duration of an episode by the wall clock, seconds."""
+    """Mean wall time of an episode, seconds."""
     return_mean: float
     """Mean return."""
     return_std: float | None
-    """Standard deviation of the returns, of a sample (n - 1)."""
+    """Sample standard deviation of the returns (n - 1)."""
     eval_mean: float
-    """Mean of the evaluation metric at the end of the episodes."""
+    """Mean evaluation metric in the last states of the episodes."""
     success: float
-    """Share of the episodes whose goal is met at the end."""
+    """Share of the episodes that end in success."""
     success_low: float
-    """Lower bound of the 95 % confidence interval of that share (Wilson 1927)."""
+    """Lower bound of the 95 % confidence interval of ``success`` (Wilson 1927)."""
     success_high: float
     """Upper bound of that interval."""
     params: Mapping[str, Any]
@@ -115,15 +108,11 @@ class ControlReport:
     """Packages, Python and machine of the first trajectory."""
 
     def to_json(self) -> str:
-        """The report as JSON, with null for missing and for infinite numbers."""
+        """The report as JSON; missing and infinite numbers are null."""
         return json.dumps(_finite(dataclasses.asdict(self)), indent=2, allow_nan=False)
 
     def write(self, path: str | Path) -> Path:
-        """Write the JSON to a file. A reader finds the old file or the whole new one.
-
-        Returns:
-            The file's path.
-        """
+        """Write the JSON to a file, atomically, and return its path."""
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         with replaced(path) as temporary:
@@ -131,7 +120,7 @@ class ControlReport:
         return path
 
     def rows(self) -> list[tuple[str, str]]:
-        """The report as rows of text: a label, and a number with its unit or "-" if it is missing."""
+        """The report as rows of text: a label, and a number with its unit, or "-" if the number is missing."""
         rows = [
             ("episodes", f"{self.episodes} of {self.task} ({self.steps} steps, {self.mode})"),
             ("return", _text(self.return_mean, ".4g") + _text(self.return_std, ".2g", " ± {}", "")),
@@ -171,11 +160,10 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
 
     Args:
         trajectories: Episodes of the same task, engine, mode and controller.
-        rate: Required plans per second, which set the deadline; by default one plan in each of the plant's periods.
+        rate: Required plans per second, which set the deadline; by default one plan per period of the plant.
 
     Raises:
-        ValueError: There is no trajectory, the trajectories are of different kinds, or the rate is not
-            positive.
+        ValueError: There is no trajectory, the trajectories are of different kinds, or the rate is not positive.
     """
     episodes = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
     if not episodes:
@@ -183,17 +171,15 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
     first = episodes[0]
     for name in ("task", "engine", "mode", "timestep", "period"):
         if len(values := {getattr(episode, name) for episode in episodes}) > 1:
-            raise ValueError(f"these trajectories differ in their {name} ({values}): make a report of each kind")
+            raise ValueError(f"these trajectories differ in their {name} ({values}): make separate reports")
     for name in ("params", "controller"):
-        if names := differing_names([getattr(episode, name) for episode in episodes]):
-            raise ValueError(
-                f"these trajectories differ in their {name} ({', '.join(names)}): make a report of each kind"
-            )
+        if names := _differing_names([getattr(episode, name) for episode in episodes]):
+            raise ValueError(f"these trajectories differ in their {name} ({', '.join(names)}): make separate reports")
     deadline = first.period if rate is None else 1 / positive_number("rate", rate, "plans per second")
     return ControlReport(
         task=first.task, engine=first.engine, mode=first.mode, params=first.params, controller=first.controller,
-        versions=first.versions, **outcome_statistics(episodes), **plan_statistics(episodes, deadline),
-        **sample_statistics(episodes), **tick_statistics(episodes), **age_statistics(episodes),
+        versions=first.versions, **_outcome_statistics(episodes), **_plan_statistics(episodes, deadline),
+        **_sample_statistics(episodes), **_tick_statistics(episodes), **_age_statistics(episodes),
     )  # fmt: skip
 
 
@@ -213,3 +199,119 @@ def _finite(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+# the quantiles, each with the number of plans from which on one plan is expected beyond it
+_QUANTILES = {"p50": (0.5, 2), "p90": (0.9, 10), "p99": (0.99, 100), "p99_9": (0.999, 1000)}
+
+
+def wilson(successes: int, trials: int) -> tuple[float, float]:
+    """Wilson's 95 % confidence interval of a share (Wilson 1927)."""
+    z = 1.959963984540054
+    share = successes / trials
+    middle = share + z * z / (2 * trials)
+    spread = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
+    low, high = ((middle + sign * spread) / (1 + z * z / trials) for sign in (-1, 1))
+    return max(0.0, low), min(1.0, high)
+
+
+def _joined(parts: Iterable[torch.Tensor]) -> np.ndarray:
+    return torch.cat(list(parts)).numpy()
+
+
+def _std(values: np.ndarray) -> float | None:
+    """Sample standard deviation (n - 1); None for fewer than two values, or if one is not finite."""
+    return float(values.std(ddof=1)) if len(values) > 1 and np.isfinite(values).all() else None
+
+
+def _differing_names(mappings: Sequence[Mapping[str, Any]]) -> list[str]:
+    names = dict.fromkeys(name for mapping in mappings for name in mapping)
+    # compare as text, because NaN != NaN
+    return [name for name in names if len({json.dumps(mapping.get(name)) for mapping in mappings}) > 1]
+
+
+def _plan_statistics(episodes: Sequence[Trajectory], deadline: float) -> dict[str, Any]:
+    """Planning times and missed deadlines, without the first plan of each episode."""
+    times = _joined(episode.plan_times[1:] for episode in episodes)
+    misses = int((times > deadline).sum())
+    return {
+        "plans": len(times),
+        "first_plan_ms": 1000 * max(float(episode.plan_times[0]) for episode in episodes),
+        "plan_mean_ms": 1000 * float(times.mean()) if len(times) else None,
+        **{
+            f"plan_{name}_ms": float(np.quantile(1000 * times, q)) if len(times) >= enough else None
+            for name, (q, enough) in _QUANTILES.items()
+        },
+        "plan_max_ms": 1000 * float(times.max()) if len(times) else None,
+        "plan_jitter_ms": _std(1000 * times),
+        "plans_per_second": _plans_per_second(episodes),
+        "deadline_ms": 1000 * deadline,
+        "misses": misses,
+        "miss_share": misses / len(times) if len(times) else None,
+    }
+
+
+def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
+    """Plans per second, without the first plan of each episode and the wall time that it took."""
+    plans, seconds = 0, 0.0
+    for episode in episodes:
+        ends = episode.plan_starts + episode.plan_times
+        plans += int((ends[1:] <= episode.wall_seconds).sum())  # the last plan may end after the plant has stopped
+        seconds += episode.wall_seconds - max(0.0, float(ends[0]))
+    return plans / seconds if plans and seconds > 0 else None
+
+
+def _sample_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
+    """Failed and effective samples of the plans for which the controller reports them."""
+    failed, effective = (_joined(getattr(e, name) for e in episodes) for name in ("plan_failed", "plan_effective"))
+    failed, effective = failed[np.isfinite(failed)], effective[np.isfinite(effective)]
+    samples = episodes[0].controller.get("samples")
+    known = isinstance(samples, int) and samples > 0 and len(failed) > 0
+    return {
+        "blind_plans": int((failed >= samples).sum()) if known else None,
+        "known_plans": len(failed) if known else 0,
+        "failed_share": float(failed.mean() / samples) if known else None,
+        "effective_samples_mean": float(effective.mean()) if len(effective) else None,
+    }
+
+
+def _tick_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
+    """Delays of the steps in an asynchronous run."""
+    if episodes[0].mode == "sync":
+        return {"tick_jitter_ms": None, "tick_delay_max_ms": None, "late_ticks": None}
+    delays = 1000 * _joined(episode.times - episode.period * torch.arange(episode.steps) for episode in episodes)
+    return {
+        "tick_jitter_ms": _std(delays),
+        "tick_delay_max_ms": float(delays.max()),
+        "late_ticks": sum(int(episode.late.sum()) for episode in episodes),
+    }
+
+
+def _age_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
+    ages = _joined(episode.ages for episode in episodes)
+    age_steps = _joined(episode.age_steps for episode in episodes)
+    return {
+        "age_mean_ms": 1000 * float(ages.mean()),
+        "age_max_ms": 1000 * float(ages.max()),
+        "age_steps_mean": float(age_steps.mean()),
+        "age_steps_max": int(age_steps.max()),
+    }
+
+
+def _outcome_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
+    returns = np.array([episode.episode_return for episode in episodes])
+    wall, steps = sum(episode.wall_seconds for episode in episodes), sum(episode.steps for episode in episodes)
+    successes = sum(episode.succeeded for episode in episodes)
+    low, high = wilson(successes, len(episodes))
+    return {
+        "episodes": len(episodes),
+        "steps": steps,
+        "real_time_factor": steps * episodes[0].timestep / wall,
+        "episode_seconds_mean": wall / len(episodes),
+        "return_mean": float(returns.mean()),
+        "return_std": _std(returns),
+        "eval_mean": float(np.mean([float(episode.evals[-1]) for episode in episodes])),
+        "success": successes / len(episodes),
+        "success_low": low,
+        "success_high": high,
+    }

@@ -1,4 +1,4 @@
-"""The protocols of a controller: the members that ``lw.control`` and ``lw.control_async`` use."""
+"""Define the protocols of a controller: the members that ``lw.control`` and ``lw.control_async`` use."""
 
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
@@ -11,9 +11,8 @@ from lyceum_warp.env import Env
 class Controller(Protocol):
     """A function that returns an action for the state and the observation of one world, the plant.
 
-    A plain function is a controller, and so is ``lw.MPPI``. A policy becomes one as
-    ``lambda state, obs: policy(obs)``. A controller may also have members of ``PlanningController``. Each of them is
-    optional, and the loops use those that exist.
+    A plain function is a controller, and so is ``lw.MPPI``. To control with a policy, pass
+    ``lambda state, obs: policy(obs)``. All further members, listed in ``PlanningController``, are optional.
     """
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /) -> torch.Tensor:
@@ -21,7 +20,7 @@ class Controller(Protocol):
 
         Args:
             state: State of the plant as in ``env.get_state()[0]``, (state_size,) float64, on the plant's device.
-            obs: Observation of that state, (nobs,) float32, on the same device.
+            obs: Its observation, (nobs,) float32, on the same device.
 
         Returns:
             The action, (nu,), finite, on any device.
@@ -33,8 +32,7 @@ class Controller(Protocol):
 class PlanningController(Controller, Protocol):
     """A controller that makes a plan, a sequence of actions, at every call. ``lw.MPPI`` is one.
 
-    These are all members that the loops use beyond the call. A controller implements those that it needs, and does not
-    derive from this class.
+    A controller implements the members that it needs, and need not derive from this class.
     """
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /, *, shift: int = 1) -> torch.Tensor:
@@ -44,12 +42,12 @@ class PlanningController(Controller, Protocol):
             state: See ``Controller``.
             obs: See ``Controller``.
             shift: Steps of length ``timestep`` since the state of the last plan, 0 for the first plan after a reset.
-                With ``reset=False`` the last plan is taken to have been made in the step before, or in the last step in
-                which a run with the same ``replan_every`` makes one. The loops pass it to controllers that have an
-                argument of this name.
+                With ``reset=False`` the loops assume that the last plan was made in the previous step, or with
+                ``replan_every`` in the last step that is due for a plan. They pass ``shift`` only to controllers
+                that have an argument of this name.
 
         Returns:
-            The first action of the plan, (nu,). The loops read ``actions`` instead, if it is there.
+            The first action of the plan, (nu,). The loops read ``actions`` instead, if the controller has it.
         """
         ...
 
@@ -64,12 +62,12 @@ class PlanningController(Controller, Protocol):
 
     @property
     def timestep(self) -> float:
-        """Simulated seconds between two actions of the plan. By default the plant's time step."""
+        """Simulated seconds between two actions of the plan; by default the plant's time step."""
         ...
 
     @property
     def plants(self) -> int:
-        """Number of plants that it plans for, by default 1. The loops control one."""
+        """Number of plants to plan for, by default 1. The loops accept no other number."""
         ...
 
     @property
@@ -79,12 +77,12 @@ class PlanningController(Controller, Protocol):
 
     @property
     def summary(self) -> Mapping[str, float]:
-        """Quality of the last plan: ``failed_samples``, and ``effective_samples``, the effective number of samples."""
+        """Quality of the last plan: ``failed_samples``, and ``effective_samples``, the effective sample size."""
         ...
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """Settings for ``Trajectory.controller``. Values that JSON cannot hold are converted to text."""
+        """Settings for ``Trajectory.controller``. Values without a JSON type are converted to text."""
         ...
 
     @property

@@ -1,4 +1,4 @@
-"""The common part of both loops: the limits of an episode, its progress, and the collection of its steps and plans."""
+"""Begin the episode of a control loop, collect its steps and plans, and report its progress."""
 
 import dataclasses
 import time
@@ -16,20 +16,20 @@ from lyceum_warp.support.validate import check_flag, check_function, check_kind,
 @document_attributes
 @dataclasses.dataclass(frozen=True)
 class ControlProgress:
-    """Progress of an episode after a step; ``on_step`` is called with it."""
+    """Progress of an episode after a step, the argument of ``on_step``."""
 
     step: int
     """Number of steps so far."""
     time: float
-    """Seconds of the wall clock so far, this step included."""
+    """Wall time so far, this step included, seconds."""
     reward: float
     """Reward of the step."""
     eval: float
     """Evaluation metric of the state after the step."""
     success: bool
-    """Whether the task's goal is met in that state."""
+    """Whether that state is a success."""
     plan_time: float
-    """Planning time of the plan that the action came from, seconds."""
+    """Planning time of the action's plan, seconds."""
     age: float
     """Age of the action when it was applied, seconds; see ``Trajectory.ages``."""
     plans: int
@@ -42,51 +42,43 @@ OnAbort = Callable[[Trajectory], object]
 
 @dataclasses.dataclass(frozen=True)
 class TimedPlan:
-    """A finished plan, with its number and its times."""
+    """A finished plan and its planning time."""
 
     index: int
-    step: int  # of the state from which it was made
+    step: int  # of the state that it was made from
     begun: float  # by the clock of the run
     seconds: float
     actions: torch.Tensor  # (horizon, nact)
 
 
-def check_plant(env: Env, *, reset: bool, on_step: OnStep | None, on_abort: OnAbort | None) -> None:
-    """Check the arguments that both loops share.
-
-    Raises:
-        ValueError: One is of another type.
-    """
+def check_arguments(env: Env, *, reset: bool, on_step: OnStep | None, on_abort: OnAbort | None) -> None:
+    """Check the types of the arguments that both loops share."""
     check_kind("env", env, Env, "as lw.make(..., autoreset=False) makes it")
     check_flag("reset", reset)
     check_function("on_step", on_step)
     check_function("on_abort", on_abort)
 
 
-def step_limit(env: Env, steps: int | None) -> int:
-    """The number of steps after which a run stops.
+def begin_episode(
+    env: Env, controller: CheckedController, steps: int | None, seed: int | None, *, reset: bool
+) -> tuple[int, int]:
+    """Reset the plant and the controller, unless the run continues from their states.
+
+    Returns:
+        The number of steps after which to stop, and the step of the episode at which the run begins.
 
     Raises:
-        ValueError: The environment has several worlds or automatic resets, or its episodes may never end.
+        ValueError: The environment has several worlds or automatic resets, its episodes may never end, the episode is
+            already over, or a seed is given without a reset.
     """
     if env.nworld != 1 or env.autoreset:
         raise ValueError(
-            "a controller controls one world without automatic resets, not "
+            "a control loop needs one world without automatic resets, not "
             f"nworld={env.nworld}, autoreset={env.autoreset}: make(..., nworld=1, autoreset=False)"
         )
-    if steps is not None:
-        return whole_number("steps", steps, low=1)
-    if env.horizon == 0:
+    if steps is None and env.horizon == 0:
         raise ValueError(f"episodes of {env.task.name!r} may never end without a horizon: give steps, or a horizon")
-    return env.horizon
-
-
-def begin_episode(env: Env, controller: CheckedController, seed: int | None, *, reset: bool) -> None:
-    """Reset the plant and the controller, unless the run continues from their states.
-
-    Raises:
-        ValueError: A seed is given without a reset, or the episode is already over.
-    """
+    limit = env.horizon if steps is None else whole_number("steps", steps, low=1)
     if reset:
         env.rand_reset(seed)
         controller.reset(seed)
@@ -94,11 +86,7 @@ def begin_episode(env: Env, controller: CheckedController, seed: int | None, *, 
         raise ValueError(f"seed={seed} has no effect with reset=False: leave out one of them")
     if env.done.item():
         raise ValueError("the episode is over before its first step: reset the environment, or leave out reset=False")
-
-
-def first_step(env: Env, *, reset: bool) -> int:
-    """The step of the episode at which a run begins."""
-    return 0 if reset else int(env.episode_step.item())
+    return limit, 0 if reset else int(env.episode_step.item())
 
 
 class EpisodeCollector:
@@ -110,9 +98,9 @@ class EpisodeCollector:
         env: The plant, in its initial state.
         controller: Its controller.
         mode: "sync" or "async"; see ``Trajectory.mode``.
-        period: Seconds of the wall clock between two steps.
+        period: Wall time between two steps, seconds.
         seed: Seed of the run.
-        now: The clock.
+        now: Reads the clock, in seconds.
     """
 
     def __init__(
@@ -123,18 +111,14 @@ class EpisodeCollector:
         self.controller = controller.description()
         self.states, self.obs = [env.get_state()[0]], [env.obs[0].clone()]
         self.times: list[float] = []
-        self._actions: list[torch.Tensor] = []
+        self._applied: list[tuple[torch.Tensor, TimedPlan, float, bool]] = []  # action, plan, age, late
         self._outcomes: list[tuple[float, float, bool]] = []
-        self._ages: list[float] = []
-        self._late: list[bool] = []
-        self._plan_of: list[int] = []
         self._plans: list[tuple[int, float, float, float, float]] = []
-        self._applied: TimedPlan | None = None
         self._now = now
         self.start = now()
 
     def restart_clock(self) -> None:
-        """Count seconds from now on. The clock started when the collector was made."""
+        """Count wall time from now on, instead of from the construction of the collector."""
         self.start = self._now()
 
     def elapsed(self) -> float:
@@ -142,41 +126,31 @@ class EpisodeCollector:
         return self._now() - self.start
 
     def add_plan(self, plan: TimedPlan, quality: tuple[float, float]) -> None:
-        """Add a finished plan.
-
-        Args:
-            plan: The plan.
-            quality: Number of failed samples, and effective number of samples.
-        """
+        """Add a finished plan; ``quality`` has its number of failed samples and its effective sample size."""
         self._plans.append((plan.step, plan.begun - self.start, plan.seconds, *quality))
 
     def before_step(self, plan: TimedPlan, now: float, age: float, *, late: bool) -> None:
-        """Add the action in ``env.action``, which is about to be applied.
+        """Add the action in ``env.action``, just before it is applied.
 
         Args:
-            plan: The plan that it comes from.
+            plan: The action's plan.
             now: Seconds since the clock started.
             age: Age of the action, seconds.
             late: Whether the step begins late.
         """
-        self._actions.append(self.env.action[0].clone())
+        self._applied.append((self.env.action[0].clone(), plan, age, late))
         self.times.append(now)
-        self._ages.append(age)
-        self._late.append(late)
-        self._plan_of.append(plan.index)
-        self._applied = plan
 
     def after_step(self, on_step: OnStep | None) -> None:
-        """Add the state, the observation and the outcome of a step, and report the progress."""
+        """Add the state, the observation and the outcome of a step, and report progress."""
         env = self.env
         self.states.append(env.get_state()[0])
         self.obs.append(env.final_obs[0].clone())
         self._outcomes.append((env.reward.item(), env.eval.item(), bool(env.success.item())))
         if on_step is not None:
-            assert self._applied is not None
-            plan_time, plans = self._applied.seconds, self._applied.index + 1
-            step, outcome, age = len(self._outcomes), self._outcomes[-1], self._ages[-1]
-            on_step(ControlProgress(step, self.elapsed(), *outcome, plan_time, age, plans))
+            _, plan, age, _ = self._applied[-1]
+            step, outcome = len(self._outcomes), self._outcomes[-1]
+            on_step(ControlProgress(step, self.elapsed(), *outcome, plan.seconds, age, plan.index + 1))
 
     def abort(self, on_abort: OnAbort | None, wall_seconds: float) -> None:
         """Call ``on_abort`` with the steps so far, if there are any."""
@@ -185,17 +159,18 @@ class EpisodeCollector:
 
     def trajectory(self, wall_seconds: float, done_reason: int) -> Trajectory:
         """Make the trajectory of all complete steps."""
-        steps = len(self._outcomes)  # outcomes are added last: an interrupted step has none
+        steps = len(self._outcomes)  # outcomes are added last, so an interrupted step has none
         rewards, evals, success = zip(*self._outcomes, strict=True)
+        actions, applied, ages, late = zip(*self._applied[:steps], strict=True)
         plan_steps, *plans = zip(*self._plans, strict=True)
         plan_starts, plan_times, failed, effective = (torch.tensor(column, dtype=torch.float64) for column in plans)
-        times, ages = (torch.tensor(column[:steps], dtype=torch.float64) for column in (self.times, self._ages))
         return Trajectory(
             states=torch.stack(self.states[: steps + 1]).cpu(), obs=torch.stack(self.obs[: steps + 1]).cpu(),
-            actions=torch.stack(self._actions[:steps]).cpu(), rewards=torch.tensor(rewards), evals=torch.tensor(evals),
-            success=torch.tensor(success), times=times, ages=ages, late=torch.tensor(self._late[:steps]),
-            plan_of=torch.tensor(self._plan_of[:steps]), plan_steps=torch.tensor(plan_steps), plan_starts=plan_starts,
-            plan_times=plan_times, plan_failed=failed, plan_effective=effective, timestep=self.env.timestep,
-            period=self.period, wall_seconds=wall_seconds, mode=self.mode, done_reason=done_reason, seed=self.seed,
-            controller=self.controller, **provenance(self.env),
+            actions=torch.stack(actions).cpu(), rewards=torch.tensor(rewards), evals=torch.tensor(evals),
+            success=torch.tensor(success), times=torch.tensor(self.times[:steps], dtype=torch.float64),
+            ages=torch.tensor(ages, dtype=torch.float64), late=torch.tensor(late),
+            plan_of=torch.tensor([plan.index for plan in applied]), plan_steps=torch.tensor(plan_steps),
+            plan_starts=plan_starts, plan_times=plan_times, plan_failed=failed, plan_effective=effective,
+            timestep=self.env.timestep, period=self.period, wall_seconds=wall_seconds, mode=self.mode,
+            done_reason=done_reason, seed=self.seed, controller=self.controller, **provenance(self.env),
         )  # fmt: skip

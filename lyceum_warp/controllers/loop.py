@@ -1,4 +1,4 @@
-"""The synchronous loop: the plant waits for each plan."""
+"""Run the synchronous loop, ``lw.control``: the plant waits for each plan."""
 
 import time
 
@@ -12,9 +12,7 @@ from lyceum_warp.controllers.episode_collector import (
     OnStep,
     TimedPlan,
     begin_episode,
-    check_plant,
-    first_step,
-    step_limit,
+    check_arguments,
 )
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
@@ -37,32 +35,30 @@ def control(
 
     Args:
         env: The plant: one world, made with ``autoreset=False``.
-        controller: Called once a step; see ``lw.Controller``. It must not step ``env``.
+        controller: Called for each plan; see ``lw.Controller``. It must not step ``env``.
         steps: Steps after which to stop if the episode has not ended.
-        replan_every: Steps from one plan to the next. The steps between apply the plan's further actions, so that a
-            controller of more than 1 must have ``actions``.
+        replan_every: Steps from one plan to the next. The steps in between apply the next actions of the plan, so
+            values above 1 need a controller with ``actions``.
         seed: Seed of the initial state and of the controller.
         reset: Whether to reset the plant and the controller first. With False the run continues from the plant's
-            state and the controller's last plan, which is taken for one of a run with the same ``replan_every``.
-        on_step: Called with a ``ControlProgress`` after each step. Its time counts as no plan's time.
+            state and the controller's last plan; the last run must have had the same ``replan_every``.
+        on_step: Called with a ``ControlProgress`` after each step. Planning times do not include it.
         on_abort: Called with the trajectory of the complete steps, if there are any, when an exception ends the run
-            (Ctrl-C included). ``done_reason`` of that trajectory is 0. The exception is raised afterwards.
+            (Ctrl-C included). Its ``done_reason`` is 0. The exception is raised afterwards.
 
     Returns:
         The episode. Its ``period`` is the plant's time step.
 
     Raises:
-        ValueError: The environment has several worlds or automatic resets, the episode is over or may never end, or
-            the controller does not return a finite action of the right shape, or its plan ends before the next one.
+        ValueError: The environment has several worlds or automatic resets, the episode is over or may never end, an
+            action has the wrong shape or is not finite, or a plan is shorter than ``replan_every``.
     """
-    check_plant(env, reset=reset, on_step=on_step, on_abort=on_abort)
-    limit = step_limit(env, steps)
+    check_arguments(env, reset=reset, on_step=on_step, on_abort=on_abort)
     every = whole_number("replan_every", replan_every, low=1)
     checked = CheckedController(controller, env)
-    begin_episode(env, checked, seed, reset=reset)
+    # steps count from the reset, so a run in several parts shifts its plans like one run
+    limit, first = begin_episode(env, checked, steps, seed, reset=reset)
     episode = EpisodeCollector(env, checked, mode="sync", period=env.timestep, seed=seed)
-    # steps count from the reset, so that a run in parts shifts its plans as one run does
-    first = first_step(env, reset=reset)
     planned = max(first - 1, 0) // every * every
     plan = None
     try:

@@ -1,4 +1,4 @@
-"""Episodes of a policy as trajectories, in many worlds at once."""
+"""Run episodes of a policy in many worlds at once, and return them as trajectories."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -21,21 +21,21 @@ def policy_episodes(
     controller: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Iterator[Trajectory]:
-    """Run whole episodes of a policy from random initial states, and make trajectories of them.
+    """Run whole episodes of a policy from random initial states, and return them as trajectories.
 
-    With the seed ``lw.evaluate`` resets worlds with, and as many worlds, these are the episodes that it evaluates. The
-    times of a trajectory are those of its batch: a policy acts in all worlds at once.
+    With the same reset seed and number of worlds, these are the episodes of ``lw.evaluate``. The policy acts in all
+    worlds at once, so the times in a trajectory are times of the whole batch.
 
     Args:
         env: An environment made with ``autoreset=False``; its worlds are reset.
         policy: Called with observations, (nworld, nobs); returns actions, (nworld, nact).
         episodes: Number of episodes.
         seed: Seed of the initial states; by default the worlds continue their random streams.
-        controller: What the trajectories say of the policy; see ``Trajectory.controller``.
-        progress: Called now and then with the number of steps so far and the largest possible number.
+        controller: Description of the policy; see ``Trajectory.controller``.
+        progress: Called every ten steps with the number of steps so far and its upper bound.
 
     Yields:
-        The episodes: those of all worlds, then the next ones of all worlds.
+        The first episodes of all worlds, then the second episodes of all worlds, and so on.
 
     Raises:
         ValueError: The environment has automatic resets, or its episodes may never end.
@@ -57,18 +57,20 @@ def policy_episodes(
                 progress(number * env.horizon + batch.steps, rounds * env.horizon)
         for world in range(min(env.nworld, episodes - number * env.nworld)):
             place = {"world": env.first_world + world, "episode": number}
-            yield batch.trajectory(world, seed=seed, controller=named | place, **_own(origin, env, world))
+            own = {name: [value[world].tolist()] for name, value in env.task.parameters.per_world.items()}
+            params = {"params": origin["params"] | own}
+            yield batch.trajectory(world, seed=seed, controller=named | place, **origin | params)
 
 
 class _Batch:
-    """An episode in every world of an environment, whose worlds were reset."""
+    """One episode in every world of an environment, starting from its current states."""
 
     def __init__(self, env: Env) -> None:
         self.env = env
         self._states, self._obs = [env.get_state().cpu()], [env.obs.cpu().clone()]
         self._actions: list[torch.Tensor] = []
         self._outcomes: list[torch.Tensor] = []
-        self._times: list[tuple[float, float, float]] = []  # of applying the action, of the policy, of the step's end
+        self._times: list[tuple[float, float, float]] = []  # action applied at, policy's duration, step ended at
         self._lengths = torch.zeros(env.nworld, dtype=torch.long)
         self._reasons = torch.zeros(env.nworld, dtype=torch.long)
         self._start = time.perf_counter()
@@ -84,7 +86,7 @@ class _Batch:
         return bool((self._lengths > 0).all())
 
     def step(self, policy: Callable[[torch.Tensor], torch.Tensor]) -> None:
-        """Step all worlds, also those whose episodes have ended."""
+        """Step all worlds, finished or not."""
         env, begun = self.env, time.perf_counter()
         env.action.copy_(policy(env.obs))
         self._actions.append(env.action.cpu().clone())
@@ -99,7 +101,7 @@ class _Batch:
         self._reasons[over] = env.done_reason.cpu()[over].long()
 
     def trajectory(self, world: int, **origin: Any) -> Trajectory:
-        """The episode of a world, with the attributes that describe its origin."""
+        """The episode of a world; ``origin`` has the attributes that describe its origin."""
         env, steps = self.env, int(self._lengths[world])
         states, obs = (torch.stack([row[world] for row in rows[: steps + 1]]) for rows in (self._states, self._obs))
         rewards, evals, success = torch.stack([row[:, world] for row in self._outcomes[:steps]], 1)
@@ -116,9 +118,3 @@ class _Batch:
             timestep=env.timestep, period=env.timestep, wall_seconds=self._times[steps - 1][2], mode="sync",
             done_reason=int(self._reasons[world]), **origin,
         )  # fmt: skip
-
-
-def _own(origin: Mapping[str, Any], env: Env, world: int) -> dict[str, Any]:
-    """The origin of a world's episode: of parameters that differ between worlds it has its own value."""
-    values = {name: [value[world].tolist()] for name, value in env.task.parameters.per_world.items()}
-    return {**origin, "params": origin["params"] | values}

@@ -1,4 +1,4 @@
-"""The loop in real time: the plant keeps its rate while a thread plans."""
+"""Run the loop in real time, ``lw.control_async``: the plant keeps its rate while a thread plans."""
 
 import atexit
 import contextlib
@@ -10,7 +10,6 @@ import threading
 import time
 import weakref
 from collections.abc import Iterator
-from typing import Protocol
 
 import torch
 
@@ -22,18 +21,17 @@ from lyceum_warp.controllers.episode_collector import (
     OnStep,
     TimedPlan,
     begin_episode,
-    check_plant,
-    first_step,
-    step_limit,
+    check_arguments,
 )
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_kind, positive_number, whole_number
 
-_SPIN = 0.0005  # seconds before its end that a wait stops sleeping and polls the clock
-_PATIENCE = 0.2  # seconds that an unfinished plan delays an exception at most
-_EXIT_PATIENCE = 5.0  # seconds that an unfinished plan delays the end of the program at most
-_SWITCH_INTERVAL = 0.0005  # seconds; Python's default of 5 ms is most of a fast plant's period
+# all in seconds
+_SPIN = 0.0005  # the last part of a wait, which polls the clock instead of sleeping
+_PATIENCE = 0.2  # longest wait of an exception for an unfinished plan
+_EXIT_PATIENCE = 5.0  # longest wait of the program's end for an unfinished plan
+_SWITCH_INTERVAL = 0.0005  # Python's default of 5 ms is most of a fast plant's period
 
 
 @torch.no_grad()
@@ -50,53 +48,52 @@ def control_async(
     on_abort: OnAbort | None = None,
     clock: "Clock | None" = None,
 ) -> Trajectory:
-    """Control one world, the plant, that keeps its rate by the wall clock and does not wait for plans.
+    """Control one world, the plant, in real time: it steps by the wall clock and does not wait for plans.
 
-    The plant steps in the calling thread. Step k is due at ``k * period``; a late step does not delay the steps after
-    it. The controller plans in a second thread, each time from the newest state, and never twice from the same state.
+    The plant steps in the calling thread. Step k is due at ``k * period``; a late step does not delay later steps. The
+    controller plans in a second thread, each time from the newest state, and never twice from the same state.
 
     Each step applies the newest finished plan. If d simulated seconds have passed since the plan's state, the action is
-    number ``round(d / timestep)`` of the plan, or the last one if the plan is shorter. A controller without a plan has
-    one action only. This compensates for the planning delay up to the length of the plan. The plant waits for the first
-    plan, so the first action has the age 0. All others are at least one step old, and exactly one step if every plan
-    takes less than a period.
+    number ``round(d / timestep)`` of the plan, or the last one if the plan is shorter. This compensates for the
+    planning delay up to the length of the plan. The plant waits for the first plan, so the first action has age 0. All
+    other actions are at least one step old, and exactly one step old if every plan takes less than a period.
 
     Before the clock starts, the controller is called three times with the first state, and the plant takes three steps
-    and is set back to its state: this loads kernels and captures graphs, because Warp must not capture a graph while
-    another thread launches kernels. For the same reason ``on_step`` must not evaluate given states (as
-    ``env.get_reward(before, action, after)`` does).
+    and returns to its state. This warm-up loads kernels and captures graphs, because Warp cannot capture a graph while
+    another thread launches kernels. For the same reason ``on_step`` must not call functions that evaluate given states,
+    such as ``env.get_reward(before, action, after)``.
 
     During the run Python switches between threads more often than usual (``sys.setswitchinterval``). To keep the plant
-    on time, leave a core to it with ``nthread`` of the planner's environment. Put the plant on the CPU: on the
-    planner's GPU both would share Warp's one stream, and each step would wait for the plan before it.
+    on time, leave a CPU core free with ``nthread`` of the planner's environment. Put the plant on the CPU: on the
+    planner's GPU both would share one stream, and each step would wait for the previous plan.
 
     When the episode ends, the unfinished plan is completed and counted. When an exception ends the run (Ctrl-C
-    included), a plan that takes longer than 0.2 seconds is left to its thread, and the controller must not be used
-    until that thread has ended.
+    included), the loop waits at most 0.2 seconds for the unfinished plan. The controller must not be used until the
+    thread, which is named "lyceum_warp planner", has ended.
 
     Args:
         env: The plant: one world, made with ``autoreset=False``.
         controller: Called in the second thread; see ``lw.Controller``. It plans in an environment of its own.
-        period: Seconds of the wall clock between steps; by default the plant's time step, which is real time.
+        period: Wall time between steps, seconds; by default the plant's time step, which is real time.
         steps: Steps after which to stop if the episode has not ended.
-        seconds: Seconds of the wall clock after which to stop if the episode has not ended.
+        seconds: Wall time after which to stop if the episode has not ended.
         seed: Seed of the initial state and of the controller.
         reset: Whether to reset the plant and the controller first. With False the run continues from the plant's state
             and the controller's last plan.
-        on_step: Called with a ``ControlProgress`` after each step, in the calling thread. Its time delays the plant.
+        on_step: Called with a ``ControlProgress`` after each step, in the calling thread. Slow calls delay the plant.
         on_abort: Called with the trajectory of the complete steps, if there are any, when an exception ends the run
-            (Ctrl-C included). ``done_reason`` of that trajectory is 0. The exception is raised afterwards.
-        clock: Another clock, for instance one that works while the plant waits for its next step.
+            (Ctrl-C included). Its ``done_reason`` is 0. The exception is raised afterwards.
+        clock: Replaces the wall clock, for example by a subclass that does other work while the plant waits.
 
     Returns:
         The episode.
 
     Raises:
         ValueError: The environment has several worlds or automatic resets, the episode is over or may never end, a
-            number is out of range, or the controller does not return a finite action of the right shape.
+            number is out of range, or an action has the wrong shape or is not finite.
         Exception: Any exception that the controller raises.
     """
-    check_plant(env, reset=reset, on_step=on_step, on_abort=on_abort)
+    check_arguments(env, reset=reset, on_step=on_step, on_abort=on_abort)
     check_kind("clock", clock, Clock | None, "which has now, wait_until and wait_for")
     period = positive_number("period", env.timestep if period is None else period, "seconds")
     if period > threading.TIMEOUT_MAX:
@@ -104,17 +101,16 @@ def control_async(
     if seconds is not None:
         ticks = max(1, math.ceil(min(2**31 - 1, positive_number("seconds", seconds, "seconds") / period - 1e-9)))
         steps = ticks if steps is None else min(whole_number("steps", steps, low=1), ticks)
-    limit = step_limit(env, steps)
     checked = CheckedController(controller, env)
-    begin_episode(env, checked, seed, reset=reset)
+    limit, first = begin_episode(env, checked, steps, seed, reset=reset)
     _capture_graphs(env)
     clock = Clock() if clock is None else clock
     episode = EpisodeCollector(env, checked, mode="async", period=period, seed=seed, now=clock.now)
-    planner = _PlannerThread(checked, clock, seed, first_step(env, reset=reset), reset=reset)
+    planner = PlannerThread(checked, clock, seed, first, reset=reset)
     with _frequent_thread_switches():
         try:
             planner.publish(0, episode.states[0], episode.obs[0])
-            planner.wait(clock)
+            planner.wait()
             episode.restart_clock()
             wall = run_plant(env, checked, planner, clock, episode, limit, on_step)
             planner.stop()
@@ -130,10 +126,10 @@ def control_async(
 
 
 class Clock:
-    """The wall clock, with a wait that is more precise than a sleep."""
+    """The wall clock, with a wait that is more precise than ``time.sleep``."""
 
     def now(self) -> float:
-        """Seconds since an arbitrary moment."""
+        """Seconds since an arbitrary origin."""
         return time.perf_counter()
 
     def wait_until(self, moment: float) -> None:
@@ -144,32 +140,20 @@ class Clock:
             pass
 
     def wait_for(self, event: threading.Event) -> None:
-        """Wait until an event is set: the first plan of a run."""
+        """Wait until an event is set. The loop waits in this way for the first plan."""
         event.wait()
-
-
-class PlanSource(Protocol):
-    """Makes plans of published states: the planner's thread, or a simulation of it in a test."""
-
-    def newest(self) -> TimedPlan:
-        """The newest finished plan."""
-        ...
-
-    def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor) -> None:
-        """Make the next plan from this state, unless a newer one is published first."""
-        ...
 
 
 def run_plant(
     env: Env,
     controller: CheckedController,
-    plans: PlanSource,
+    plans: "PlannerThread",
     clock: Clock,
     episode: EpisodeCollector,
     limit: int,
     on_step: OnStep | None,
 ) -> float:
-    """Step the plant by the clock until its episode ends; return the seconds up to the end of the last period."""
+    """Step the plant by the clock until its episode ends; returns the time at the end of the last period, seconds."""
     start, period = episode.start, episode.period
     for k in range(limit):
         due = start + k * period
@@ -178,7 +162,7 @@ def run_plant(
         plan = plans.newest()
         env.action[0] = plan.actions[controller.index(k - plan.step, len(plan.actions))]
         now = episode.elapsed()
-        # the first action has the age 0: the clock started when its plan was finished
+        # the first action has age 0, because the clock started when its plan was finished
         planned_from = episode.times[plan.step] if plan.step < k else now
         episode.before_step(plan, now, now - planned_from, late=late)
         if k > 0:
@@ -192,7 +176,7 @@ def run_plant(
 
 
 def _capture_graphs(env: Env) -> None:
-    """Step the plant until its graphs are captured, and set it back to its state."""
+    """Step the plant until its graphs are captured, and restore its state."""
     before = env.get_state()
     for _ in range(3):
         env.step()
@@ -210,7 +194,7 @@ def _frequent_thread_switches() -> Iterator[None]:
         sys.setswitchinterval(before)
 
 
-class _PlannerThread:
+class PlannerThread:
     """A thread that calls a controller with the newest published state.
 
     Args:
@@ -226,21 +210,21 @@ class _PlannerThread:
     ) -> None:  # fmt: skip
         self._controller, self._clock, self._seed, self._first, self._reset = controller, clock, seed, first, reset
         self._plans: list[TimedPlan] = []
-        self._qualities: list[tuple[float, float]] = []  # of the plans; that of the last one may not be there yet
+        self._qualities: list[tuple[float, float]] = []  # one per plan, appended after the plan
         self._error: BaseException | None = None
         self._begun = threading.Event()  # set after the first plan, or an error
-        # written in C: a thread switch cannot happen while one side holds a lock that the other needs
+        # implemented in C, so no thread switch happens while one side holds a lock that the other side needs
         self._states: queue.SimpleQueue[tuple[int, torch.Tensor, torch.Tensor] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="lyceum_warp planner", daemon=True)
         self._thread.start()
 
     def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor) -> None:
-        """Make the next plan from this state, unless a newer one is published first. The tensors must not change."""
+        """Make the next plan from this state, unless a newer state is published first. The tensors must not change."""
         self._states.put((step, state, obs))
 
-    def wait(self, clock: Clock) -> None:
+    def wait(self) -> None:
         """Wait for the first plan."""
-        clock.wait_for(self._begun)
+        self._clock.wait_for(self._begun)
         self.check()
 
     def check(self) -> None:
@@ -257,8 +241,8 @@ class _PlannerThread:
         """End the thread after its unfinished plan.
 
         Args:
-            patience: Seconds to wait for that plan, None for no limit. A thread that takes longer ends after its plan,
-                or with the program.
+            patience: Timeout in seconds, None for no limit. After a timeout the thread ends after its plan, or with
+                the program.
         """
         self._states.put(None)
         self._thread.join(patience)
@@ -271,7 +255,7 @@ class _PlannerThread:
     def add_plans(self, episode: EpisodeCollector) -> None:
         """Add the finished plans to an episode."""
         qualities = list(self._qualities)
-        plans = self._plans[: len(qualities) + 1]  # the thread may be about to add the quality of the last one
+        plans = self._plans[: len(qualities) + 1]  # the thread may not have appended the last quality yet
         qualities += [(math.nan, math.nan)] * (len(plans) - len(qualities))
         for plan, quality in zip(plans, qualities, strict=True):
             episode.add_plan(plan, quality)
@@ -280,7 +264,7 @@ class _PlannerThread:
 
     def _run(self) -> None:
         try:
-            with torch.no_grad():  # of the calling thread does not hold here
+            with torch.no_grad():  # the calling thread's no_grad has no effect in this thread
                 last = 0
                 while (published := self._newest_state()) is not None:
                     self._plan(*published, last)
@@ -308,23 +292,18 @@ class _PlannerThread:
         shift = controller.passed(self._first + last, self._first + step)
         actions = controller(state, obs, shift, step)
         self._plans.append(TimedPlan(len(self._plans), step, begun, self._clock.now() - begun, actions))
-        self._qualities.append(controller.quality())  # after the plan, for which the plant may be waiting
+        self._qualities.append(controller.quality())  # last, because the plant may be waiting for the plan
 
 
 _unfinished: "weakref.WeakSet[threading.Thread]" = weakref.WeakSet()
 
 
 def _interrupt_unfinished() -> None:
-    for thread in list(_unfinished):
-        _interrupt(thread)
+    """End planner threads at the end of the program; otherwise Python frees memory that the engine uses, and crashes.
 
-
-def _interrupt(thread: threading.Thread) -> None:
-    """End a planner's thread at the end of the program.
-
-    Python would free the memory on which the engine still computes, and crash. An exception that is set in the thread
-    is raised when the engine's call returns, which is one improvement of the plan and not all of them.
+    Python raises the exception in the thread when the engine's current call returns, after one iteration of the plan.
     """
-    if thread.is_alive() and thread.ident is not None:
-        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread.ident), ctypes.py_object(SystemExit))
-        thread.join(_EXIT_PATIENCE)
+    for thread in list(_unfinished):
+        if thread.is_alive() and thread.ident is not None:
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread.ident), ctypes.py_object(SystemExit))
+            thread.join(_EXIT_PATIENCE)

@@ -1,4 +1,4 @@
-"""Files of episodes, read for playback, and an environment that shows them."""
+"""Load saved episodes for playback, and make an environment that fits them."""
 
 import os
 import stat
@@ -13,19 +13,19 @@ from lyceum_warp.task import Task
 
 
 def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajectory]:
-    """Read files of episodes that can be shown together: of one task, with states of one form.
+    """Load episodes of one task whose states have the same layout.
 
     Args:
-        paths: Files that ``Trajectory.save``, ``lyceum-warp plan`` or ``lyceum-warp eval --episodes-to`` wrote. A
-            folder stands for its ``.npz`` files in the order of their names.
+        paths: Files written by ``Trajectory.save``, ``lyceum-warp plan`` or ``lyceum-warp eval --episodes-to``. For a
+            folder, its ``.npz`` files are loaded in the order of their names.
 
     Returns:
-        The episodes by their files, in the given order.
+        The episodes by file, in the given order.
 
     Raises:
         FileNotFoundError: A file does not exist, or a folder holds no episode.
-        ValueError: A file is broken, was written by a newer release, or is of another task or of another model than
-            the first one.
+        ValueError: A file is broken, was written by a newer release, or has another task or another model than the
+            first file.
     """
     episodes: dict[Path, Trajectory] = {}
     for path in _files([paths] if isinstance(paths, str | Path) else paths):
@@ -40,24 +40,25 @@ def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajec
 def episode_env(
     episodes: Mapping[Path, Trajectory] | Trajectory, *, task: str | Path | type[Task] | None = None, **changes: Any
 ) -> Env:
-    """Make an environment of saved episodes' task, in which their states can be set: one world, no automatic resets.
+    """Make an environment for the states of saved episodes, with one world and no automatic resets.
 
-    It has the parameters, the model and the physics of the first episode. ``env.set_state`` takes the states of all.
+    It has the parameters, the model and the physics of the first episode. ``env.set_state`` accepts the states of all
+    given episodes.
 
-    The file of an episode may come from another person, and names the file of its task, which is run as code. Without
-    ``task`` this is done only where the task's file and its folder belong to this user or to the administrator, and no
+    An episode's file may come from another person. It names the file of its task, which Python would run. Without
+    ``task``, this function runs a task's file only if the file and its folder belong to this user or to root, and no
     other user can write them.
 
     Args:
         episodes: The episodes, as ``load_episodes`` returns them.
-        task: The task, where the file cannot name it (a notebook's, one whose file has moved, or one whose file others
-            can write). It must have the name of the episodes' task.
-        changes: Other options and parameters, as for ``lw.make``.
+        task: The task. Needed if it was defined in a notebook, if its file has moved, or if other users can write the
+            file. It must have the name of the episodes' task.
+        changes: Further options and parameters of ``lw.make``.
 
     Raises:
         FileNotFoundError: The file of the task or of its model is missing.
-        ValueError: The task cannot be found or has another name, others can write its file, or the states do not fit
-            it.
+        ValueError: The task cannot be found or has another name, other users can write its file, or the states do not
+            fit the task.
     """
     if isinstance(episodes, Trajectory):
         episodes = {Path("the episode"): episodes}
@@ -77,15 +78,15 @@ def episode_env(
 
 
 def check_episode(env: Env, episode: Trajectory, name: str | Path = "the episode") -> None:
-    """Check that an environment can be in the states of an episode.
+    """Check that an environment accepts the states of an episode.
 
     Args:
         env: The environment.
         episode: The episode.
-        name: What messages call it.
+        name: Name of the episode in error messages.
 
     Raises:
-        ValueError: The episode is of another task, or its states have another form.
+        ValueError: The episode has another task, or its states have another layout.
     """
     if episode.task != env.task.name:
         raise ValueError(f"{name} is an episode of the task {episode.task!r}, not of {env.task.name!r}")
@@ -103,7 +104,7 @@ def _files(paths: Iterable[str | Path]) -> list[Path]:
         if path.is_dir():
             inside = sorted(path.glob("*.npz"))
             if not inside:
-                raise FileNotFoundError(f"there is no episode in the folder {path}: its files would end in .npz")
+                raise FileNotFoundError(f"there is no episode in the folder {path}: it contains no .npz file")
             found += inside
         elif not path.exists():
             raise FileNotFoundError(f"there is no file {path}")
@@ -115,25 +116,21 @@ def _files(paths: Iterable[str | Path]) -> list[Path]:
 def _check_same(first: Path, one: Trajectory, path: Path, other: Trajectory) -> None:
     if other.task != one.task:
         raise ValueError(
-            f"{path} is an episode of the task {other.task!r}, and {first} of {one.task!r}: load them apart"
+            f"{path} is an episode of the task {other.task!r}, and {first} of {one.task!r}: load them separately"
         )
     if difference := _difference(one.state_parts, other.state_parts):
         raise ValueError(f"{path} is of another model than {first}: its states have {difference}")
 
 
 def _difference(wanted: Mapping[str, Sequence[int]], found: Mapping[str, Sequence[int]]) -> str:
-    """The first difference between two forms of states, as "qpos of 7 numbers, not 9"; empty without one."""
-    for name in [*wanted, *(name for name in found if name not in wanted)]:
-        one, other = (_size(parts, name) for parts in (wanted, found))
+    """The first difference between two layouts of states, as "qpos of 7 numbers, not 9"; empty without one."""
+    for name in {**wanted, **found}:
+        one, other = (parts[name][1] - parts[name][0] if name in parts else None for parts in (wanted, found))
         if one != other:
             return f"no {name}" if other is None else f"{name} of {other} numbers, not {one or 0}"
     if list(wanted) != list(found) or any(list(wanted[name]) != list(found[name]) for name in wanted):
         return "their parts in another order"
     return ""
-
-
-def _size(parts: Mapping[str, Sequence[int]], name: str) -> int | None:
-    return parts[name][1] - parts[name][0] if name in parts else None
 
 
 def _task(path: Path, episode: Trajectory, given: str | Path | type[Task] | None) -> type[Task]:
@@ -160,7 +157,7 @@ def _task(path: Path, episode: Trajectory, given: str | Path | type[Task] | None
 
 
 def _foreign(file: Path) -> str:
-    """Why a file may hold another user's code, as "it can be written by others"; empty where it cannot."""
+    """Why a file may hold another user's code, as "it can be written by other users"; empty if it cannot."""
     if not hasattr(os, "getuid"):
         return "this system does not say who can write it"
     for place, name in ((file, "it"), (file.parent, f"its folder {file.parent}")):
@@ -173,7 +170,7 @@ def _foreign(file: Path) -> str:
 
 
 def _is_private(group: int) -> bool:
-    """Whether a group has this user, or the administrator, as its only member: the user's own, as many systems have."""
+    """Whether a group's only member is this user (many systems give each user a group) or root."""
     import grp
     import pwd
 

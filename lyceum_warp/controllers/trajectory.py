@@ -1,4 +1,4 @@
-"""Trajectories: one episode of a controlled world, in memory and in a file."""
+"""Store one episode of a controlled world, in memory and in a file: ``lw.Trajectory``."""
 
 import dataclasses
 import json
@@ -17,9 +17,9 @@ from lyceum_warp.support.files import newer_format, replaced
 from lyceum_warp.support.versions import versions
 
 FORMAT = 1
-"""Format of the file. It is raised when an older release could no longer read the file."""
+"""Version of the file format. It increases when older releases cannot read new files."""
 
-# type and axes of every array of a trajectory; axes of the same name have the same length
+# type and axes of every array; axes of the same name have the same length
 _ARRAYS = {
     "states": (torch.float64, ("steps + 1", "state_size")), "obs": (torch.float32, ("steps + 1", "nobs")),
     "actions": (torch.float32, ("steps", "nu")), "rewards": (torch.float32, ("steps",)),
@@ -32,66 +32,64 @@ _ARRAYS = {
 _SCALARS: dict[str, Callable[[Any], Any]] = {
     "timestep": float, "period": float, "wall_seconds": float, "mode": str, "done_reason": int, "task": str,
     "engine": str, "params": dict, "versions": dict, "seed": lambda seed: seed if seed is None else int(seed),
-    "controller": dict, "state_parts": dict, "obs_parts": dict, "action_names": list,
+    "controller": dict, "state_parts": dict, "obs_parts": dict, "action_names": list, "source": dict,
 }  # fmt: skip
-_LATER: dict[str, Callable[[Any], Any]] = {"source": dict}
-"""Scalars that files of earlier releases lack."""
 
 
 @document_attributes
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One episode of one world, the plant, under a controller. All tensors lie on the CPU.
+    """One episode of one world, the plant, under a controller. All tensors are on the CPU.
 
-    Step k leads from state k to state k + 1 under action k. On the engine that made them, ``set_state`` of the first
-    state and a step with each action give all other states again, to the bit.
+    Step k leads from state k to state k + 1 under action k. To replay the episode bit by bit on the same engine, set
+    the first state with ``set_state`` and step with each action.
 
-    Times are seconds of the wall clock since the start of the clock, which is before the first plan in a synchronous
-    run and after it in an asynchronous one.
+    Times are seconds of wall time. The clock starts before the first plan in a synchronous run, and after it in an
+    asynchronous run.
     """
 
     states: torch.Tensor
-    """States, (steps + 1, state_size) float64. After a fault the last one is the first of the next episode."""
+    """States, (steps + 1, state_size) float64. After a fault the last state is the first state of the next episode."""
     obs: torch.Tensor
-    """Observations of the states, (steps + 1, nobs) float32. After a fault the last one is the last good one."""
+    """Observations of the states, (steps + 1, nobs) float32. After a fault the previous observation is repeated."""
     actions: torch.Tensor
-    """Actions that were applied, (steps, nact) float32."""
+    """Applied actions, (steps, nact) float32."""
     rewards: torch.Tensor
     """Rewards, (steps,) float32."""
     evals: torch.Tensor
     """Evaluation metric of the state after each step, (steps,) float32."""
     success: torch.Tensor
-    """Whether the task's goal is met in the state after each step, (steps,) bool."""
+    """Whether the state after each step is a success, (steps,) bool."""
     times: torch.Tensor
-    """When each action was applied, (steps,) float64, seconds."""
+    """Time at which each action was applied, (steps,) float64, seconds."""
     ages: torch.Tensor
-    """Age of each action when it was applied, (steps,) float64, seconds: the time since the plant was in the state from
-    which the action was planned. In a synchronous run this is the planning time, for the first action of a plan."""
+    """Age of each action when it was applied, (steps,) float64, seconds: the time since the plant was in the state that
+    the plan starts from. In a synchronous run the first action of a plan is as old as the planning time."""
     late: torch.Tensor
-    """Whether a step began late because the step before it was not finished in time, (steps,) bool. Always False in a
+    """Whether a step began late because the previous step was not finished in time, (steps,) bool. Always False in a
     synchronous run."""
     plan_of: torch.Tensor
-    """Index of the plan that each action came from, (steps,) int64."""
+    """Index of each action's plan, (steps,) int64."""
     plan_steps: torch.Tensor
-    """Step whose state each plan was made from, (plans,) int64."""
+    """Index of the state that each plan starts from, (plans,) int64."""
     plan_starts: torch.Tensor
-    """When each plan was begun, (plans,) float64, seconds. Negative for the first plan of an asynchronous run."""
+    """Time at which planning began, (plans,) float64, seconds. Negative for the first plan of an asynchronous run."""
     plan_times: torch.Tensor
-    """Planning time of each plan, until its actions were on the CPU, (plans,) float64, seconds."""
+    """Planning time, including the copy of the actions to the CPU, (plans,) float64, seconds."""
     plan_failed: torch.Tensor
-    """Number of failed samples of each plan, (plans,) float64. NaN for controllers that do not report it."""
+    """Number of failed samples of each plan, (plans,) float64; NaN if unknown."""
     plan_effective: torch.Tensor
-    """Effective number of samples of each plan, (plans,) float64: 0 if all failed, NaN where unknown."""
+    """Effective sample size of each plan, (plans,) float64: 0 if all samples failed, NaN if unknown."""
     timestep: float
     """Simulated seconds in a step."""
     period: float
-    """Seconds of the wall clock between two steps; in a synchronous run the seconds of real time."""
+    """Wall time between two steps, seconds; in a synchronous run equal to ``timestep``."""
     wall_seconds: float
-    """Duration of the run by the wall clock, seconds."""
+    """Wall time of the run, seconds."""
     mode: str
-    """"sync" if the plant waited for each plan, "async" if it kept its rate."""
+    """"sync" if the plant waited for each plan, "async" if it ran in real time."""
     done_reason: int
-    """Bits of ``Done``: why the episode ended. 0 if it had not ended when the run stopped."""
+    """Bits of ``Done``: why the episode ended. 0 if the run stopped before."""
     task: str
     """Name of the task."""
     engine: str
@@ -101,7 +99,7 @@ class Trajectory:
     versions: Mapping[str, Any]
     """Packages, Python, machine and commit."""
     seed: int | None
-    """Seed of the initial state and of the controller, None if none was given."""
+    """Seed of the initial state and of the controller, or None."""
     controller: Mapping[str, Any]
     """The controller's ``name``, and its settings, ``engine`` and ``device`` if it has them."""
     state_parts: Mapping[str, Sequence[int]]
@@ -109,11 +107,11 @@ class Trajectory:
     obs_parts: Mapping[str, Sequence[int]]
     """Columns of the named parts of an observation."""
     action_names: Sequence[str]
-    """Names of the actions' columns."""
+    """Names of the action columns."""
     source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """How to make the plant again, for ``episode_env``: ``task``, a name or a file with a class, None for a task of a
-    notebook or of the program that ran; ``params``, names of the parameters that were given; ``options``. Empty in
-    files of earlier releases."""
+    """Arguments of ``lw.make`` from which ``episode_env`` rebuilds the plant: ``task``, a name or "file:class", None
+    for a task from a notebook or script; ``params``, the names of the given parameters; ``options``. Empty in files of
+    earlier releases."""
 
     @property
     def steps(self) -> int:
@@ -137,16 +135,16 @@ class Trajectory:
 
     @property
     def succeeded(self) -> bool:
-        """Whether the task's goal is met in the last state."""
+        """Whether the last state is a success."""
         return bool(self.success[-1])
 
     @property
     def age_steps(self) -> torch.Tensor:
-        """Age of each action in steps: steps since the state from which it was planned, (steps,) int64."""
+        """Age of each action in steps of the plant, (steps,) int64."""
         return torch.arange(self.steps) - self.plan_steps[self.plan_of]
 
     def part(self, name: str) -> torch.Tensor:
-        """A part of all states, (steps + 1, size), a view: ``part("qpos")`` are the positions.
+        """View of a part of all states, (steps + 1, size), such as ``part("qpos")``.
 
         Raises:
             ValueError: The states have no such part.
@@ -157,32 +155,24 @@ class Trajectory:
         return self.states[:, start:stop]
 
     def save(self, path: str | Path) -> Path:
-        """Write the trajectory to a file. A reader finds the old file or the whole new one.
+        """Write the trajectory to a file, atomically, and return the file's path.
 
-        The file is a compressed ``.npz``, which numpy reads without pickle. Each array has the name, the shape, the
-        type and the unit of its attribute. ``info`` is JSON text, a string array without axes, with ``format`` (1),
-        ``task``, ``engine``, ``params``, ``versions``, ``mode``, ``timestep``, ``period``, ``wall_seconds``,
-        ``done_reason``, ``seed``, ``controller``, ``state_parts``, ``obs_parts``, ``action_names`` and ``source``. For
-        example, with ``start, stop = info["state_parts"]["qpos"]``, the positions are ``states[:, start:stop]``.
-
-        Returns:
-            The file's path.
+        The file is a compressed ``.npz``, which numpy reads without pickle. Each tensor attribute is an array of that
+        name. ``info``, a string array without axes, holds the other attributes and ``format`` (1) as JSON. For example,
+        with ``start, stop = info["state_parts"]["qpos"]``, the positions are ``states[:, start:stop]``.
         """
         path = Path(path)
-        info = {"format": FORMAT, **{name: getattr(self, name) for name in _SCALARS | _LATER}}
+        info = {"format": FORMAT, **{name: getattr(self, name) for name in _SCALARS}}
         arrays: dict[str, Any] = {name: getattr(self, name).numpy() for name in _ARRAYS}
         arrays["info"] = np.array(json.dumps(info))
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replaced(path) as temporary, temporary.open("wb") as file:  # numpy would add a suffix to a name
+        with replaced(path) as temporary, temporary.open("wb") as file:  # numpy would append .npz to a path
             np.savez_compressed(file, **arrays)
         return path
 
     @classmethod
     def load(cls, path: str | Path) -> "Trajectory":
-        """Read a file that ``save`` wrote.
-
-        Reading executes no code. The file may name a task file, which ``episode_env`` runs as code only if it belongs
-        to this user and no other user can write it.
+        """Read a file that ``save`` wrote. This runs no code from the file.
 
         Raises:
             FileNotFoundError: The file does not exist.
@@ -191,24 +181,23 @@ class Trajectory:
         path = Path(path)
         try:
             with np.load(path, allow_pickle=False) as file:
-                info = json.loads(str(file["info"]))
+                info = {"source": {}, **json.loads(str(file["info"]))}  # files of earlier releases have no source
                 if info["format"] <= FORMAT:
                     content: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
                     _check(content)
                     scalars = {name: kind(info[name]) for name, kind in _SCALARS.items()}
-                    scalars |= {name: kind(info[name]) for name, kind in _LATER.items() if name in info}
                     _check_scalars(scalars, content)
                     return cls(**content, **scalars)
         except OSError:
             raise
-        except Exception as error:  # of many types, from numpy and zipfile
+        except Exception as error:  # numpy and zipfile raise many types
             text = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise ValueError(f"{path} is broken, or is not a trajectory of lyceum_warp ({text[:200]})") from error
         raise newer_format(path, info["format"], FORMAT)
 
 
 def _check(arrays: Mapping[str, torch.Tensor]) -> None:
-    """Refuse arrays whose types, axes or lengths do not fit together."""
+    """Reject arrays with wrong types or inconsistent shapes."""
     steps = len(arrays["actions"])
     lengths = {"steps": steps, "steps + 1": steps + 1, "plans": len(arrays["plan_times"])}
     for name, (dtype, axes) in _ARRAYS.items():
@@ -221,13 +210,13 @@ def _check(arrays: Mapping[str, torch.Tensor]) -> None:
 
 
 def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor]) -> None:
-    """Refuse parts that are no columns of their array, and a source of other types."""
+    """Reject parts that are not columns of their array, and a source with wrong types."""
     for name, array in (("state_parts", "states"), ("obs_parts", "obs")):
         for part, place in scalars[name].items():
             whole = isinstance(place, list) and len(place) == 2 and all(type(column) is int for column in place)
             if not whole or not 0 <= place[0] <= place[1] <= arrays[array].shape[1]:
                 raise ValueError(f"{name} has {place!r} as the columns of {part!r}")
-    source = scalars.get("source", {})
+    source = scalars["source"]
     for name, kind in {"task": str | None, "params": list, "options": dict}.items():
         if name in source and not isinstance(source[name], kind):
             raise ValueError(f"source has {source[name]!r} as its {name}")
@@ -236,7 +225,7 @@ def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor
 
 
 def provenance(env: Env) -> dict[str, Any]:
-    """Attributes of a trajectory that describe its origin: task, engine, versions, and the names of the columns."""
+    """Attributes of a trajectory that describe its origin: task, engine, versions, names of columns."""
     params = {name: np.asarray(value).tolist() for name, value in env.task.params.items()}
     return {
         "task": env.task.name, "engine": env.engine.name, "params": params, "versions": versions(env.device.alias),
@@ -251,7 +240,7 @@ _PLACEMENT = ("engine", "device", "nthread", "nworld", "seed", "first_world", "a
 
 
 def source(env: Env) -> dict[str, Any]:
-    """How to make an environment again; see ``Trajectory.source``."""
+    """Arguments that rebuild an environment; see ``Trajectory.source``."""
     task = env.task.task
     options = {name: value for name, value in env.options.given().items() if name not in _PLACEMENT}
     model = options.pop("model", None)

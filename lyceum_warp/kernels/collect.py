@@ -1,4 +1,4 @@
-"""Kernels that store the inputs and results of steps in a rollout buffer, at an index that is kept on the device."""
+"""Store the inputs and results of steps in a rollout buffer, at an index on the device."""
 
 import warp as wp
 
@@ -10,7 +10,7 @@ _BITS = wp.constant(int(FAULTS).bit_length())
 
 @wp.struct
 class RolloutArrays:
-    """The arrays of a rollout buffer, (steps, nworld), with a last axis for vectors."""
+    """The arrays of a rollout buffer, (steps, nworld) or (steps, nworld, size)."""
 
     obs: wp.array3d[float]
     action: wp.array3d[float]
@@ -58,7 +58,7 @@ def store_outputs(
 ):
     """Store the results of a step and the episode's return so far, and count faults; launched over (nworld, nobs).
 
-    With ``first_only`` the returns of a world's later episodes are nan.
+    With ``first_only`` the returns of a world's later episodes are NaN.
     """
     w, i = wp.tid()
     t = index_in[0]
@@ -85,7 +85,7 @@ def store_outputs(
 
 @wp.kernel(enable_backward=False)
 def store_rows(index_in: wp.array[int], rows_in: wp.array2d[float], rows_out: wp.array3d[float]):
-    """Store a row of every world; launched over (nworld, size of a row)."""
+    """Store one row per world; launched over (nworld, size of a row)."""
     w, i = wp.tid()
     rows_out[index_in[0], w, i] = rows_in[w, i]
 

@@ -1,4 +1,4 @@
-"""Kernels that find each world's faults, as bits of ``Done``."""
+"""Find each world's faults, as bits of ``Done``."""
 
 import warp as wp
 
@@ -13,13 +13,13 @@ WARNING = wp.constant(int(Done.ENGINE_WARNING))
 
 @wp.func
 def is_out_of_range(x: float) -> bool:
-    # written so that not-a-number, for which every comparison is false, counts as out of range
+    # written so that NaN, for which every comparison is false, counts as out of range
     return not (wp.abs(x) < MAX_MAGNITUDE)
 
 
 @wp.func
 def count_faults(fault: int, count_inout: wp.array[int]):
-    """Count each kind of fault of a world, at the place of its bit in Done."""
+    """Increment the counter of each fault bit that is set."""
     for bit in range(count_inout.shape[0]):
         if ((fault >> bit) & 1) != 0:
             count_inout[bit] = count_inout[bit] + 1
@@ -36,10 +36,9 @@ def faults_of_rows(
 ):
     """Find faults of the C engine in the masked worlds; launched over (nworld,).
 
-    Time, qpos, qvel and act lead the rows of ``state``; ``warning`` holds counters, (nworld, kind, 2).
-
-    The kinds are mjtWarning's: 0 inertia, 1 contacts full, 2 constraints full, 3 to 5 bad qpos, qvel, qacc,
-    6 bad control, which would become a bad state on the Warp engine. A counter is cleared when it is read.
+    The first ``nphysics`` columns of ``state`` are time, qpos, qvel and act. ``warning`` holds counters, (nworld, kind,
+    2), which are cleared here. The kinds are mjtWarning's: 0 inertia, 1 contacts full, 2 constraints full, 3 to 5 bad
+    qpos, qvel, qacc, 6 bad control, which counts as a bad state, as on the Warp engine.
     """
     w = first + wp.tid()
     if not mask_in[w]:
@@ -59,6 +58,8 @@ def faults_of_rows(
                 fault = fault | NAN
             else:
                 fault = fault | WARNING
+    if (fault & NAN) != 0:  # a bad state leads to further warnings, such as one of inertia
+        fault = fault & ~WARNING
     fault_out[w] = fault
 
 
@@ -71,9 +72,9 @@ def pool_overflow(
     bits: int,
     overflow_inout: wp.array[int],
 ):
-    """Set the bits of an overflow of the pool of pairs and contacts; launched over (nworld,).
+    """Set the overflow bits if the pool of pairs or contacts is full, as ``mujoco_warp.step`` does.
 
-    ``mujoco_warp.step`` sets them in the same way.
+    Launched over (nworld,).
     """
     w = wp.tid()
     if mask_in[w] and (npair_in[0] > nmax or ncontact_in[0] > nmax):
@@ -92,10 +93,7 @@ def faults_of_fields(
     ignored_bits: int,
     fault_out: wp.array[int],
 ):
-    """Find faults of the Warp engine in the masked worlds; launched over (nworld,).
-
-    They are found in the state fields and in the engine's own overflow bits.
-    """
+    """Find faults of the Warp engine in the masked worlds, from states and overflow bits; launched over (nworld,)."""
     w = wp.tid()
     if not mask_in[w]:
         return

@@ -1,9 +1,9 @@
-"""Plans as splines: a few knots, from which the actions of all steps are interpolated.
+"""Interpolate plans from spline knots, and move the knots forward in time.
 
-K knots over a horizon of H steps lie H / K steps apart, on a grid that is fixed in time. The horizon moves over the
-grid, so that a plan that moves forward in time keeps the actions of the steps that remain. (MuJoCo MPC calls this a
-sliding plan.) Positions are counted in units of 1 / H of the distance of two knots, which makes them whole numbers: a
-step advances by K of them, and the phase, that of the first step, is from 0 to H - 1.
+K knots over a horizon of H steps are H / K steps apart, on a grid that is fixed in time. The horizon moves over the
+grid, so a plan that moves forward in time keeps the actions of its remaining steps (a sliding plan in MuJoCo MPC).
+Positions are whole numbers, in units of 1 / H of the knot spacing: a step advances by K units, and the phase, the
+position of the first step after its knot, is from 0 to H - 1.
 """
 
 import math
@@ -13,14 +13,14 @@ import warp as wp
 from lyceum_warp.kernels.planning import plant_of
 
 ORDERS = {"zero": 0, "linear": 1, "cubic": 3}
-"""Names of the interpolations, with their orders."""
+"""Spline orders by name."""
 
 _NEEDED = {"zero": 1, "linear": 2, "cubic": 4}
-"""Knots that a value depends on."""
+"""Number of knots that an interpolated value depends on."""
 
 
 def knot_count(horizon: int, knots: int, spline: str) -> int:
-    """The number of knots that a plan needs, at whatever phase its horizon lies on the grid."""
+    """The number of knots that a plan needs at any phase."""
     largest_phase = horizon - math.gcd(horizon, knots)
     return ((horizon - 1) * knots + largest_phase) // horizon + _NEEDED[spline]
 
@@ -29,7 +29,7 @@ def knot_count(horizon: int, knots: int, spline: str) -> int:
 def pass_knots(
     steps_in: wp.array[int], horizon: int, knots: int, phase_inout: wp.array[int], passed_out: wp.array[int]
 ):
-    """Move the phases forward by some steps, and count the knots that are passed; launched over (nplant,)."""
+    """Advance the phases by some steps, and count the knots passed; launched over (nplant,)."""
     p = wp.tid()
     place = wp.int64(phase_inout[p]) + wp.int64(steps_in[p]) * wp.int64(knots)
     passed = place // wp.int64(horizon)
@@ -49,9 +49,9 @@ def interpolate(
 ):
     """Interpolate actions between knots and clip them to the bounds; launched over (horizon, nworld, nact).
 
-    The worlds of a sample follow one another, and so do those of a plant. Order 0 holds each knot until the next one,
+    The worlds of a sample are consecutive, and so are the samples of a plant. Order 0 holds each knot until the next,
     order 1 is linear. Order 3 is a cubic Hermite spline whose slope at a knot is half the difference of its neighbours
-    (Catmull and Rom 1974); its first knot lies one before the grid's.
+    (Catmull and Rom 1974); it has one more knot in front of the grid.
     """
     t, w, i = wp.tid()
     k = w // (action_out.shape[1] // knot_in.shape[1])

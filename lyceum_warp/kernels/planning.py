@@ -1,8 +1,7 @@
-"""Planning by sampling: controls of open-loop rollouts, noise around a plan, weights, and the weighted mean.
+"""Plan by sampling: controls of open-loop rollouts, noise around a plan, weights, and the weighted mean.
 
-Plans are (horizon, nplant, nact), actions of samples (horizon, nsample, nact), where the samples of a plant follow one
-another. A plan with knots holds (knots, nplant, nact) numbers instead, and so do its samples: kernels that do not name
-a horizon take both.
+Plans are (horizon, nplant, nact), and the actions of samples (horizon, nsample, nact), with the samples of a plant in
+consecutive rows. With spline knots the first axis has one entry per knot instead.
 """
 
 import warp as wp
@@ -12,19 +11,19 @@ from lyceum_warp.kernels.random import stream, world_key
 
 ACTION = wp.constant(int(Done.ACTION))
 NOISE = wp.constant(-2)
-"""Stands in for the number of an episode, so that worlds and samples of one seed draw from independent streams."""
+"""Replaces the episode number in the streams of the noise, so that they are independent of the worlds' streams."""
 DRAWS = wp.constant(-3)
-"""The same for the keys of what a task draws in the samples."""
+"""Replaces the episode number in the stream keys of the samples."""
 
 _TILES = f"{__name__}.tiles"
-"""Warp's module for kernels with tiles. On the CPU all kernels of a module write the variable that holds the tiles'
-address, and only kernels with tiles are kept from running in two threads at once (see ``graphs.capture``)."""
+"""Warp module of the kernels with tiles. On the CPU all kernels of a module write a shared variable, the address of the
+tiles; ``graphs.capture`` serialises only kernels with tiles, so the others need a module of their own."""
 
 
 @wp.func
 def plant_of(row: int, rows: int, plants: int) -> int:
-    """The plant of a row (a sample, a world), where the rows of a plant follow one another."""
-    if plants == 1:  # on the CPU a division takes as long as the rest of a small kernel
+    """The plant of a row, such as a sample or a world; the rows of a plant are consecutive."""
+    if plants == 1:  # on the CPU a division would double the time of a small kernel
         return 0
     return row // (rows // plants)
 
@@ -39,21 +38,21 @@ def first_row(plant: int, rows: int, plants: int) -> int:
 
 @wp.kernel(enable_backward=False)
 def broadcast(state_in: wp.array2d[wp.float64], state_out: wp.array2d[wp.float64]):
-    """Copy each state to its consecutive worlds, as many for each; launched over (nworld, state_size)."""
+    """Copy each state to an equal number of consecutive worlds; launched over (nworld, state_size)."""
     w, i = wp.tid()
     state_out[w, i] = state_in[plant_of(w, state_out.shape[0], state_in.shape[0]), i]
 
 
 @wp.kernel(enable_backward=False)
 def overwrite(row_in: wp.array2d[float], first: int, state_out: wp.array2d[wp.float64]):
-    """Copy one row of float32 into columns of every world's state, from ``first`` on; launched over (nworld, size)."""
+    """Copy a float32 row into every world's state, starting at column ``first``; launched over (nworld, size)."""
     w, i = wp.tid()
     state_out[w, first + i] = wp.float64(row_in[0, i])
 
 
 @wp.kernel(enable_backward=False)
 def overwrite_rows(rows_in: wp.array2d[wp.float64], first: int, state_out: wp.array2d[wp.float64]):
-    """Copy some rows in turn into columns of the worlds' states, from ``first`` on; launched over (nworld, size)."""
+    """Copy rows in turn into the worlds' states, starting at column ``first``; launched over (nworld, size)."""
     w, i = wp.tid()
     state_out[w, first + i] = rows_in[w % rows_in.shape[0], i]
 
@@ -66,9 +65,9 @@ def controls(
     fault_out: wp.array[int],
     ctrl_out: wp.array3d[float],
 ):
-    """Map actions to controls, within their ranges; launched over (steps, nworld).
+    """Map actions to controls, clipped to their ranges; launched over (steps, nworld).
 
-    An action with a number that is not finite becomes zero, and is a fault of its world.
+    An action that is not finite becomes zero, and is a fault of its world.
     """
     t, w = wp.tid()
     fault = int(0)
@@ -92,10 +91,10 @@ def repeat_columns(columns_in: wp.array2d[wp.float64], rows_out: wp.array3d[floa
 
 
 @wp.kernel(enable_backward=False)
-def add_steps(count: int, step_inout: wp.array[int]):
-    """Advance the step counters; launched over (nworld,)."""
+def add_to(number: int, count_inout: wp.array[int]):
+    """Add a number to counters; launched over their size."""
     w = wp.tid()
-    step_inout[w] = step_inout[w] + count
+    count_inout[w] = count_inout[w] + number
 
 
 @wp.kernel(enable_backward=False)
@@ -123,7 +122,7 @@ def shift_plan(
 def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.array3d[float]):
     """Draw standard normal numbers by (seed, sample, count, action, step); launched over (nsample, nact).
 
-    Seed and count are those of the plant, and its samples are counted from 0.
+    Each plant has its own seed and count, and numbers its samples from 0.
     """
     k, i = wp.tid()
     nsample, plants = noise_out.shape[1], seed_in.shape[0]
@@ -138,7 +137,7 @@ def draw_noise(seed_in: wp.array[int], count_in: wp.array[int], noise_out: wp.ar
 def draw_keys(seed_in: wp.array[int], count_in: wp.array[int], key_out: wp.array[wp.uint32]):
     """Make the samples' stream keys from (seed, sample, count); launched over (nworld,).
 
-    A plant's keys are those of (seed, world) alone, so that no sample draws what the plant will draw.
+    They differ from the plant's own keys, so no sample can foresee the plant's random numbers.
     """
     w = wp.tid()
     worlds, plants = key_out.shape[0], seed_in.shape[0]
@@ -158,10 +157,10 @@ def perturb(
     high_in: wp.array[float],
     action_out: wp.array3d[float],
 ):
-    """Add coloured, smoothed noise to plans and clip the sum to the bounds; launched over (nsample, nact).
+    """Add correlated, smoothed noise to plans and clip the sum to the bounds; launched over (nsample, nact).
 
-    ``scale_in`` is the lower Cholesky factor L of the noise's covariance: n_t = L z_t for standard normal z_t.
-    Smoothing follows trajopt: e_t = n_t in the first two steps, then e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2). With
+    ``scale_in`` is the lower Cholesky factor L of the noise covariance: n_t = L z_t for standard normal z_t. Smoothing
+    follows trajopt: e_t = n_t in the first two steps, then e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2). With
     ``include_plan`` a plant's first sample is the plan without noise.
     """
     k, i = wp.tid()
@@ -194,7 +193,7 @@ def perturb_adapted(
     high_in: wp.array[float],
     action_out: wp.array3d[float],
 ):
-    """The same with a standard deviation for each number of the plan, which scales smoothed standard normal noise."""
+    """As ``perturb``, with smoothed standard normal noise scaled by a standard deviation per element of the plan."""
     k, i = wp.tid()
     nsample, plants = noise_in.shape[1], nominal_in.shape[1]
     p = plant_of(k, nsample, plants)
@@ -224,8 +223,8 @@ def add_up(
 ):
     """Add up the worlds' discounted rewards and terminal values; launched over (nworld,).
 
-    With ``stop`` a sample earns nothing after the end of its episode, also no terminal value. The return of a sample
-    with a fault, or of one that is not finite, is minus infinity.
+    With ``stop`` a sample gets no reward and no terminal value after its episode has terminated. Returns of samples
+    with a fault, and returns that are not finite, become minus infinity.
     """
     k = wp.tid()
     total = float(0.0)
@@ -246,9 +245,9 @@ def add_up(
 
 @wp.kernel(enable_backward=False)
 def combine_models(world_return_in: wp.array[float], worst: bool, return_out: wp.array[float]):
-    """The mean or the smallest of each sample's returns in several models; launched over (nsample,).
+    """The mean or the minimum of each sample's returns over several models; launched over (nsample,).
 
-    The worlds of a sample follow one another. A sample that failed in one model fails.
+    The worlds of a sample are consecutive. A sample that fails in one model fails.
     """
     k = wp.tid()
     models = world_return_in.shape[0] // return_out.shape[0]
@@ -262,10 +261,10 @@ def combine_models(world_return_in: wp.array[float], worst: bool, return_out: wp
 
 @wp.kernel(enable_backward=False, module=_TILES)
 def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[float], summary_out: wp.array2d[float]):
-    """Weigh samples by w = exp((R - max R) / temperature), divided by the sum; launched as one block for each plant.
+    """Weigh samples by w = exp((R - max R) / temperature), divided by the sum; launched as one block per plant.
 
-    All weights are zero where every sample failed. The summary is the best return, the mean return, the effective
-    number of samples 1 / sum w^2, and the number of failed samples.
+    If every sample failed, all weights are zero. The summary is the best return, the mean return, the effective sample
+    size 1 / sum w^2, and the number of failed samples.
     """
     p, lane = wp.tid()
     n = return_in.shape[0] // summary_out.shape[0]
@@ -299,10 +298,7 @@ def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[f
 
 @wp.kernel(enable_backward=False)
 def rank(return_in: wp.array[float], samples: int, rank_out: wp.array[int]):
-    """For each sample, count the better ones of its plant; launched over (nsample,).
-
-    Of equal samples those with smaller numbers are the better ones.
-    """
+    """Rank the samples of each plant, from 0 for the best; ties go to the lower index. Launched over (nsample,)."""
     k = wp.tid()
     own = return_in[k]
     better = int(0)
@@ -321,9 +317,9 @@ def weigh_elites(
     weight_out: wp.array[float],
     summary_out: wp.array2d[float],
 ):
-    """Weigh the best samples equally and the others by zero; launched as one block for each plant.
+    """Weigh the best samples equally and the others by zero; launched as one block per plant.
 
-    The summary is that of ``weigh``. Samples that failed have no weight, also where fewer than ``elites`` are left.
+    The summary is as in ``weigh``. Failed samples have zero weight, even if fewer than ``elites`` samples remain.
     """
     p, lane = wp.tid()
     n = return_in.shape[0] // summary_out.shape[0]
@@ -358,10 +354,10 @@ def fit_deviation(
     summary_in: wp.array2d[float],
     deviation_out: wp.array3d[float],
 ):
-    """Fit the noise's standard deviation to the weighted samples; launched as one block for each number of the plans.
+    """Fit the standard deviation of the noise to the weighted samples; launched as one block per element of the plans.
 
-    It is that of the samples around their mean, the plan, divided by the spread that smoothing gives standard normal
-    noise in this step, and at least the smallest one. Where every sample failed it stays as it is.
+    It is the samples' deviation from their mean, the plan, divided by the standard deviation ``spread`` of smoothed
+    standard normal noise in this step, and at least ``smallest``. If every sample failed, it does not change.
     """
     number, lane = wp.tid()
     nsample, plants, nact = weight_in.shape[0], plan_in.shape[1], plan_in.shape[2]
@@ -387,9 +383,9 @@ def average(
     summary_in: wp.array2d[float],
     plan_out: wp.array3d[float],
 ):
-    """Average the samples' actions by their weights; launched as one block for each number of the plans.
+    """Average the samples' actions by their weights; launched as one block per element of the plans.
 
-    Where every sample failed the plan stays as it is.
+    If every sample failed, the plan does not change.
     """
     number, lane = wp.tid()
     nsample, plants, nact = weight_in.shape[0], plan_out.shape[1], plan_out.shape[2]
@@ -405,15 +401,8 @@ def average(
         plan_out[t, p, i] = wp.where(summary_in[p, 0] > -wp.inf, total, nominal_in[t, p, i])
 
 
-@wp.kernel(enable_backward=False)
-def count_up(count_inout: wp.array[int]):
-    """Count one improvement of each plan; launched over (nplant,)."""
-    p = wp.tid()
-    count_inout[p] = count_inout[p] + 1
-
-
 def value_kernel(value: wp.Function) -> wp.Kernel:
-    """The kernel that calls a value function, ``value(obs: Row[float]) -> float``, for each sample.
+    """Make a kernel that calls a value function, ``value(obs: Row[float]) -> float``, for each sample.
 
     Raises:
         ValueError: The function has other arguments.
@@ -424,7 +413,7 @@ def value_kernel(value: wp.Function) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False)
     def values(obs_in: wp.array2d[float], value_out: wp.array[float]):
-        """Evaluate the worlds' last observations; launched over (nworld,)."""
+        """Evaluate the final observations of the worlds; launched over (nworld,)."""
         k = wp.tid()
         value_out[k] = value(obs_in[k])
 

@@ -1,7 +1,7 @@
-"""Counted random streams: a draw depends on (seed, world, episode, step) alone, in any order of worlds.
+"""Draw from counter-based random streams: a draw depends only on (seed, world, episode, step).
 
-The four numbers are hashed one inside the other. A sum of them would give seed 0, episode 1 the same stream as seed 1,
-episode 0.
+The four numbers are hashed one after the other. If they were added, seed 0 with episode 1 would have the same stream as
+seed 1 with episode 0.
 """
 
 import warp as wp
@@ -23,16 +23,15 @@ def stream(key: wp.uint32, episode: int, step: int) -> wp.uint32:
 
 @wp.func
 def substream(base: wp.uint32, number: int) -> wp.uint32:
-    """Start of one of several independent streams that begin at one place of a stream."""
+    """Start of one of several independent streams derived from ``base``."""
     return wp.rand_init(int(base), number)
 
 
 @wp.func
 def uniform(rng: wp.array[wp.uint32], low: float, high: float) -> float:
-    """Draw from U(low, high) and advance the stream; with vectors, draw each element in turn between their elements.
+    """Draw from U(low, high) and advance the stream. With vectors, each element is drawn from its own range.
 
-    The stream is a row of one element: a number passed by value would not advance in the caller, so that two draws
-    would be equal.
+    The stream is a row of one element, because Warp passes numbers by value and could not advance the caller's.
     """
     state = rng[0]
     value = wp.randf(state, low, high)
@@ -73,9 +72,9 @@ def seed_worlds(
     key_out: wp.array[wp.uint32],
     episode_out: wp.array[int],
 ):
-    """Start the masked worlds' streams from a seed, before their first episode; launched over (nworld,).
+    """Seed the streams of the masked worlds, before their first episode; launched over (nworld,).
 
-    World 0 has the number ``first``.
+    ``first`` is the number of world 0.
     """
     w = wp.tid()
     if mask_in[w]:

@@ -1,4 +1,4 @@
-"""Advantages and returns of rollouts: one thread for each world goes through its steps backwards."""
+"""Compute advantages and returns of rollouts: one thread per world goes through its steps backwards."""
 
 import warp as wp
 
@@ -18,10 +18,8 @@ def advantages(
     """Compute advantages and discounted returns, (steps, nworld); launched over (nworld,).
 
     Advantages are generalised advantage estimates (Schulman et al. 2016, "High-dimensional continuous control using
-    generalized advantage estimation", eq. 16).
-
-    ``next_value`` is the value of the state that a step led to, before any reset. It stands for the rest of an
-    episode that a time limit or the end of the rollout cut off, and counts as 0 where the episode terminated.
+    generalized advantage estimation", eq. 16). ``next_value`` is the value of the state after a step, before any reset.
+    Episodes that a time limit or the end of the rollout truncates bootstrap from it; terminated episodes do not.
     """
     w = wp.tid()
     last = reward_in.shape[0] - 1

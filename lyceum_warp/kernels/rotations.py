@@ -1,7 +1,7 @@
-"""Unit quaternions in MuJoCo's order w, x, y, z, as Warp functions for tasks.
+"""Compute with unit quaternions in MuJoCo's order w, x, y, z, in Warp functions for tasks.
 
-The functions expect unit quaternions, as MuJoCo's fields hold them; none of them normalises its arguments. Where MuJoCo
-has the same function, it is named. Warp's own quaternion functions expect x, y, z, w and refuse these quaternions.
+No function normalises its arguments: MuJoCo's fields hold unit quaternions. Docstrings name the equal function of
+MuJoCo. Warp's own quaternion functions have the order x, y, z, w and do not accept these quaternions.
 """
 
 import warp as wp
@@ -31,7 +31,7 @@ def quat_inverse(q: wp.vec4) -> wp.vec4:
 
 @wp.func
 def quat_rotate(q: wp.vec4, v: wp.vec3) -> wp.vec3:
-    """Rotate a vector, from the frame whose orientation is q into the world's.
+    """Rotate a vector from the frame with orientation q into the world frame.
 
     v + 2 u x (w v + u x v) for q = (w, u), as mju_rotVecQuat.
     """
@@ -41,7 +41,7 @@ def quat_rotate(q: wp.vec4, v: wp.vec3) -> wp.vec3:
 
 @wp.func
 def quat_rotate_inverse(q: wp.vec4, v: wp.vec3) -> wp.vec3:
-    """Rotate a vector of the world into the frame whose orientation is q, as a velocity into a body's own frame.
+    """Rotate a vector from the world frame into the frame with orientation q, such as a body's own frame.
 
     v - 2 u x (w v - u x v) for q = (w, u), as mju_rotVecQuat with the inverse.
     """
@@ -51,7 +51,7 @@ def quat_rotate_inverse(q: wp.vec4, v: wp.vec3) -> wp.vec3:
 
 @wp.func
 def quat_from_axis_angle(axis: wp.vec3, angle: float) -> wp.vec4:
-    """Make the rotation by an angle, in radians, about a unit axis.
+    """Make the rotation by an angle, in rad, about a unit axis.
 
     (cos(angle / 2), sin(angle / 2) axis), as mju_axisAngle2Quat.
     """
@@ -61,7 +61,7 @@ def quat_from_axis_angle(axis: wp.vec3, angle: float) -> wp.vec4:
 
 @wp.func
 def quat_from_rotvec(r: wp.vec3) -> wp.vec4:
-    """Make the rotation by |r| radians about r; an angular velocity times a duration is such a vector."""
+    """Make the rotation by |r| rad about r, for example an angular velocity times a duration."""
     angle = wp.length(r)
     scale = float(0.5)  # the limit of sin(angle / 2) / angle
     if angle > 0.0:
@@ -71,9 +71,9 @@ def quat_from_rotvec(r: wp.vec3) -> wp.vec4:
 
 @wp.func
 def quat_to_rotvec(q: wp.vec4) -> wp.vec3:
-    """Turn a rotation into its axis times its angle, of at most pi radians.
+    """Convert a rotation to its rotation vector: axis times angle, at most pi rad.
 
-    2 atan2(|u|, w) u / |u| for q = (w, u) with w >= 0, else for -q, the same rotation; as mju_quat2Vel for a second.
+    2 atan2(|u|, w) u / |u| for q = (w, u) with w >= 0, else for the equal rotation -q; as mju_quat2Vel with dt = 1.
     """
     u = wp.vec3(q[1], q[2], q[3])
     w = q[0]
@@ -89,19 +89,19 @@ def quat_to_rotvec(q: wp.vec4) -> wp.vec3:
 
 @wp.func
 def quat_difference(a: wp.vec4, b: wp.vec4) -> wp.vec3:
-    """Find the rotation vector r, in the frame of b, that turns b into a: a = b quat_from_rotvec(r), as mju_subQuat."""
+    """The rotation vector r, in the frame of b, from b to a: a = b quat_from_rotvec(r); as mju_subQuat."""
     return quat_to_rotvec(quat_mul(quat_inverse(b), a))
 
 
 @wp.func
 def quat_angle(a: wp.vec4, b: wp.vec4) -> float:
-    """Measure the angle between two orientations, from 0 to pi: the length of ``quat_difference``."""
+    """The angle between two orientations, from 0 to pi rad."""
     return wp.length(quat_difference(a, b))
 
 
 @wp.func
 def quat_to_mat(q: wp.vec4) -> wp.mat33:
-    """Turn a rotation into its matrix, whose columns are the rotated axes, as mju_quat2Mat."""
+    """Convert a rotation to its matrix, with the rotated axes as columns; as mju_quat2Mat."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     return wp.mat33(
         w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
@@ -112,7 +112,7 @@ def quat_to_mat(q: wp.vec4) -> wp.mat33:
 
 @wp.func
 def quat_from_mat(m: wp.mat33) -> wp.vec4:
-    """Turn a rotation matrix, as ``site_xmat`` holds, into its quaternion; up to the sign, as mju_mat2Quat.
+    """Convert a rotation matrix, such as a row of ``site_xmat``, to a quaternion; as mju_mat2Quat up to the sign.
 
     The trace and the diagonal show which of w, x, y, z is large enough to divide by (Shepperd 1978,
     "Quaternion from rotation matrix").
@@ -143,9 +143,9 @@ def quat_from_mat(m: wp.mat33) -> wp.vec4:
 
 @wp.func
 def quat_from_euler(angles: wp.vec3) -> wp.vec4:
-    """Make the rotation by three angles, in radians: about x, then about the new y, then about the new z.
+    """Make the rotation by three angles, in rad: about x, then about the new y, then about the new z.
 
-    As mju_euler2Quat with the sequence "xyz", and as models give ``euler`` unless they name another ``eulerseq``.
+    As mju_euler2Quat with the sequence "xyz", and as ``euler`` in MJCF with the default ``eulerseq``.
     """
     h = 0.5 * angles
     x = wp.vec4(wp.cos(h[0]), wp.sin(h[0]), 0.0, 0.0)
@@ -156,22 +156,22 @@ def quat_from_euler(angles: wp.vec3) -> wp.vec4:
 
 @wp.func
 def quat_to_euler(q: wp.vec4) -> wp.vec3:
-    """Turn a rotation into the angles of ``quat_from_euler``, the second from -pi / 2 to pi / 2.
+    """Convert a rotation to the angles of ``quat_from_euler``, in rad; the second is from -pi / 2 to pi / 2.
 
-    With the matrix R: atan2(-R12, R22), atan2(R02, sqrt(R12^2 + R22^2)), atan2(-R01, R00). Where the second angle is
-    a right one, only the sum or the difference of the others is known, and the first is given as 0.
+    With the matrix R: atan2(-R12, R22), atan2(R02, sqrt(R12^2 + R22^2)), atan2(-R01, R00). If the second angle is a
+    right angle, only the sum or difference of the others is defined, and the first is set to 0.
     """
     m = quat_to_mat(q)
     cosine = wp.sqrt(m[1, 2] * m[1, 2] + m[2, 2] * m[2, 2])
     y = wp.atan2(m[0, 2], cosine)
-    if cosine < 1e-6:  # rounding alone
+    if cosine < 1e-6:  # zero, up to rounding
         return wp.vec3(0.0, y, wp.atan2(m[1, 0], m[1, 1]))
     return wp.vec3(wp.atan2(-m[1, 2], m[2, 2]), y, wp.atan2(-m[0, 1], m[0, 0]))
 
 
 @wp.func
 def quat_random(rng: wp.array[wp.uint32]) -> wp.vec4:
-    """Draw a rotation, all of them equally likely, and advance the stream.
+    """Draw a rotation from the uniform distribution, and advance the stream.
 
     (a sin t, a cos t, b sin s, b cos s) for a^2 = 1 - b^2 from U(0, 1) and angles t, s from U(0, 2 pi) (Shoemake 1992,
     "Uniform random rotations").

@@ -1,11 +1,11 @@
-"""Rows that the threads of a world share: thread ``lane`` of ``lanes`` has every place i with i % lanes == lane."""
+"""Process rows with several threads per world: thread ``lane`` of ``lanes`` has the indices i % lanes == lane."""
 
 import warp as wp
 
 
 @wp.func
 def finite_row(row: wp.array[float], lane: int, lanes: int) -> bool:
-    """Whether every number of a lane, which has one place of a row in ``lanes``, is finite."""
+    """Whether every element of a lane is finite."""
     for i in range(lane, row.shape[0], lanes):  # noqa: SIM110 (Warp has no all())
         if not wp.isfinite(row[i]):
             return False
@@ -14,7 +14,7 @@ def finite_row(row: wp.array[float], lane: int, lanes: int) -> bool:
 
 @wp.func
 def restored_row(before: wp.array[float], after: wp.array[float], lane: int, lanes: int) -> bool:
-    """Put back a lane's numbers that are not finite any more; returns whether there are none."""
+    """Restore the elements of a lane that are not finite from ``before``; returns whether all were finite."""
     finite = bool(True)
     for i in range(lane, after.shape[0], lanes):
         if not wp.isfinite(after[i]):
@@ -25,7 +25,7 @@ def restored_row(before: wp.array[float], after: wp.array[float], lane: int, lan
 
 @wp.func
 def copy_row(source: wp.array[float], target: wp.array[float], lane: int, lanes: int):
-    """Copy a lane's numbers of a row."""
+    """Copy the elements of a lane."""
     for i in range(lane, source.shape[0], lanes):
         target[i] = source[i]
 
@@ -42,7 +42,7 @@ def mark_changes(
     lanes: int,
     first: int,
 ):
-    """Mark the masked worlds whose rows differ, apart where they are physics; launched over (nworld, lanes)."""
+    """Mark the masked worlds whose rows differ; ``physics`` marks a change of physics too. Over (nworld, lanes)."""
     k, lane = wp.tid()
     w = first + k
     if mask_in[w]:

@@ -1,8 +1,8 @@
-"""Casts and masked copies between the arrays of an environment and of an engine.
+"""Cast and copy masked rows between the arrays of an environment and an engine.
 
-The float64 side is often a strided alias of an engine's own rows, where an unmasked write would round the other
-worlds. Most masks are nearly empty, and most rows short: ``launch_rows`` gives each world as many threads as pay
-off on the device, one on the CPU and up to a warp on a GPU.
+Float64 arrays are often strided views of an engine's own rows, so an unmasked write would round the other worlds. Most
+masks are nearly empty and most rows short: ``launch_rows`` launches one thread per world (``lanes``) on the CPU, and up
+to a warp on a GPU.
 """
 
 import warp as wp
@@ -92,7 +92,7 @@ def widen_four(
 def widen_bool(
     mask_in: wp.array[bool], source_in: wp.array2d[bool], target_out: wp.array2d[wp.float64], lanes: int, first: int
 ):
-    """Write the masked rows of truth values as 0 and 1; launched over (nworld, lanes)."""
+    """Write the masked rows of booleans as 0 and 1; launched over (nworld, lanes)."""
     k, lane = wp.tid()
     w = first + k
     if mask_in[w]:
@@ -104,7 +104,7 @@ def widen_bool(
 def narrow_bool(
     mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[bool], lanes: int, first: int
 ):
-    """Read what ``widen_bool`` writes, in the masked rows; launched over (nworld, lanes)."""
+    """Convert the masked rows of ``widen_bool`` back to booleans; launched over (nworld, lanes)."""
     k, lane = wp.tid()
     w = first + k
     if mask_in[w]:
@@ -190,10 +190,7 @@ def pack_counters(
     done_reason_in: wp.array[int],
     state_out: wp.array2d[wp.float64],
 ):
-    """Write step, stream key, episode and done reason into four columns; launched over (nworld,).
-
-    float64 holds 32-bit integers exactly.
-    """
+    """Write step, stream key, episode and done reason into four columns, which is exact; launched over (nworld,)."""
     w = wp.tid()
     state_out[w, 0] = wp.float64(step_in[w])
     state_out[w, 1] = wp.float64(key_in[w])
@@ -210,7 +207,7 @@ def unpack_counters(
     episode_out: wp.array[int],
     done_reason_out: wp.array[int],
 ):
-    """Read the four columns that ``pack_counters`` writes, in the masked worlds; launched over (nworld,)."""
+    """Read the columns of ``pack_counters`` in the masked worlds; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
         step_out[w] = int(state_in[w, 0])

@@ -1,4 +1,4 @@
-"""The kernels of one step, around the functions of a task."""
+"""Make the kernels of a step around the functions of a task: clip actions, judge transitions, begin episodes."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
@@ -19,13 +19,13 @@ OBSERVATION = wp.constant(int(Done.OBSERVATION))
 MODEL = wp.constant(int(Done.MODEL))
 NAN = wp.constant(int(Done.NAN))
 
-# streams that begin at the place of one step; ``advance`` draws from that place itself
+# substreams of a step's stream; ``advance`` draws from the stream itself
 OBSERVE = wp.constant(-1)
 EVENT = wp.constant(-2)
 STARTUP = wp.constant(-1)
-"""Stands in for the number of an episode."""
+"""Replaces the episode number."""
 
-# the parts of a judgement; the groups of observations follow
+# the parts that ``judge`` computes; the observation groups follow
 ENDS = wp.constant(0)
 GAIN = wp.constant(1)
 METRICS = wp.constant(2)
@@ -34,17 +34,17 @@ OBSERVE_FIRST = wp.constant(3)
 
 @wp.struct
 class Counters:
-    """The counters of each world; every array is (nworld,)."""
+    """Counters and random streams of the worlds; every array is (nworld,) unless noted."""
 
     step: wp.array[int]
     """Steps since the reset."""
     key: wp.array[wp.uint32]
     """Key of the world's random streams."""
     episode: wp.array[int]
-    """Number of the episode."""
+    """Index of the episode."""
     rng: wp.array2d[wp.uint32]
-    """The random stream that a task's function draws from, (groups of observations * nworld, 1), a row for each
-    thread that draws; every kernel starts it again."""
+    """Stream that a task's function draws from, (observation groups * nworld, 1), one row per thread that draws. Every
+    kernel starts it again."""
 
 
 @wp.struct
@@ -64,14 +64,14 @@ class Outcome:
 
 @wp.struct
 class Findings:
-    """What the parts of a judgement find before it is known whether a world has a fault; every array is (nworld,)."""
+    """Results of ``judge``, before it is known whether a world has a fault; every array is (nworld,)."""
 
     reward: wp.array[float]
     eval: wp.array[float]
     terminated: wp.array[bool]
     success: wp.array[bool]
     fault: wp.array2d[int]
-    """Faults found by each part, (parts, nworld)."""
+    """Faults of each part, (parts, nworld)."""
 
 
 OUTCOMES = {
@@ -83,7 +83,7 @@ OUTCOMES = {
     "done": wp.bool,
     "done_reason": wp.int32,
 }
-"""The fields of Outcome with one number a world, and their types."""
+"""Types of the fields of Outcome that are (nworld,)."""
 
 
 @wp.kernel(enable_backward=False)
@@ -95,9 +95,9 @@ def hold_success(
     success_inout: wp.array[bool],
     first: int,
 ):
-    """Let a success count only after ``needed`` steps in a row, in the masked worlds; launched over (nworld,).
+    """Report success only after ``needed`` consecutive steps, in the masked worlds; launched over (nworld,).
 
-    A transition goes on with the count, (nworld, 1), up to ``needed``, or clears it; a state alone keeps it.
+    A transition increases or clears the count, (nworld, 1). Judging a state without a transition keeps it.
     """
     w = first + wp.tid()
     if mask_in[w]:
@@ -108,59 +108,42 @@ def hold_success(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TaskCode:
-    """A task's structs and functions, with those that are generated around them for all worlds.
+    """A task's structs and functions, and the functions that are generated from them.
 
-    Args:
-        module: Name of the Warp module that the kernels are compiled into, one for each task.
-        functions: The task's functions by name, with defaults for those that it does not have.
-        written: Names of the functions that the task has. Without ``control`` a scale and an offset map actions to
-            controls; without ``evaluate`` the evaluation is the reward; without ``advance`` memory stays as it is.
-        World: The task's struct of one world's fields.
-        Params: The task's struct of parameters.
-        Batch: A struct of the task's fields for all worlds.
-        Observations: A struct of the groups of observations.
-        view: The function from (batch, world) to ``World``.
-        copy_state: Copies what steps change.
-        observe_group: Writes a group of observations.
-        finite_group: Whether a group of observations is finite.
-        copy_observations: Copies all groups.
-        finite_memory: Whether the task's memory is finite.
-        valid_model: Whether the model fields that the task writes are valid.
-        has_state: Whether ``copy_state`` has anything to do.
-        has_memory: Whether ``finite_memory`` has.
-        checks_model: Whether ``valid_model`` has.
+    Without ``control``, actions are scaled and shifted to controls. Without ``evaluate``, the evaluation is the reward.
+    Without ``advance``, the memory does not change.
     """
 
-    module: str
-    functions: Mapping[str, wp.Function]
-    written: Collection[str]
+    module: str  # name of the task's Warp module
+    functions: Mapping[str, wp.Function]  # by name, defaults included
+    written: Collection[str]  # names of the functions that the task defines
     World: Any
     Params: Any
-    Batch: Any
-    Observations: Any
-    view: wp.Function
-    copy_state: wp.Function
+    Batch: Any  # struct of the task's fields in all worlds
+    Observations: Any  # struct of the observation groups
+    view: wp.Function  # (batch, world) -> World
+    copy_state: wp.Function  # copies the fields that steps change
     observe_group: wp.Function
     finite_group: wp.Function
     copy_observations: wp.Function
     finite_memory: wp.Function
-    valid_model: wp.Function
-    has_state: bool
-    has_memory: bool
-    checks_model: bool
+    valid_model: wp.Function  # whether the model fields that the task writes are valid
+    has_state: bool  # whether ``copy_state`` is needed
+    has_memory: bool  # whether ``finite_memory`` is needed
+    checks_model: bool  # whether ``valid_model`` is needed
 
     def kernel(self, needed: bool = True) -> Callable[[Any], Any]:
-        """Decorator: a kernel of the task's module, or None for tasks that do not need it."""
+        """Decorator: make a kernel in the task's module, or None if it is not needed."""
         return wp.kernel(module=self.module, enable_backward=False) if needed else lambda body: None
 
     def kernel_for(self, function: str) -> Callable[[Any], Any]:
-        """Decorator: a kernel for tasks that have a function, and None for the others."""
+        """Decorator: make a kernel if the task has a function, else None."""
         return self.kernel(function in self.written)
 
 
 @dataclasses.dataclass(frozen=True)
 class ActKernels:
-    """From an action to controls, substeps and the task's memory."""
+    """Kernels that map actions to controls and advance the task's memory."""
 
     keep_before: wp.Kernel | None
     act: wp.Kernel
@@ -179,7 +162,7 @@ def act_kernels(task: TaskCode) -> ActKernels:
 
     @task.kernel(task.has_state)
     def keep_before(after: Batch, before_out: Batch, lanes: int, first: int):
-        """Copy the fields that a step changes; launched over (nworld, lanes)."""
+        """Save the fields that a step changes; launched over (nworld, lanes)."""
         k, lane = wp.tid()
         w = first + k
         copy_state(after, before_out, w, lane, lanes)
@@ -199,8 +182,7 @@ def act_kernels(task: TaskCode) -> ActKernels:
     ):
         """Map actions to controls, clipped to their ranges; launched over (nworld,).
 
-        An action that is not finite counts as zero, and so does a control that is not-a-number, which clipping would
-        turn into a bound.
+        An action that is not finite becomes zero, and so does a NaN control, which clipping would replace by a bound.
         """
         w = first + wp.tid()
         fault = int(0)
@@ -225,7 +207,7 @@ def act_kernels(task: TaskCode) -> ActKernels:
 
     @task.kernel(task.checks_model)
     def check_model(batch: Batch, fault_inout: wp.array[int], lanes: int, first: int):
-        """Find faults of the model fields that the task writes; launched over (nworld, lanes)."""
+        """Find faults in the model fields that the task writes; launched over (nworld, lanes)."""
         k, lane = wp.tid()
         w = first + k
         if not valid_model(view(batch, w), lane, lanes):
@@ -235,7 +217,7 @@ def act_kernels(task: TaskCode) -> ActKernels:
     def control_worlds(
         batch: Batch, params: wp.array[Params], action_in: wp.array2d[float], ctrl_out: wp.array2d[float], first: int
     ):
-        """Turn actions into controls and inputs, and nothing else; launched over (nworld,)."""
+        """Call only the task's ``control``; launched over (nworld,)."""
         w = first + wp.tid()
         control(view(batch, w), action_in[w], params[w % params.shape[0]], ctrl_out[w])
 
@@ -265,7 +247,7 @@ def act_kernels(task: TaskCode) -> ActKernels:
 
 @dataclasses.dataclass(frozen=True)
 class JudgeKernels:
-    """Transitions and states: rewards, ends, metrics and observations."""
+    """Kernels that compute rewards, ends of episodes, metrics and observations."""
 
     check_memory: wp.Kernel | None
     judge: wp.Kernel
@@ -288,7 +270,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
 
     @wp.func
     def observe(group: int, s: World, p: Params, out: Observations, w: int, counters: Counters):
-        """Write a group of observations; its noise is a function of the counters alone."""
+        """Write an observation group; its noise depends only on the counters."""
         base = substream(stream(counters.key[w], counters.episode[w], counters.step[w]), OBSERVE)
         observe_group(group, s, p, out, w, base, counters.rng[group * counters.step.shape[0] + w])
 
@@ -296,7 +278,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
     def check_memory(
         mask_in: wp.array[bool], before: Batch, after: Batch, fault_inout: wp.array[int], lanes: int, first: int
     ):
-        """Find faults of the task's memory in the masked worlds; launched over (nworld, lanes)."""
+        """Find faults in the task's memory, in the masked worlds; launched over (nworld, lanes)."""
         k, lane = wp.tid()
         w = first + k
         if mask_in[w] and not finite_memory(view(before, w), view(after, w), lane, lanes):
@@ -319,11 +301,10 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         threads: int,
         first: int,
     ):
-        """Judge a transition, or a state alone, in the masked worlds; launched over (threads, nworld).
+        """Evaluate a transition or a state in the masked worlds without a fault; launched over (threads, nworld).
 
-        The parts do not depend on each other. On a GPU each has a thread of its own, because one after the other they
-        take several times as long, and there are places for far more threads than worlds. A world that has a fault
-        already is not judged.
+        The parts are independent. On a GPU each part has a thread of its own, which is several times faster than one
+        thread per world.
         """
         start, k = wp.tid()
         w = first + k
@@ -378,16 +359,14 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         lanes: int,
         first: int,
     ):
-        """Put together what ``judge`` found in the masked worlds; launched over (nworld, lanes).
+        """Combine the results of ``judge`` in the masked worlds; launched over (nworld, lanes).
 
-        Writes the reward, the metrics and their sums, the evaluation, the ends, success and the observations. The
-        lanes of a world share its rows.
+        Writes the reward, the metrics and their sums, the evaluation, the end of the episode, success and the
+        observations. A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and the
+        last good observations. It counts as truncated, so that learners bootstrap from those observations.
 
-        A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and the last good
-        observations. It counts as truncated, so that learners bootstrap from those observations.
-
-        Only a transition ends an episode: the ends of a state alone are those that it was saved with (``keep_reason``),
-        and ``found.terminated`` says whether the task's ``terminated`` holds in it.
+        Only a transition ends an episode. For a state without a transition, ``keep_reason`` keeps the saved reason, and
+        ``found.terminated`` shows whether the task's ``terminated`` holds.
         """
         k, lane = wp.tid()
         w = first + k
@@ -404,7 +383,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
             for i in range(lane, out.metrics.shape[1], lanes):
                 if fault != 0 or not transition:
                     out.metrics[w, i] = 0.0
-                if wp.isfinite(out.metrics[w, i]):  # the sum belongs to the state, which is finite
+                if wp.isfinite(out.metrics[w, i]):  # the sum is part of the state, which must be finite
                     metric_sum_inout[w, i] = metric_sum_inout[w, i] + out.metrics[w, i]
                 out.episode_metrics[w, i] = metric_sum_inout[w, i]
         if lane > 0:
@@ -419,7 +398,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
                 out.eval[w] = found.eval[w]
             elif transition:
                 found.eval[w] = evaluate(view(before, w), params[w % params.shape[0]])
-                if not faults.is_out_of_range(found.eval[w]):  # else keep the evaluation of an earlier state
+                if not faults.is_out_of_range(found.eval[w]):  # else keep the previous evaluation
                     out.eval[w] = found.eval[w]
         else:
             out.eval[w] = gain
@@ -439,7 +418,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         out.truncated[w] = (reason & ~TERMINATED) != 0
         out.done[w] = reason != 0
         if transition:
-            # without automatic resets a world steps on after its end, but not after a fault
+            # without automatic resets a world continues after its episode's end, but not after a fault
             restart_out[w] = wp.where(keep_reason, fault != 0, reason != 0)
             if fault != 0:
                 faults.count_faults(fault, fault_count_inout[w])
@@ -456,9 +435,9 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         parts: int,
         first: int,
     ):
-        """Observe the masked worlds, and find the groups whose numbers are finite; launched over (parts, nworld).
+        """Observe the masked worlds, and find the groups that are finite; launched over (parts, nworld).
 
-        With one part for all groups it replaces what is not finite as well; else ``replace_observations`` must follow.
+        With one part it also replaces observations that are not finite; else ``replace_observations`` must follow.
         """
         start, k = wp.tid()
         w = first + k
@@ -480,9 +459,9 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         lanes: int,
         first: int,
     ):
-        """Put the last good observations where a number is not finite; launched over (nworld, lanes).
+        """Replace observations that are not finite by the last good ones; launched over (nworld, lanes).
 
-        Such a number is a fault of the next step.
+        The next step reports the fault.
         """
         k, lane = wp.tid()
         w = first + k
@@ -507,7 +486,7 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
 
 @dataclasses.dataclass(frozen=True)
 class BeginKernels:
-    """New episodes, and what is drawn in them or happens between two steps."""
+    """Kernels that begin episodes, draw model fields, and run events between steps."""
 
     restart: wp.Kernel
     reject_worlds: wp.Kernel | None
@@ -535,7 +514,7 @@ def begin_kernels(task: TaskCode) -> BeginKernels:
     ):
         """Begin an episode in the masked worlds, or draw its initial state again; launched over (nworld,).
 
-        The engine has already put them into the fixed initial state. A further draw goes on in the stream of the last.
+        The engine has already reset these worlds to the fixed initial state. A repeated draw continues the stream.
         """
         w = first + wp.tid()
         if not mask_in[w]:
@@ -554,13 +533,13 @@ def begin_kernels(task: TaskCode) -> BeginKernels:
     def reject_worlds(
         mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], again_out: wp.array[bool], first: int
     ):
-        """Find the masked worlds whose initial state must be drawn again; launched over (nworld,)."""
+        """Find the masked worlds whose initial states are rejected; launched over (nworld,)."""
         w = first + wp.tid()
         again_out[w] = mask_in[w] and reject(view(batch, w), params[w % params.shape[0]])
 
     @task.kernel_for("startup")
     def start_worlds(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], counters: Counters, first: int):
-        """Draw the model fields of the masked worlds once; launched over (nworld,)."""
+        """Call ``startup`` in the masked worlds; launched over (nworld,)."""
         w = first + wp.tid()
         if mask_in[w]:
             counters.rng[w, 0] = stream(counters.key[w], STARTUP, 0)
@@ -594,7 +573,7 @@ def begin_kernels(task: TaskCode) -> BeginKernels:
 
 @dataclasses.dataclass(frozen=True)
 class RolloutKernels:
-    """Open-loop rollouts, which keep their fields for all steps."""
+    """Kernels for open-loop rollouts, which store their fields for all steps."""
 
     judge_rows: wp.Kernel
     advance_rows: wp.Kernel | None
@@ -603,8 +582,8 @@ class RolloutKernels:
 def rollout_kernels(task: TaskCode) -> RolloutKernels:
     """Make the kernels of ``RolloutKernels`` around a task's functions.
 
-    Row t * nworld + w is world w after t steps. The transition of that row leads to the one nworld further, so
-    ``before`` and ``after`` are the same arrays, shifted.
+    Row t * nworld + w is world w after t steps. Its transition leads to the row nworld further on, so ``before`` and
+    ``after`` are views of the same arrays.
     """
     Batch, Params = task.Batch, task.Params  # noqa: N806
     view = task.view
@@ -654,14 +633,14 @@ def rollout_kernels(task: TaskCode) -> RolloutKernels:
 
 @dataclasses.dataclass(frozen=True)
 class Kernels(ActKernels, JudgeKernels, BeginKernels, RolloutKernels):
-    """The kernels of a step, and the structs of their arrays. None stands for a kernel that the task does not need."""
+    """The kernels of a step, and the structs of their arrays. Kernels that the task does not need are None."""
 
     Batch: Any
     Observations: Any
 
 
 def make_kernels(task: TaskCode) -> Kernels:
-    """Fuse a task's functions into the kernels of a step."""
+    """Make all kernels of a task."""
     parts = (make(task) for make in (act_kernels, judge_kernels, begin_kernels, rollout_kernels))
     kernels = {name: kernel for part in parts for name, kernel in vars(part).items()}
     return Kernels(**kernels, Batch=task.Batch, Observations=task.Observations)

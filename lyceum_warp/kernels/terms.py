@@ -1,4 +1,4 @@
-"""Terms that tasks share, as Warp functions: what rewards, observations and ends of episodes are made of."""
+"""Provide Warp functions for tasks: write observations, shape rewards, test bounds, compute velocities."""
 
 import enum
 from typing import Any
@@ -24,10 +24,10 @@ class Sigmoid(enum.IntEnum):
 
 @wp.func
 def put(row: wp.array[float], at: int, value: float) -> int:
-    """Write a value into a row from the index ``at`` on; returns the index after it.
+    """Write a value into a row, starting at the index ``at``; returns the next index.
 
-    The value is a number or a bool, a vector, a matrix (row by row), or a row of any of these; of a row, ``first`` and
-    ``last`` choose the elements with first <= i < last. An observation is written as a chain: ``k = lw.put(obs, 0,
+    The value is a number, a bool, a vector, a matrix (row by row), or a row of any of these. For a row, ``first`` and
+    ``last`` select the elements with first <= i < last. Chain calls to write an observation: ``k = lw.put(obs, 0,
     s.qpos)``, then ``k = lw.put(obs, k, s.qvel)``.
     """
     row[at] = value
@@ -77,7 +77,7 @@ def put(row: wp.array[float], at: int, value: wp.array[Any]) -> int:
     return put(row, at, value, 0, value.shape[0])
 
 
-# the last, because Warp takes the first overload that fits
+# the last overload, because Warp takes the first that fits
 @wp.func
 def put(row: wp.array[float], at: int, value: Any) -> int:
     for i in range(len(value)):
@@ -87,13 +87,13 @@ def put(row: wp.array[float], at: int, value: Any) -> int:
 
 @wp.func
 def put_upright(qpos: wp.array[float], at: int, position: wp.vec3, yaw: float) -> int:
-    """Write the pose of an upright body into the coordinates of its free joint; returns the index after them.
+    """Write the pose of an upright body into the coordinates of its free joint; returns the next index.
 
     Args:
         qpos: The coordinates of a world.
-        at: Where those of the joint begin, as ``lw.qpos`` names it.
-        position: The place of the body, in m.
-        yaw: The angle by which the body is turned about the vertical, z, in radians.
+        at: Index of the joint's first coordinate, from ``lw.qpos``.
+        position: Position of the body, m.
+        yaw: Rotation of the body about the vertical axis z, rad.
     """
     k = put(qpos, at, position)
     return put(qpos, k, quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw))
@@ -101,10 +101,7 @@ def put_upright(qpos: wp.array[float], at: int, position: wp.vec3, yaw: float) -
 
 @wp.func
 def sum_squares(row: wp.array[float], first: int, last: int) -> float:
-    """Add the squares of a row's elements with first <= i < last; without these two, of all elements.
-
-    The elements are numbers or vectors.
-    """
+    """Sum the squares of a row's elements, numbers or vectors, with first <= i < last (by default of all elements)."""
     total = float(0.0)
     for i in range(first, last):
         total += row[i] * row[i]
@@ -131,7 +128,7 @@ def sum_squares(row: wp.array[Any]) -> float:
 
 @wp.func
 def inside(x: float, bounds: wp.vec2) -> bool:
-    """Whether a number lies strictly between two bounds, (low, high); a NaN does not."""
+    """Whether a number lies strictly between two bounds, (low, high); False for NaN."""
     return bounds[0] < x and x < bounds[1]
 
 
@@ -146,7 +143,7 @@ def all_inside(row: wp.array[float], first: int, last: int, bounds: wp.vec2) -> 
 
 @wp.func
 def angle_between(a: wp.vec3, b: wp.vec3) -> float:
-    """The angle between two vectors of any length but 0, in radians, 0 to pi: atan2(|a x b|, a . b)."""
+    """The angle between two vectors that are not zero, from 0 to pi rad: atan2(|a x b|, a . b)."""
     return wp.atan2(wp.length(wp.cross(a, b)), wp.dot(a, b))
 
 
@@ -157,9 +154,9 @@ def body_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3) -> wp.s
     w, v + w x (point - com) for cvel = (w, v); as mj_objectVelocity in the world's axes.
 
     Args:
-        cvel: The body's row of ``cvel``, (angular, linear), which MuJoCo gives at the centre of mass of its tree.
-        com: That centre of mass: the row of ``subtree_com`` of the body at the tree's root.
-        point: A point of the body, in the world's frame, such as its row of ``xpos`` or ``xipos``.
+        cvel: The body's row of ``cvel``, (angular, linear), at the centre of mass of its kinematic tree.
+        com: That centre of mass: the row of ``subtree_com`` of the tree's root body.
+        point: A point of the body, in the world's frame, such as the body's row of ``xpos`` or ``xipos``.
     """
     w = wp.spatial_top(cvel)
     return wp.spatial_vector(w, wp.spatial_bottom(cvel) + wp.cross(w, point - com))
@@ -167,14 +164,12 @@ def body_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3) -> wp.s
 
 @wp.func
 def local_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3, quat: wp.vec4) -> wp.spatial_vector:
-    """The velocity of a body at a point, as (angular, linear) in the axes of a frame, such as the body's own.
-
-    As mj_objectVelocity with flg_local.
+    """The velocity of a body at a point, as (angular, linear) in the axes of a frame; as mj_objectVelocity, flg_local.
 
     Args:
-        cvel: As of ``body_velocity``.
-        com: As of ``body_velocity``.
-        point: As of ``body_velocity``.
+        cvel: See ``body_velocity``.
+        com: See ``body_velocity``.
+        point: See ``body_velocity``.
         quat: The orientation of the frame (w, x, y, z), such as the body's row of ``xquat``.
     """
     v = body_velocity(cvel, com, point)
@@ -191,7 +186,7 @@ def tolerance(
     sigmoid: int = int(Sigmoid.GAUSSIAN),
     value_at_margin: float = 0.1,
 ) -> float:
-    """1 where a number lies within bounds, falling towards 0 outside them, as dm_control's ``tolerance``.
+    """1 if a number lies within bounds; outside it falls towards 0, as dm_control's ``tolerance``.
 
     With d, the distance from the nearer bound divided by the margin, and v, the value at the margin:
 
@@ -200,17 +195,17 @@ def tolerance(
     HYPERBOLIC    1 / cosh(d s), s = arccosh(1 / v)        0 < v < 1
     LONG_TAIL     1 / ((d s)^2 + 1), s = sqrt(1 / v - 1)   0 < v < 1
     RECIPROCAL    1 / (d s + 1), s = 1 / v - 1             0 < v < 1
-    COSINE        (1 + cos(pi d s)) / 2 where d s < 1      0 <= v < 1, s = arccos(2 v - 1) / pi
-    LINEAR        1 - d s where d s < 1, s = 1 - v         0 <= v < 1
-    QUADRATIC     1 - (d s)^2 where d s < 1, s^2 = 1 - v   0 <= v < 1
+    COSINE        (1 + cos(pi d s)) / 2 if d s < 1, or 0   0 <= v < 1, s = arccos(2 v - 1) / pi
+    LINEAR        max(0, 1 - d s), s = 1 - v               0 <= v < 1
+    QUADRATIC     max(0, 1 - (d s)^2), s^2 = 1 - v         0 <= v < 1
     TANH_SQUARED  1 - tanh(d s)^2, s = arctanh(sqrt(1-v))  0 < v < 1
     ============  =======================================  =================
 
     Args:
         x: The number.
-        bounds: The lowest and the highest number whose value is 1; either may be infinite.
-        margin: The distance outside the bounds at which the value is ``value_at_margin``; with 0 the value falls to 0
-            at the bounds.
+        bounds: The lowest and the highest number with value 1; both may be infinite.
+        margin: The distance from the bounds at which the value is ``value_at_margin``; with 0 the value falls to 0 at
+            the bounds.
         sigmoid: The shape, an ``lw.Sigmoid``.
         value_at_margin: The value at the margin.
     """
@@ -244,16 +239,15 @@ def tolerance(
 
 @wp.func
 def grasp_terms(distance: float, finger: float, closed: float) -> tuple[float, float, float]:
-    """Terms of a reward for grasping with two fingers, each between 0 and 1: ``near, reach, grasp``.
+    """Reward terms for grasping with two fingers, each from 0 to 1: ``near, reach, grasp``.
 
-    ``near`` is 1 up to 1 cm from the target and 0.1 at 2 cm; ``reach`` falls slowly, to 0.2 at 10.5 cm. ``grasp`` asks
-    for open fingers on the way and closed ones at the target: it is 0.5 for open fingers far from the target, 1 for
-    closed ones near it, and 0 for closed ones far from it and for open ones near it.
+    ``near`` is 1 up to 1 cm from the target and 0.1 at 2 cm; ``reach`` falls slowly, to 0.2 at 10.5 cm. ``grasp``
+    rewards open fingers on the way and closed fingers at the target: 0.5 if far and open, 1 if near and closed, else 0.
 
     Args:
-        distance: From the point between the fingers to the target, in m.
-        finger: Position of a finger, in m; 0 where the fingers meet.
-        closed: Up to this position the fingers are closed, and from about 2 cm above it they are open, in m.
+        distance: Distance from the point between the fingers to the target, m.
+        finger: Position of a finger, m; 0 if the fingers meet.
+        closed: Position up to which the fingers count as closed, m; from 2 cm above it they count as open.
     """
     near = tolerance(distance, wp.vec2(0.0, 0.01), 0.01)
     reach = tolerance(distance, wp.vec2(0.0, 0.005), 0.1, int(Sigmoid.RECIPROCAL), 0.2)

@@ -236,7 +236,7 @@ class Run:
             ValueError: ``which`` is something else.
         """
         if which == "last":
-            # earlier releases wrote the policy into the checkpoint alone
+            # earlier releases wrote the policy only into the checkpoint
             return self.policy if self.policy.is_file() else self.checkpoint
         if which == "best":
             path = self.best

@@ -1,1 +1,1 @@
-"""Tasks that come with the package, one module each; the module's name is the task's."""
+"""Define the tasks of the package, one module each, with the module's name as the name of the task."""

@@ -1,9 +1,9 @@
 """AdroitDoor: turn a latch with the hand and pull the door open (Gymnasium-Robotics' AdroitHandDoor-v1).
 
-The hand's model comes with the extra "hand". The door's frame is a mocap body here, so that its place belongs to the
-state. The tips of ring and little finger, which the model pairs twice, are paired once. As in the original, positions
-of sites are those that ``mj_step`` leaves. The reward grows with the palm's distance from the handle, as in
-gymnasium-robotics 1.2.1 to 1.4.2, by mistake; ``palm_weight=-0.1`` subtracts it, as in version 1.2.0.
+The hand's model needs the extra "hand". The door's frame is a mocap body here, so its position is part of the state.
+The model lists the contact pair of ring and little fingertip twice; here it is listed once. As in the original, site
+positions lag by one substep, as ``mj_step`` leaves them. The reward grows with the palm's distance from the handle: a
+mistake of gymnasium-robotics 1.2.1 to 1.4.2, which is kept. ``palm_weight=-0.1`` corrects it, as in version 1.2.0.
 """
 
 import mujoco
@@ -102,5 +102,5 @@ class AdroitDoor(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Let each world move its door."""
+        """Make the door's frame a mocap body, so that each world has a door position of its own."""
         spec.body("frame").mocap = True

@@ -1,9 +1,9 @@
 """AdroitHammer: pick up a hammer and drive a nail into a board (Gymnasium-Robotics' AdroitHandHammer-v1).
 
-The hand's model comes with the extra "hand". The board is a mocap body here, so that its height belongs to the state.
-The tips of ring and little finger, which the model pairs twice, are paired once. As in the original, positions and the
-force on the nail are those that ``mj_step`` leaves. The reward grows with the palm's distance from the hammer, as in
-gymnasium-robotics 1.2.1 to 1.4.2, by mistake; ``palm_weight=-0.1`` subtracts it, as in version 1.2.0.
+The hand's model needs the extra "hand". The board is a mocap body here, so its height is part of the state. The model
+lists the contact pair of ring and little fingertip twice; here it is listed once. As in the original, positions and the
+force on the nail lag by one substep, as ``mj_step`` leaves them. The reward grows with the palm's distance from the
+hammer: a mistake of gymnasium-robotics 1.2.1 to 1.4.2, which is kept. ``palm_weight=-0.1`` corrects it (as in 1.2.0).
 """
 
 import mujoco
@@ -31,13 +31,13 @@ class Params:
     dt: float
     sparse: bool = False  # a reward of 10 for success, else -0.1
     palm_weight: float = 0.1
-    success_distance: float = 0.01  # m between the nail's head and its place
+    success_distance: float = 0.01  # m between the nail's head and its goal
     board_height: wp.vec2 = wp.vec2(0.1, 0.25)
     hammer: int = lw.body("Object")
     head: int = lw.site("tool")
     palm: int = lw.site("S_grasp")
     nail: int = lw.site("S_target")
-    goal: int = lw.site("nail_goal")  # where the nail's head belongs
+    goal: int = lw.site("nail_goal")  # goal of the nail's head
     board: int = lw.mocap("nail_board")
     nail_force: int = lw.sensor("S_nail")
 
@@ -108,5 +108,5 @@ class AdroitHammer(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Let each world move its board."""
+        """Make the board a mocap body, so that each world has a board height of its own."""
         spec.body("nail_board").mocap = True

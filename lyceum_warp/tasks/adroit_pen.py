@@ -1,9 +1,9 @@
-"""AdroitPen: turn a pen in the hand until it points as the target does (Gymnasium-Robotics' AdroitHandPen-v1).
+"""AdroitPen: turn a pen in the hand to a target orientation (Gymnasium-Robotics' AdroitHandPen-v1).
 
-The hand's model comes with the extra "hand". The target is a mocap body here, so that it belongs to the state, and
-nothing collides with it; in the original, the pen can collide with the target. The tips of ring and little finger,
-which the model pairs twice, are paired once. As in the original, positions are those that ``mj_step`` leaves. An
-episode is a success once the pen was held in the goal orientation for more than 20 steps in all.
+The hand's model needs the extra "hand". The target is a mocap body here, so it is part of the state. The target does
+not collide; in the original, the pen can collide with it. The model lists the contact pair of ring and little fingertip
+twice; here it is listed once. As in the original, positions lag by one substep, as ``mj_step`` leaves them.
+Success: the pen has been in the goal orientation for more than 20 steps of the episode.
 """
 
 import mujoco
@@ -20,7 +20,7 @@ class World:
     xpos: Row[wp.vec3]
     site_xpos: Row[wp.vec3]
     mocap_quat: Row[lw.quat]
-    memory: Row[float]  # steps of the episode at the goal
+    memory: Row[float]  # number of steps at the goal in this episode
 
 
 @wp.struct
@@ -32,14 +32,14 @@ class Params:
     goal_steps: float = 20.0
     near_similarity: float = 0.9
     drop_height: float = 0.075
-    target_range: float = 1.0  # of the target's first two Euler angles
+    target_range: float = 1.0  # +-, of the target's first two Euler angles, rad
     pen: int = lw.body("Object")
     pen_top: int = lw.site("object_top")
     pen_bottom: int = lw.site("object_bottom")
     target: int = lw.mocap("target")
     target_top: int = lw.site("target_top")
     target_bottom: int = lw.site("target_bottom")
-    palm: int = lw.site("eps_ball")  # where the pen belongs
+    palm: int = lw.site("eps_ball")  # goal position of the pen
 
 
 @wp.func
@@ -109,7 +109,7 @@ class AdroitPen(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Let the target be turned in each world and touch nothing."""
+        """Make the target a mocap body without collisions, so that each world has an orientation of its own."""
         spec.body("target").mocap = True
         for geom in spec.body("target").geoms:
             geom.contype = geom.conaffinity = 0

@@ -1,9 +1,10 @@
 """AdroitRelocate: pick up a ball and carry it to a target (Gymnasium-Robotics' AdroitHandRelocate-v1).
 
-The hand's model comes with the extra "hand". The target is a mocap body here, and resets move the ball by its own
-joints: both places belong to the state. The tips of ring and little finger, which the model pairs twice, are paired
-once. As in the original, positions are those that ``mj_step`` leaves. The reward grows with the palm's distance from
-the ball, as in gymnasium-robotics 1.2.1 to 1.4.2, by mistake; ``palm_weight=-0.1`` subtracts it, as in version 1.2.0.
+The hand's model needs the extra "hand". The target is a mocap body here, and resets move the ball by its own joints, so
+both positions are part of the state. The model lists the contact pair of ring and little fingertip twice; here it is
+listed once. As in the original, positions lag by one substep, as ``mj_step`` leaves them. The reward grows with the
+palm's distance from the ball: a mistake of gymnasium-robotics 1.2.1 to 1.4.2, which is kept. ``palm_weight=-0.1``
+corrects it, as in version 1.2.0.
 """
 
 import mujoco
@@ -83,7 +84,7 @@ def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[fl
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    lw.put(s.qpos, p.ball_x, lw.uniform(rng, p.ball_low, p.ball_high))  # from the body's place, above (0, 0)
+    lw.put(s.qpos, p.ball_x, lw.uniform(rng, p.ball_low, p.ball_high))  # relative to the body's position above (0, 0)
     s.mocap_pos[p.target] = lw.uniform(rng, p.target_low, p.target_high)
 
 
@@ -103,7 +104,7 @@ class AdroitRelocate(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Let each world move its target."""
+        """Make the target a mocap body, so that each world has a target of its own."""
         fixed = spec.site("target")
         target = spec.worldbody.add_body(name="target", mocap=True, pos=fixed.pos)
         looks = {"size": fixed.size.copy(), "rgba": fixed.rgba.copy()}

@@ -1,8 +1,8 @@
-"""AlohaLift: take a pot by its two handles and lift it with two arms (ALOHA and pot of mujoco_warp's test data).
+"""AlohaLift: lift a pot by its two handles with two arms (ALOHA and pot of mujoco_warp's test data).
 
-Meshes are only drawn: what collides are capsules fitted to the arms, which pass through each other, and the simple
-shapes of the MJCF file beside this one. Actions are velocities, which move the targets of the model's position servos.
-An episode is a success while the pot was held up for ten steps.
+Meshes are visual only. Collision geoms are capsules fitted to the arms, which do not collide with each other, and the
+simple shapes of the MJCF file beside this one. Actions are velocities of the targets of the model's position servos.
+Success: the pot has been above the goal height for ten consecutive steps.
 """
 
 import mujoco
@@ -14,9 +14,9 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    qpos: Row[float]  # per arm 6 joints and 2 fingers, left arm first; then the pot's position and quaternion, its lid
+    qpos: Row[float]  # left arm: 6 joints, 2 fingers; right arm alike; position and quaternion of the pot; its lid
     qvel: Row[float]
-    act: Row[float]  # targets of both arms
+    act: Row[float]  # servo targets of both arms
     xpos: Row[wp.vec3]
     xmat: Row[wp.mat33]
     site_xpos: Row[wp.vec3]
@@ -28,7 +28,7 @@ class Params:
     dt: float
     goal_height: float = 0.1
     rest_height: float = 0.0658  # of the pot on the table
-    place: wp.vec3 = wp.vec3(0.03, 0.03, 0.25)  # of the pot at the start: x, y and yaw, each plus or minus this
+    place: wp.vec3 = wp.vec3(0.03, 0.03, 0.25)  # +-, of the pot at the start: x, y (m) and yaw (rad)
     pot: int = lw.body("partnet_100015/")
     left_grip: int = lw.site("lift/left_grip")
     right_grip: int = lw.site("lift/right_grip")
@@ -55,7 +55,7 @@ def evaluate(s: World, p: Params) -> float:  # height of the pot above the table
 @wp.func
 def arm(s: World, grip: int, handle: int, finger: int) -> wp.vec4:
     near, reach, grasp = lw.grasp_terms(wp.length(s.site_xpos[grip] - s.site_xpos[handle]), s.qpos[finger], 0.015)
-    # the fingers slide along the gripper's y axis, across the handle's bar, the pot's x axis
+    # best: the fingers' sliding axis, y of the gripper, is perpendicular to the handle's bar, x of the pot
     orient = 1.0 - wp.abs(wp.dot(s.site_xmat[grip][:, 1], s.site_xmat[handle][:, 0]))
     return wp.vec4(reach, orient, grasp, near)
 
@@ -99,7 +99,7 @@ class AlohaLift(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Let simple shapes collide, and turn the servos into ones that follow velocities."""
+        """Replace colliding meshes by simple shapes, and make the servos follow velocities."""
         spec.option.timestep, spec.option.integrator = 0.005, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         for servo in spec.actuators:
             lw.follow_velocity(servo, 0.1 if servo.name.endswith("gripper") else 1.0)  # m/s or rad/s
@@ -109,12 +109,12 @@ class AlohaLift(lw.Task):
                 geom.type, geom.conaffinity = mujoco.mjtGeom.mjGEOM_CAPSULE, 1
             elif geom.name.startswith("partnet"):
                 geom.rgba = (0.75, 0.77, 0.8, 1.0)
-        spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK  # so that videos take it
+        spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK  # the camera of videos
         for light in spec.lights:
-            light.castshadow = False  # drawing a frame without a GPU took 17 times as long
+            light.castshadow = False  # shadows make rendering without a GPU 17 times slower
         child = lw.package_model("lyceum_warp", "tasks/aloha_lift.xml").spec()
         for part in child.worldbody.bodies:
             spec.body(part.name).add_frame().attach_body(part, "lift/", "")
-        arm = [0, -1.05, 1.06, 0, 0.78, 1.57, 0.035, 0.035]  # beside a handle, one finger above the other
+        arm = [0, -1.05, 1.06, 0, 0.78, 1.57, 0.035, 0.035]  # the gripper beside a handle, one finger above the other
         pot = [0, 0, 0.0658, 0.7071068, 0, 0, 0.7071068, 0]
         spec.add_key(name="start", qpos=arm + arm + pot, act=2 * arm[:7])

@@ -1,8 +1,8 @@
 """ArmHandPickup: pick up a ball with an arm and a hand, and hold it at a goal (Lyceum's ArmHandPickup).
 
-Arm and hand are Kinova's Jaco (extra "jaco"). Goal, reward and the ball's start are Lyceum's, whose code takes, by
-mistake, the ball's distance from (ball - goal), which is constant; here it is the distance from the goal. Actions are
-speeds of joints; a step takes 20 ms. Success: the ball has been within 5 cm of the goal for ten steps, 0.2 s.
+Arm and hand are Kinova's Jaco (extra "jaco"). Goal, reward and initial states are Lyceum's, except that Lyceum's code
+uses, by mistake, the distance from the ball to (ball - goal), which is constant; here it is the distance to the goal.
+Actions are joint velocities. Success: the ball has been within 5 cm of the goal for ten consecutive steps, 0.2 s.
 """
 
 import mujoco
@@ -29,18 +29,18 @@ class World:
 @wp.struct
 class Params:
     dt: float
-    far: float = 0.5  # m; longer distances count as this
-    near: float = 0.03  # m from the palm to the ball, from which on the goal counts
+    far: float = 0.5  # m; longer distances are clipped to this
+    near: float = 0.03  # m between palm and ball, below which the reward includes the goal
     finger_weight: float = 0.1
     success_distance: float = 0.05
     ball: int = lw.body("table/ball")
     goal: int = lw.site("table/goal")
     palm: int = lw.site("hand/pinchsite")
-    finger: int = lw.geom("hand/finger_tip_1")  # those of the other two lie 2 and 4 geoms further on
+    finger: int = lw.geom("hand/finger_tip_1")  # the other two fingertips are 2 and 4 geoms further on
 
 
 @wp.func
-def distances(s: World, p: Params) -> wp.vec3:  # of the ball from the palm, from the goal, and from the fingers in all
+def distances(s: World, p: Params) -> wp.vec3:  # from the ball to the palm, to the goal, and summed to the fingertips
     d = wp.vec3(wp.length(s.site_xpos[p.palm] - s.xpos[p.ball]), wp.length(s.site_xpos[p.goal] - s.xpos[p.ball]), 0.0)
     d = wp.min(d, wp.vec3(p.far))
     for i in range(3):
@@ -93,18 +93,18 @@ class ArmHandPickup(lw.Task):
     keyframe, frame_skip, horizon, success_steps = "home", 4, 300, 10
     obs = {"joints": 9, "velocity": 9, "ball_velocity": 3, "ball": 3, "palm": 3, "goal": 3, "fingers": 9}
     metrics, action_range = ("palm_distance", "goal_distance", "finger_distances"), (-1.0, 1.0)
-    planning = lw.Planning(  # whose reward shows the goal from afar and asks more for a closed hand
+    planning = lw.Planning(  # this reward has a longer range, and a stronger term for closing the hand
         settings=dict(horizon=32, samples=64, temperature=0.1, noise=0.8, fill="repeat", include_plan=False),
         params={"far": 1.0, "finger_weight": 2.0},
     )
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Give the arm a hand, a table and motors that hold the speeds of joints."""
+        """Add the hand, a table, and motors that control joint velocities."""
         spec.attach(jaco("jaco_hand.xml").spec(), site=spec.site("wristsite"), prefix="hand/")
         for geom in spec.geoms:
-            geom.contype, geom.conaffinity = 0, 1  # arm and hand touch table and ball, not each other
-        for i, joint in enumerate(spec.joints):  # of large joints, small joints, fingers: gain, rad/s and N m at most
+            geom.contype, geom.conaffinity = 0, 1  # arm and hand collide with table and ball, not with each other
+        for i, joint in enumerate(spec.joints):  # large joints, small joints, fingers: gain, maximum rad/s and N m
             gain, speed, torque = ((500, 0.628, 30.5), (500, 0.838, 6.8), (100, 1.0, 1.0))[i // 3]
             motor = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             motor.set_to_velocity(kv=gain)

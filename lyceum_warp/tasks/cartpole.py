@@ -1,8 +1,8 @@
 """Cartpole: keep a pole upright on a cart in the middle of its rail (dm_control's cartpole balance).
 
-The reward is dm_control's smooth one; ``sparse=True`` gives that of balance_sparse. An episode is a success while cart
-and pole are within the bounds of the sparse reward. Episodes do not terminate; those of Gymnasium's CartPole-v1 end
-with the pole at 12 degrees, and its actions are two forces. CartpoleSwingup starts with the pole hanging down.
+The reward is dm_control's smooth reward; ``sparse=True`` selects the reward of balance_sparse. Success: cart and pole
+are within the bounds of the sparse reward. Episodes do not terminate. In Gymnasium's CartPole-v1, for comparison, they
+end when the pole tilts by 12 degrees, and the action is one of two forces.
 """
 
 import warp as wp
@@ -21,11 +21,11 @@ class World:
 class Params:
     dt: float
     sparse: bool = False
-    cart_range: wp.vec2 = wp.vec2(-0.25, 0.25)  # in balance
-    cosine_range: wp.vec2 = wp.vec2(0.995, 1.0)  # in balance, of the pole's angle
-    reset_cart: float = 0.1
-    reset_pole: float = 0.034
-    reset_velocity: float = 0.01  # standard deviation; the other two are half-widths
+    cart_range: wp.vec2 = wp.vec2(-0.25, 0.25)  # m, for balance
+    cosine_range: wp.vec2 = wp.vec2(0.995, 1.0)  # of the pole's angle, for balance
+    reset_cart: float = 0.1  # +-, m
+    reset_pole: float = 0.034  # +-, rad
+    reset_velocity: float = 0.01  # standard deviation, m/s and rad/s
 
 
 @wp.func

@@ -1,7 +1,7 @@
 """CartpoleSwingup: swing a pole up and balance it (dm_control's cartpole swingup, with Lyceum's reward).
 
-In Lyceum's reward every sigmoid is quadratic; dm_control's are Gaussian, except that of the control. An episode never
-terminates. Cartpole is the task that starts with the pole upright.
+In Lyceum's reward every sigmoid is quadratic; in dm_control's reward they are Gaussian, except for the control.
+Episodes do not terminate.
 """
 
 import warp as wp

@@ -1,16 +1,14 @@
 """Go1Velocity: a Unitree Go1 walks at a commanded velocity, as in mjlab 1.6.0's Mjlab-Velocity-Flat-Unitree-Go1.
 
-Observations, rewards, commands, pushes and resets have mjlab's numbers. An action moves the targets of the joints'
-servos away from the default pose. Joints and feet are in the order FR, FL, RR, RL, each leg hip, thigh, calf.
+Observations, rewards, commands, pushes and resets have mjlab's numbers; docs/go1.md lists the differences. Actions are
+offsets of the joints' servo targets from the default pose. Joints and feet are in the order FR, FL, RR, RL, with hip,
+thigh and calf for each leg.
 
-Functions read the state after the last substep, while mjlab's rewards read velocities, orientations and contacts of the
-substep before, and heights of feet of the step before. Only the forces on the feet are those of the last substep's
-beginning, as for every task, and 0 when an episode begins. Feet are spheres on a plane: one touches it where its centre
-is within its radius.
-A reward that is not finite is a fault; mjlab counts such a term as 0.
+Functions read the state after the last substep. Only the forces on the feet are from the beginning of that substep, and
+0 at the start of an episode. Feet are spheres on a plane, so a foot is in contact if its height is at most its radius.
 
-Loops over legs are written range(int(4)), which Warp does not unroll: on a GPU, where a thread has a whole world, the
-kernels otherwise have three times as many instructions, each of which is fetched for one use.
+Loops over legs are written range(int(4)), which Warp does not unroll: unrolled, the GPU kernels have three times as
+many instructions and are limited by instruction fetches.
 """
 
 import math
@@ -20,17 +18,17 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row
 
-# places in memory
-VELOCITY = wp.constant(0)  # commanded forward and lateral velocity and yaw rate, as they were drawn
+# indices in memory
+VELOCITY = wp.constant(0)  # commanded forward and lateral velocity and yaw rate, as drawn
 HEADING = wp.constant(3)  # commanded heading, rad
-HEADING_CONTROLLED = wp.constant(4)  # 1 where the heading determines the yaw rate
-STANDING = wp.constant(5)  # 1 where the command is to stand
+HEADING_CONTROLLED = wp.constant(4)  # 1 if the heading determines the yaw rate
+STANDING = wp.constant(5)  # 1 if the command is to stand
 COMMAND_TIMER = wp.constant(6)  # seconds until a new command
 PUSH_TIMER = wp.constant(7)  # seconds until a push
 LAST_ACTION = wp.constant(8)
-CONTACT_TIME = wp.constant(20)  # seconds for which each foot has touched the floor; 0 in the air
-AIR_TIME = wp.constant(24)  # seconds since each foot touched the floor; 0 in contact
-# places in lasting memory
+CONTACT_TIME = wp.constant(20)  # seconds since each foot came into contact; 0 in the air
+AIR_TIME = wp.constant(24)  # seconds since each foot left the floor; 0 in contact
+# indices in lasting memory
 ENCODER_BIAS = wp.constant(0)  # of the joints, rad
 PEAK_HEIGHT = wp.constant(12)  # of each foot since its last landing, m
 ENV_STEPS = wp.constant(16)
@@ -58,7 +56,7 @@ class World:
 class Params:
     dt: float
     substep_dt: float
-    # weights of the rewards' terms, per second
+    # weights of the reward terms, per second
     track_linear_velocity: float = 2.0
     track_angular_velocity: float = 2.0
     upright: float = 1.0
@@ -69,27 +67,27 @@ class Params:
     foot_swing_height: float = -0.25
     foot_slip: float = -0.1
     soft_landing: float = -1e-5
-    # their scales
+    # scales of the reward terms
     linear_velocity_variance: float = 0.25  # (m/s)^2
     angular_velocity_variance: float = 0.5  # (rad/s)^2
     tilt_variance: float = 0.2
     standing_pose_std: wp.vec3 = wp.vec3(0.05, 0.05, 0.1)  # of hip, thigh and calf, rad
     walking_pose_std: wp.vec3 = wp.vec3(0.3, 0.3, 0.6)
     soft_limit: float = 0.9  # share of a joint's range
-    foot_height: float = 0.1  # of a swing, m
-    least_command: float = 0.05  # below it, terms of the gait are 0 and the pose is that of standing
+    foot_height: float = 0.1  # target height of a swing, m
+    least_command: float = 0.05  # below it, the gait terms are 0 and the pose term uses standing_pose_std
     fall_angle: float = math.radians(70.0)
     # actions
     default_pose: wp.array[float] = 2 * [0.1, 0.9, -1.8, -0.1, 0.9, -1.8]  # rad
-    action_scale: float = 0.25  # of the angle at which a servo's force reaches its limit
-    # commands: from so many steps on, forward velocity from, to (m/s), and greatest yaw rate (rad/s)
+    action_scale: float = 0.25  # as a share of the angle at which a servo's force reaches its limit
+    # commands: first step of the stage, minimum and maximum forward velocity (m/s), maximum yaw rate (rad/s)
     stages: wp.array2d[float] = [[0.0, -1.0, 1.0, 0.5], [120e3, -1.5, 2.0, 0.7], [240e3, -2.0, 3.0, 0.7]]
     lateral_velocity: float = 1.0
     command_seconds: wp.vec2 = wp.vec2(3.0, 8.0)
-    heading_share: float = 0.3  # of commands whose yaw rate follows a heading
+    heading_share: float = 0.3  # share of commands whose yaw rate follows a heading
     heading_gain: float = 0.5  # 1/s
     standing_share: float = 0.1
-    forward_share: float = 0.2  # of commands that are forward only
+    forward_share: float = 0.2  # share of commands that are forward only
     least_forward_velocity: float = 0.3
     # uniform noise of the policy's observations, +-
     linear_velocity_noise: float = 0.5
@@ -101,18 +99,18 @@ class Params:
     push_seconds: wp.vec2 = wp.vec2(1.0, 3.0)
     push_velocity: wp.vec3 = wp.vec3(0.5, 0.5, 0.4)  # +-, in the world's axes, m/s
     push_spin: wp.vec3 = wp.vec3(0.52, 0.52, 0.78)  # +-, in the world's axes, rad/s
-    # robots that differ
+    # differences between robots
     encoder_bias: float = 0.015  # +-, rad
     trunk_offset: wp.vec3 = wp.vec3(0.025, 0.025, 0.03)  # +-, of the trunk's centre of mass, m
     sliding_friction: wp.vec2 = wp.vec2(0.3, 1.5)
-    spinning_friction: wp.vec2 = wp.vec2(1e-4, 2e-2)  # drawn with a uniform logarithm, as the next one
+    spinning_friction: wp.vec2 = wp.vec2(1e-4, 2e-2)  # log-uniform, like the rolling friction
     rolling_friction: wp.vec2 = wp.vec2(1e-5, 5e-3)
     # resets
     start_height: float = 0.278
     start_low: wp.vec3 = wp.vec3(-0.5, -0.5, 0.01)  # offset of the trunk, m
     start_high: wp.vec3 = wp.vec3(0.5, 0.5, 0.05)
     start_yaw: float = 3.14  # +-
-    # the model's elements; the twelve bodies, the twelve joints, the feet's sites and their sensors follow each other
+    # elements of the model; the twelve bodies, the twelve joints, the feet's sites and sensors are consecutive
     trunk: int = lw.body("trunk")
     bodies: int = lw.body("FR_hip")
     joints: int = lw.joint("FR_hip")
@@ -134,17 +132,17 @@ def orientation(s: World) -> lw.quat:
 
 
 @wp.func
-def linear_velocity(s: World) -> wp.vec3:  # of the trunk's origin, in its own axes
+def linear_velocity(s: World) -> wp.vec3:  # of the trunk's origin, in the trunk's axes
     return lw.quat_rotate_inverse(orientation(s), wp.vec3(s.qvel[0], s.qvel[1], s.qvel[2]))
 
 
 @wp.func
-def angular_velocity(s: World) -> wp.vec3:  # in its own axes
+def angular_velocity(s: World) -> wp.vec3:  # in the trunk's axes
     return wp.vec3(s.qvel[3], s.qvel[4], s.qvel[5])
 
 
 @wp.func
-def gravity(s: World) -> wp.vec3:  # its direction in the trunk's axes
+def gravity(s: World) -> wp.vec3:  # direction of gravity in the trunk's axes
     return lw.quat_rotate_inverse(orientation(s), wp.vec3(0.0, 0.0, -1.0))
 
 
@@ -159,7 +157,7 @@ def heading(s: World) -> float:
 
 @wp.func
 def foot(s: World, p: Params, leg: int) -> tuple[wp.vec3, wp.vec3]:
-    """Position and velocity of a foot in the world, from the joints alone, so that no forward pass is needed."""
+    """Position and velocity of a foot in the world, computed from the joints, which saves a forward pass."""
     x, v = wp.vec3(s.site_pos[p.feet + leg]), wp.vec3(0.0)
     for k in range(int(3)):
         j = 3 * leg + 2 - k  # calf, thigh, hip
@@ -175,7 +173,7 @@ def foot(s: World, p: Params, leg: int) -> tuple[wp.vec3, wp.vec3]:
 
 
 @wp.func
-def height(x: wp.vec3) -> float:  # of a foot's centre; mjlab's rays end after 1 m
+def height(x: wp.vec3) -> float:  # of a foot's centre; clipped at 1 m, the range of mjlab's rays
     return wp.clamp(x[2], 0.0, 1.0)
 
 
@@ -191,7 +189,7 @@ def touches(x: wp.vec3, s: World, p: Params) -> bool:
 
 @wp.func
 def landed(seconds: float, p: Params) -> bool:
-    """Whether a contact that has lasted for some seconds began in the last step."""
+    """Whether a contact with this duration began in the last step."""
     return seconds > 0.0 and seconds < p.dt + 1e-6
 
 
@@ -236,12 +234,12 @@ def command(s: World, p: Params) -> wp.vec3:
 
 
 @wp.func
-def amount(c: wp.vec3) -> float:  # of a command
+def amount(c: wp.vec3) -> float:  # magnitude of a command
     return wp.length(wp.vec2(c[0], c[1])) + wp.abs(c[2])
 
 
 @wp.func
-def active(c: wp.vec3, p: Params) -> float:  # 1 where the command is to move
+def active(c: wp.vec3, p: Params) -> float:  # 1 if the command is to move
     return wp.where(amount(c) > p.least_command, 1.0, 0.0)
 
 
@@ -278,7 +276,7 @@ def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
 
 @wp.func
 def put_robot(s: World, p: Params, obs: Row[float], bias: float) -> int:
-    """Write what both groups observe, with a share of the encoders' bias; returns the index after it."""
+    """Write the part that both groups share, with ``bias`` times the encoders' bias; returns the next index."""
     imu_velocity = linear_velocity(s) + wp.cross(angular_velocity(s), s.site_pos[p.imu])
     k = lw.put(obs, 0, imu_velocity)
     k = lw.put(obs, k, angular_velocity(s))
@@ -319,7 +317,7 @@ def observe_critic(s: World, p: Params, obs: Row[float]):
             obs[k + 12 + 3 * leg + i] = wp.sign(f[i]) * wp.log(1.0 + wp.abs(f[i]))
 
 
-# the terms of the reward; the command c is that of the state in which the action was chosen
+# the terms of the reward; c is the command in the state before the step
 
 
 @wp.func
@@ -371,7 +369,7 @@ def action_rate_l2(s0: World, action: Row[float]) -> float:
 
 @wp.func
 def foot_clearance_and_slip(c: wp.vec3, s1: World, p: Params) -> wp.vec2:
-    """Both terms, which follow from the same positions and velocities of the feet."""
+    """Both terms in one function, so that positions and velocities of the feet are computed once."""
     clearance, slip = float(0.0), float(0.0)
     for leg in range(int(4)):
         x, v = foot(s1, p, leg)
@@ -395,7 +393,7 @@ def foot_swing_height(c: wp.vec3, s0: World, s1: World, p: Params) -> float:
 def soft_landing(c: wp.vec3, s1: World, p: Params) -> float:
     total = float(0.0)
     for leg in range(int(4)):
-        # the force is that of the last substep's beginning, at which the contact was younger
+        # the force is from the beginning of the last substep, when the contact was one substep younger
         if landed(s1.memory[CONTACT_TIME + leg] - p.substep_dt, p):
             total += wp.length(force(s1, p, leg))
     return total * active(c, p)
@@ -438,7 +436,7 @@ def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[fl
 
 
 @wp.func
-def evaluate(s: World, p: Params) -> float:  # how far the velocity is from the command, m/s
+def evaluate(s: World, p: Params) -> float:  # velocity error, m/s
     return velocity_error(command(s, p), s)
 
 
@@ -552,5 +550,5 @@ class Go1Velocity(lw.Task):
         "velocity_error",
         "yaw_rate_error",
     )
-    cleared = ("sensordata",)  # no substep has been made; mjlab computes them for the first state
+    cleared = ("sensordata",)  # zero before the first substep; mjlab computes it for the first state
     memory, lasting_memory = 28, 17

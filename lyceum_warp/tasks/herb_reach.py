@@ -1,10 +1,10 @@
-"""HerbReach: move the hands of two 7-joint Barrett arms to targets in space (the paper's HERB).
+"""HerbReach: move the hands of two 7-joint Barrett arms to targets in space (HERB in the Lyceum paper).
 
-The paper's model of HERB is not published; this one has published numbers (see herb.xml). An action is a share of each
-motor's peak torque, fingers included, on top of gravity compensation. The targets are mocap bodies, and so belong to
-the state; they are drawn from two boxes in front of the shoulders, which the arms can reach. An episode starts at
-HERB's home position, and is a success once both palms have been within 5 cm of their targets for ten steps, 0.2 s.
-Where two boxes of the arms touch, MuJoCo Warp finds fewer points of contact than MuJoCo.
+The paper's model is not published; this one is built from the robot's published data (see herb.xml). An action is a
+share of each motor's peak torque, fingers included, added to gravity compensation. The targets are mocap bodies, and so
+part of the state. They are drawn from two boxes within reach, in front of the shoulders. Episodes start near HERB's
+home position. Success: both palms have been within 5 cm of their targets for ten consecutive steps, 0.2 s. MuJoCo Warp
+finds fewer contact points than MuJoCo between two boxes of the arms.
 """
 
 import warp as wp
@@ -15,7 +15,7 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    qpos: Row[float]  # 15 joints of the left arm and hand, then those of the right
+    qpos: Row[float]  # 15 joints of the left arm and hand, then 15 of the right
     qvel: Row[float]
     site_xpos: Row[wp.vec3]
     mocap_pos: Row[wp.vec3]
@@ -27,9 +27,9 @@ class Params:
     success_distance: float = 0.05
     precision_weight: float = 0.5
     ctrl_cost_weight: float = 0.01
-    target_low: wp.vec3 = wp.vec3(0.6, 0.1, 0.7)  # of the left target; the right one's box is its mirror image in y
+    target_low: wp.vec3 = wp.vec3(0.6, 0.1, 0.7)  # of the left target; mirrored in y for the right target
     target_high: wp.vec3 = wp.vec3(0.95, 0.6, 1.3)
-    reset_noise_scale: float = 0.1  # of the arms' joints
+    reset_noise_scale: float = 0.1  # +-, of the arms' joints, rad
     left_arm: int = lw.qpos("left/j1")
     right_arm: int = lw.qpos("right/j1")
     left_palm: int = lw.site("left/palm")
@@ -97,7 +97,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     s.mocap_pos[p.right_target][1] = -s.mocap_pos[p.right_target][1]
 
 
-# the wrist's motors turn little: a large share of their torque would only shake the hand
+# less noise for the wrist, whose links are light: a large share of its torque would only shake the hand
 ARM_NOISE, FINGER_NOISE = (0.14, 0.07, 0.035, 0.1, 0.02, 0.02, 0.02), (0.0, 0.0, 0.0, 0.0)
 
 

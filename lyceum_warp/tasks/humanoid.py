@@ -1,8 +1,8 @@
 """Humanoid: walk forward on two legs without falling over (Gymnasium's Humanoid-v5).
 
-The contact forces are those that a sensor of the model sees. Under RK4, the model's integrator, sensors are
-computed in the first of a substep's four passes; Gymnasium computes ``cfrc_ext`` once more after the last. The
-two differ while feet touch the ground, everything else is equal. The model's PGS solver is replaced by Newton.
+The contact forces are from MuJoCo's sensor stage. Under RK4, the model's integrator, this stage runs in the first of a
+substep's four passes; Gymnasium computes ``cfrc_ext`` once more after the last pass. The forces differ while feet touch
+the ground; everything else is equal. The solver is Newton instead of the model's PGS.
 """
 
 import warp as wp
@@ -67,7 +67,7 @@ def contact_cost(s: World, p: Params) -> float:
 
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    # the subtree of the world body is everything: its centre of mass is the robot's
+    # the subtree of the world body is the whole robot
     forward = p.forward_reward_weight * (s1.subtree_com[0][0] - s0.subtree_com[0][0]) / p.dt
     alive = wp.where(healthy(s1, p), p.healthy_reward, 0.0)
     return forward + alive - p.ctrl_cost_weight * lw.sum_squares(action) - contact_cost(s1, p)

@@ -1,8 +1,8 @@
 """HumanoidStandup: stand up from the floor (Gymnasium's HumanoidStandup-v5).
 
-The contact forces are those that a sensor of the model sees, as in the task humanoid; the first observation of an
-episode shows them, too, where Gymnasium shows zeros. The model's PGS solver is replaced by Newton. Gymnasium documents
-``uph_cost_weight`` but does not use it; here it is the weight of the height.
+The contact forces are from MuJoCo's sensor stage, as in humanoid. Here they are also in the first observation of an
+episode, in which Gymnasium has zeros. The solver is Newton instead of the model's PGS. Gymnasium documents
+``uph_cost_weight`` but does not use it; here it weighs the height.
 """
 
 import warp as wp
@@ -53,7 +53,7 @@ def observe(s: World, p: Params, obs: Row[float]):
 
 @wp.func
 def terms(action: Row[float], s1: World, p: Params) -> wp.vec3:
-    # as in Gymnasium: the height of the torso, not its change, over the time of a substep
+    # as in Gymnasium: the height of the torso, not its change, divided by the duration of a substep
     height = p.uph_cost_weight * s1.qpos[2] / p.substep_dt
     impact = p.impact_cost_weight * lw.sum_squares(s1.cfrc_ext)
     impact = wp.clamp(impact, p.impact_cost_range[0], p.impact_cost_range[1])

@@ -1,7 +1,7 @@
 """InvertedDoublePendulum: keep a pole of two links upright on a cart (Gymnasium's InvertedDoublePendulum-v5).
 
-As in Gymnasium, the tip's position and the constraint force on the cart, at the ends of the rail, are those that
-``mj_step`` leaves.
+As in Gymnasium, the tip's position and the constraint force on the cart, which is not zero at the ends of the rail, lag
+by one substep, as ``mj_step`` leaves them.
 """
 
 import warp as wp

@@ -1,9 +1,9 @@
 """PandaLift: grasp a cube on a table and lift it (a Franka Panda with its gripper, as in robosuite's Lift).
 
-The arm comes with the extra "robots", without a gripper: hand, table and cube are MJCF files beside this one. Actions
-are velocities, which move the targets of position servos; the arm compensates gravity, as the robot itself does. The
-arm's meshes are only drawn: capsules fitted to them collide with table and cube. The reward weighs four terms between
-0 and 1. An episode is a success once the cube has been held up for ten steps in a row.
+The arm needs the extra "robots" and has no gripper; hand, table and cube are MJCF files beside this one. Actions are
+velocities of the targets of position servos. The arm compensates gravity, as the real robot does. Meshes are visual
+only: capsules fitted to the arm collide with table and cube. Success: the cube has been above the goal height for ten
+consecutive steps.
 """
 
 import mujoco
@@ -12,14 +12,14 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row
 
-HOME = (0.0, 0.1, 0.0, -2.1, 0.0, 2.2, 0.785, 0.03, 0.03)  # of arm and fingers: the gripper points down
+HOME = (0.0, 0.1, 0.0, -2.1, 0.0, 2.2, 0.785, 0.03, 0.03)  # arm and fingers; the gripper points down
 
 
 @wp.struct
 class World:
     qpos: Row[float]  # 7 joints of the arm, 2 fingers, the cube's position and quaternion
     qvel: Row[float]
-    act: Row[float]  # targets of arm and gripper
+    act: Row[float]  # servo targets of arm and gripper
     xpos: Row[wp.vec3]
     xmat: Row[wp.mat33]
     site_xpos: Row[wp.vec3]
@@ -30,8 +30,8 @@ class World:
 class Params:
     dt: float
     goal_height: float = 0.1
-    half_size: float = 0.02  # of the cube, in m
-    area: wp.vec4 = wp.vec4(0.45, 0.65, -0.15, 0.15)  # of the cube at the start: x from, to, y from, to
+    half_size: float = 0.02  # of the cube, m
+    area: wp.vec4 = wp.vec4(0.45, 0.65, -0.15, 0.15)  # of the cube at the start: x min, x max, y min, y max, m
     cube: int = lw.body("table/cube")
     cube_qpos: int = lw.qpos("table/cube")
     finger: int = lw.qpos("hand/left_finger")
@@ -58,7 +58,7 @@ def terms(s: World, p: Params) -> wp.vec4:
     grip = s.site_xmat[p.grip]  # z points out of the hand, the fingers slide along y
     distance = wp.length(s.xpos[p.cube] - s.site_xpos[p.grip])
     near, reach, grasp = lw.grasp_terms(distance, s.qpos[p.finger], p.half_size)
-    # down, and the fingers along an edge of the cube
+    # the gripper points down, and the fingers slide along an edge of the cube
     orient = wp.clamp(-grip[2, 2], 0.0, 1.0) * wp.max(wp.abs(wp.transpose(s.xmat[p.cube]) * grip[:, 1]))
     lift = near * orient * wp.clamp(evaluate(s, p) / (1.5 * p.goal_height), 0.0, 1.0)
     return wp.vec4(reach, orient, grasp, lift)
@@ -82,7 +82,7 @@ def success(s: World, p: Params) -> bool:
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     x, y = lw.uniform(rng, p.area[0], p.area[1]), lw.uniform(rng, p.area[2], p.area[3])
-    place = wp.vec3(x, y, p.half_size - 1e-4)  # at rest, its weight presses it into the table
+    place = wp.vec3(x, y, p.half_size - 1e-4)  # at rest, its weight presses it slightly into the table
     lw.put_upright(s.qpos, p.cube_qpos, place, lw.uniform(rng, -wp.pi, wp.pi))
 
 
@@ -97,10 +97,10 @@ class PandaLift(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Put the arm at a table, give it a hand, and turn its motors into servos that follow velocities."""
+        """Add the hand, a table and the cube, and make the motors servos that follow velocities."""
         spec.option.timestep, spec.option.cone = 0.005, mujoco.mjtCone.mjCONE_ELLIPTIC
         for i, (motor, joint) in enumerate(zip(spec.actuators, spec.joints, strict=True)):
-            kp, force = (4500.0, 87.0) if i < 4 else (2000.0, 12.0)  # the published limits of torque
+            kp, force = (4500.0, 87.0) if i < 4 else (2000.0, 12.0)  # the published torque limits, N m
             motor.set_to_position(kp=kp, kv=0.05 * kp)
             motor.ctrlrange, motor.forcerange = joint.range, (-force, force)
             lw.follow_velocity(motor, 1.0)  # rad/s

@@ -1,7 +1,7 @@
 """Pusher: push a cylinder to a goal with a 7-joint arm (Gymnasium's Pusher-v5).
 
-As in Gymnasium, the positions of bodies are those that ``mj_step`` leaves. A success, which Gymnasium does not have,
-is a cylinder whose centre is over the goal's disc.
+As in Gymnasium, body positions lag by one substep, as ``mj_step`` leaves them. Success, which Gymnasium does not
+define: the cylinder's centre is over the goal's disc.
 """
 
 import warp as wp
@@ -12,7 +12,7 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    qpos: Row[float]  # 7 angles, then y and x of the cylinder and of the goal, from their places in the model
+    qpos: Row[float]  # 7 angles; y and x of the cylinder, then of the goal, relative to their positions in the model
     qvel: Row[float]
     xpos: Row[wp.vec3]
 

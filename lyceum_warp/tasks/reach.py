@@ -1,8 +1,8 @@
 """Reach: move the hand of a 7-joint arm to a target in space (the arm that the Lyceum paper calls Sawyer).
 
-Gravity does not act on the arm. Its target is a mocap body, and so belongs to the state. An episode is a success
-while the distance, averaged over ten steps, is under 5 cm. With ``random_start`` one episode in five begins with the
-palm inside the table, whose contact forces push it out.
+The model has no gravity. The target is a mocap body, and so part of the state. Success: the mean distance over the
+last ten steps is below 5 cm. With ``random_start`` one episode in five begins with the palm inside the table, and
+contact forces push it out.
 """
 
 import warp as wp
@@ -11,9 +11,9 @@ import lyceum_warp as lw
 from lyceum_warp import Row
 
 REMEMBERED = 10
-"""Distances that the task remembers, one a step."""
+"""Number of steps over which the distance is averaged."""
 FAR = 10.0
-"""Metres in the place of a distance that is not there yet: with one of these, the average is never a success."""
+"""Initial value of the distances in memory, m: large enough to prevent success before the tenth step."""
 
 
 @wp.struct
@@ -30,7 +30,7 @@ class World:
 class Params:
     dt: float
     success_distance: float = 0.05
-    random_start: bool = False  # joints anywhere in their ranges, as in the paper's text, not at zero as in its code
+    random_start: bool = False  # draw joints from their ranges, as in the paper's text; zero, as in its code
     target_range: wp.vec3 = wp.vec3(0.3, 0.2, 0.25)
     finger: int = lw.site("finger")
     target: int = lw.mocap("target")
@@ -96,5 +96,5 @@ class Reach(lw.Task):
     obs = {"position": 7, "velocity": 7, "hand": 3, "error": 3}
     horizon = 75
     memory = REMEMBERED
-    # the paper's; its temperature of 5 is an inverse one
+    # the paper's settings; its inverse temperature is 5
     planning = lw.Planning(settings={"horizon": 16, "samples": 30, "temperature": 0.2, "noise": 1.0})

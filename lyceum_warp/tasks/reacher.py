@@ -1,7 +1,7 @@
 """Reacher: move the tip of a planar arm of two links to a target (Gymnasium's Reacher-v5).
 
-As in Gymnasium, the positions of bodies are those that ``mj_step`` leaves. A success, which Gymnasium does not have,
-is a tip that touches the target.
+As in Gymnasium, body positions lag by one substep, as ``mj_step`` leaves them. Success, which Gymnasium does not
+define: the tip touches the target.
 """
 
 import warp as wp

@@ -1,8 +1,8 @@
-"""SoftBall: grip a soft ball with two fingers and lift it to a target (a flex).
+"""SoftBall: grip a soft ball, a flex, with two fingers and lift it to a target.
 
-Squeezing the ball costs reward, and a ball that is crushed to two thirds of its width ends the episode. The policy sees
-the mean and the extents of its vertices. An episode is a success once the ball has been within 3 cm of the target for
-half a second. MuJoCo Warp merges contacts of a flex that lie within 1 mm, so that the engines differ in hard squeezes.
+Squeezing the ball costs reward, and crushing it to two thirds of its width ends the episode. The policy observes the
+mean and the extents of the ball's vertices. Success: the ball has been within 3 cm of the target for half a second.
+MuJoCo Warp merges flex contacts that are less than 1 mm apart, so the engines differ when the ball is squeezed hard.
 """
 
 import warp as wp
@@ -10,7 +10,7 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row
 
-NODE = 4  # where the ball begins in qpos and qvel: after the gripper's joints come 8 corners of 3 numbers each
+NODE = 4  # first index of the ball in qpos and qvel: 8 corners with 3 numbers each, after the gripper's joints
 
 
 @wp.struct
@@ -26,10 +26,10 @@ class World:
 class Params:
     dt: float
     success_distance: float = 0.03
-    reach: float = 0.4  # m from the origin, beyond which the ball is lost
+    reach: float = 0.4  # m; further from the origin the ball is lost
     diameter: float = 0.09
-    start_range: float = 0.2  # of the ball and of its target, along x
-    heights: wp.vec2 = wp.vec2(0.15, 0.3)  # of the target
+    start_range: float = 0.2  # +-, of the ball and of the target along x, m
+    heights: wp.vec2 = wp.vec2(0.15, 0.3)  # of the target, m
     grip: int = lw.site("grip")
     target: int = lw.mocap("target")
 

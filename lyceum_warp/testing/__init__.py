@@ -1,4 +1,4 @@
-"""The rules of an environment, as checks for any task on any engine; ``check_task`` runs them.
+"""Check the rules of an environment for any task on any engine.
 
 Each check is one rule. It takes the environments under test, raises an AssertionError that names the task, the
 engine, the rule, the values, the seed and a world's state, and leaves the environments usable for the next check.
@@ -15,11 +15,11 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.task import Task
-from lyceum_warp.testing import bounds_rules as bounds
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import episode_rules as episodes
 from lyceum_warp.testing import fault_rules as faults
 from lyceum_warp.testing import form_rules as form
+from lyceum_warp.testing import index_rules as indices
 from lyceum_warp.testing import physics_rules as physics
 from lyceum_warp.testing import reset_rules as resets
 from lyceum_warp.testing import state_rules as state
@@ -27,52 +27,19 @@ from lyceum_warp.testing.context import OUTCOMES, Context
 
 log = logging.getLogger(__name__)
 
-CHECKS: tuple[Callable[[Context], None], ...] = (
-    buffers.check_spaces,
-    buffers.check_addresses,
-    buffers.check_getters,
-    buffers.check_time,
-    state.check_round_trip,
-    state.check_restoring,
-    state.check_masked_restoring,
-    state.check_masked_getting,
-    state.check_set_state_shows,
-    state.check_purity,
-    state.check_determinism,
-    state.check_reset,
-    state.check_masked_reset,
-    state.check_rand_reset,
-    state.check_world_count,
-    state.check_saved_stream,
-    episodes.check_truncation,
-    episodes.check_no_autoreset,
-    episodes.check_graphs,
-    episodes.check_memory,
-    bounds.check_bounds,
-    faults.check_bad_state,
-    faults.check_bad_action,
-    faults.check_bad_warmstart,
-    faults.check_not_finite,
-    form.check_groups,
-    form.check_noise,
-    form.check_metrics,
-    form.check_success_steps,
-    form.check_events,
-    form.check_substep,
-    form.check_lasting_memory,
-    physics.check_inputs,
-    physics.check_dynamics,
-    resets.check_keyframe,
-    resets.check_rejection,
-    resets.check_settle,
+CHECKS: tuple[Callable[[Context], None], ...] = tuple(
+    value
+    for module in (buffers, state, episodes, indices, faults, form, physics, resets)
+    for name, value in vars(module).items()
+    if name.startswith("check_")
 )
-"""All checks, in the order in which ``check_task`` runs them."""
+"""All checks, which are the functions ``check_*`` of the modules of rules, in the order in which they run."""
 
 
 @document_attributes
 @dataclasses.dataclass
 class Report:
-    """The result of ``check_task``: a task keeps every rule on an engine."""
+    """The result of ``check_task`` for a task that keeps every rule."""
 
     task: str
     """The task's name."""
@@ -105,17 +72,17 @@ def check_task(
 
     Args:
         task: Name of a task, a file with one, or its class.
-        engine: As for ``make``, or a class of your own (see ``engines.base``).
+        engine: As for ``make``, or an engine class (see ``engines.base``).
         device: As for ``make``.
         nworld: Number of worlds, at least 2.
         steps: Steps of the long checks (determinism, memory).
         seed: Seed of the worlds and of the random actions.
-        checks: The rules to check, out of ``CHECKS``.
-        options: Other options of ``make`` and parameters of the task. On a CUDA device ``deterministic`` is True by
-            default, because the rules compare to the bit.
+        checks: The rules to check, a selection of ``CHECKS``.
+        options: Further options of ``make`` and parameters of the task. On a CUDA device ``deterministic`` is True by
+            default, because the rules compare numbers to the bit.
 
     Returns:
-        A report of the checks, to print.
+        A report of the checks, which can be printed.
 
     Raises:
         AssertionError: Rules are broken; the message lists them.
@@ -127,7 +94,6 @@ def check_task(
     if nworld < 2:
         raise ValueError(f"the checks compare worlds with one another: nworld must be at least 2, not {nworld}")
     steps = whole_number("steps", steps, low=1)
-
     if str(device or "").startswith("cuda"):
         options = {"deterministic": True} | options
 

@@ -1,23 +1,22 @@
-"""Copies of a task's functions that check every index, and kernels that run them.
+"""Copy a task's functions with a check of every index, and make kernels that run the copies.
 
-The copies are made from the functions' sources: each index of a row, a vector or a matrix goes through a function that
-compares it with the size, and each ``while`` loop counts its rounds. Everything else stays as it is, so that the
-numbers are those of the task. Native functions (``wp.func_native``) are C++ and cannot be checked.
+In a copy each index of a row, a vector or a matrix goes through a function that compares it with the size, and each
+``while`` loop counts its rounds. Everything else stays as it is, so that a copy computes the same numbers. Native
+functions (``wp.func_native``) are C++ and cannot be checked.
 """
 
 import ast
 import copy
 import dataclasses
-import linecache
-import re
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from lyceum_warp.binding.sources import FunctionSource, has_source, is_row, is_struct, name_of, overloads
-from lyceum_warp.kernels import bounds
+from lyceum_warp.binding import sources
+from lyceum_warp.binding.sources import FunctionSource, is_row, is_struct, name_of, overloads
+from lyceum_warp.kernels import index_checks
 
 _SHAPES = ("shape", "strides")
 """Attributes of an array that are tuples."""
@@ -25,7 +24,7 @@ _SHAPES = ("shape", "strides")
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """One index, or one loop, in the source of a function."""
+    """An index or a loop in the source of a function."""
 
     function: str
     text: str
@@ -33,25 +32,22 @@ class Place:
     where: str
     """The file and the line."""
     verb: str
-    """What the function does there: "reads", "writes" or "loops"."""
+    """The action: reads, writes or loops."""
 
     def problem(self, index: int, size: int) -> str:
-        """What went wrong, in one line."""
+        """The message about an index out of range, or about an endless loop."""
         if self.verb == "loops":
-            rounds = int(bounds.MOST_ROUNDS)
+            rounds = int(index_checks.MOST_ROUNDS)
             return f"{self.function} is still in its loop {self.text!r} after {rounds} rounds ({self.where})"
-        there = f"{size} elements, 0 to {size - 1}" if size else "no elements"
-        return (
-            f"{self.function} {self.verb} {self.text} out of range ({self.where}): the index is {index}, and there are "
-            f"{there}"
-        )
+        there = f"there are {size} elements, 0 to {size - 1}" if size else "there are no elements"
+        return f"{self.function} {self.verb} {self.text} out of range ({self.where}): the index is {index}, and {there}"
 
 
 _HELPERS = {
-    "bounds_at": bounds.at, "bounds_from_end": bounds.from_end, "bounds_element": bounds.element,
-    "bounds_is_endless": bounds.is_endless,
+    "bounds_at": index_checks.at, "bounds_from_end": index_checks.from_end, "bounds_element": index_checks.element,
+    "bounds_is_endless": index_checks.is_endless,
 }  # fmt: skip
-"""The names that the copies use, chosen so that no task has them."""
+"""Functions that the copies call, by names that no task is likely to use."""
 
 
 class Unchecked(Exception):  # noqa: N818
@@ -65,12 +61,6 @@ class CheckedFunctions:
     ``Batch`` for the task's World, (nworld,) or (1,) for Params, (nworld, size) for a row. The report has, for each
     place, the number of times that its index was out of range, the first such index and the size.
 
-    Args:
-        module: Name of the Warp module that the copies are compiled into.
-        functions: The functions by name.
-        world: The task's World.
-        batch: The struct of the task's fields for all worlds.
-
     Raises:
         Unchecked: A function can't be copied.
     """
@@ -82,39 +72,32 @@ class CheckedFunctions:
         self._copies: dict[int, wp.Function] = {}
         self._scopes: list[tuple[dict[str, Any], list[int]]] = []
         self.kernels = {name: self._kernel(name, function) for name, function in functions.items()}
-        for scope, numbers in self._scopes:  # functions may call each other
+        for scope, numbers in self._scopes:  # after all copies are made, because functions may call each other
             scope |= {f"bounds_{number}": self._copies[number] for number in numbers}
 
     def load(self, device: wp.Device) -> None:
-        """Compile the kernels.
-
-        Raises:
-            Unchecked: Warp can't compile the copies.
-        """
+        """Compile the kernels, or raise Unchecked if Warp can't."""
         try:
             wp.get_module(self._module).load(device)
         except Exception as error:
-            lines = [line.strip(" ;") for line in str(error).splitlines() if line.strip(" ;")]
-            raise Unchecked(f"Warp can't compile the functions with checks: {' '.join(lines[-2:])}") from error
+            raise Unchecked(f"Warp can't compile the functions with checks: {' '.join(str(error).split())}") from error
 
     def report(self, device: wp.Device) -> wp.array:
-        """A report without findings."""
+        """An empty report."""
         return wp.zeros((max(len(self.places), 1), 3), dtype=int, device=device)
 
     def problems(self, report: wp.array) -> list[str]:
-        """The findings of a report, one line each."""
+        """The messages for a report, one line each."""
         found: np.ndarray = report.numpy()
         return list(dict.fromkeys(place.problem(*found[i, 1:]) for i, place in enumerate(self.places) if found[i, 0]))
 
-    # parts of the copies, for the rewriter
-
     def place(self, source: FunctionSource, node: ast.AST, text: str, verb: str) -> int:
-        """The number of a new place."""
+        """Add a place, and return its number."""
         self.places.append(Place(source.name, text, source.place(node), verb))
         return len(self.places) - 1
 
     def number(self, function: wp.Function) -> int:
-        """The number of a function's copy, which is made if it is not there yet."""
+        """The number of a function's copy, which is made at the first call."""
         if function not in self._numbers:
             number = self._numbers[function] = len(self._numbers)
             for overload in overloads(function):
@@ -143,22 +126,19 @@ class CheckedFunctions:
         types |= {"bounds_report_type": wp.array2d(dtype=int), "bounds_result_type": returned}
         scope = source.scope | _HELPERS | types | defaults
         scope |= {"bounds_wp": wp, "bounds_module": wp.get_module(self._module)}
-        if number in self._copies:  # Warp takes the next for an overload of this one
+        if number in self._copies:  # Warp then adds the new copy as an overload
             scope[tree.name] = self._copies[number]
         self._scopes.append((scope, rewriter.callees))
-        self._execute(ast.unparse(ast.fix_missing_locations(tree)), scope, len(self._scopes))
+        self._run(ast.unparse(ast.fix_missing_locations(tree)), scope, len(self._scopes))
         copied: wp.Function = scope[tree.name]
         return copied
 
-    def _execute(self, text: str, scope: dict[str, Any], part: int | str) -> None:
-        """Run generated source in a scope, and keep it where Warp looks for it."""
-        file = f"<{self._module} {part}>"
-        linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
+    def _run(self, text: str, scope: dict[str, Any], part: int | str) -> None:
         scope["__name__"] = self._module
-        exec(compile(text, file, "exec"), scope)
+        sources.run_source(text, f"<{self._module} {part}>", scope)
 
     def _kernel(self, name: str, function: wp.Function) -> wp.Kernel:
-        """The kernel that runs the copy of one function in every world."""
+        """The kernel that runs a function's copy in every world."""
         number = self.number(function)
         scope: dict[str, Any] = {
             "wp": wp, "World": self._world, "Batch": self._batch, "copy": self._copies[number],
@@ -176,22 +156,22 @@ class CheckedFunctions:
                 values.append(f"values_{i}[w % values_{i}.shape[0]]")
         lines.append(f"copy({', '.join(values)})")
         text = f"def run_{name}({', '.join(arguments)}):\n" + "\n".join(f"    {line}" for line in lines) + "\n"
-        self._execute(text, scope, name)
+        self._run(text, scope, name)
         return wp.kernel(scope[f"run_{name}"], module=wp.get_module(self._module), enable_backward=False)
 
 
 class _Rewriter(ast.NodeTransformer):
-    """Puts checks into the syntax tree of one function."""
+    """Inserts checks into the syntax tree of one function."""
 
     def __init__(self, checked: CheckedFunctions, source: FunctionSource) -> None:
         self.checked, self.source = checked, source
         self.callees: list[int] = []
         self.loops = 0
         self.writes = False
-        """Whether the expression at hand is written: of ``a[i].x = 1.0`` all parts are."""
+        """Whether the current expression is a part of an assignment's target."""
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
-        """Leave the type of a local name alone."""
+        """Do not visit the annotation."""
         node.target = self.visit(node.target)
         node.value = node.value and self.visit(node.value)
         return node
@@ -211,7 +191,7 @@ class _Rewriter(ast.NodeTransformer):
         return visited
 
     def _refused(self, node: ast.Name | ast.Attribute) -> ast.AST:
-        """Refuse a function that is not called here: the copy that is called elsewhere takes one argument more."""
+        """Refuse a function that is used as a value: its copy has one more argument."""
         function = self.source.value(node)
         if isinstance(function, wp.Function) and function.func is not None:
             raise Unchecked(
@@ -220,41 +200,39 @@ class _Rewriter(ast.NodeTransformer):
         return node
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
-        if self.source.is_static(node):
+        kind, callee = self.source.call(node)
+        if kind == "static":
             return node
-        callee = self.source.value(node.func)
         if callee is None and self.source.is_static(node.func):
-            raise Unchecked(f"{self.source.name} calls what a loop chooses ({self.source.place(node)})")
-        if isinstance(callee, wp.Function) and callee.func is None and callee.key.startswith("atomic_"):
-            self._check_atomic(node, callee.key)
-        node.args = [self.visit(argument) for argument in node.args]
-        for keyword in node.keywords:
-            keyword.value = self.visit(keyword.value)
-        if not isinstance(callee, wp.Function) or callee.func is None:
-            if not isinstance(node.func, ast.Name):
-                node.func = self.visit(node.func)
-            return node
-        if has_source(callee):
-            number = self.checked.number(callee)
-            self.callees.append(number)
-            node.func = _name(f"bounds_{number}")
-            node.args.insert(0, _name("bounds_report"))
-        elif any(is_row(kind) or is_struct(kind) for kind in callee.input_types.values()):
+            raise Unchecked(f"{self.source.name} calls a function that a loop chooses ({self.source.place(node)})")
+        if kind == "native" and any(is_row(given) or is_struct(given) for given in callee.input_types.values()):
             raise Unchecked(
                 f"{self.source.name} calls the native function {name_of(callee)} ({self.source.place(node)}), which "
                 "has no source in Python: give it numbers instead of rows"
             )
+        if kind == "builtin" and callee.key.startswith("atomic_"):
+            self._check_atomic(node, callee.key)
+        node.args = [self.visit(argument) for argument in node.args]
+        for keyword in node.keywords:
+            keyword.value = self.visit(keyword.value)
+        if kind == "helper":
+            number = self.checked.number(callee)
+            self.callees.append(number)
+            node.func = _name(f"bounds_{number}")
+            node.args.insert(0, _name("bounds_report"))
+        elif kind != "native" and not isinstance(node.func, ast.Name):
+            node.func = self.visit(node.func)
         return node
 
     def _check_atomic(self, node: ast.Call, key: str) -> None:
-        """Put checks around the indices of ``wp.atomic_add(row, i, value)`` and other functions of its kind."""
+        """Check the indices of ``wp.atomic_add(row, i, value)`` and similar functions."""
         text, values = ast.unparse(node), 2 if key == "atomic_cas" else 1
         row = self.visit(copy.deepcopy(node.args[0]))
         for axis, index in enumerate(node.args[1:-values]):
             node.args[1 + axis] = self._checked(node, text, "writes", row, axis, index)
 
     def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
-        if self._is_left_alone(node):
+        if self._is_constant(node):
             return node
         writes = self.writes or not isinstance(node.ctx, ast.Load)
         text, verb = ast.unparse(node), "writes" if writes else "reads"
@@ -275,14 +253,14 @@ class _Rewriter(ast.NodeTransformer):
         node.slice = ast.Tuple(checked, ast.Load()) if isinstance(node.slice, ast.Tuple) else checked[0]
         return node
 
-    def _is_left_alone(self, node: ast.Subscript) -> bool:
-        """Whether Warp itself checks the index, which must be a constant."""
+    def _is_constant(self, node: ast.Subscript) -> bool:
+        """Whether the subscript belongs to a type, a tuple or a shape, where Warp itself requires a constant."""
         value = self.source.value(node.value)
-        not_ours = value is not None and not hasattr(value, "_wp_scalar_type_")  # a type, or Python's own tuple
-        return not_ours or (isinstance(node.value, ast.Attribute) and node.value.attr in _SHAPES)
+        type_or_tuple = value is not None and not hasattr(value, "_wp_scalar_type_")
+        return type_or_tuple or (isinstance(node.value, ast.Attribute) and node.value.attr in _SHAPES)
 
     def _checked(self, node: ast.AST, text: str, verb: str, base: ast.expr, axis: int, index: ast.expr) -> ast.expr:
-        """An index along one axis, with its check."""
+        """The checked index along one axis."""
         place = ast.Constant(self.checked.place(self.source, node, text, verb))
         for _ in range(axis):
             base = ast.Subscript(_loaded(base), ast.Constant(0), ast.Load())
@@ -292,7 +270,7 @@ class _Rewriter(ast.NodeTransformer):
         return _call("bounds_from_end" if constant else "bounds_at", _name("bounds_report"), place, index, size)
 
     def visit_While(self, node: ast.While) -> list[ast.stmt]:
-        """Count the rounds of a loop."""
+        """Insert a counter that ends an endless loop."""
         place = self.checked.place(self.source, node, f"while {ast.unparse(node.test)}", "loops")
         self.loops += 1
         rounds = f"bounds_rounds_{self.loops}"
@@ -313,7 +291,7 @@ def _call(name: str, *arguments: ast.expr) -> ast.Call:
 
 
 def _loaded(node: ast.expr) -> ast.expr:
-    """A copy of an expression that is read."""
+    """A copy of an expression, to be read."""
     loaded = copy.deepcopy(node)
     if isinstance(loaded, ast.Attribute | ast.Subscript | ast.Name):
         loaded.ctx = ast.Load()
@@ -321,30 +299,21 @@ def _loaded(node: ast.expr) -> ast.expr:
 
 
 _made: dict[Any, CheckedFunctions] = {}
-_module_names: list[str] = []
 
 
 def checked_functions(
     name: str, functions: Mapping[str, wp.Function], world: Any, batch: Any, device: wp.Device
 ) -> CheckedFunctions:
-    """The compiled copies of a task's functions, made once for the same functions.
+    """The copies of a task's functions, compiled for a device and made once for the same functions.
 
-    Args:
-        name: A name for their Warp module, the same in every process.
-        functions: The task's functions by name.
-        world: The task's World.
-        batch: The struct of the task's fields for all worlds.
-        device: The device to compile for.
+    ``name`` is for their Warp module, ``batch`` the struct of the task's fields for all worlds.
 
     Raises:
         Unchecked: A function can't be checked.
     """
     key = (world, batch, *functions.items())
     if key not in _made:
-        module = re.sub(r"[^\w.]", "_", f"lyceum_warp.checked.{name}")
-        taken = sum(other == module or other.startswith(f"{module}_again") for other in _module_names)
-        module = f"{module}_again{taken}" if taken else module
-        _module_names.append(module)
+        module = sources.free_module_name(f"lyceum_warp.checked.{name}")
         _made[key] = CheckedFunctions(module, functions, world, batch)
     _made[key].load(device)
     return _made[key]

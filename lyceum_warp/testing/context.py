@@ -1,4 +1,4 @@
-"""The environments under test, and the comparisons that the checks share."""
+"""Hold the environments under test, and compare their numbers for the checks."""
 
 import contextlib
 import dataclasses
@@ -8,6 +8,7 @@ from typing import Any, NoReturn
 import numpy as np
 import torch
 
+from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.kernels import steps
 from lyceum_warp.support.arrays import torch_view
@@ -23,14 +24,14 @@ SHORT = 8
 @document_attributes
 @dataclasses.dataclass
 class Context:
-    """Two environments made with the same options, those options, and comparisons with messages."""
+    """Two environments made with the same options, and comparisons that name the rule and the values."""
 
     a: Env
     """The environment that most checks use."""
     b: Env
-    """One for comparison."""
+    """An environment to compare with."""
     make: Callable[..., Env]
-    """Makes another environment with the same options, except for the given ones."""
+    """Makes another environment with the same options and the given changes."""
     steps: int
     """Steps of the long checks."""
     seed: int
@@ -51,12 +52,12 @@ class Context:
         raise AssertionError(f"{what}\n  {where}")
 
     def that(self, holds: bool | torch.Tensor, problem: str) -> None:
-        """Fail unless something holds."""
+        """Fail unless a condition holds."""
         if not bool(holds):
             self.fail(problem)
 
     def equal(self, found: torch.Tensor, wanted: torch.Tensor, what: str) -> None:
-        """Fail unless two tensors have the same shape, type and values to the bit (not-a-number equals itself)."""
+        """Fail unless two tensors have the same shape, type and values to the bit (NaN equals NaN)."""
         if found.shape != wanted.shape or found.dtype != wanted.dtype:
             self.fail(f"{what}: {found.dtype} {tuple(found.shape)} instead of {wanted.dtype} {tuple(wanted.shape)}")
         differ = ~((found == wanted) | ((found != found) & (wanted != wanted)))
@@ -75,7 +76,7 @@ class Context:
             env.rand_reset(self.seed if seed is None else seed)
 
     def actions(self, steps: int, salt: int = 0) -> torch.Tensor:
-        """Random actions within their bounds (-1 to 1 where there are none), (steps, nworld, nact)."""
+        """Random actions within their bounds, or within -1 and 1 if there are none, (steps, nworld, nact)."""
         env = self.a
         assert env.action_space.low is not None and env.action_space.high is not None
         low = torch.as_tensor(np.where(np.isfinite(env.action_space.low), env.action_space.low, -1.0))
@@ -84,14 +85,24 @@ class Context:
         draws = torch.rand(steps, *env.action.shape, generator=generator)
         return (low + draws * (high - low)).to(env.action)
 
+    def mask(self, *worlds: int) -> torch.Tensor:
+        """A mask of some worlds, by default of every second one, (nworld,) bool."""
+        numbers = torch.arange(self.a.nworld)
+        mask = torch.isin(numbers, torch.tensor(worlds)) if worlds else numbers % 2 == 0
+        return mask.to(self.a.action.device)
+
+    def faulty(self, env: Env) -> torch.Tensor:
+        """A mask of the worlds that had a fault in the last step, (nworld,) bool."""
+        return (env.done_reason & int(FAULTS)) != 0
+
     def calm(self, env: Env) -> torch.Tensor:
-        """The worlds that no event changed after the last step, (nworld,) bool."""
+        """A mask of the worlds that no event changed after the last step, (nworld,) bool."""
         if env.task.functions["event"] is None:
             return torch.ones_like(env.done)
         return ~env.worlds.changed_view
 
     def run(self, env: Env, actions: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Step through actions; returns the state and the outcome of every step, (steps, nworld, ...)."""
+        """Step through actions, and return the state and the outcome of every step, (steps, nworld, ...)."""
         kept: dict[str, list[torch.Tensor]] = {name: [] for name in ("state", "calm", *OUTCOMES)}
         for action in actions:
             env.step(action)
@@ -102,13 +113,13 @@ class Context:
         return {name: torch.stack(values) for name, values in kept.items()}
 
     def same_runs(self, found: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], what: str) -> None:
-        """Fail unless two runs have the same numbers to the bit."""
+        """Fail unless two results of ``run`` are the same to the bit."""
         for name in wanted:
             self.equal(found[name], wanted[name], f"{name} {what} (step, world, ...)")
 
     @contextlib.contextmanager
     def changed(self, *envs: Env, **choices: Any) -> Iterator[None]:
-        """Within a ``with`` block, give environments another ``horizon``, ``autoreset`` or ``graphs``."""
+        """Context in which environments have another ``horizon``, ``autoreset`` or ``graphs``."""
         kept: list[Any] = [
             {"horizon": env.horizon, "autoreset": env.autoreset, "graphs": env.worlds.programs.graphs.enabled}
             for env in envs

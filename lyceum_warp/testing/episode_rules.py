@@ -1,4 +1,4 @@
-"""Rules about the end of an episode, graphs, and memory that steps use."""
+"""Check the end of episodes, graphs, and the memory that steps use."""
 
 import gc
 import tracemalloc
@@ -6,11 +6,11 @@ import tracemalloc
 import torch
 import warp as wp
 
-from lyceum_warp.done import FAULTS, Done
+from lyceum_warp.done import Done
 from lyceum_warp.env import Env
 from lyceum_warp.testing.context import Context
 
-_PYTHON_BYTES = 2_048  # the interpreter's own caches; a leak of one float a step would be 3,200 after 100 steps
+_PYTHON_BYTES = 2_048  # for the interpreter's caches; a leak of one float per step is 3,200 bytes after 100 steps
 
 
 def _check_flags(ctx: Context, env: Env) -> None:
@@ -23,7 +23,8 @@ def _check_flags(ctx: Context, env: Env) -> None:
 def check_truncation(ctx: Context) -> None:
     """At the horizon an episode is truncated; ``final_obs`` is its last observation, ``obs`` the first of the next.
 
-    Truncation does not set ``terminated``, and in worlds that go on both observations are equal.
+    Truncation does not set ``terminated``. In worlds that go on, both observations are equal. All of this holds for
+    every group of observations.
     """
     a, b, horizon = ctx.a, ctx.b, 4
     with ctx.changed(a, horizon=horizon, autoreset=True), ctx.changed(b, horizon=horizon, autoreset=False):
@@ -36,16 +37,18 @@ def check_truncation(ctx: Context) -> None:
             steps += 1
             _check_flags(ctx, a)
             ctx.equal(a.truncated, steps >= horizon, f"truncated after {steps.tolist()} steps of an episode")
+            going, state = ~a.done & ctx.calm(a), a.get_state()
             # until its first end, a world has the same numbers without automatic resets
-            ctx.equal(a.final_obs[alive], b.final_obs[alive], "final_obs against the one without automatic resets")
+            for name, obs in a.obs_groups.items():
+                final = a.final_obs_groups[name]
+                ctx.equal(final[alive], b.final_obs_groups[name][alive], f"the final group {name} without resets")
+                ctx.equal(final[going], obs[going], f"the final group {name} of worlds that go on")
+                ctx.equal(a.get_obs(state, group=name), obs, f"get_obs of the group {name} after automatic resets")
             ctx.equal(a.reward[alive], b.reward[alive], "reward against the one without automatic resets")
             ctx.equal(a.terminated[alive], b.terminated[alive], "terminated with and without automatic resets")
             alive &= ~a.done
-            going = ~a.done & ctx.calm(a)
-            ctx.equal(a.final_obs[going], a.obs[going], "final_obs of worlds that go on")
-            ctx.equal(a.get_obs(a.get_state()), a.obs, "obs against the state, after automatic resets")
             ctx.that((a.time[a.done] == 0).all(), f"time is {a.time.tolist()} where done is {a.done.tolist()}")
-            count = a.get_state()[:, a.state_space.parts["step"]].squeeze(1)
+            count = state[:, a.state_space.parts["step"]].squeeze(1)
             steps[a.done] = 0
             ctx.equal(count, steps.to(count.dtype), "the state's step counter")
 
@@ -62,18 +65,16 @@ def check_no_autoreset(ctx: Context) -> None:
             ctx.that((env.done | ~ended).all(), f"done was {ended.tolist()} and is {env.done.tolist()}")
             ended |= env.done
             ctx.that(i < horizon or env.truncated.all(), f"truncated is {env.truncated.tolist()} after {i} steps")
-            if not (env.done_reason & int(FAULTS)).any():
+            if not ctx.faulty(env).any():
                 ctx.that((env.time > (i - 0.5) * env.timestep).all(), f"time is {env.time.tolist()} after {i} steps")
                 calm = ctx.calm(env)
                 ctx.equal(env.final_obs[calm], env.obs[calm], "final_obs without automatic resets")
-        mask = torch.zeros_like(env.done)
-        mask[0] = True
-        env.rand_reset(mask=mask)
+        env.rand_reset(mask=ctx.mask(0))
         ctx.that(not env.truncated[0] and env.truncated[1:].all(), "a masked reset cleared other ends")
 
 
 def check_graphs(ctx: Context) -> None:
-    """Steps and resets with graphs have the numbers of those without, to the bit."""
+    """Steps and resets have the same numbers with and without graphs, to the bit."""
     a, b, n = ctx.a, ctx.b, 20
     with ctx.changed(a, horizon=6, graphs=True), ctx.changed(b, horizon=6, graphs=False):
         ctx.restart()
@@ -97,11 +98,11 @@ def _memory(device: wp.Device) -> dict[str, int]:
 
 
 def check_memory(ctx: Context) -> None:
-    """Steps, resets, ``get_state`` and ``set_state`` allocate no lasting memory."""
+    """Steps, resets, ``get_state`` and ``set_state`` leak no memory."""
     env = ctx.a
     ctx.restart()
     actions, state = ctx.actions(32), env.get_state()
-    mask = torch.arange(env.nworld, device=env.action.device) % 2 == 0
+    mask = ctx.mask()
 
     def steps(n: int) -> None:
         for i in range(n):

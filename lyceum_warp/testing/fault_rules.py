@@ -1,11 +1,11 @@
-"""Rules about faults."""
+"""Check that a fault ends the episode of its world and changes no other world."""
 
 from collections.abc import Callable
 
 import numpy as np
 import torch
 
-from lyceum_warp.done import FAULTS, Done
+from lyceum_warp.done import Done
 from lyceum_warp.env import Env
 from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 
@@ -14,7 +14,7 @@ def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, 
     """Cause a fault in one world of env a, and compare with env b, which has none."""
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     ctx.restart()
-    others = torch.arange(a.nworld, device=a.action.device) != bad
+    others = ~ctx.mask(bad)
     for action in ctx.actions(5):
         a.step(action)
         b.step(action)
@@ -33,8 +33,7 @@ def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, 
     ctx.that(torch.isfinite(a.eval[bad]), f"{what}: eval is {a.eval[bad].item()}")
     ctx.equal(a.final_obs[bad], good, f"{what}: final_obs against the last good observation")
     ctx.that(a.time[bad] == 0, f"{what}: the world was not reset, its time is {a.time[bad].item()}")
-    assert reason.name is not None
-    name = reason.name.lower()
+    name = str(reason.name).lower()
     ctx.that(a.fault_counts[name] == counts[name] + 1, f"{what}: counted {counts} before, {a.fault_counts} after")
     ctx.finite(a, f"after {what}")
     again = diverges = False
@@ -45,30 +44,25 @@ def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, 
         a.step(action)
         b.step(action)
         ctx.finite(a, f"{i + 1} steps after {what}")
-        again = again or bool(_faulty(a)[bad])
-        diverges = diverges or bool(_faulty(b)[bad])  # a world may have faults without a cause from outside
+        again = again or bool(ctx.faulty(a)[bad])
+        diverges = diverges or bool(ctx.faulty(b)[bad])  # the task itself may be unstable
     ctx.that(not again or diverges, f"{what}: the world has another fault")
 
 
-def _faulty(env: Env) -> torch.Tensor:
-    """Which worlds had a fault in the last step, (nworld,) bool."""
-    return (env.done_reason & int(FAULTS)) != 0
-
-
 def check_bad_state(ctx: Context) -> None:
-    """A state that is not-a-number or beyond 1e10 ends the episode of its world and changes no other."""
+    """A state that is NaN or beyond 1e10 ends the episode of its world and changes no other world."""
     for part, value in (("qpos", np.nan), ("qvel", np.nan), ("qvel", np.inf), ("qpos", 1e11), ("qvel", -1e11)):
 
         def spoil(env: Env, world: int, part: str = part, value: float = value) -> None:
             state = env.get_state()
             state[world, env.state_space.parts[part].start] = value
-            env.set_state(state, torch.arange(env.nworld, device=state.device) == world, check=False)
+            env.set_state(state, ctx.mask(world), check=False)
 
         _check_fault(ctx, spoil, Done.NAN, f"{value} in {part}")
 
 
 def check_bad_action(ctx: Context) -> None:
-    """An action that is not finite counts as zero, ends the episode of its world and changes no other."""
+    """An action that is not finite counts as zero, ends the episode of its world and changes no other world."""
     for value in (np.nan, np.inf, -np.inf):
 
         def spoil(env: Env, world: int, value: float = value) -> None:
@@ -78,7 +72,7 @@ def check_bad_action(ctx: Context) -> None:
 
 
 def check_bad_warmstart(ctx: Context) -> None:
-    """A warm start of not-a-number changes no other world and is gone after the reset of its own."""
+    """A warm start of NaN changes no other world, and a reset of its world removes it."""
     a, b, bad = ctx.a, ctx.b, 0
     if "qacc_warmstart" not in a.state_space.parts:
         return
@@ -90,25 +84,24 @@ def check_bad_warmstart(ctx: Context) -> None:
     for i, action in enumerate(ctx.actions(4)):
         a.step(action)
         b.step(action)
-        if i == 0 and not _faulty(a)[bad]:
-            # this state has no contacts, so the solver did not read its warm start
+        if i == 0 and not ctx.faulty(a)[bad]:
+            # without contacts the solver does not read its warm start
             ctx.that(torch.isfinite(a.obs[bad]).all(), "the observation is not finite, but there is no fault")
-        diverges = diverges or bool(_faulty(b)[bad])
-        ctx.that(i == 0 or diverges or not _faulty(a)[bad], f"the world has another fault at step {i}")
+        diverges = diverges or bool(ctx.faulty(b)[bad])
+        ctx.that(i == 0 or diverges or not ctx.faulty(a)[bad], f"the world has another fault at step {i}")
         ctx.equal(a.get_state()[bad + 1 :], b.get_state()[bad + 1 :], f"the state of other worlds at step {i}")
-    ctx.finite(a, "after a warm start of not-a-number")
+    ctx.finite(a, "after a warm start of NaN")
 
 
 def check_not_finite(ctx: Context) -> None:
-    """A reward or an observation that is not finite is a fault of its world, and changes no other.
+    """A reward or an observation that is not finite is a fault of its world, and changes no other world.
 
     Each parameter of the task in turn is infinite in one world.
     """
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
-    others = torch.arange(a.nworld, device=a.action.device) != bad
-    actions = ctx.actions(2)
+    others, actions = ~ctx.mask(bad), ctx.actions(2)
     names = [name for name, value in a.task.params.items() if name not in ("dt", "substep_dt") and _is_real(value)]
-    with ctx.changed(a, b, graphs=False):  # one value a world would make graphs of its own
+    with ctx.changed(a, b, graphs=False):  # values per world would capture new graphs
         for name in names:
             kept = a.task.params[name]
             ctx.restart()

@@ -1,68 +1,43 @@
-"""Rules about what a task may have beside an observation and a reward: groups, noise, metrics, memory and events."""
+"""Check the optional parts of a task: groups of observations, noise, metrics, memory and events."""
 
 import torch
 
-from lyceum_warp.done import FAULTS
-from lyceum_warp.env import Env
 from lyceum_warp.kernels import steps
 from lyceum_warp.support.arrays import launch_worlds, torch_view
-from lyceum_warp.task import FUNCTIONS
 from lyceum_warp.testing.context import SHORT, Context
 
 
-def _groups(env: Env, *, final: bool = False) -> dict[str, torch.Tensor]:
-    return {name: values.clone() for name, values in (env.final_obs_groups if final else env.obs_groups).items()}
-
-
 def check_groups(ctx: Context) -> None:
-    """Every group of observations is kept as the policy's is, through ends of episodes, faults and restored states."""
-    a, b, horizon = ctx.a, ctx.b, 4
+    """The group ``policy`` is ``env.obs``, and a fault leaves the last good observation of every group."""
+    a = ctx.a
     ctx.that(a.obs is a.obs_groups["policy"], "the group policy is not env.obs")
     ctx.that(a.final_obs is a.final_obs_groups["policy"], "the final group policy is not env.final_obs")
+    ctx.restart()
+    a.step(ctx.actions(1)[0])
+    good = {name: values.clone() for name, values in a.obs_groups.items()}
+    a.action[0] = torch.nan
+    a.step()
+    ctx.that(a.done[0], "an action of NaN is not a fault")
     for name, space in a.obs_spaces.items():
-        for buffer in (a.obs_groups[name], a.final_obs_groups[name]):
+        final = a.final_obs_groups[name]
+        ctx.equal(final[0], good[name][0], f"the final group {name} after a fault")
+        for buffer in (a.obs_groups[name], final):
             ctx.that(buffer.shape == (a.nworld, space.size), f"the group {name} is {tuple(buffer.shape)}")
-    if len(a.obs_groups) == 1:
-        return
-    with ctx.changed(a, horizon=horizon, autoreset=True), ctx.changed(b, horizon=horizon, autoreset=False):
-        ctx.restart()
-        alive = torch.ones_like(a.done)
-        for action in ctx.actions(2 * horizon + 1):
-            a.step(action)
-            b.step(action)
-            going, state = ~a.done & ctx.calm(a), a.get_state()
-            for name, obs in a.obs_groups.items():
-                final = a.final_obs_groups[name]
-                ctx.equal(final[alive], b.final_obs_groups[name][alive], f"the final group {name} without resets")
-                ctx.equal(final[going], obs[going], f"the final group {name} of worlds that go on")
-                ctx.equal(a.get_obs(group=name), obs, f"get_obs of the group {name}")
-                ctx.equal(a.get_obs(state, group=name), obs, f"get_obs of the state, group {name}")
-            alive &= ~a.done
-        ctx.restart()
-        a.step(ctx.actions(1)[0])
-        good = _groups(a)
-        a.action[0] = torch.nan
-        a.step()
-        ctx.that(a.done[0], "an action of not-a-number is not a fault")
-        for name, final in a.final_obs_groups.items():
-            ctx.equal(final[0], good[name][0], f"the final group {name} after a fault")
+        ctx.equal(a.get_obs(group=name), a.obs_groups[name], f"get_obs of the group {name}")
 
 
 def check_noise(ctx: Context) -> None:
-    """A state always has the same noise in its observation; another world, episode or step has another."""
+    """The noise of an observation is a function of the state, and differs between worlds, episodes and steps."""
     env = ctx.a
-    if not env.task.has_noise:
+    if not env.task.noisy_groups:
         return
     ctx.restart()
     env.step(ctx.actions(1)[0])
     state = env.get_state()
-    kept = env.get_obs(state)
-    ctx.equal(kept, env.obs, "the noise of a state")
-    ctx.equal(env.get_obs(state), kept, "the noise of a state, a second time")
+    ctx.equal(env.get_obs(state), env.obs, "the noise of a state")
     parts = env.state_space.parts
-    # the same world in the same state, except for its place in the random stream
+    # copies of one state that differ only in the position in the random stream
     same = state[:1].expand_as(state).contiguous()
-    noisy = [group for group, f in env.task.observers.items() if len(f.input_types) > len(FUNCTIONS["observe"].kinds)]
     changes: dict[str, torch.Tensor] = {"key": state[:, parts["key"]]}
     for name in ("episode", "step"):
         changes[name] = same[:, parts[name]] + torch.arange(env.nworld, device=state.device)[:, None].double()
@@ -70,7 +45,7 @@ def check_noise(ctx: Context) -> None:
     for name, values in changes.items():
         moved = same.clone()
         moved[:, parts[name]] = values
-        shown = [env.get_obs(moved, group=group) for group in noisy]
+        shown = [env.get_obs(moved, group=group) for group in env.task.noisy_groups]
         differ[name] = any(bool((obs[1:] != obs[:1]).any(dim=1).all()) for obs in shown)
     if any(differ.values()):  # its scale may be 0
         for name, found in differ.items():
@@ -92,10 +67,10 @@ def check_metrics(ctx: Context) -> None:
             for name, values in a.metrics.items():
                 sums[name] += values
                 ctx.equal(a.episode_metrics[name], sums[name], f"the sums of {name} at step {i}")
-                ctx.that((values[(a.done_reason & int(FAULTS)) != 0] == 0).all(), f"{name} of a fault: {values}")
+                ctx.that((values[ctx.faulty(a)] == 0).all(), f"{name} of a fault: {values}")
                 sums[name][a.done] = 0.0
             if i == horizon + 1:
-                ctx.that(bool(a.done_reason[-1] & int(FAULTS)), "an action of not-a-number is not a fault")
+                ctx.that(ctx.faulty(a)[-1], "an action of NaN is not a fault")
         b.set_state(a.get_state())
         for name in a.metrics:
             ctx.equal(b.episode_metrics[name], sums[name], f"the sums of {name} after set_state")
@@ -110,9 +85,9 @@ def check_metrics(ctx: Context) -> None:
 
 
 def check_success_steps(ctx: Context) -> None:
-    """``success`` is True at the end of so many steps in a row, the count belongs to the state, and a reset clears it.
+    """``success`` needs ``success_steps`` steps in a row; their count belongs to the state, and a reset clears it.
 
-    Whether the goal is met in a state is what ``set_state`` shows where the count in that state is already full.
+    To see whether a state meets the goal, the check sets it with a full count and reads ``success``.
     """
     a, b, needed = ctx.a, ctx.b, int(ctx.a.task.task.success_steps)
     if needed == 1:
@@ -129,11 +104,11 @@ def check_success_steps(ctx: Context) -> None:
         for i, action in enumerate(ctx.actions(SHORT + needed)):
             a.step(action)
             state = a.get_state()
-            found, good = state[:, column].squeeze(1), (a.done_reason & int(FAULTS)) == 0
+            found, good = state[:, column].squeeze(1), ~ctx.faulty(a)
             full = state.clone()
             full[:, column] = float(needed)
             b.set_state(full)
-            calm = ctx.calm(a) & good  # an event's state is not the one that was judged
+            calm = ctx.calm(a) & good  # an event changes the state after it was judged
             count = torch.where(calm & b.success, (count + 1).clamp(max=needed), 0.0)
             ctx.equal(found[calm], count[calm], f"the count of steps in a row after step {i}")
             ctx.equal(a.success[good], found[good] == needed, f"success of step {i} with the counts {found.tolist()}")
@@ -146,17 +121,16 @@ def check_success_steps(ctx: Context) -> None:
 
 
 def check_events(ctx: Context) -> None:
-    """An event happens after a step is judged: it changes the state and the next observation, in some worlds.
+    """An event runs after a step is judged, and changes the state and the next observation of some worlds.
 
-    Worlds that restart have none, and worlds in which nothing changed keep every bit. The state repeats its events.
+    It does not run in worlds that restart, and worlds without an event keep every bit.
     """
     a, b = ctx.a, ctx.b
     if a.task.functions["event"] is None:
         return
     with ctx.changed(a, b, horizon=5):
         ctx.restart()
-        state, actions, found = a.get_state(), ctx.actions(2 * SHORT), []
-        for i, action in enumerate(actions):
+        for i, action in enumerate(ctx.actions(2 * SHORT)):
             b.set_state(a.get_state())
             b.action.copy_(action)
             for phase in b.worlds.step_phases():
@@ -180,15 +154,10 @@ def check_events(ctx: Context) -> None:
                     )
             for name, obs in a.obs_groups.items():
                 ctx.equal(a.get_obs(now, group=name), obs, f"the group {name} after the event of step {i}")
-            found.append(now)
-        a.set_state(state)
-        for i, (action, wanted) in enumerate(zip(actions, found, strict=True)):
-            a.step(action)
-            ctx.equal(a.get_state(), wanted, f"the events of step {i}, repeated from a state")
 
 
 def check_substep(ctx: Context) -> None:
-    """``substep`` runs after each substep, and leaves the numbers of the physics as they are."""
+    """``substep`` runs after each substep and does not change the physics."""
     a, b = ctx.a, ctx.b
     substep = a.task.kernels.substep_memory
     if substep is None:
@@ -206,7 +175,7 @@ def check_substep(ctx: Context) -> None:
         for i, action in enumerate(ctx.actions(SHORT)):
             state = a.get_state()
             a.step(action)
-            wanted, calm = a.get_state(), ctx.calm(a) & ((a.done_reason & int(FAULTS)) == 0)
+            wanted, calm = a.get_state(), ctx.calm(a) & ~ctx.faulty(a)
             start(state, action)
             for _ in range(a.task.frame_skip):
                 b.engine.step(1)
@@ -239,9 +208,8 @@ def check_lasting_memory(ctx: Context) -> None:
         if "lasting_memory" not in writes.get("randomize", ()):
             a.rand_reset()
             ctx.equal(a.get_state()[:, columns], state[:, columns], "lasting_memory after rand_reset")
-    mask = torch.arange(a.nworld, device=a.obs.device) == 0
     a.set_state(state)
-    a.rand_reset(ctx.seed, mask)
+    a.rand_reset(ctx.seed, ctx.mask(0))
     found, fresh = a.get_state()[:, columns], b.get_state()[:, columns]
     ctx.equal(found[:1], fresh[:1], "lasting_memory after rand_reset with a seed")
     ctx.equal(found[1:], state[1:, columns], "lasting_memory of other worlds")

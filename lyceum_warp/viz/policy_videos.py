@@ -1,4 +1,4 @@
-"""Videos of a policy, at the end of its training and on the way."""
+"""Make videos of a policy, during and after its training."""
 
 import logging
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from lyceum_warp.viz.video import Progress, episode, write_video
 log = logging.getLogger(__name__)
 
 NamedProgress: TypeAlias = Callable[[str, str, int, int], object]
-"""Called with what is done, the unit in which it is counted, how much is done, and how much there is in all."""
+"""Progress callback: (description, unit, amount done, total amount)."""
 
 
 def policy_states(env: Env, policy: Policy, seed: int, *, progress: Progress | None = None) -> tuple[Env, torch.Tensor]:

@@ -1,4 +1,4 @@
-"""Curves, hyperparameters and videos of a run for TensorBoard. They need the extra ``tensorboard``.
+"""Write curves, hyperparameters and videos of a run for TensorBoard, with the extra ``tensorboard``.
 
 ``metrics.csv`` holds the same numbers; the files written here are a copy for another viewer.
 """

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from full_task import Full
-from gymnasium import wrappers
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
@@ -45,14 +44,7 @@ def test_gymnasiums_checker_has_no_complaint(hopper: gymnasium.Env, draws: bool)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(hopper.unwrapped, skip_render_check=not draws)
-    said = [str(warning.message) for warning in caught]
-    assert not [text for text in said if not any(known in text for known in THEIRS)]
-
-
-def test_the_checker_accepts_groups_of_observations() -> None:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        check_env(GymnasiumEnv(Full), skip_render_check=True)
+        check_env(GymnasiumEnv(Full), skip_render_check=True)  # groups of observations
     said = [str(warning.message) for warning in caught]
     assert not [text for text in said if not any(known in text for known in THEIRS)]
 
@@ -85,16 +77,6 @@ def test_a_fault_truncates_the_episode_with_its_last_good_observation(hopper: gy
     np.testing.assert_array_equal(obs, before)
 
 
-def test_wrappers_of_gymnasium_work(hopper: gymnasium.Env) -> None:
-    env: Any = wrappers.TimeLimit(wrappers.NormalizeObservation(hopper), max_episode_steps=5)
-    env = wrappers.RecordEpisodeStatistics(wrappers.ClipAction(wrappers.NormalizeReward(env)))
-    env.reset(seed=0)
-    for step in range(5):
-        *_, terminated, truncated, info = env.step(np.zeros(3, dtype=np.float32))
-        assert not terminated and truncated == (step == 4)
-    assert info["episode"]["l"] == 5
-
-
 def test_gymnasiums_own_vector_environments_take_it() -> None:
     envs = gymnasium.make_vec("lyceum_warp.gym:lyceum/PointMass-v0", num_envs=2, vectorization_mode="sync")
     obs, _ = envs.reset()
@@ -117,9 +99,7 @@ def test_a_maximal_number_of_steps_is_gymnasiums(hopper: gymnasium.Env) -> None:
     "action, message",
     [
         (np.zeros(2, dtype=np.float32), r"float32 array of shape \(3,\), not a float32 array of shape \(2,\)"),
-        (np.zeros((1, 3), dtype=np.float32), r"not a float32 array of shape \(1, 3\)"),
         (np.zeros(3, dtype=int), r"float32 array of shape \(3,\), not a int64 array of shape \(3,\)"),
-        (torch.zeros(3), r"not a float32 tensor of shape \(3,\)"),
     ],
 )
 def test_an_action_that_does_not_fit_is_refused(action: Any, message: str, hopper: gymnasium.Env) -> None:

@@ -38,6 +38,7 @@ def test_a_version_must_lie_in_the_range(
     "package, module, install_hint",
     [
         ("gymnasium", "gymnasium_spaces", "gymnasium>=1.1,<2"),
+        ("rsl-rl-lib", "rsl_rl_env", r"lyceum-warp\[rsl-rl\]"),
         ("stable-baselines3", "stable_baselines3", r"lyceum-warp\[stable-baselines3\]"),
     ],
 )

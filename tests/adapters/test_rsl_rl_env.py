@@ -1,9 +1,5 @@
 """An environment under rsl_rl's own runner, and what its VecEnv gives."""
 
-import importlib
-import importlib.metadata
-import re
-import sys
 from pathlib import Path
 
 import pytest
@@ -159,29 +155,6 @@ def test_rsl_rls_writer_gets_the_metrics(env: lw.Env, tmp_path: Path) -> None:
     OnPolicyRunner(RslRlVecEnv(env), config, str(tmp_path), "cpu").learn(2)
     found = EventAccumulator(str(tmp_path)).Reload().Tags()["scalars"]
     assert {"metrics/forward", "metrics/effort", "faults/worlds", "Train/mean_reward"} <= set(found)
-
-
-# what is installed
-
-
-@pytest.mark.parametrize("release, found", [
-    (None, "this adapter needs the package rsl-rl-lib: "),
-    ("5.3.0", "this adapter needs rsl-rl-lib from 5.4.2 to below 6, and 5.3.0 is installed: "),
-    ("6.0.0", "this adapter needs rsl-rl-lib from 5.4.2 to below 6, and 6.0.0 is installed: "),
-])  # fmt: skip
-def test_a_missing_extra_and_another_major_version_are_one_line(
-    release: str | None, found: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def version(name: str) -> str:
-        if release is None:
-            raise importlib.metadata.PackageNotFoundError(name)
-        return release
-
-    monkeypatch.setattr(importlib.metadata, "version", version)
-    for name in [name for name in sys.modules if name.startswith("lyceum_warp.adapters.rsl_rl")]:
-        monkeypatch.delitem(sys.modules, name)
-    with pytest.raises(ImportError, match=f"^{re.escape(found)}pip install 'lyceum-warp.rsl-rl.'$"):
-        importlib.import_module("lyceum_warp.adapters.rsl_rl_env")
 
 
 @pytest.mark.gpu

@@ -1,7 +1,6 @@
 """Many worlds as Stable-Baselines3's vector environment: its numbers, its learners, its wrappers, its errors."""
 
 import warnings
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -59,23 +58,6 @@ def test_a_step_has_the_numbers_of_the_environment_behind_it(full: StableBaselin
                 timeouts += info["TimeLimit.truncated"]
         returns[done], lengths[done], ends = 0, 0, ends + done.sum()
     assert ends and timeouts
-
-
-def test_a_fault_truncates_the_episode_with_its_last_good_observation(hopper: StableBaselines3VecEnv) -> None:
-    before = hopper.reset()
-    action = np.zeros((N, 3), dtype=np.float32)
-    action[1] = np.nan
-    _, reward, done, infos = hopper.step(action)
-    np.testing.assert_array_equal(done, [False, True, False, False])
-    assert reward[1] == 0 and infos[1]["TimeLimit.truncated"] and infos[1]["done_reason"] == lw.Done.ACTION
-    np.testing.assert_array_equal(infos[1]["terminal_observation"], before[1])
-
-
-def test_only_ended_worlds_cost_a_dictionary(hopper: StableBaselines3VecEnv) -> None:
-    hopper.reset()
-    *_, first = hopper.step(np.zeros((N, 3), dtype=np.float32))
-    *_, second = hopper.step(np.zeros((N, 3), dtype=np.float32))
-    assert first == [{}] * N and all(a is b for a, b in zip(first, second, strict=True)) and first is not second
 
 
 def test_results_of_a_step_do_not_change_with_the_next(hopper: StableBaselines3VecEnv) -> None:
@@ -186,18 +168,10 @@ def test_a_picture_shows_all_worlds() -> None:
         env.close()
 
 
-@pytest.mark.parametrize(
-    "action, message",
-    [
-        (np.zeros((N, 2), dtype=np.float32), r"float32 array of shape \(4, 3\), not a float32 array of shape \(4, 2\)"),
-        (np.zeros((N, 3), dtype=int), r"not a int64 array of shape \(4, 3\)"),
-        (torch.zeros(N, 3), r"not a float32 tensor of shape \(4, 3\)"),
-    ],
-)
-def test_actions_that_do_not_fit_are_refused(action: Any, message: str, hopper: StableBaselines3VecEnv) -> None:
+def test_actions_that_do_not_fit_are_refused(hopper: StableBaselines3VecEnv) -> None:
     hopper.reset()
-    with pytest.raises(ValueError, match=message):
-        hopper.step(action)
+    with pytest.raises(ValueError, match=r"float32 array of shape \(4, 3\), not a int64 array of shape \(4, 3\)"):
+        hopper.step(np.zeros((N, 3), dtype=int))
 
 
 def test_a_step_before_a_reset_and_unknown_options_are_refused(full: StableBaselines3VecEnv) -> None:

@@ -130,34 +130,6 @@ def test_names_of_one_checkout_alone_are_added_or_removed() -> None:
     assert [(each.name, each.kind) for each in found] == [("u/gone", "removed"), ("u/new", "added")]
 
 
-class Saved:
-    """A side that has computed a run and a resumed one."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def ask(self, unit: dict[str, Any]) -> None:
-        pass
-
-    def answer(self) -> dict[str, Any]:
-        return {"axes": {"whole/return": ["row"]}, "equal": [["whole", "resumed"]]}
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {"whole/return": np.array([1.0, 2.0]), "resumed/return": np.array([1.0, 3.0])}
-
-
-def test_a_resumed_run_that_differs_is_reported_in_both_checkouts() -> None:
-    report = compare.Report(())
-    unit = compare.Unit("commands", "point_mass", "mujoco", {})
-    compare.compare_unit(unit, [Saved("old"), Saved("new")], "cpu", report)
-    found = [(each.name, each.first, each.text.partition(";")[0]) for each in report.found]
-    name = "commands/point_mass/mujoco/return"
-    assert found == [
-        (name, {"row": 1}, "old, whole -> resumed: 2.0 -> 3.0 at row 1"),
-        (name, {"row": 1}, "new, whole -> resumed: 2.0 -> 3.0 at row 1"),
-    ]
-
-
 # the whole program
 
 

@@ -45,19 +45,6 @@ def test_other_dynamics_are_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     assert pairs["engines"]["half_apart"] <= 4 and pairs["moved"]["half_apart"] is None
 
 
-def test_starts_are_moved_by_the_rounding_of_float32() -> None:
-    env = lw.make(TASK, nworld=5, nthread=1)
-    env.rand_reset(3)
-    state = fidelity.rounded(env, env.get_state())
-    parts = env.state_space.parts
-    for name in ("qpos", "qvel"):
-        assert torch.equal(state[:, parts[name]], state[:, parts[name]].float().double())
-    assert torch.equal(state[:, parts["key"]], env.get_state()[:, parts["key"]])
-    difference = (fidelity.moved(env, state, 0) - state).abs()
-    assert 0.0 < difference.max() <= 2.0**-24 * state.abs().max().clamp(min=1.0)
-    assert difference[:, parts["key"]].max() == 0.0
-
-
 def test_half_apart_counts_worlds_that_were_ever_apart() -> None:
     error = torch.zeros(6, 4)
     error[2:, 0], error[4:, 1], error[3, 2] = 1.0, 1.0, 1.0  # apart after 3, 5 and 4 steps, and never

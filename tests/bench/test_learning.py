@@ -1,9 +1,7 @@
 """Test the experiment on the seconds until a return is reached."""
 
-import itertools
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import experiment
 import learning
@@ -23,16 +21,6 @@ def test_a_run_ends_at_its_target(
     assert result["reached"] and result["curve"][-1][0] == result["samples"]
     assert result["curve"][-1][1] == pytest.approx(result["seconds"], abs=1e-4) and result["curve"][-1][2] >= 0.0
     assert f"| hopper | {algorithm.upper()} | default | 8 | 0 | 0 |" in capsys.readouterr().out
-
-
-def test_the_mean_of_the_last_episodes_decides_without_evaluations(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = itertools.count(step=0.01)  # each iteration takes 0.01 s
-    monkeypatch.setattr(learning, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    monkeypatch.setitem(learning.TARGETS, "hopper", ("npg", 1e9, 8, 64, 0))
-    case = learning.Case("hopper", "npg", "default", 0, 8, 1e9, 0.3, "cpu")
-    result = learning.measure(case, learning.Options())
-    assert not result["reached"] and 64 * 30 <= result["samples"] <= 64 * 31
-    assert 0 < len(result["curve"]) < 30  # not before the first episodes that began at step 0
 
 
 def test_a_robot_that_stands_has_tracking_errors(monkeypatch: pytest.MonkeyPatch) -> None:

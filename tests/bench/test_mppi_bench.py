@@ -5,7 +5,6 @@ from typing import Any
 
 import experiment
 import mppi
-import numpy as np
 import pytest
 import torch
 
@@ -53,12 +52,3 @@ def test_an_episode_that_two_blocks_share_counts_once() -> None:
     (table,) = mppi.tables(rows)
     ours, python = table.rows
     assert (ours[2:4], python[2:4], python[-1]) == (["2", "2 of 3"], ["2", "1 of 1"], "3.00")
-
-
-def test_one_planner_for_all_plants_repeats_single_planners() -> None:
-    alone, together = (
-        mppi.run_episodes(mppi.Case("episodes", "reach", name, 1, 1000, 3, 8, 0.0, 1), mppi.Options())["each"]
-        for name in ("mppi", "mppi_together")
-    )
-    assert [row[:2] for row in together] == [row[:2] for row in alone]
-    np.testing.assert_allclose([row[2] for row in together], [row[2] for row in alone], rtol=1e-4)

@@ -82,22 +82,6 @@ def test_a_run_yields_a_curve(contestant: str) -> None:
     assert (result.get("mode") in ("sync", "async")) == (contestant == "npg_gymnasium")
 
 
-def test_ppo_of_stable_baselines3_yields_a_curve() -> None:
-    pytest.importorskip("stable_baselines3")
-    result = npg.measure(case("ppo_sb3"), npg.Options(short=True))
-    assert result["samples"] == 512 and [point[0] for point in result["curve"]] == [0, 256, 512]
-
-
-def test_a_long_iteration_is_evaluated_once() -> None:
-    curve = npg.Curve(dataclasses.replace(case("npg"), short=False))
-    curve.judge = lambda act: 0.0
-    curve.start(lambda obs: obs)
-    for samples in (20, 25, 30, 90, 95, 100, 500, 500):
-        if curve.due(samples):
-            curve.add(samples, len)
-    assert [point[0] for point in curve.points] == [0, 25, 90, 100, 500]
-
-
 def test_a_yardstick_ends_when_its_time_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("stable_baselines3")
     monkeypatch.setitem(npg.LIMITS, "ppo_sb3", 1e-2)

@@ -7,7 +7,6 @@ from typing import Any
 import experiment
 import plot
 import pytest
-import venvs
 
 BENCH = Path(__file__).parents[2] / "bench"
 
@@ -54,19 +53,6 @@ def test_rates_are_measured_by_cores_and_worlds(tmp_path: Path, capsys: pytest.C
     assert "| task | threads | native C | lyceum_warp, C engine |" in printed and "| cartpole | 8 |" in printed
     native, ours = (row["result"]["env_steps_per_second"] for row in lines(out)[:2])
     assert f"| {ours:,.0f}; {ours / native:.2f} |" in printed
-
-
-def test_missing_peers_are_skipped_with_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("LYCEUM_WARP_PEERS", str(tmp_path / "peers"))
-    monkeypatch.setenv("PIP_NO_INDEX", "1")
-    venvs._made.cache_clear()
-    out = tmp_path / "throughput.jsonl"
-    words = "--tasks cartpole --contestants dm_control --threads 1 --parts sampling single".split()
-    assert run("throughput", out, *words) == 0
-    assert capsys.readouterr().out.count("skipped: dm_control cannot be installed: ") == 1 and not out.exists()
-    venvs._made.cache_clear()
 
 
 @pytest.mark.parametrize("task", ["cartpole", "herb_reach"])

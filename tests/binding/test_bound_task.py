@@ -1,4 +1,4 @@
-"""A task bound to its model: its class, the types of its fields, and the size of its observation are checked."""
+"""Binding checks a task's class, the types of its fields, and the size of its observation."""
 
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ import torch
 from conftest import TaskFile
 
 import lyceum_warp as lw
-from lyceum_warp.binding.bound_task import BoundTask, task_spec
+from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.options import PhysicsOptions
 
@@ -25,23 +25,17 @@ def bound(file: Path, **options: Any) -> BoundTask:
     ("line", "message"),
     [
         ("obs = 10", "obs of the task 'tiny' is 10: add the parts of its observation"),
-        ("memory = 1", "the task 'tiny' needs both, memory = ... in the class and memory in World"),
-        ("lagged = ('qvel',)", "the task 'tiny' wants 'qvel' lagged but does not list it in World"),
-        ("cleared = ('qacc',)", "the task 'tiny' wants 'qacc' cleared but does not list it in World"),
+        ("memory = 1", "the task 'tiny' needs both memory = ... in its class and memory in World"),
+        ("del model", "the task 'tiny' has no model: add a model, as model = \"robot.xml\""),
+        ("lagged = ('qvel',)", "lagged of the task 'tiny' has 'qvel': list it in World, too"),
+        ("cleared = ('qacc',)", "cleared of the task 'tiny' has 'qacc': list it in World, too"),
         ("frame_skip = 0", "frame_skip of the task 'tiny' must be a whole number from 1 to .*, not 0"),
-        *(
-            (
-                f"success_steps = {bad}",
-                rf"^success_steps of the task 'tiny' must be a whole number from 1 to \d+, not {bad}$",
-            )
-            for bad in ("0", "-1", "2.5", "True", "'ten'", "None")
-        ),
+        ("success_steps = 2.5", r"^success_steps of the task 'tiny' must be a whole number from 1 to \d+, not 2\.5$"),
         (
             "success_steps = 2",
             r"^success_steps of the task 'tiny' is 2, but the task has no success\(s: World, p: Params\)",
         ),
         ("horizon = -1", "horizon of the task 'tiny' must be a whole number from 0 to .*, not -1"),
-        ("action_range = 1.0", r"must be two finite numbers, lowest first, as \(-1.0, 1.0\), not 1.0"),
         ("action_range = (1.0, -1.0)", r"action_range of the task 'tiny' must be .* not \(1.0, -1.0\)"),
         ("action_range = (0.0, float('inf'))", r"must be two finite numbers, lowest first"),
     ],
@@ -51,26 +45,7 @@ def test_a_line_of_the_class_that_does_not_fit_is_refused(line: str, message: st
         bound(tiny_task.write(tmp_path, f"{tiny_task.TINY}    {line}\n"))
 
 
-INCOMPLETE = {
-    "no obs": ("    obs = {", "    parts = {", "the task 'tiny' has no obs: add the parts of its observation"),
-    "no model": ("    model = ", "    file = ", "the task 'tiny' has no model: add a model, as model = \"robot.xml\""),
-    "no memory": (
-        "qpos: Row[float]",
-        "qpos: Row[float]\n    memory: Row[float]",
-        "needs both, memory = ... in the class",
-    ),
-    "no such field": ("qpos: Row[float]", "qpoz: Row[float]", "no field 'qpoz': did you mean qpos"),
-}
-
-
-@pytest.mark.parametrize(("old", "new", "message"), INCOMPLETE.values(), ids=INCOMPLETE)
-def test_an_incomplete_class_says_what_is_missing(old: str, new: str, message: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=message):
-        bound(tiny_task.write(tmp_path, tiny_task.changed((old, new))))
-
-
 DECLARED_OTHERWISE = {
-    "element": ("qpos: Row[wp.vec3]", r"World.qpos of the task 'tiny' must be declared as Row\[float\]"),
     "vector": ("qpos: Row[float]\n    xpos: Row[float]", r"World.xpos .* must be declared as Row\[wp.vec3\]"),
     "quaternion": ("qpos: Row[float]\n    xquat: Row[wp.quat]", r"World.xquat .* must be declared as Row\[lw.quat\]"),
     "scalar": ("qpos: Row[float]\n    time: Row[float]", "World.time of the task 'tiny' must be declared as float"),
@@ -84,7 +59,6 @@ def test_a_field_of_another_type_is_refused_with_the_type_to_write(fields: str, 
 
 
 OBSERVATIONS = {
-    "too long": ("obs[0] = s.qpos[0]\n    obs[2] = 1.0", "writes 3 numbers, but obs declares 1"),
     "unwritten": ("pass", r"leaves the places \[0\] of obs unwritten"),
     "not-a-number": ("obs[0] = wp.sqrt(s.qpos[0] - 100.0)", r"writes not-a-number into the places \[0\] of obs"),
 }
@@ -101,27 +75,6 @@ def test_an_observation_that_does_not_fit_obs_is_refused(case: str, task_file: T
 
 
 CONTROL = "def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):\n"
-LONG_ROWS = {
-    "metrics": (
-        "def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):\n"
-        "    for i in range(3):\n        metrics[i] = s1.qpos[0]",
-        '    metrics = ("a", "b")\n',
-        r"measure of the task 'tiny' writes 3 numbers, but metrics names \['a', 'b'\]",
-    ),
-    "controls": (
-        f"{CONTROL}    for i in range(4):\n        ctrl[i] = wp.sqrt(-1.0)",
-        "",
-        "control of the task 'tiny' writes 4 numbers into ctrl, but the model has 3",
-    ),
-}
-
-
-@pytest.mark.parametrize(("function", "line", "message"), LONG_ROWS.values(), ids=LONG_ROWS)
-def test_a_function_that_writes_past_its_row_is_refused(function: str, line: str, message: str, tmp_path: Path) -> None:
-    file = tiny_task.write(tmp_path, tiny_task.with_function(function) + line)
-    with pytest.raises(ValueError, match=message) as caught:
-        lw.make(file, nworld=2)
-    assert "\n" not in str(caught.value)
 
 
 def test_the_check_of_a_control_leaves_the_inputs_as_they_are(tmp_path: Path) -> None:
@@ -150,10 +103,6 @@ NOT_COMPILED = {
         f"{REWARD} -> float:\n    q = lw.quat(1.0, 0.0, 0.0, 0.0)\n    return (q * q)[0]",
         "quaternions are w, x, y, z here: use lw.quat_rotate, lw.quat_mul",
     ),
-    "whole number": (
-        f"{REWARD}:\n    return 1",
-        r"reward of the task 'tiny' returns int32: it must be written as reward\(s0: World, .* -> float",
-    ),
     "tuple": (
         f"{REWARD}:\n    r = (1.0, 2.0)\n    return r",
         r"returns tuple\w*(\(.*\))?: it must be written as reward|: a function returns one number, not a tuple",
@@ -162,9 +111,6 @@ NOT_COMPILED = {
         f"def height(s: World):\n    h = s.qpos[0]\n    for i in range(2):\n        h = 1\n    return h\n\n\n@wp.func\n"
         f"{REWARD} -> float:\n    return height(s1)",
         "can't compile the functions of the task 'tiny': .*\"height\"",
-    ),
-    "declared tuple": (
-        f"{REWARD} -> float:\n    r = (1.0, 2.0)\n    return r", ": a function returns one number, not a tuple"
     ),
 }  # fmt: skip
 
@@ -199,17 +145,6 @@ def test_a_step_lasts_frame_skip_substeps(tmp_path: Path) -> None:
         task = bound(file, physics=physics)
         assert task.frame_skip == skip
         assert task.params["dt"] == task.timestep == skip * task.model.opt.timestep
-
-
-def test_the_engine_keeps_the_tasks_fields_then_the_further_ones_time_and_ctrl(tmp_path: Path) -> None:
-    task = bound(tiny_task.write(tmp_path, tiny_task.TINY), fields=["xpos", "qpos"])
-    assert [field.name for field in task.fields] == ["qpos", "xpos", "time", "ctrl"]
-
-
-def test_task_spec_gives_the_tasks_own_model_unless_another_one_is_given(tmp_path: Path) -> None:
-    task = find_task(tiny_task.write(tmp_path, tiny_task.TINY))
-    assert task_spec(task).modelname == "hopper"
-    assert task_spec(task, "swimmer.xml").modelname == "swimmer"
 
 
 def test_more_success_steps_than_an_episode_has_are_refused(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Modules beside a task's file: which of them it imports, and how it finds them."""
+"""A task's file finds and imports the modules beside it."""
 
 import sys
 from pathlib import Path

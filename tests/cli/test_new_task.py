@@ -16,8 +16,8 @@ from lyceum_warp import cli
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.testing import CHECKS, check_task
-from lyceum_warp.testing import bounds_rules as bounds
 from lyceum_warp.testing import episode_rules as episodes
+from lyceum_warp.testing import index_rules as indices
 
 ROOT = Path(__file__).parent.parent.parent
 RICH = text(
@@ -43,7 +43,7 @@ SENSED = text(
 """Its sensors measure every joint, and the motion of the body that floats."""
 
 # without those that take long, whatever the model
-QUICK_CHECKS = tuple(check for check in CHECKS if check not in (episodes.check_memory, bounds.check_bounds))
+QUICK_CHECKS = tuple(check for check in CHECKS if check not in (episodes.check_memory, indices.check_bounds))
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ def test_a_model_whose_sensors_measure_every_joint_is_observed_through_them_alon
 def test_any_model_gets_a_task_that_fits_it(model: str, folder: Path) -> None:
     task = BoundTask(find_task(new("walk", model)))
     sizes = {"position": task.model.nq, "velocity": task.model.nv, "activation": task.model.na}
-    found = dict(task.obs_layout)
+    found = dict(task.obs_layouts["policy"])
     assert found.pop("sensors", 0) <= task.model.nsensordata
     assert all(sizes[part] == size for part, size in found.items())
     assert task.timestep == pytest.approx(0.02)

@@ -1,6 +1,6 @@
-"""Tasks of arbitrary models keep the rules on the engines that take the model; the others say in a line why not."""
+"""Tasks of arbitrary models keep the rules on every engine that supports the model; others refuse it in a line."""
 
-from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,8 +14,13 @@ from lyceum_warp import Row
 from lyceum_warp.testing import CHECKS, check_task
 from lyceum_warp.testing import episode_rules as episodes
 
-# without the one that looks through all objects, whatever the model
-QUICK_CHECKS = tuple(check for check in CHECKS if check is not episodes.check_memory)
+OPTIONS: dict[str, dict[str, Any]] = {
+    "mujoco": {  # without a check that takes long and does not depend on the model
+        "nworld": 3, "steps": 20, "frame_skip": 2, "checks": [c for c in CHECKS if c is not episodes.check_memory],
+    },
+    "warp": {"nworld": 2, "steps": 20, "horizon": 6, "frame_skip": 1, "checks": MODEL_CHECKS},
+}  # fmt: skip
+"""Options of ``check_task`` for each engine."""
 
 
 @wp.struct
@@ -51,7 +56,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 
 class Moving(lw.Task):
-    """Moves, and sees where it is."""
+    """Moves, and observes positions and velocities."""
 
     horizon = 15
 
@@ -82,72 +87,54 @@ def start_sensing(s: SensingWorld, p: Params, rng: Row[wp.uint32]):
 
 
 class Sensing(lw.Task):
-    """Moves, and sees what its sensors measure."""
+    """Moves, and observes its sensors."""
 
     horizon = 15
 
 
 def moving(model: str) -> type[lw.Task]:
-    """A task of a model that sees positions and velocities."""
+    """A task of a model that observes positions and velocities."""
     spec = mujoco.MjSpec.from_string(model)
     compiled = spec.copy().compile()
     return type("Moving", (Moving,), {"model": spec, "obs": {"position": compiled.nq, "velocity": compiled.nv}})
 
 
 def sensing(model: str) -> type[lw.Task]:
-    """A task of a model that sees its sensors."""
+    """A task of a model that observes its sensors."""
     spec = mujoco.MjSpec.from_string(model)
     obs = {"velocity": 1, "sensors": spec.copy().compile().nsensordata}
     own = {"World": SensingWorld, "observe": sense, "reward": judge, "randomize": start_sensing}
     return type("Sensing", (Sensing,), {"model": spec, "obs": obs, **own})
 
 
+@pytest.mark.parametrize("engine", OPTIONS)
 @pytest.mark.parametrize("model", MOVING.values(), ids=MOVING)
-def test_a_model_keeps_the_rules_on_the_mujoco_engine(model: str) -> None:
-    check_task(moving(model), engine="mujoco", nworld=3, steps=20, frame_skip=2, checks=QUICK_CHECKS)
+def test_a_model_keeps_the_rules(model: str, engine: str) -> None:
+    check_task(moving(model), engine=engine, **OPTIONS[engine])
 
 
-@pytest.mark.parametrize("model", MOVING.values(), ids=MOVING)
-def test_a_model_keeps_the_rules_on_the_warp_engine(model: str) -> None:
-    task = moving(model)
-    check_task(task, engine="warp", nworld=2, steps=20, horizon=6, frame_skip=1, checks=MODEL_CHECKS)
-
-
+@pytest.mark.parametrize("engine", OPTIONS)
 @pytest.mark.parametrize("model", SENSING.values(), ids=SENSING)
-def test_a_model_with_sensors_keeps_the_rules_on_the_mujoco_engine(model: str) -> None:
-    task = sensing(model)
-    check_task(task, engine="mujoco", nworld=3, steps=20, frame_skip=2, checks=QUICK_CHECKS)
+def test_a_model_with_sensors_keeps_the_rules(model: str, engine: str) -> None:
+    check_task(sensing(model), engine=engine, **OPTIONS[engine])
 
 
-@pytest.mark.parametrize("model", SENSING.values(), ids=SENSING)
-def test_a_model_with_sensors_keeps_the_rules_on_the_warp_engine(model: str) -> None:
-    task = sensing(model)
-    check_task(task, engine="warp", nworld=2, steps=20, horizon=6, frame_skip=1, checks=MODEL_CHECKS)
-
-
-# plugins, and what MuJoCo Warp does not have
+# plugins, and other features that MuJoCo Warp lacks
 
 
 @pytest.mark.parametrize("model", PLUGINS.values(), ids=PLUGINS)
-def test_a_model_of_the_mujoco_engine_alone_keeps_the_rules_there(model: str) -> None:
+def test_a_model_that_only_the_mujoco_engine_supports_keeps_the_rules(model: str) -> None:
     check_task(moving(model), engine="mujoco", nworld=2, steps=20, frame_skip=2, checks=MODEL_CHECKS)
 
 
 @pytest.mark.parametrize(("reason", "model"), PLUGINS.items())
-def test_a_model_that_the_warp_engine_does_not_take_is_refused_in_a_line(reason: str, model: str) -> None:
+def test_a_model_that_the_warp_engine_does_not_support_is_refused_in_a_line(reason: str, model: str) -> None:
     task = moving(model)
     with pytest.raises(ValueError, match=f"MuJoCo Warp refuses the model: .*{reason}.*; .* use engine='mujoco'$"):
         lw.make(task, engine="warp")
 
 
-def test_names_that_are_used_twice_are_refused_in_a_line(tmp_path: Path) -> None:
-    file = tmp_path / "twice.xml"
-    file.write_text(text(ARM, actuated('<motor name="twice" joint="hinge"/>', '<motor name="twice" joint="wrist"/>')))
-    with pytest.raises(ValueError, match="^MuJoCo can't read the model .*: Error: repeated name 'twice' in actuator"):
-        lw.make(moving(text(ARM)), model=file)
-
-
-# fields that only some models have
+# fields of only some models
 
 RICH = text(
     ARM
@@ -181,7 +168,7 @@ def test_fields_of_some_models_are_the_same_on_both_engines_and_in_mujoco() -> N
 
 
 def test_an_equality_constraint_is_switched_on_at_a_reset_alike_on_both_engines() -> None:
-    """The engine takes over truth values as it does numbers."""
+    """The engine takes over booleans, too."""
     ends = []
     for engine in ("mujoco", "warp"):
         env = lw.make(moving(RICH), engine=engine, nworld=2, fields=["eq_active"])
@@ -250,8 +237,7 @@ def judge_pushed(s0: PushedWorld, action: Row[float], s1: PushedWorld, p: Params
 class Pushed(lw.Task):
     """Pushes a joint of a model without actuators."""
 
-    World, observe, control = PushedWorld, look, push
-    randomize, reward = start_pushed, judge_pushed
+    World, observe, control, randomize, reward = PushedWorld, look, push, start_pushed, judge_pushed
     model = mujoco.MjSpec.from_string(text(ARM, ""))
     obs = {"position": 1, "velocity": 1}
     actions = {"push": 1}
@@ -259,9 +245,6 @@ class Pushed(lw.Task):
     horizon = 15
 
 
-def test_a_model_without_actuators_keeps_the_rules_on_the_mujoco_engine() -> None:
-    check_task(Pushed, engine="mujoco", nworld=3, steps=20, frame_skip=2, checks=QUICK_CHECKS)
-
-
-def test_a_model_without_actuators_keeps_the_rules_on_the_warp_engine() -> None:
-    check_task(Pushed, engine="warp", nworld=2, steps=20, horizon=6, frame_skip=1, checks=MODEL_CHECKS)
+@pytest.mark.parametrize("engine", OPTIONS)
+def test_a_model_without_actuators_keeps_the_rules(engine: str) -> None:
+    check_task(Pushed, engine=engine, **OPTIONS[engine])

@@ -1,4 +1,4 @@
-"""Copies of Warp functions that check every index: what they find, and that they compute the same numbers."""
+"""Copies of Warp functions that check every index find mistakes and compute the same numbers."""
 
 import re
 import sys
@@ -41,7 +41,7 @@ class Batch:
     sensordata: wp.array2d[float]
 
 
-# functions without a mistake, in every form that Warp takes
+# functions without mistakes, in every form that Warp supports
 
 ORDER = wp.constant(wp.vec3i(2, 1, 0))
 
@@ -85,7 +85,7 @@ def doubled(v: wp.vec3) -> wp.vec3:
 @wp.func
 def right(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):
     total = 0.0
-    for i in range(3):  # written out, because it changes a constant
+    for i in range(3):  # unrolled, because it changes a constant
         total += s.qpos[i] * p.gains[i]
     obs[0] = total
     obs[1] = s.qpos[-1] + s.site_xpos[1][2] + s.site_xpos[-1].x + s.xmat[0][1, 2] + s.xmat[0][-1][0]
@@ -146,9 +146,7 @@ KEPT: list[wp.array] = []
 """Arrays that others only point to."""
 
 
-@pytest.fixture(scope="module")
-def device() -> wp.Device:
-    return wp.get_device("cpu")
+DEVICE = wp.get_device("cpu")
 
 
 @pytest.fixture(scope="module")
@@ -184,24 +182,24 @@ def run_right(batch: Batch, params: wp.array[Params], obs: wp.array2d[float], rn
     right(s, params[0], obs[w], rng[w])
 
 
-def test_a_checked_copy_computes_the_same_numbers_and_finds_nothing(device: wp.Device, params: wp.array) -> None:
-    checked = checked_functions("test.right", {"right": right}, World, Batch, device)
-    report = checked.report(device)
+def test_a_checked_copy_computes_the_same_numbers_and_finds_nothing(params: wp.array) -> None:
+    checked = checked_functions("test.right", {"right": right}, World, Batch, DEVICE)
+    report = checked.report(DEVICE)
     results = []
     for kernel, first in ((checked.kernels["right"], [report]), (run_right, [])):
         s, obs, rng = batch(), wp.zeros((2, 7), dtype=float), wp.array([[1], [2]], dtype=wp.uint32)
-        wp.launch(kernel, 2, [*first, s, params, obs, rng], device=device)
+        wp.launch(kernel, 2, [*first, s, params, obs, rng], device=DEVICE)
         results.append((obs.numpy(), s.site_xpos.numpy(), rng.numpy()))
     for found, wanted in zip(*results, strict=True):
         np.testing.assert_array_equal(found, wanted)
     assert checked.problems(report) == []
-    assert checked_functions("test.right", {"right": right}, World, Batch, device) is checked
+    assert checked_functions("test.right", {"right": right}, World, Batch, DEVICE) is checked
 
 
-def test_indices_out_of_range_and_endless_loops_are_named(device: wp.Device, params: wp.array) -> None:
-    checked = checked_functions("test.wrong", {"wrong": wrong}, World, Batch, device)
-    report = checked.report(device)
-    wp.launch(checked.kernels["wrong"], 2, [report, batch(), params, wp.zeros((2, 1), dtype=float)], device=device)
+def test_indices_out_of_range_and_endless_loops_are_named(params: wp.array) -> None:
+    checked = checked_functions("test.wrong", {"wrong": wrong}, World, Batch, DEVICE)
+    report = checked.report(DEVICE)
+    wp.launch(checked.kernels["wrong"], 2, [report, batch(), params, wp.zeros((2, 1), dtype=float)], device=DEVICE)
     problems = checked.problems(report)
     assert len(problems) == len(FINDINGS), problems
     for pattern in FINDINGS:
@@ -233,6 +231,6 @@ def function_as_a_value(s: World, p: Params) -> float:
         (function_as_a_value, r"function_as_a_value uses last as a value \(.*, line \d+\): call it instead"),
     ],
 )
-def test_a_function_that_cannot_be_checked_is_named(function: Any, message: str, device: wp.Device) -> None:
+def test_a_function_that_cannot_be_checked_is_named(function: Any, message: str) -> None:
     with pytest.raises(Unchecked, match=message):
-        checked_functions("test.unchecked", {"function": function}, World, Batch, device)
+        checked_functions("test.unchecked", {"function": function}, World, Batch, DEVICE)

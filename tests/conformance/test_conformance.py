@@ -1,4 +1,4 @@
-"""Every task of the package keeps the rules of an environment on both engines; so do some on a third, a toy."""
+"""Every task of the package keeps the rules of an environment on both engines, and some tasks on a toy engine."""
 
 import pytest
 from conftest import settle
@@ -12,28 +12,28 @@ from lyceum_warp.testing import state_rules as state
 from lyceum_warp.testing.episode_rules import check_memory
 
 EVERY_RULE = ("hopper", "humanoid", "adroit_pen", "soft_ball")
-"""Tasks for which all rules are always checked, on both engines. Together they use most of what a model can have."""
+"""Tasks for which all rules are checked on both engines. Together they use most features of models."""
 OF_THE_TASK = tuple(check for check in CHECKS if check is not check_memory)
-"""For other tasks on the C engine: without the rule about memory, which takes long and depends little on the task."""
+"""Rules for other tasks on the C engine, without the slow rule about memory, which depends little on the task."""
 OF_THE_STATE = (
     buffers.check_addresses, buffers.check_getters, state.check_restoring, state.check_purity, state.check_determinism,
     state.check_reset,
 )  # fmt: skip
-"""For other tasks on the Warp engine, whose steps take milliseconds on a CPU: whether it keeps and restores states of
-their models. Their functions are checked on the C engine, and their numbers by the comparison of the engines."""
+"""Rules for other tasks on the Warp engine, whose steps take milliseconds on a CPU. Functions of these tasks are
+checked on the C engine, and other tests compare the engines."""
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
 
 
 @pytest.fixture(autouse=True)
 def settled_again() -> None:
-    """The rule about memory looks through all objects, and each engine loads kernels of its own."""
+    """Drop objects of earlier tests, because the rule about memory counts all objects."""
     settle()
 
 
 def options(task: str, engine: str) -> dict[str, int]:
-    """The steps of the long rules, for one task enough to notice a leak of one number a step.
+    """The number of steps of the long rules. For hopper it suffices to find a leak of one number per step.
 
-    On the CPU a step of the Warp engine takes milliseconds: one task runs for long there, with all its substeps.
+    On a CPU a step of the Warp engine takes milliseconds, so that other tasks take few steps there.
     """
     if engine == "mujoco":
         return {"steps": 1000 if task == "hopper" else 300 if task in EVERY_RULE else 150}

@@ -1,4 +1,4 @@
-"""A controller as the loops call it: what is refused, which action is applied, how it is described."""
+"""Checks of controllers and their actions, conversion of time steps, and descriptions in trajectories."""
 
 import math
 from collections.abc import Callable
@@ -52,24 +52,16 @@ def test_a_time_step_that_is_not_positive_is_refused(env: lw.Env, timestep: obje
 
 
 @BOTH
-def test_an_action_of_another_shape_is_refused(run: Run, env: lw.Env) -> None:
-    with pytest.raises(ValueError, match=r"return an action of shape \(2,\), not a float32 tensor of shape \(1, 2\)"):
-        run(env, lambda state, obs: torch.zeros(1, 2))
-    with pytest.raises(ValueError, match=r"must return an action of shape \(2,\), not NoneType None"):
-        run(env, lambda state, obs: None)
-
-
-@BOTH
-def test_a_plan_of_another_shape_is_refused(run: Run, env: lw.Env) -> None:
+def test_a_bad_action_or_plan_is_refused(run: Run, env: lw.Env) -> None:
     bad = type("Bad", (), {"actions": torch.zeros(8, 3), "__call__": lambda *_: torch.zeros(2)})
-    with pytest.raises(ValueError, match=r"must have actions of shape \(horizon, 2\), not a float32 tensor"):
-        run(env, bad())
-
-
-@BOTH
-def test_an_action_that_is_not_finite_is_refused_by_name(run: Run, env: lw.Env) -> None:
-    with pytest.raises(ValueError, match=r"the controller's action 'y' at step 0 must be finite, not nan"):
-        run(env, lambda state, obs: torch.tensor([0.0, math.nan]))
+    for controller, message in (
+        (lambda *_: torch.zeros(1, 2), r"return an action of shape \(2,\), not a float32 tensor of shape \(1, 2\)"),
+        (lambda *_: None, r"must return an action of shape \(2,\), not NoneType None"),
+        (bad(), r"must have actions of shape \(horizon, 2\), not a float32 tensor"),
+        (lambda *_: torch.tensor([0.0, math.nan]), "the controller's action 'y' at step 0 must be finite, not nan"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            run(env, controller)
 
 
 def test_index_converts_steps_of_the_plant_to_steps_of_the_plan(env: lw.Env) -> None:

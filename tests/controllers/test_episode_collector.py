@@ -1,4 +1,4 @@
-"""What both loops share: limits, progress, and the trajectory of an interrupted episode."""
+"""The common part of both loops: limits, progress, and the trajectory of an interrupted episode."""
 
 import time
 from collections.abc import Callable
@@ -25,36 +25,26 @@ def env() -> lw.Env:
 
 
 @BOTH
-def test_several_worlds_and_automatic_resets_are_refused(run: Run, shared_env: SharedEnv) -> None:
-    with pytest.raises(ValueError, match="one world without automatic resets, not nworld=1, autoreset=True"):
-        run(shared_env("point_mass"), towards)
-    with pytest.raises(ValueError, match="one world without automatic resets, not nworld=2, autoreset=False"):
-        run(shared_env("point_mass", nworld=2, autoreset=False), towards)
+def test_unsuitable_environments_are_refused(run: Run, shared_env: SharedEnv) -> None:
+    for options, message in (
+        ({}, "one world without automatic resets, not nworld=1, autoreset=True"),
+        ({"nworld": 2, "autoreset": False}, "one world without automatic resets, not nworld=2, autoreset=False"),
+        ({"autoreset": False, "horizon": 0}, "give steps, or a horizon"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            run(shared_env("point_mass", **options), towards)
 
 
 @BOTH
-def test_an_episode_without_a_horizon_needs_steps(run: Run, shared_env: SharedEnv) -> None:
-    with pytest.raises(ValueError, match="give steps, or a horizon"):
-        run(shared_env("point_mass", autoreset=False, horizon=0), towards)
-
-
-@BOTH
-def test_zero_steps_are_refused(run: Run, env: lw.Env) -> None:
-    with pytest.raises(ValueError, match="steps must be a whole number from 1 to .*, not 0"):
-        run(env, towards, steps=0)
-
-
-@BOTH
-def test_a_seed_without_a_reset_is_refused(run: Run, env: lw.Env) -> None:
-    with pytest.raises(ValueError, match="seed=1 has no effect with reset=False"):
-        run(env, towards, seed=1, reset=False)
-
-
-@BOTH
-def test_a_finished_episode_is_refused_without_a_reset(run: Run, env: lw.Env) -> None:
+def test_arguments_without_a_run_are_refused(run: Run, env: lw.Env) -> None:
     control(env, towards)
-    with pytest.raises(ValueError, match="over before its first step: reset the environment"):
-        run(env, towards, reset=False)
+    for arguments, message in (
+        ({"steps": 0}, "steps must be a whole number from 1 to .*, not 0"),
+        ({"seed": 1, "reset": False}, "seed=1 has no effect with reset=False"),
+        ({"reset": False}, "over before its first step: reset the environment"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            run(env, towards, **arguments)
 
 
 @BOTH

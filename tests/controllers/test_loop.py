@@ -53,20 +53,10 @@ def test_the_seed_determines_the_episode(env: lw.Env) -> None:
     assert torch.equal(one.states, same.states) and not torch.equal(one.states, other.states)
 
 
-def test_steps_stop_the_episode_early(env: lw.Env) -> None:
-    episode = control(env, towards, steps=3)
-    assert episode.done_reason == 0 and episode.steps == 3
-
-
-def test_a_reset_calls_the_controllers_reset_and_starts_with_shift_zero(env: lw.Env) -> None:
+def test_shifts_start_with_zero_after_a_reset_and_with_one_without(env: lw.Env) -> None:
     planner = StepPlanner(env)
-    control(env, planner, seed=4, steps=4)
+    assert control(env, planner, seed=4, steps=4).done_reason == 0
     assert planner.shifts == [0, 1, 1, 1] and planner.resets == [4]
-
-
-def test_without_a_reset_the_episode_continues_with_shift_one(env: lw.Env) -> None:
-    planner = StepPlanner(env)
-    control(env, planner, seed=4, steps=4)
     episode = control(env, planner, steps=3, reset=False)
     assert planner.shifts[4:] == [1, 1, 1] and planner.resets == [4]
     assert torch.allclose(episode.actions[:, 0], torch.tensor([0.04, 0.05, 0.06]))
@@ -110,25 +100,11 @@ def test_an_mppi_plan_is_played_until_the_next_one() -> None:
     assert torch.equal(whole.actions, plan.actions[:4])
 
 
-@pytest.mark.parametrize(
-    ("replan_every", "message"),
-    [
-        (0, "replan_every must be a whole number from 1"),
-        (9, "replan_every=9 needs a plan of 9 actions, and the controller has a plan of 8 actions: plan more often"),
-    ],
-)
-def test_replanning_after_the_end_of_the_plan_is_refused(env: lw.Env, replan_every: int, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        control(env, StepPlanner(env), steps=20, replan_every=replan_every)
-
-
-def test_replanning_of_a_controller_without_a_plan_is_refused(env: lw.Env) -> None:
-    with pytest.raises(ValueError, match="replan_every=2 needs a plan of 2 actions, and the controller has no plan"):
-        control(env, towards, steps=20, replan_every=2)
-
-
-def test_shift_counts_steps_of_the_controller(env: lw.Env) -> None:
-    planner = StepPlanner(env)
-    planner.timestep = 2 * env.timestep
-    control(env, planner, steps=6)
-    assert planner.shifts == [0, 1, 0, 1, 0, 1]
+def test_replanning_after_the_end_of_the_plan_is_refused(env: lw.Env) -> None:
+    for every, controller, message in (
+        (0, StepPlanner(env), "replan_every must be a whole number from 1"),
+        (9, StepPlanner(env), "needs a plan of 9 actions, and the controller has a plan of 8 actions: plan more often"),
+        (2, towards, "replan_every=2 needs a plan of 2 actions, and the controller has no plan"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            control(env, controller, steps=20, replan_every=every)

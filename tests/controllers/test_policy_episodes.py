@@ -1,4 +1,4 @@
-"""Episodes of a policy as trajectories."""
+"""Run episodes of a policy as trajectories."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The loop against the clock: on a simulated clock, where every time is exact, and with a thread on the real one."""
+"""The loop in real time: on a simulated clock, on which every time is exact, and with a thread on the real clock."""
 
 import math
 import subprocess
@@ -42,7 +42,7 @@ def test_a_fast_planner_is_one_step_behind(env: lw.Env) -> None:
 
 def test_a_slow_planner_misses_its_deadlines(env: lw.Env) -> None:
     episode = simulated_run(env, seconds=2.5, steps=9)
-    # the plan from state 1 ends at 3.5; the next one, from the newest state at that time, takes from 3.5 to 6
+    # the plan from state 1 ends at 3.5; the next plan starts from the newest state and takes from 3.5 to 6
     assert episode.plan_of.tolist() == [0, 0, 0, 0, 1, 1, 2, 2, 2]
     assert episode.plan_steps[:3].tolist() == [0, 1, 3]
     assert episode.ages.tolist() == pytest.approx([0, 1, 2, 3, 3, 4, 3, 4, 5])
@@ -67,7 +67,7 @@ def test_a_slow_step_does_not_delay_the_schedule(env: lw.Env) -> None:
     assert report.tick_jitter_ms == pytest.approx(np.std([0, 0, 1250, 250, 0, 0], ddof=1))
 
 
-# the thread, with long periods and planners that are much slower
+# the thread, with long periods and even longer planning times
 
 
 def planner_threads() -> list[threading.Thread]:
@@ -81,7 +81,7 @@ def test_a_slow_planner_in_a_thread_plans_while_the_plant_steps(env: lw.Env) -> 
     assert planner.resets == [6, 6]
     assert planner.shifts[:3] == [0, 0, 0]
     assert planner.shifts[3:] == episode.plan_steps.diff().tolist()
-    # on a busy machine, too, each action is the one that its plan has for its step
+    # even on a busy machine, each action is the plan's action for its step
     assert hundredths(episode.actions[:, 0]) == episode.plan_steps[episode.plan_of].tolist()
     assert hundredths(episode.actions[:, 1]) == episode.age_steps.clamp(max=7).tolist()
     assert episode.plan_starts[0] < 0 and episode.ages[0] == 0 and (episode.plan_starts[1:] > 0).all()
@@ -94,14 +94,6 @@ def test_a_slow_planner_in_a_thread_plans_while_the_plant_steps(env: lw.Env) -> 
         env.set_state(episode.states[k : k + 1])
         env.step(action[None])
         assert torch.equal(env.get_state()[0], episode.states[k + 1])
-
-
-def test_a_policy_in_a_thread_acts_on_the_state_of_its_plan(env: lw.Env) -> None:
-    episode = control_async(env, towards, period=0.03, steps=12, seed=6)
-    assert episode.age_steps[0] == 0 and (episode.age_steps[1:] >= 1).all()
-    for k in range(12):
-        made_from = int(episode.plan_steps[episode.plan_of[k]])
-        assert torch.allclose(episode.actions[k], towards(episode.states[made_from], episode.obs[made_from]))
 
 
 def test_mppi_in_a_thread_makes_the_same_plans_as_without(env: lw.Env) -> None:
@@ -118,9 +110,13 @@ def test_mppi_in_a_thread_makes_the_same_plans_as_without(env: lw.Env) -> None:
     assert torch.equal(control(env, mppi, seed=5, steps=4).states, control(env, mppi, seed=5, steps=4).states)
 
 
-def test_the_run_ends_with_its_episode(env: lw.Env) -> None:
-    episode = control_async(env, towards, period=0.001, steps=1000)
+def test_a_policy_acts_on_the_state_of_its_plan_until_the_episode_ends(env: lw.Env) -> None:
+    episode = control_async(env, towards, period=0.003, steps=1000, seed=6)
     assert episode.steps == 40 and episode.truncated
+    assert episode.age_steps[0] == 0 and (episode.age_steps[1:] >= 1).all()
+    for k in range(40):
+        made_from = int(episode.plan_steps[episode.plan_of[k]])
+        assert torch.allclose(episode.actions[k], towards(episode.states[made_from], episode.obs[made_from]))
 
 
 @pytest.mark.parametrize("period", [0.0, math.nan, math.inf, "fast"])

@@ -1,4 +1,4 @@
-"""Files of episodes, read for playback."""
+"""Load saved episodes for playback."""
 
 import dataclasses
 import json
@@ -32,15 +32,6 @@ def folder(episodes: list[lw.Trajectory], tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def without_source(path: Path) -> None:
-    """Make a file one of an earlier release."""
-    with np.load(path) as file:
-        arrays = dict(file)
-    info = json.loads(str(arrays["info"]))
-    del info["source"]
-    np.savez(path, **(arrays | {"info": np.array(json.dumps(info))}))
-
-
 def test_several_files_and_folders_are_loaded_in_order(folder: Path, episodes: list[lw.Trajectory]) -> None:
     first, second = sorted(folder.iterdir())
     for given, expected in ((folder, [first, second]), (str(second), [second]), ([second, first], [second, first])):
@@ -66,7 +57,11 @@ def test_an_environment_of_the_episodes_shows_and_continues_them(folder: Path) -
 
 def test_files_of_earlier_releases_are_read(folder: Path, tmp_path: Path) -> None:
     path = lw.control(lw.make("point_mass", autoreset=False, horizon=5), towards).save(tmp_path / "old.npz")
-    without_source(path)
+    with np.load(path) as file:
+        arrays = dict(file)
+    info = json.loads(str(arrays.pop("info")))
+    del info["source"]
+    np.savez(path, **arrays, info=np.array(json.dumps(info)))
     old = load_episodes(path)
     assert old[path].source == {}
     check_episode(episode_env(old), old[path])
@@ -127,7 +122,7 @@ def test_missing_broken_and_newer_files_are_reported_in_one_line(folder: Path, t
     empty.mkdir()
     for given, kind, message in (
         (tmp_path / "none.npz", FileNotFoundError, f"^there is no file {tmp_path / 'none.npz'}$"),
-        (empty, FileNotFoundError, f"there is no episode in the folder {empty}: its files would end in .npz"),
+        (empty, FileNotFoundError, f"there is no episode in the folder {empty}: it contains no .npz file"),
         (newer, ValueError, rf"{newer} was written by a newer lyceum_warp \(format 2, this one reads up to 1\)"),
         (broken, ValueError, f"{broken} is broken, or is not a trajectory"),
     ):

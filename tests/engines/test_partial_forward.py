@@ -43,13 +43,15 @@ def test_partial_passes_give_the_same_run(monkeypatch: pytest.MonkeyPatch) -> No
 def test_an_overflow_in_the_first_state_of_an_episode_is_reported(
     partial: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After a reset at once, within a step with the next one; here a world starts in more contacts than have room."""
+    """The first step reports it; here a world starts in more contacts than have room."""
     monkeypatch.setattr(WarpEngine, "partial_refresh", partial)
     spec = lw.gymnasium_model("humanoid.xml").spec()
     spec.body("torso").pos[2] = 0.1
     env = lw.make("humanoid", engine="warp", nworld=2, model=spec, nconmax=1, njmax=128, reset_noise_scale=0.0,
                   autoreset=False)  # fmt: skip
     env.reset(torch.tensor([True, False]))
+    assert not env.done.any()
+    env.step()
     assert env.done_reason[0] & int(lw.Done.CONTACT_OVERFLOW)
 
 

@@ -1,7 +1,7 @@
 """Give random command lines to ``lyceum-warp``.
 
-A case is "COMMAND SEED", or the name of one of the minimal cases in ``known_failures.py``. The flags are read from the
-help texts, so that a new one is attacked, too.
+A case is "COMMAND SEED", or the name of a minimal case in ``minimal_cases.py``. The flags come from the help texts, so
+that a new one is attacked, too.
 """
 
 import contextlib
@@ -9,6 +9,7 @@ import functools
 import io
 import os
 import re
+import shlex
 import shutil
 import warnings
 from pathlib import Path
@@ -16,6 +17,7 @@ from random import Random
 
 import guarded
 import torch
+from file_attacks import content
 from guarded import ProblemError
 from mutations import NUMBERS, TEXTS
 
@@ -46,18 +48,13 @@ SMALL: dict[str, dict[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """Commands with flags that make them short."""
 
-FIRST = {
-    "tasks": "",
-    "new": "my_task",
-    "eval": "good",
-    "export": "good",
-    "train --resume good": "",
-    "train --from good": "",
-}
+FIRST = {"tasks": "", "new": "my_task", "eval": "good", "export": "good"} | dict.fromkeys(
+    ("train --resume good", "train --from good"), ""
+)
 """First arguments of commands; a task by default."""
 
 _OMIT = ("--help", "--video", "--video-every", "--view", "--frame-skip")
-"""Flags that start other processes, one that prints, and one that can ask for hours within one native call."""
+"""Flags that print or start other processes, and one with which a single native call can take hours."""
 
 
 @functools.cache
@@ -86,9 +83,13 @@ _WORDS = (
 )  # fmt: skip
 
 
+def _line(command: str, first: str, flags: dict[str, tuple[str, ...]]) -> list[str]:
+    name, *rest = command.split()
+    return [name, *([first] if first else []), *rest, *(word for flag in flags for word in (flag, *flags[flag]))]
+
+
 def words(command: str, random: Random) -> list[str]:
     """A random command line."""
-    name, *rest = command.split()
     given = dict(SMALL[command])
     first = FIRST.get(command, "point_mass")
     others = []
@@ -102,16 +103,13 @@ def words(command: str, random: Random) -> list[str]:
         elif kind == 2 and known:
             flag = random.choice(known)
             given[flag[:-1] if random.random() < 0.5 else flag.replace("-", "_", 3)] = (_word(random),)
-        elif kind == 3 and given:
-            others += [flag := random.choice(list(given)), *given[flag]]
         elif known:
             flag = random.choice(known)
             given.pop(flag.replace("--no-", "--"), None)
             given.pop(flag.replace("--", "--no-", 1), None)
             short = flag.startswith("--no-") or f"--no-{flag[2:]}" in known
             given[flag] = () if short else tuple(_word(random) for _ in range(random.choice((1, 1, 1, 1, 0, 2, 3))))
-    line = [word for flag, values in given.items() for word in (flag, *values)]
-    line = [name, *([first] if first else []), *rest, *line, *others]
+    line = [*_line(command, first, given), *others]
     if random.random() < 0.03:
         line[0] = random.choice(("trian", "", "--version", "-h", "[red]", "--"))
     return line
@@ -119,28 +117,28 @@ def words(command: str, random: Random) -> list[str]:
 
 def attack(case: str) -> str:
     """Run a case."""
-    from known_failures import COMMANDS
+    from minimal_cases import COMMANDS
 
     if case in COMMANDS:
-        return run(list(COMMANDS[case].words))
+        return run(COMMANDS[case].split())
     return run(words(case.rsplit(" ", 1)[0], Random(case)))
 
 
 def run(line: list[str]) -> str:
-    """Run a command line in a folder with a run, and judge its end."""
+    """Run a command line in a folder with a run, and check how it ends."""
     os.chdir(HERE.parent)
     shutil.rmtree(HERE, ignore_errors=True)
     HERE.mkdir()
     shutil.copytree(RUN, HERE / "good")
     os.chdir(HERE)
-    before = _content()
+    before = content(Path())
     out, err = io.StringIO(), io.StringIO()
     parsed = True
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             code = cli.main(line)
-        except SystemExit as end:  # of the parser, which explains itself in a box
+        except SystemExit as end:  # the parser prints a box
             code, parsed = end.code, False
         except KeyboardInterrupt:
             raise
@@ -155,36 +153,28 @@ def run(line: list[str]) -> str:
         errors = [text for text in lines if text.startswith("lyceum-warp: ")]
         if parsed and (not errors or lines[-1] != errors[-1]):
             raise ProblemError(f"{_spelled(line)}: stderr ends without an error of one line: {lines[-3:]}")
-        if (after := _content()) != before:
+        if (after := content(Path())) != before:
             changed = [name for name in after | before if before.get(name) != after.get(name)]
             raise ProblemError(f"{_spelled(line)}: ended with 2, but changed {', '.join(changed)}: {lines[-1:]}")
     return ("worked", "worked", "refused")[code]
 
 
 def _spelled(line: list[str]) -> str:
-    plain = [word[:80] if word.isprintable() and word and " " not in word else repr(word) for word in line]
-    return "lyceum-warp " + " ".join(plain)
-
-
-def _content() -> dict[str, bytes]:
-    return {str(path): path.read_bytes() if path.is_file() else b"" for path in Path(".").rglob("*")}
+    return ascii(shlex.join(["lyceum-warp", *(word[:80] for word in line)]))[1:-1]
 
 
 def warm_up() -> None:
     """Make a run, and run every command once."""
-    lyceum_warp.cli.view.view = lambda *args, **options: None  # the window, beyond everything that is checked
+    lyceum_warp.cli.view.view = lambda *args, **options: None  # no window
     torch.set_num_threads(1)
     HERE.mkdir(parents=True, exist_ok=True)
     if not RUN.exists():
         os.chdir(HERE)
-        line = [word for flag, values in SMALL["train"].items() for word in (flag, *values)]
-        assert cli.main(["train", "point_mass", *line]) == 0
+        assert cli.main(_line("train", "point_mass", SMALL["train"])) == 0
         (HERE / "out").rename(RUN)
     for command in SMALL:
         if command != "bench":  # another process
-            first = FIRST.get(command, "point_mass")
-            line = [word for flag, values in SMALL[command].items() for word in (flag, *values)]
-            run([*command.split()[:1], *([first] if first else []), *command.split()[1:], *line])
+            run(_line(command, FIRST.get(command, "point_mass"), SMALL[command]))
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
-"""Read files that were damaged at random: a run's, saved episodes, models and tables.
+"""Read files that were damaged at random: files of runs, saved episodes, models and tables.
 
-A case is "KIND SEED", or the name of one of the minimal cases in ``known_failures.py``.
+A case is "KIND SEED", or the name of a minimal case in ``minimal_cases.py``.
 """
 
 import contextlib
 import dataclasses
+import functools
 import io
 import json
 import re
@@ -72,40 +73,23 @@ SLIDE = """<mujoco model="slide">
   <keyframe><key name="home" qpos="0.1"/></keyframe>
 </mujoco>
 """
-URDF = """<robot name="arm">
-  <link name="base"><inertial><mass value="1"/>
-    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
-  <link name="arm"><inertial><origin xyz="0 0 .5"/><mass value="1"/>
-    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
-    <collision><geometry><sphere radius="0.1"/></geometry></collision></link>
-  <joint name="elbow" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
-    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
-</robot>
-"""
 SIZES = "--samples 16 --nworld 2 --hidden 4 --value-hidden 4 --mean-every 2 --mean-episodes 2 --no-video --no-plot"
 
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A kind of file: its path, its mutation, and its readers."""
+    """A kind of file."""
 
     file: str
     mutate: Callable[[bytes, Random], bytes]
     readers: tuple[str, ...]
     names: tuple[str, ...] = ()
-    """Names that an error may contain instead of the file's name."""
+    """Words that an error may contain instead of the file's name."""
 
 
-def _checkpoint(data: bytes, random: Random) -> bytes:
-    return mutations.mutated_checkpoint(data, random, CANARY)
-
-
-def _episode(data: bytes, random: Random) -> bytes:
-    return mutations.mutated_episode(data, random, CANARY)
-
-
-def _table(data: bytes, random: Random) -> bytes:
-    return mutations.mutated_table(data, random, CANARY)
+_checkpoint = functools.partial(mutations.mutated_checkpoint, canary=CANARY)
+_episode = functools.partial(mutations.mutated_episode, canary=CANARY)
+_table = functools.partial(mutations.mutated_table, canary=CANARY)
 
 
 KINDS = {
@@ -122,16 +106,11 @@ KINDS = {
     "checkpoint.pt": Kind("run/checkpoint.pt", _checkpoint, ("resume alone", "load alone")),
     "previous.pt": Kind("run/previous.pt", _checkpoint, ("resume previous",), ("checkpoint.pt",)),
     "episode.npz": Kind("episodes/episode-000.npz", _episode, ("episodes", "view episodes")),
-    "kept task": Kind("kept/task/slide.py", mutations.mutated_python, ("eval kept",), ("slide", "Slide")),
     "kept model": Kind("kept/task/slide.xml", mutations.mutated_xml, ("eval kept",), ("slide", "model")),
     "kept table": Kind("kept/task/tables/motion.npy", _table, ("eval kept",)),
     "model.xml": Kind("model.xml", mutations.mutated_xml, ("make", "new"), ("model", "slide")),
-    "model.urdf": Kind("model.urdf", mutations.mutated_xml, ("make urdf", "new urdf"), ("model", "slide")),
     "table.npy": Kind("table.npy", _table, ("table",)),
 }  # fmt: skip
-
-
-# readers: each is a way in which a person reads files of the case
 
 
 def _both(run: Path, which: str = "last") -> None:
@@ -150,19 +129,8 @@ def _episodes(path: Path) -> None:
         env.set_state(episode.states[:1])
 
 
-def _open(run: Path) -> None:
-    opened = Run.open(run)
-    assert isinstance(opened.task_name, str)
-    opened.rows()
-
-
-def _step(env: lw.Env) -> None:
-    env.rand_reset(0)
-    env.step()
-
-
 READERS: dict[str, Callable[[], object]] = {
-    "open": lambda: _open(CASE / "run"),
+    "open": lambda: (Run.open(CASE / "run").task_name, Run.open(CASE / "run").rows()),
     "load": lambda: _both(CASE / "run"),
     "load best": lambda: _both(CASE / "run", "best"),
     "load alone": lambda: _both(CASE / "run"),
@@ -178,14 +146,12 @@ READERS: dict[str, Callable[[], object]] = {
     "from kept": lambda: command("train", "--from", CASE / "kept", *_NEW),
     "episodes": lambda: _episodes(CASE / "episodes"),
     "view episodes": lambda: command("view", CASE / "episodes"),
-    "make": lambda: _step(lw.make(SLIDE_PY, model=CASE / "model.xml")),
+    "make": lambda: lw.make(SLIDE_PY, model=CASE / "model.xml").step(),
     "new": lambda: command("new", "case/my_new_task", "--model", CASE / "model.xml"),
-    "make urdf": lambda: _step(lw.make(SLIDE_PY, model=CASE / "model.urdf")),
-    "new urdf": lambda: command("new", "case/my_new_task", "--model", CASE / "model.urdf"),
-    "table": lambda: _step(lw.make(SLIDE_PY, motion=CASE / "table.npy")),
+    "table": lambda: lw.make(SLIDE_PY, motion=CASE / "table.npy").step(),
 }  # fmt: skip
 WITHOUT = {"load alone": "run/policy.pt", "resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}
-"""Files to remove, so that a reader falls back to another file."""
+"""Files that are removed so that a reader falls back to another file."""
 SLIDE_PY = str(BASE / "slide.py")
 _NEW = ("--trust", "--out", "case/new", "--iterations", "1", "--no-video", "--no-plot")
 
@@ -195,12 +161,7 @@ class RefusedError(Exception):
 
 
 def command(*words: object) -> None:
-    """Run a command in this process.
-
-    Raises:
-        RefusedError: It ended with 2.
-        ProblemError: It ended in another way than a command may.
-    """
+    """Run a command in this process, and raise RefusedError if it ended with 2, ProblemError if with another error."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = cli.main([str(word) for word in words])
@@ -211,16 +172,12 @@ def command(*words: object) -> None:
         raise ProblemError(f"{words[0]} ended with {code}: {err.getvalue()[-300:]}")
 
 
-# cases
-
-
 def attack(case: str) -> str:
     """Run a case."""
-    from known_failures import FILES
+    from minimal_cases import FILES
 
     if case in FILES:
-        known = FILES[case]
-        return read(known.kind, known.reader, known.change)
+        return read(*FILES[case])
     name = case.rpartition(" ")[0]
     random = Random(case)
     kind = KINDS[name]
@@ -228,7 +185,7 @@ def attack(case: str) -> str:
 
 
 def read(name: str, reader: str, change: Callable[[bytes], bytes]) -> str:
-    """Damage a file of a copy of the base, and read it."""
+    """Damage a file in a copy of the base folder, and read it."""
     kind = KINDS[name]
     shutil.rmtree(CASE, ignore_errors=True)
     shutil.copytree(BASE, CASE)
@@ -236,7 +193,7 @@ def read(name: str, reader: str, change: Callable[[bytes], bytes]) -> str:
     file.write_bytes(change(file.read_bytes()))
     if reader in WITHOUT:
         (CASE / WITHOUT[reader]).unlink()
-    before = _content(CASE)
+    before = content(CASE)
     did, error = "worked", None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -261,30 +218,23 @@ def read(name: str, reader: str, change: Callable[[bytes], bytes]) -> str:
 def _check_refusal(where: str, kind: Kind, error: BaseException, before: Mapping[str, bytes]) -> None:
     if guarded.out_of_memory(error):
         raise ProblemError(f"{where} takes too much memory", error)
-    file = Path(kind.file)
-    text = str(error)
-    if not any(name in text for name in (file.name, *kind.names)):
+    if not any(name in str(error) for name in (Path(kind.file).name, *kind.names)):
         raise ProblemError(f"{where}: the message does not name the file", error)
-    after = _content(CASE)
+    after = content(CASE)
     changed = [name for name in before | after if before.get(name) != after.get(name)]
     if changed:
         raise ProblemError(f"{where}: refused, but it changed {', '.join(changed)}", error)
 
 
-def _content(folder: Path) -> dict[str, bytes]:
-    return {
-        p.relative_to(folder).as_posix(): p.read_bytes()
-        for p in folder.rglob("*")
-        if p.is_file() and p.suffix != ".pyc"
-    }
-
-
-# the base
+def content(folder: Path) -> dict[str, bytes]:
+    """The files of a folder, by their paths."""
+    files = [path for path in folder.rglob("*") if path.is_file() and path.suffix != ".pyc"]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def warm_up() -> None:
-    """Make the base, unless an earlier process made it, and run every reader once."""
-    lyceum_warp.cli.view.view = lambda *args, **options: None  # the window, beyond everything that is read
+    """Make the base folder, unless an earlier process made it, and run every reader once."""
+    lyceum_warp.cli.view.view = lambda *args, **options: None  # no window
     torch.set_num_threads(1)
     if not BASE.exists():
         making = BASE.with_name("making")
@@ -293,25 +243,24 @@ def warm_up() -> None:
         _make(making)
         making.rename(BASE)
     for reader, name in {reader: name for name, kind in KINDS.items() for reader in kind.readers}.items():
-        did = read(name, reader, lambda data: data)
-        assert did == ("refused" if "urdf" in reader else "worked"), f"{reader} {did} without damage"
+        assert read(name, reader, lambda data: data) == "worked", f"{reader} fails without damage"
 
 
 def _make(folder: Path) -> None:
     (folder / "slide.py").write_text(TASK)
-    for name, text in (("slide.xml", SLIDE), ("model.xml", SLIDE), ("model.urdf", URDF)):
-        (folder / name).write_text(text)
+    (folder / "slide.xml").write_text(SLIDE)
+    (folder / "model.xml").write_text(SLIDE)
     np.save(folder / "table.npy", np.linspace(0.0, 1.0, 80, dtype=np.float32).reshape(40, 2))
     options = [*SIZES.split(), "--iterations", "2", "--keep-every", "1"]
     command("train", "point_mass", "--horizon", "8", "--out", folder / "run", *options)
-    command(
-        "train", folder / "slide.py", "--out", folder / "kept", "--param", f"motion={folder / 'table.npy'}", *options
-    )
-    for run in ("run", "kept"):  # the same bytes every time, as far as the file's length goes
+    motion = f"motion={folder / 'table.npy'}"
+    command("train", folder / "slide.py", "--out", folder / "kept", "--param", motion, *options)
+    for run in ("run", "kept"):  # so that the files have the same length every time
         path = folder / run / "metrics.csv"
         path.write_text(re.sub(r"\d+\.\d{9,}", lambda found: found[0][:8], path.read_text()))
     config = json.loads((folder / "kept/config.json").read_text())
-    config |= {"task": "/nowhere/slide.py", "params": {"motion": "/nowhere/table.npy"}}  # so that the copies are read
+    # so that the kept copies are read
+    config |= {"task": "/nowhere/slide.py", "params": {"motion": "/nowhere/table.npy"}}
     (folder / "kept/config.json").write_text(json.dumps(config, indent=2))
     plant = lw.make("point_mass", autoreset=False, horizon=4)
     episode = lw.control(plant, lambda state, obs: torch.zeros(2), seed=1)

@@ -1,10 +1,11 @@
 """Call the public functions with random values for each of their arguments.
 
-A case is "CALL SEED", or the name of one of the minimal cases in ``known_failures.py``. The arguments are read from the
-signatures, so that a new one is attacked, too.
+A case is "CALL SEED", or the name of a minimal case in ``minimal_cases.py``. The arguments come from the signatures,
+so that a new one is attacked, too.
 """
 
 import dataclasses
+import functools
 import inspect
 import os
 import shutil
@@ -39,32 +40,24 @@ OBJECTS: tuple[Any, ...] = (
 
 @dataclasses.dataclass(frozen=True)
 class Call:
-    """A function, arguments with which it works, and the names of all its arguments."""
+    """A function, valid arguments, and the names of arguments that its signature lacks."""
 
     function: Callable[..., Any]
     valid: Callable[[], dict[str, Any]]
-    names: tuple[str, ...]
+    more: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the arguments to attack; videos are made by another process."""
+        variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+        found = [name for name, p in inspect.signature(self.function).parameters.items() if p.kind not in variable]
+        return [name for name in dict.fromkeys((*found, *self.more)) if name != "video_every"]
 
 
-def _names(function: Callable[..., Any], *more: str, omit: tuple[str, ...] = ()) -> tuple[str, ...]:
-    kinds = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
-    found = [name for name, p in inspect.signature(function).parameters.items() if p.kind not in kinds]
-    return tuple(dict.fromkeys(name for name in (*found, *more) if name not in omit))
-
-
+@functools.cache
 def _env(**options: Any) -> lw.Env:
-    """An environment that cases share. Each uses it alone, and leaves it in any state."""
-    key = repr(options)
-    if key not in _ENVS:
-        _ENVS[key] = lw.make("point_mass", horizon=4, **options)
-    return _ENVS[key]
-
-
-_ENVS: dict[str, lw.Env] = {}
-
-
-def _policy() -> lw.GaussianPolicy:
-    return lw.GaussianPolicy(6, 2, (4,))
+    """An environment that cases share; each leaves it in any state."""
+    return lw.make("point_mass", horizon=4, **options)
 
 
 def _npg() -> lw.NPG:
@@ -79,49 +72,40 @@ def _plant() -> lw.Env:
     return _env(nworld=1, autoreset=False)
 
 
-_PLANNER = ("horizon", "samples", *(name for name in SETTINGS if name not in ("horizon", "samples")))
+def _planner() -> dict[str, Any]:
+    return {"task": "point_mass", "horizon": 2, "samples": 2}
+
+
 _OPTIONS = tuple(field.name for kind in (lw.EnvOptions, lw.PhysicsOptions) for field in dataclasses.fields(kind))
 
 CALLS = {
-    "EnvOptions": Call(lw.EnvOptions, dict, _names(lw.EnvOptions)),
-    "PhysicsOptions": Call(lw.PhysicsOptions, dict, _names(lw.PhysicsOptions)),
-    "MPPIConfig": Call(lw.MPPIConfig, dict, _names(lw.MPPIConfig)),
-    "NPGConfig": Call(lw.NPGConfig, dict, _names(lw.NPGConfig)),
-    "make": Call(lw.make, lambda: {"task": "point_mass"}, _names(lw.make, "success_distance")),
-    "MPPI": Call(
-        lw.MPPI, lambda: {"task": "point_mass", "horizon": 2, "samples": 2}, _names(lw.MPPI, *_PLANNER, *_OPTIONS)
-    ),
-    "CEM": Call(
-        lw.CEM, lambda: {"task": "point_mass", "horizon": 2, "samples": 2}, _names(lw.CEM, *_PLANNER, *_OPTIONS)
-    ),
-    "NPG": Call(lw.NPG, lambda: {"env": _env(nworld=2)}, _names(lw.NPG)),
-    "evaluate": Call(
-        lw.evaluate, lambda: {"env": _env(nworld=2), "policy": _policy(), "episodes": 2}, _names(lw.evaluate)
-    ),
-    "train": Call(
-        lw.train, lambda: {"learner": _npg(), "folder": "run", "iterations": 1},
-        _names(lw.train, omit=("video_every",)),  # videos are made by another process
-    ),
-    "control": Call(lw.control, lambda: {"env": _plant(), "controller": _still}, _names(lw.control)),
-    "control_async": Call(
-        lw.control_async, lambda: {"env": _plant(), "controller": _still}, _names(lw.control_async)
-    ),
-    "Rollout": Call(lw.Rollout, lambda: {"env": _env(nworld=2), "steps": 2}, _names(lw.Rollout)),
-    "OpenLoop": Call(lw.OpenLoop, lambda: {"env": _plant(), "horizon": 2}, _names(lw.OpenLoop)),
-    "load": Call(lw.load, lambda: {"run": "good"}, _names(lw.load)),
-    "load_value": Call(lw.load_value, lambda: {"run": "good"}, _names(lw.load_value)),
-    "GaussianPolicy": Call(lw.GaussianPolicy, lambda: {"nobs": 2, "nact": 2}, _names(lw.GaussianPolicy)),
-    "ValueFunction": Call(lw.ValueFunction, lambda: {"nobs": 2}, _names(lw.ValueFunction)),
-}  # fmt: skip
+    "EnvOptions": Call(lw.EnvOptions, dict),
+    "PhysicsOptions": Call(lw.PhysicsOptions, dict),
+    "MPPIConfig": Call(lw.MPPIConfig, dict),
+    "NPGConfig": Call(lw.NPGConfig, dict),
+    "make": Call(lw.make, lambda: {"task": "point_mass"}, ("success_distance",)),
+    "MPPI": Call(lw.MPPI, _planner, (*SETTINGS, *_OPTIONS)),
+    "CEM": Call(lw.CEM, _planner, (*SETTINGS, *_OPTIONS)),
+    "NPG": Call(lw.NPG, lambda: {"env": _env(nworld=2)}),
+    "evaluate": Call(lw.evaluate, lambda: {"env": _env(nworld=2), "policy": _npg().policy, "episodes": 2}),
+    "train": Call(lw.train, lambda: {"learner": _npg(), "folder": "run", "iterations": 1}),
+    "control": Call(lw.control, lambda: {"env": _plant(), "controller": _still}),
+    "control_async": Call(lw.control_async, lambda: {"env": _plant(), "controller": _still}),
+    "Rollout": Call(lw.Rollout, lambda: {"env": _env(nworld=2), "steps": 2}),
+    "OpenLoop": Call(lw.OpenLoop, lambda: {"env": _plant(), "horizon": 2}),
+    "load": Call(lw.load, lambda: {"run": "good"}),
+    "load_value": Call(lw.load_value, lambda: {"run": "good"}),
+    "GaussianPolicy": Call(lw.GaussianPolicy, lambda: {"nobs": 2, "nact": 2}),
+    "ValueFunction": Call(lw.ValueFunction, lambda: {"nobs": 2}),
+}
 
 
 def attack(case: str) -> str:
     """Run a case."""
-    from known_failures import KEYWORDS
+    from minimal_cases import KEYWORDS
 
     if case in KEYWORDS:
-        known = KEYWORDS[case]
-        return call(known.call, dict(known.arguments))
+        return call(*KEYWORDS[case])
     name = case.rpartition(" ")[0]
     random = Random(case)
     names = CALLS[name].names

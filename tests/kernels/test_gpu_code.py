@@ -1,4 +1,4 @@
-"""Kernels compile for a GPU, which needs Warp's own compiler and no GPU."""
+"""Compile kernels for a GPU, which needs Warp's compiler but no GPU."""
 
 import pkgutil
 from importlib import import_module
@@ -23,7 +23,7 @@ SHARED = [made for name in NAMES if (made := [k for k in kernels_of(import_modul
 
 
 def compiled(module: wp.Module, folder: Path) -> str:
-    """A module's code for a GPU (PTX)."""
+    """The PTX code of a module."""
     if not (archs := wp.get_cuda_supported_archs()):
         pytest.skip("this build of Warp does not compile for GPUs")
     (made,) = wp.compile_aot_module(module, arch=archs[0], module_dir=folder, use_ptx=True)

@@ -1,4 +1,4 @@
-"""Plans as splines: the interpolation between knots, and the grid that the horizon moves over."""
+"""Spline plans: interpolation between knots, and the grid on which the horizon moves."""
 
 import numpy as np
 import pytest
@@ -25,9 +25,7 @@ def interpolated(
 
 @pytest.mark.parametrize("spline", SPLINES)
 @pytest.mark.parametrize("horizon, count", [(12, 4), (13, 4), (7, 5), (5, 5), (9, 1)])
-def test_actions_between_knots_are_those_of_the_plain_version_at_every_phase(
-    horizon: int, count: int, spline: str
-) -> None:
+def test_interpolated_actions_equal_the_plain_version_at_every_phase(horizon: int, count: int, spline: str) -> None:
     number = knots.knot_count(horizon, count, spline)
     values = np.random.default_rng(1).normal(size=(number, 3, 2)).astype(np.float32)
     grid = Grid(horizon, count, spline)
@@ -38,7 +36,7 @@ def test_actions_between_knots_are_those_of_the_plain_version_at_every_phase(
 
 @pytest.mark.parametrize("spline, degree", [("zero", 0), ("linear", 1), ("cubic", 2)])
 def test_knots_of_a_polynomial_give_the_polynomial(spline: str, degree: int) -> None:
-    """A cubic spline with slopes by central differences has parabolas."""
+    """A cubic spline with slopes from central differences reproduces parabolas."""
     horizon, count = 12, 3
     number = knots.knot_count(horizon, count, spline)
     places = np.arange(number) - (spline == "cubic")
@@ -54,7 +52,7 @@ def test_interpolated_actions_stay_within_the_bounds() -> None:
     np.testing.assert_allclose(bounded, np.minimum(free, 1.0))
 
 
-def test_the_worlds_of_a_sample_follow_one_another() -> None:
+def test_the_worlds_of_a_sample_are_consecutive() -> None:
     values = np.arange(10.0).reshape(5, 2, 1)
     found = interpolated(values, 4, 4, "zero", models=3)
     np.testing.assert_array_equal(found[..., 0], np.repeat(values[:4, :, 0], 3, axis=1))

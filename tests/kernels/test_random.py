@@ -1,4 +1,4 @@
-"""Counted random streams: draws depend on (seed, world, episode, step) alone."""
+"""Counter-based random streams: draws depend only on (seed, world, episode, step)."""
 
 import itertools
 
@@ -27,7 +27,7 @@ def draw(
 
 @wp.kernel(enable_backward=False)
 def draw_vectors(rng_inout: wp.array2d[wp.uint32], one_out: wp.array2d[float], many_out: wp.array2d[float]):
-    """Draw five numbers one by one, then the same ones as two vectors from a copy of the stream."""
+    """Draw five numbers one by one, and the same five as two vectors from a copy of the stream."""
     i = wp.tid()
     for k in range(5):
         one_out[i, k] = uniform(rng_inout[2 * i], float(-k), float(k + 1))
@@ -66,7 +66,7 @@ def test_a_vector_has_the_draws_of_its_elements_in_turn() -> None:
 
 
 def test_different_counters_give_different_draws() -> None:
-    """Also those with the same sum: the counters are hashed one inside the other."""
+    """Also counters with equal sums."""
     counters = np.array(list(itertools.product(range(6), range(6), range(6), range(6))))
     found = draws(counters)
     assert len(np.unique(found[:, 0])) > 0.999 * len(counters)

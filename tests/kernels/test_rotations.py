@@ -1,4 +1,4 @@
-"""Quaternions against MuJoCo's own functions, on random numbers and at the edges."""
+"""Compare quaternion functions with MuJoCo's own, on random numbers and at edge cases."""
 
 from collections.abc import Callable
 
@@ -22,7 +22,7 @@ def compute(
     to_mat_out: wp.array[wp.mat33], from_mat_out: wp.array[wp.vec4], from_euler_out: wp.array[wp.vec4],
     to_euler_out: wp.array[wp.vec3],
 ):  # fmt: skip
-    """Every function of one pair of quaternions, one vector and one angle; launched over (n,)."""
+    """Call every function on a pair of quaternions, a vector and an angle; launched over (n,)."""
     i = wp.tid()
     a, b, v = a_in[i], b_in[i], v_in[i]
     mul_out[i] = lw.quat_mul(a, b)
@@ -61,7 +61,7 @@ def inputs() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     a[:8] = np.vstack([np.eye(4), -np.eye(4)])
     a[8:12] = unit(np.array([[1, 1e-4, -2e-4, 0], [-1, 1e-4, 0, 1e-4], [1e-5, 1, 0, 0], [1, 1e-25, 0, 0]]))
     b[12], b[13] = a[12], -a[13]
-    a[14:16] = unit(np.array([[1, 0, 1, 0], [1, 1, -1, -1]]))  # the second Euler angle is a right one
+    a[14:16] = unit(np.array([[1, 0, 1, 0], [1, 1, -1, -1]]))  # the second Euler angle is a right angle
     v[:2], angle[0] = [[0, 0, 0], [1e-6, 0, 0]], 0.0
     return a.astype(np.float32), b.astype(np.float32), v.astype(np.float32), angle.astype(np.float32)
 
@@ -114,7 +114,7 @@ def test_rotation_vectors_are_those_of_mujoco(found: dict[str, np.ndarray]) -> N
     a, b, _, _ = inputs()
     check(found["to_rotvec"], mju(lambda row, q: mujoco.mju_quat2Vel(row, q, 1.0), 3, a), 1e-5)
     difference = mju(mujoco.mju_subQuat, 3, a, b)
-    close = np.linalg.norm(difference, axis=1) < 3.1  # at pi, either sign is right
+    close = np.linalg.norm(difference, axis=1) < 3.1  # at pi, both signs are correct
     assert close.mean() > 0.95
     check(found["difference"][close], difference[close], 1e-5)
     check(found["angle"], np.linalg.norm(difference, axis=1), 1e-5)
@@ -153,7 +153,7 @@ def test_euler_angles_are_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
 
 
 def test_random_rotations_are_uniform_and_independent() -> None:
-    """The parts of a uniform unit quaternion in a plane have a squared length that is U(0, 1), and a uniform angle."""
+    """Two components of a uniform unit quaternion have a squared length from U(0, 1) and a uniform angle."""
     n = 4000
     rng, quats = (wp.zeros((n, k), dtype=t, device="cpu") for k, t in ((1, wp.uint32), (2, wp.vec4)))
     wp.launch(draw, n, [rng, quats], device="cpu")

@@ -1,11 +1,11 @@
-"""Store mjlab's Go1: its model's trajectories, and its environment's terms and observations, for the tests.
+"""Store reference data of mjlab's Go1 for the tests: trajectories, reward terms and observations.
 
-It needs mjlab 1.6.0 with MuJoCo 3.11, so it runs in a virtual environment of its own:
+It needs mjlab 1.6.0 with MuJoCo 3.11, so run it in a virtual environment of its own:
 
     python -m venv mjlab && mjlab/bin/pip install mjlab==1.6.0
     mjlab/bin/python tests/oracles/store_go1.py tests/data/go1_mjlab.npz
 
-Joints are in the order FR, FL, RR, RL, each leg hip, thigh, calf, as mjlab's environment has them.
+Joints are in mjlab's order: legs FR, FL, RR, RL, with hip, thigh and calf for each leg.
 """
 
 import sys
@@ -40,18 +40,18 @@ OPTIONS = (
 
 
 def names(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> list[str]:
-    """Names of a model's objects without mjlab's prefix and suffixes."""
+    """Names of a model's elements, without mjlab's prefix and suffixes."""
     found = [mujoco.mj_id2name(model, kind, i) or "" for i in range(count)]
     return [name.removeprefix("robot/").removesuffix("_joint").replace("_collision", "") for name in found]
 
 
 def model_arrays(model: mujoco.MjModel) -> dict[str, Any]:
-    """The constants of the model, but the drawn meshes, in the order of names that are stored with them."""
+    """Constants of the model except for visual meshes, and the names of their bodies and geoms."""
     kind = mujoco.mjtObj
     bodies = names(model, kind.mjOBJ_BODY, model.nbody)
     geoms = names(model, kind.mjOBJ_GEOM, model.ngeom)
     rows = {
-        "body": [i for i, name in enumerate(bodies) if name != "terrain"],  # a body of its own, fixed to the world
+        "body": [i for i, name in enumerate(bodies) if name != "terrain"],  # an extra body, fixed to the world
         "geom": [i for i, name in enumerate(geoms) if name],
         "actuator": actuators(model),
     }
@@ -63,7 +63,7 @@ def model_arrays(model: mujoco.MjModel) -> dict[str, Any]:
 
 
 def actuators(model: mujoco.MjModel) -> list[int]:
-    """The actuators in the order of the joints."""
+    """Indices of the actuators in the order of the joints."""
     joints = names(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt)[1:]
     own = names(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu)
     return [own.index(name) for name in joints]
@@ -95,7 +95,7 @@ def trajectories(model: mujoco.MjModel) -> dict[str, Any]:
 
 
 def judged_states(env: ManagerBasedRlEnv) -> dict[str, Any]:
-    """States of random steps, with what mjlab's own functions say of them; poses and contacts are current there."""
+    """States along random steps, with the results of mjlab's functions; poses and contacts are current."""
     torch.manual_seed(0)
     robot, command = env.scene["robot"], env.command_manager.get_term("twist")
     feet = env.scene["feet_ground_contact"]
@@ -113,7 +113,7 @@ def judged_states(env: ManagerBasedRlEnv) -> dict[str, Any]:
         if step % EVERY:
             continue
         kept = {name: value.clone() for name, value in vars(feet._air_time_state).items()}, swing.peak_heights.clone()
-        feet.update(env.physics_dt)  # clocks and contacts of this state: rewards have read those of the last substep
+        feet.update(env.physics_dt)  # update clocks and contacts to this state; the step left them one substep behind
         swing.peak_heights[:] = 0.15 * torch.rand_like(swing.peak_heights)
         origins = env.scene.env_origins
         qpos = env.sim.data.qpos.clone()
@@ -147,19 +147,14 @@ def judged_states(env: ManagerBasedRlEnv) -> dict[str, Any]:
         swing.peak_heights[:] = kept[1]
         fell = env.termination_manager.get_term_cfg("fell_over")
         keep("fell", fell.func(env, **fell.params))
-    return {f"env/{name}": np.concatenate(values) for name, values in rows.items()} | weights(env)
+    return {f"env/{name}": np.concatenate(values) for name, values in rows.items()}
 
 
 def noiseless(env: ManagerBasedRlEnv, group: str) -> torch.Tensor:
-    """A group of observations without noise."""
+    """An observation group without noise."""
     manager = env.observation_manager
     terms = zip(manager.active_terms[group], manager._group_obs_term_cfgs[group], strict=True)
     return torch.cat([term.func(env, **term.params) for _, term in terms], dim=-1)
-
-
-def weights(env: ManagerBasedRlEnv) -> dict[str, Any]:
-    """The weights of the reward's terms."""
-    return {f"weight/{term}": env.reward_manager.get_term_cfg(term).weight for term in TERMS}
 
 
 def main(path: str) -> None:
@@ -170,6 +165,7 @@ def main(path: str) -> None:
     model = env.sim.mj_model
     versions = [f"{name} {version(name)}" for name in ("mjlab", "mujoco", "mujoco-warp", "warp-lang", "torch")]
     stored = model_arrays(model) | trajectories(model) | judged_states(env)
+    stored |= {f"weight/{term}": env.reward_manager.get_term_cfg(term).weight for term in TERMS}
     np.savez_compressed(path, script="tests/oracles/store_go1.py", task=TASK, versions=versions, **stored)
 
 

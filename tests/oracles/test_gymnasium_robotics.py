@@ -1,6 +1,7 @@
-"""Every task that names an environment of Gymnasium-Robotics, against that environment, on the C engine.
+"""Compare tasks with their environments in Gymnasium-Robotics, on the C engine.
 
-A task names it in its attribute ``gymnasium``. A new one needs nothing here; entries in SPECIAL reach its bonuses.
+A task names its environment in the attribute ``gymnasium``. For a new task, add states to SPECIAL that reach its
+bonuses.
 """
 
 import dataclasses
@@ -51,7 +52,7 @@ def geoms(pair: mujoco.MjsPair) -> set[str]:
 
 @functools.cache
 def oracle_class(name: str) -> type[MujocoEnv]:
-    """Their environment, on their model with the task's changes, and without pairs that it lists a second time."""
+    """Their environment with the task's changes of the model, and without duplicate contact pairs."""
     registered: Any = load_env_creator(ENTRIES[name])
 
     class Oracle(registered):  # type: ignore[misc]
@@ -67,7 +68,7 @@ def oracle_class(name: str) -> type[MujocoEnv]:
 
 
 def registered(name: str) -> Any:
-    """Their environment as it is."""
+    """Their environment without changes."""
     return gymnasium.make(IDS[name], disable_env_checker=True).unwrapped
 
 
@@ -82,7 +83,7 @@ class Pair:
     def __init__(self, ours: lw.Env, theirs: Any) -> None:
         self.ours, self.theirs = ours, theirs
         self.places = {field: getattr(theirs.model, field).copy() for field in ("body_pos", "body_quat", "site_pos")}
-        """Their model before a reset draws some of it."""
+        """Fields of their model before random resets change them."""
         self.theirs.reset(seed=0)
         self.rng = np.random.default_rng(0)
         self.goals = 0
@@ -90,13 +91,13 @@ class Pair:
         self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
 
     def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:
-        # actions become controls in float32 here and in float64 there; over many steps the difference would show
+        # actions become controls in float32 here and in float64 there, a difference that would grow over many steps
         ours = self.ours.state_space.split(self.ours.get_state())["ctrl"][0].numpy()
         np.testing.assert_allclose(ours, ctrl, atol=2e-7)
         self._simulate(ours, frames)
 
     def reset(self) -> None:
-        """Begin an episode in the random initial state of ours."""
+        """Begin an episode in a random initial state of ours."""
         self.ours.rand_reset()
         first = self.ours.obs[0].numpy().astype(np.float64)
         self.put()
@@ -104,7 +105,7 @@ class Pair:
         self.goals = 0
 
     def put(self, **values: np.ndarray) -> None:
-        """Put both into our state, some of whose fields are replaced first."""
+        """Put both into our state, after replacing some of its fields."""
         model, data = self.theirs.model, self.theirs.data
         for field, own in self.places.items():
             getattr(model, field)[:] = own
@@ -119,14 +120,14 @@ class Pair:
         for body, i in mocap_bodies(self.ours.model).items():
             self._move(body, pos[i], quat[i])
         mujoco.mj_forward(model, data)
-        # the fields that a task reads as the engine's last step left them
+        # lagged fields
         for field, part in parts.items():
             if hasattr(data, field) and not field.startswith("mocap") and np.size(getattr(data, field)) == len(part):
                 part.copy_(torch.from_numpy(np.ravel(getattr(data, field)).astype(np.float64)))
         self.ours.set_state(state)
 
     def _move(self, body: str, pos: np.ndarray, quat: np.ndarray) -> None:
-        """Place a body that is a mocap body in our model; in theirs it may be a fixed body, or just a site."""
+        """Place a mocap body of our model; in their model it may be a mocap body, a fixed body or a site."""
         model, data = self.theirs.model, self.theirs.data
         if (id := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)) < 0:
             model.site(body).pos[:] = pos
@@ -149,7 +150,7 @@ class Pair:
         assert relative_error(self.ours.obs[0].numpy().astype(np.float64), self.obs) <= 1e-5
         assert relative_error(self.ours.reward.item(), float(self.reward)) <= 1e-5
         assert self.ours.terminated.item() == self.terminated
-        # a task may ask for several steps at their goal
+        # a task may require several steps at the goal
         steps = self.ours.task.params.get("goal_steps")
         assert self.ours.success.item() == (self.success if steps is None else self.goals > steps)
 
@@ -158,7 +159,7 @@ class Pair:
 
 
 def mocap_bodies(model: mujoco.MjModel) -> dict[str, int]:
-    """Which mocap body each name is."""
+    """Indices of the mocap bodies by name."""
     return {model.body(i).name: int(mocap) for i, mocap in enumerate(model.body_mocapid) if mocap >= 0}
 
 
@@ -186,7 +187,7 @@ class Special:
 
 
 def pen(reward: float, angle: float, up: float) -> Special:
-    """The pen at a height above the palm, its axis at an angle to the target's; its first joint moves it down."""
+    """The pen at a height above the palm, with an angle between its axis and the target's."""
     turn = (np.pi / 2 - angle) / 2
     return Special(reward, {"OBJTx": -up}, {"target": (0.2, 0.2, 0.2, np.cos(turn), 0.0, np.sin(turn), 0.0)})
 
@@ -249,7 +250,7 @@ def pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 def test_the_registered_environment_agrees_until_contacts_differ(make_pair: MakePair, task: str) -> None:
-    """Their model as it is, until geoms touch that collide only there, or whose contact is counted twice there."""
+    """Their unchanged model, until there is a contact that only they have, or that they count twice."""
     pair = make_pair(registered(task))
     ours, theirs = pair.ours.model, pair.theirs.model
     ghosts = set(np.flatnonzero(ours.geom_contype != theirs.geom_contype))
@@ -306,7 +307,7 @@ KINDS = {
     "site": mujoco.mjtObj.mjOBJ_SITE, "tendon": mujoco.mjtObj.mjOBJ_TENDON,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR, "sensor": mujoco.mjtObj.mjOBJ_SENSOR, "dof": None, "wrap": None,
 }  # fmt: skip
-"""The kinds of elements, and how their names are found."""
+"""The kinds of elements, with the types for looking up their names."""
 
 
 def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, str]]:
@@ -323,7 +324,7 @@ def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, 
 
 
 def test_model_is_theirs_except_for_edits(shared_env: SharedEnv, task: str) -> None:
-    """Only what a reset moves may differ, and pairs that they list twice. Sensors count sites in another order."""
+    """The models may differ only in bodies that a reset moves, duplicate pairs, and the order of sensor sites."""
     ours, theirs = shared_env(task, autoreset=False, horizon=0, nthread=1).model, registered(task).model
     moved = mocap_bodies(ours)
     others = {(field, name) for field, name in differences(ours, theirs) if name not in moved}
@@ -342,7 +343,7 @@ def test_model_is_theirs_except_for_edits(shared_env: SharedEnv, task: str) -> N
 
 
 def test_fixed_resets_put_everything_where_the_model_does(make_pair: MakePair, task: str) -> None:
-    """Their model before any reset has the same places."""
+    """Positions equal those of their model before any reset."""
     pair = make_pair(registered(task))
     pair.ours.reset()
     pair.put()
@@ -354,7 +355,7 @@ def test_fixed_resets_put_everything_where_the_model_does(make_pair: MakePair, t
 
 @pytest.mark.usefixtures("freed")
 def test_random_resets_are_distributed_as_theirs(task: str) -> None:
-    """Each number of the first observations by a Kolmogorov-Smirnov test, and the correlations between them."""
+    """Compare each number of the first observations by a Kolmogorov-Smirnov test, and their correlations."""
     n, m = 400, 1000
     env, original = lw.make(task, engine="mujoco", nworld=m, nthread=1), registered(task)
     ours = env.obs.numpy().astype(np.float64)

@@ -1,7 +1,7 @@
-"""go1_velocity against mjlab's Mjlab-Velocity-Flat-Unitree-Go1: its model, observations, rewards and terminations.
+"""Compare go1_velocity with mjlab's Mjlab-Velocity-Flat-Unitree-Go1: model, observations, rewards and terminations.
 
-The numbers are mjlab's own, computed by its environment and stored by store_go1.py; the tests need no mjlab. All states
-are those that mjlab had after its forward pass, so that its poses and contacts were current, too.
+store_go1.py stored the numbers of mjlab's environment, so the tests do not need mjlab. They were stored after a forward
+pass, so mjlab's poses and contacts are current.
 """
 
 from pathlib import Path
@@ -81,7 +81,7 @@ def stored(name: str) -> torch.Tensor:
 
 
 def mjlabs_states(env: lw.Env, *, heading: bool) -> torch.Tensor:
-    """The stored states, with commands as mjlab shows them, or with the headings that they follow."""
+    """The stored states, with the final commands, or with ``heading`` with headings from which the commands follow."""
     state = env.get_state()
     parts = env.state_space.split(state)
     parts["qpos"].copy_(stored("qpos"))
@@ -116,11 +116,11 @@ def test_stored_states_hold_every_kind_of_command_and_contact() -> None:
 
 @pytest.mark.parametrize("term", TERMS)
 def test_terms_of_the_reward_equal_mjlabs(env: lw.Env, term: str) -> None:
-    """Each term alone, with mjlab's weight, by leaving out the others'."""
+    """Each term separately, with mjlab's weight and all other weights zero."""
     after = mjlabs_states(env, heading=False)
     before = after.clone()
     env.state_space.split(before)["memory"][:, LAST_ACTION] = stored("previous_action")
-    if term == "soft_landing":  # mjlab's forces are current there, ours come a substep after the contact
+    if term == "soft_landing":  # mjlab's forces are current, ours are one substep late
         times = env.state_space.split(after)["memory"][:, CONTACT_TIME]
         times += 0.005 * (times > 0)
     weight = float(STORED[f"weight/{term}"])

@@ -1,4 +1,4 @@
-"""An update of PPO, against rsl_rl's from equal weights and samples."""
+"""Compare an update of PPO with rsl_rl's update, from equal weights and samples."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -19,14 +19,14 @@ STEPS, N = 12, 8
 
 @pytest.fixture(autouse=True)
 def double() -> Iterator[None]:
-    """Adam in float32 would turn the rounding of tiny gradients into whole steps."""
+    """Use float64: in float32, Adam amplifies rounding errors of tiny gradients to full steps."""
     torch.set_default_dtype(torch.float64)
     yield
     torch.set_default_dtype(torch.float32)
 
 
 def samples(ppo: lw.PPO) -> dict[str, torch.Tensor]:
-    """Samples near the policy and the value function, so that some ratios and values are clipped and some are not."""
+    """Samples near the policy and the value function, so that some ratios and values are clipped."""
     env, generator = ppo.env, torch.Generator().manual_seed(1)
 
     def drawn(*shape: int) -> torch.Tensor:
@@ -75,7 +75,7 @@ def test_an_update_gives_rsl_rls_parameters(
         torch.nn.init.xavier_uniform_(module.network[-1].weight, generator=torch.Generator().manual_seed(0))
     given = samples(ppo)
     other = theirs(ppo, given)
-    used = config.minibatches * ppo.minibatches.batch  # rsl_rl shuffles these alone
+    used = config.minibatches * ppo.minibatches.batch  # rsl_rl shuffles only these
     order = torch.randperm(used, generator=torch.Generator().manual_seed(0))
     order = torch.cat([order, torch.arange(used, STEPS * N)])
     monkeypatch.setattr(torch, "randperm", lambda count, **_: order[:count])

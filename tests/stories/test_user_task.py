@@ -273,24 +273,6 @@ def test_acceleration_sensors_belong_to_the_last_substep(module: ModuleType, eng
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_named_elements_are_views_of_their_fields(module: ModuleType, engine: str) -> None:
-    env = lw.make("follow_target", engine=engine, nworld=2, fields=["geom_xpos"])
-    random_steps(env, 3)
-    for name, element, where in [
-        ("qpos", "elbow", np.s_[:, 1:2]), ("qvel", "shoulder", np.s_[:, 0:1]), ("site_xpos", "tip", np.s_[:, 0]),
-        ("xpos", "lower", np.s_[:, 3]), ("sensordata", "tip_position", np.s_[:, 3:6]),
-        ("mocap_pos", "target", np.s_[:, 0]), ("geom_xpos", None, np.s_[:]), ("ctrl", "elbow", np.s_[:, 1:2]),
-    ]:  # fmt: skip
-        view = env.field(name, element)
-        torch.testing.assert_close(view, env.field(name)[where], rtol=0, atol=0)
-        assert view.data_ptr() == env.field(name)[where].data_ptr(), f"{name} is not a view"
-    for element, place in (("tip", 0), ("lower", 3), ("target", 0), ("elbow", 1), ("velocity", 6)):
-        assert env.task.params[element] == place
-    with pytest.raises(ValueError, match="no site 'hand'; it has: tip"):
-        env.field("site_xpos", "hand")
-
-
-@pytest.mark.parametrize("engine", ENGINES)
 def test_a_further_field_of_the_acceleration_stage_joins_the_state(module: ModuleType, engine: str) -> None:
     plain, env = (lw.make("follow_target", engine=engine, nworld=2, fields=fields) for fields in ((), ["qacc"]))
     assert env.state_space.size == plain.state_space.size + 2
@@ -380,26 +362,3 @@ def test_a_state_beyond_the_limit_is_terminated(module: ModuleType) -> None:
     assert not env.done.any()
     env.step()
     assert env.done_reason.tolist() == [int(lw.Done.TERMINATED), 0]
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_another_model_frame_skip_and_cone_take_effect(
-    module: ModuleType, path: Path, engine: str, tmp_path: Path
-) -> None:
-    xml = tmp_path / "light.xml"
-    xml.write_text(module.XML.replace('size=".03"', 'size=".02"'))
-    env = lw.make("follow_target", engine=engine, model=xml, frame_skip=3, cone="elliptic")
-    assert env.model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
-    assert (env.model.geom_size[:, 0] == 0.02).sum() == 3
-    assert env.timestep == pytest.approx(0.015) == env.task.params["dt"]
-    env.step()
-    assert env.time.item() == pytest.approx(0.015)
-    torch.testing.assert_close(env.get_obs(env.get_state()), env.obs, rtol=0, atol=0)  # also in scratch worlds
-
-
-def test_the_task_is_found_by_name_by_path_and_as_a_class(module: ModuleType, path: Path) -> None:
-    assert "follow_target" in lw.task_names()
-    assert lw.make("follow_target").task.task.__name__ == "FollowTarget"
-    assert lw.make(module.ScaledActions).task.name == "scaled_actions"
-    # the file is imported already, and registers its task again
-    assert lw.make(f"{path}:FollowTarget").task.name == "follow_target"

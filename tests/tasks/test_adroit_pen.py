@@ -7,7 +7,7 @@ import lyceum_warp as lw
 
 
 def formula(obs: np.ndarray, near: float, goal: float, reach: np.ndarray | float, drop: float) -> np.ndarray:
-    """The reward as a formula of the observation."""
+    """The reward, computed from the observation."""
     distance = np.linalg.norm(obs[:, 39:42], axis=1)
     similarity = (obs[:, 33:36] * obs[:, 36:39]).sum(axis=1)
     reward = similarity - distance
@@ -16,7 +16,7 @@ def formula(obs: np.ndarray, near: float, goal: float, reach: np.ndarray | float
 
 
 def test_every_threshold_takes_effect() -> None:
-    """One of the thresholds has another value in each world."""
+    """``goal_distance`` differs between worlds."""
     n = 400
     rng = np.random.default_rng(0)
     reach = rng.uniform(0.02, 0.2, n)
@@ -30,7 +30,7 @@ def test_every_threshold_takes_effect() -> None:
     parts["qpos"][:, 27:] = torch.from_numpy(rng.uniform(-1.5, 1.5, (n, 3)))
     env.set_state(state)
     assert not env.reward.any()
-    # set_state restores the fields that mj_step left, so only a step shows the new positions
+    # set_state restores the lagged fields, so the new positions show only after a step
     counts, terms = np.zeros(n), set()
     for _ in range(6):
         env.step(torch.zeros(n, 24))
@@ -47,7 +47,7 @@ def test_every_threshold_takes_effect() -> None:
 
 
 def test_success_needs_more_than_20_steps_at_the_goal() -> None:
-    """A reset clears the count, and a state holds it."""
+    """A reset clears the count, and the state includes it."""
     env = lw.make("adroit_pen", engine="mujoco", nworld=3, horizon=0, goal_similarity=-2.0, goal_distance=10.0)
     still = torch.zeros(3, 24)
     for i in range(25):
@@ -76,7 +76,7 @@ def test_a_smaller_target_range_gives_smaller_angles() -> None:
 
 
 def test_the_target_has_no_contacts() -> None:
-    """A pen inside the target moves as without it."""
+    """A pen inside the target moves as if the target were far away."""
     env = lw.make("adroit_pen", engine="mujoco", nworld=2, nthread=1)
     state = env.get_state()
     parts = env.state_space.split(state)

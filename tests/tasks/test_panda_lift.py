@@ -1,4 +1,4 @@
-"""The panda_lift task: the robot, a scripted grasp, the reward's terms, resets and the rule of success."""
+"""The panda_lift task: the robot, a scripted grasp, the terms of the reward (aloha_lift's too), resets and success."""
 
 import mujoco
 import numpy as np
@@ -19,7 +19,7 @@ def cube(env: lw.Env) -> np.ndarray:
 
 
 def put_cube(env: lw.Env, height: float) -> None:
-    """Hang the cube in the air, beside the hand, in every world."""
+    """Put the cube into the air, beside the hand, in every world."""
     state = env.get_state()
     env.state_space.split(state)["qpos"][:, 9:] = torch.tensor([0.3, 0.5, height, 1.0, 0.0, 0.0, 0.0])
     env.set_state(state)
@@ -46,7 +46,7 @@ def test_only_simple_shapes_collide(shared_env: SharedEnv) -> None:
 
 
 def test_arm_without_commands_stands_still(shared_env: SharedEnv) -> None:
-    """Gravity does not act on it; an action of 1 moves a target by 1 rad/s."""
+    """Gravity is compensated; an action of 1 moves a servo target by 1 rad/s."""
     env = shared_env("panda_lift", nworld=2, autoreset=False)
     before = positions(env)[0][:, :9]
     for _ in range(50):
@@ -80,21 +80,26 @@ def test_a_scripted_grasp_lifts_the_cube_in_every_world(shared_env: SharedEnv) -
     assert (env.reward > 6.0).all() and not any(env.fault_counts.values())
 
 
-def test_reward_weighs_terms_between_0_and_1(shared_env: SharedEnv) -> None:
-    env = shared_env("panda_lift", nworld=32)
+@pytest.mark.parametrize(
+    ("task", "effort", "height", "rest"), [("panda_lift", 0.01, 11, 0.02), ("aloha_lift", 0.005, 18, 0.0658)]
+)
+def test_reward_weighs_terms_between_0_and_1(
+    shared_env: SharedEnv, task: str, effort: float, height: int, rest: float
+) -> None:
+    env = shared_env(task, nworld=16)
     rng = np.random.default_rng(0)
-    for _ in range(20):
-        action = torch.from_numpy(rng.uniform(-1.0, 1.0, (32, 8)).astype(np.float32))
+    for _ in range(10):
+        action = torch.from_numpy(rng.uniform(-1.0, 1.0, env.action.shape).astype(np.float32))
         env.step(action)
         terms = torch.stack([env.metrics[name] for name in ("reach", "orient", "grasp", "lift")], dim=1)
         assert (terms >= 0.0).all() and (terms <= 1.0 + 1e-6).all()
-        expected = terms @ torch.tensor([1.0, 0.5, 1.0, 4.0]) - 0.01 * (action**2).sum(dim=1)
+        expected = terms @ torch.tensor([1.0, 0.5, 1.0, 4.0]) - effort * (action**2).sum(dim=1)
         torch.testing.assert_close(env.reward, expected)
-        np.testing.assert_allclose(env.eval, cube(env)[:, 2] - 0.02, atol=1e-6)
+        np.testing.assert_allclose(env.eval, positions(env)[0][:, height] - rest, atol=1e-6)
 
 
 def test_success_needs_ten_steps_in_a_row_above_the_goal() -> None:
-    """A cube that falls from 0.5 m is up for 7 steps, one that falls from 1.6 m for 13; a state holds the count."""
+    """A cube that falls from 0.5 m is above the goal for 7 steps, from 1.6 m for 13. The state includes the count."""
     env = lw.make("panda_lift", engine="mujoco", nworld=1, autoreset=False, horizon=0)
     for height, steps in ((0.5, 0), (1.6, 4)):
         env.rand_reset(0)

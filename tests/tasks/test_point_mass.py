@@ -40,8 +40,8 @@ def test_reward_evaluation_observation_and_success_equal_lyceums_formulas(shared
     assert 10 < env.success.sum() < NWORLD - 10
 
 
-def test_a_push_accelerates_the_agent_alone(shared_env: SharedEnv) -> None:
-    """A push of 1 accelerates by gear over mass and armature; the target stays where it is."""
+def test_a_push_accelerates_only_the_agent(shared_env: SharedEnv) -> None:
+    """The acceleration is gear / (mass + armature); the target does not move."""
     env = shared_env("point_mass", nworld=2, autoreset=False)
     env.reset()
     assert env.model.opt.timestep == env.timestep == 0.02

@@ -1,4 +1,4 @@
-"""The soft_ball task: a ball that is squeezed and lifted, what the policy sees of it, and how episodes go."""
+"""The soft_ball task: squeezing and lifting the ball, observations, rewards, resets and the end of episodes."""
 
 import mujoco
 import numpy as np
@@ -33,7 +33,7 @@ def hold(env: lw.Env, steps: int, *action: float) -> None:
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_a_gripped_ball_is_squeezed_and_lifted_to_the_target(shared_env: SharedEnv, engine: str) -> None:
-    """It gives way to the fingers by millimetres, and bulges upwards."""
+    """The fingers compress the ball by millimetres, and it bulges upwards."""
     env = shared_env("soft_ball", engine=engine, nworld=1, autoreset=False)
     env.reset()
     hold(env, 20, 0.0, LOW, OPEN)
@@ -73,7 +73,7 @@ def test_observation_and_reward_follow_the_balls_vertices(shared_env: SharedEnv)
 
 @pytest.mark.parametrize("axis", range(3))
 def test_a_crushed_or_lost_ball_ends_the_episode(shared_env: SharedEnv, axis: int) -> None:
-    """The corners of the ball's box hold it; the ball is scaled to 80 and 60 % along an axis, and moved."""
+    """The ball is scaled to 80 % and 60 % of its width along an axis, and moved by 0.3 and 0.45 m."""
     env = shared_env("soft_ball", nworld=4, autoreset=False)
     env.reset()
     corners = np.array([env.model.body(f"ball_{i // 4}_{i // 2 % 2}_{i % 2}").pos for i in range(8)])
@@ -100,7 +100,7 @@ def test_random_resets_place_ball_and_target(shared_env: SharedEnv) -> None:
 
 
 def test_sizes_for_a_flex_hold_bursts_of_contacts(shared_env: SharedEnv) -> None:
-    """Random steps press the fingers into the ball, with more constraints than twice the probe's peak."""
+    """Pressing the fingers into the ball needs more constraints than twice the probe's peak."""
     model = shared_env("soft_ball").model
     assert probe_sizes(model) >= (256, 512)
     env = shared_env("soft_ball", engine="warp", nworld=4, autoreset=False)
@@ -108,16 +108,3 @@ def test_sizes_for_a_flex_hold_bursts_of_contacts(shared_env: SharedEnv) -> None
     hold(env, 10, 0.0, 1.0, CLOSED)
     hold(env, 25, 0.0, LOW, CLOSED)
     assert not any(env.fault_counts.values())
-
-
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_npg_trains_on_the_engine(shared_env: SharedEnv, engine: str) -> None:
-    """Two iterations change the policy, and every number stays finite; bench/README.md has learning curves."""
-    env = shared_env("soft_ball", engine=engine, nworld=4, frame_skip=1)
-    npg = lw.NPG(env, config=lw.NPGConfig(samples=64, mean_every=0, hidden=(8,)))
-    before = torch.cat([p.flatten() for p in npg.policy.parameters()]).clone()
-    for _ in range(2):
-        next(npg)
-    after = torch.cat([p.flatten() for p in npg.policy.parameters()])
-    assert torch.isfinite(after).all()
-    assert not torch.equal(before, after) and not any(env.fault_counts.values())

@@ -157,7 +157,7 @@ def dm_control_env(task: str, seed: int) -> Any:
             return 0.0 if ends and not self.env.is_healthy else None
 
     class FromStep(FromGymnasium):
-        """The same for a task that judges the new state alone: by Gymnasium's step, without its physics."""
+        """The same for a task that judges only the new state: by Gymnasium's step, without its physics."""
 
         def __init__(self, env: Any, physics: Any) -> None:
             super().__init__(env, physics)

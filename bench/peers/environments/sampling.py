@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 KEPT_ACTIONS = 4096
-"""Actions of all environments that are drawn before the clock starts; at least those of 16 steps."""
+"""Actions of all environments that are drawn before the clock starts, enough for at least 16 steps."""
 
 ENVPOOL = {
     "hopper": "Hopper-v5",

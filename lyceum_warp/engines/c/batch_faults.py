@@ -14,8 +14,8 @@ _COUNTED_AS = mujoco.mjtWarning.mjWARN_INERTIA.value
 class ErrorsAsWarnings:
     """Context that counts errors of single worlds as warnings, which ``find_faults`` reads, instead of raising them.
 
-    MuJoCo leaves a world with an error in its state before the call, and finishes the others. Every step enters the
-    same instance; a class takes a quarter of the time of a generator.
+    After an error MuJoCo restores the state that the world had before the call, and finishes the other worlds. Every
+    step enters the same instance; a class takes a quarter of the time of a generator.
 
     Args:
         batch: The worlds.

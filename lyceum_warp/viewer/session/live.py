@@ -66,7 +66,7 @@ class Past:
         self.oldest = max(self.oldest, self.now - self.length + 1)
 
     def drop_ahead(self) -> None:
-        """Forget the steps that were taken back."""
+        """Forget the steps that were taken back, so that they cannot be restored."""
         self.newest = self.now
 
 
@@ -329,7 +329,7 @@ class Live:
         """Start copying the rows of a frame to the host, unless a copy is already in progress.
 
         Args:
-            worlds: Further worlds.
+            worlds: Worlds to copy beside the shown one.
             burst: Number of earlier states of the shown world.
         """
         if self._reading is not None:

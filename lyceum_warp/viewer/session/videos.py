@@ -18,7 +18,7 @@ from lyceum_warp.viz.video import Recorder
 FPS = 30
 _MOST_WAITING = 4 * FPS  # poses that wait for the drawing process, which starts slowly
 _PATIENCE = 120.0  # seconds to finish drawing when the viewer ends; a signal ends the wait
-_GRACE = 5.0  # further seconds to complete the files with what is drawn
+_GRACE = 5.0  # further seconds to complete the files with the frames drawn so far
 
 
 class VideoTaker:
@@ -105,7 +105,7 @@ class VideoTaker:
 
     @contextlib.contextmanager
     def finishing(self, show: Callable[[str], object]) -> Iterator[None]:
-        """Finish all videos at the end of a ``with`` block; after an exception, such as Ctrl-C, with what is drawn.
+        """Finish all videos at the end of a ``with`` block; after an exception, such as Ctrl-C, with the frames drawn.
 
         Args:
             show: Called with a line about each.
@@ -120,7 +120,7 @@ class VideoTaker:
     def finish(self, show: Callable[[str], object], *, seconds: float = _PATIENCE) -> None:
         """Wait until all videos are complete.
 
-        After ``seconds``, a video ends with what is drawn; if it is not complete a few seconds later, it is discarded.
+        After ``seconds``, a video ends with the frames drawn; if it is incomplete a few seconds later, it is discarded.
         An exception during the wait, such as a second Ctrl-C, discards all of them.
 
         Args:

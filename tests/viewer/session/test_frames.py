@@ -12,26 +12,6 @@ from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.session.clock import Session
 
 
-def test_rows_that_come_later_are_shown_a_frame_later(shared_env: SharedEnv) -> None:
-    """As on a GPU."""
-    env = shared_env("hopper", nworld=4)
-    session = Session(env, controllers={"policy": pushing}, seed=0)
-    session.stage.live.asynchronous = True
-    points, rewards = [session.stage.frame().samples], []
-    for _ in range(6):
-        at_last_frame = env.get_state()[0]
-        for _ in range(5):
-            session.stage.advance()
-            rewards.append(env.reward[0].item())
-        frame = session.stage.frame()
-        np.testing.assert_array_equal(frame.state, at_last_frame[: len(frame.state)].numpy())
-        points.append(frame.samples)
-    session.obey(protocol.SetPaused(True))
-    frame = session.stage.frame()  # while paused, of now
-    np.testing.assert_array_equal(frame.state, env.get_state()[0, : len(frame.state)].numpy())
-    np.testing.assert_array_equal(np.concatenate([*points, frame.samples])[:, 1], rewards)
-
-
 def test_other_worlds_and_the_past_are_shown_as_ghosts(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=4)
     session = Session(env, paused=True, seed=0)

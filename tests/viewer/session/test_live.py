@@ -10,7 +10,7 @@ import lyceum_warp as lw
 from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import StepBy
 from lyceum_warp.viewer.session.clock import Session
-from lyceum_warp.viewer.session.live import HISTORY_BYTES, PLANT_HISTORY_BYTES, Live
+from lyceum_warp.viewer.session.live import HISTORY_BYTES, PLANT_HISTORY_BYTES
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
@@ -54,18 +54,6 @@ def test_the_history_is_bounded_and_a_message_says_where_it_ends(shared_env: Sha
     worlds = shared_env("point_mass", nworld=3)
     plant = Session(worlds, controllers={"own": towards}).stage.live
     assert plant.env is not worlds and plant.past.states.nbytes <= PLANT_HISTORY_BYTES
-
-
-def test_a_history_without_memory_for_two_states_stays_empty(shared_env: SharedEnv) -> None:
-    env = shared_env("hopper", nworld=2)
-    live = Live(env, limit=1000)
-    for _ in range(3):
-        live.step(lambda: None)
-    after = env.get_state()
-    assert live.past.length == 0 and live.back(2) == 0 and torch.equal(env.get_state(), after)
-    live.request(burst=4)
-    rows = live.take()
-    assert rows is not None and len(rows.back) == 0 and len(rows.points) == 3
 
 
 def test_the_return_ends_with_the_episode_without_autoreset() -> None:

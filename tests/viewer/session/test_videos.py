@@ -7,7 +7,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 from conftest import SharedEnv
@@ -108,15 +107,3 @@ def test_a_second_signal_discards_the_videos(
             taker.finish(print, seconds=60.0)
     assert 0 < time.monotonic() - begin < 6
     assert not list(tmp_path.iterdir())
-
-
-def test_a_video_that_cannot_be_drawn_is_reported_once(tmp_path: Path) -> None:
-    pytest.importorskip("imageio_ffmpeg")
-    (tmp_path / "file").write_text("")
-    taker = VideoTaker(mujoco.MjModel.from_xml_string("<mujoco/>"), "none", tmp_path / "file")
-    lines: list[str] = []
-    for _ in range(2):
-        taker.begin(None)
-        taker.finish(lines.append)
-        taker.cancel()
-    assert len(lines) == 2 and all(line.startswith("no video: ") for line in lines)

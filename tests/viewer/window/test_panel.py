@@ -7,8 +7,7 @@ from headless_screen import Bench, frame_of, pose_of, robot, scene_of, status_of
 
 from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import Ghost, Opened, SetVideo
-from lyceum_warp.viewer.window import studio
-from lyceum_warp.viewer.window.actions import Key, key_table
+from lyceum_warp.viewer.window.actions import key_table
 from lyceum_warp.viewer.window.windows import WINDOWS
 
 KEYS = {key.name: key for key in key_table()}
@@ -117,13 +116,6 @@ def test_every_key_acts_in_every_mode(bench: Bench, mode: str) -> None:
         bench.draw()
 
 
-def test_keys_are_unique_and_known_to_studio() -> None:
-    chords = [(int(key.code), key.ctrl, key.shift) for key in KEYS.values()]
-    assert len(set(chords)) == len(chords)
-    key = Key("Ctrl+Shift+A", "", lambda actions: None)
-    assert (key.code, key.ctrl, key.shift) == (studio.imgui.Key.A, True, True)
-
-
 # cameras and videos
 
 
@@ -156,10 +148,3 @@ def test_world_of_another_size_gets_a_model_of_its_own(bench: Bench, monkeypatch
     bench.draw(frame_of(bench.model, bench.data, model_fields={"geom_size": sizes}))
     bench.draw(frame_of(bench.model, bench.data))
     assert [model.geom("ball").size[0] for model in bench.models] == pytest.approx([0.3, 0.1])
-
-
-def test_world_of_another_mass_keeps_the_picture(bench: Bench) -> None:
-    masses = np.array(bench.model.body_mass) * 2
-    bench.draw(frame_of(bench.model, bench.data, model_fields={"body_mass": masses}))
-    assert bench.models == []
-    np.testing.assert_array_equal(bench.viewer.model.body_mass, masses)

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from headless_screen import robot
 
-from lyceum_warp.viewer.protocol import BEST_COLOUR, Ghost, Pose
+from lyceum_warp.viewer.protocol import Ghost, Pose
 from lyceum_warp.viewer.window.scene import ExtraGeoms, ModelValues
 
 MODEL = robot()
@@ -33,27 +33,10 @@ def test_hidden_groups_have_no_ghosts() -> None:
     assert ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(2.0)], groups=groups).geoms == []
 
 
-def test_the_last_ghosts_are_dropped() -> None:
-    drawn = ExtraGeoms(MODEL, 5).draw(pose(0), [ghost(1.0), ghost(-2.0), ghost(9.0)])
-    assert drawn.ghosts == 2
-    np.testing.assert_allclose([geom.pos[0] for geom in drawn.geoms], [1.0, -2.0])
-
-
 def test_a_ghost_leaves_out_geoms_that_coincide_with_the_worlds() -> None:
     drawn = ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(0.0), ghost(0.5)])
     assert drawn.ghosts == 2
     np.testing.assert_allclose([geom.pos[0] for geom in drawn.geoms], [0.5])
-
-
-def test_traces_are_lines_between_their_points() -> None:
-    traces = np.zeros((2, 4, 3))
-    traces[..., 0] = np.arange(4)
-    drawn = ExtraGeoms(MODEL, 100).draw(pose(0), traces=traces, best=1)
-    assert drawn.traces == 2
-    assert len(drawn.geoms) == 6
-    assert all(geom.type == int(mujoco.mjtGeom.mjGEOM_LINE) for geom in drawn.geoms)
-    np.testing.assert_allclose(drawn.geoms[0].rgba, BEST_COLOUR)
-    np.testing.assert_allclose([geom.size[2] for geom in drawn.geoms], 1.0)
 
 
 @pytest.mark.parametrize(("limit", "number"), [(1024, 10), (100, 10), (10, 10), (1024, 100), (3, 7), (1, 7)])
@@ -65,11 +48,6 @@ def test_traces_get_fewer_points_before_some_are_dropped(limit: int, number: int
     assert len(drawn.geoms) <= min(limit, 160)  # most geoms are left to ghosts
     assert (drawn.traces == number) == (limit >= 100 and number == 10)
     assert len(scene.draw(pose(0), [ghost(i) for i in range(20)], traces, best).geoms) <= limit
-
-
-@pytest.mark.parametrize("traces", [np.zeros((0, 5, 3)), np.zeros((3, 1, 3)), None])
-def test_traces_without_lines_draw_nothing(traces: np.ndarray | None) -> None:
-    assert ExtraGeoms(MODEL, 10).draw(pose(0), traces=traces).geoms == []
 
 
 # the model of the world that is shown

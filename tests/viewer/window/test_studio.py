@@ -27,11 +27,6 @@ def used_names(path: Path) -> set[str]:
     return found
 
 
-def test_only_one_file_imports_studio() -> None:
-    importing = [path.name for path in ROOT.rglob("*.py") if "mujoco.studio import" in path.read_text()]
-    assert importing == ["studio.py"]
-
-
 @pytest.mark.parametrize("name", sorted(set().union(*map(used_names, (ROOT / "viewer" / "window").glob("*.py")))))
 def test_studio_has_every_name_that_the_window_uses(name: str) -> None:
     module, *attributes = name.split(".")

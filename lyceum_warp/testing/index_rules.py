@@ -1,4 +1,4 @@
-"""The rule about indices."""
+"""Check that no function of a task uses an index out of range."""
 
 from typing import Any
 
@@ -15,10 +15,10 @@ from lyceum_warp.testing.context import Context
 from lyceum_warp.worlds import Worlds
 
 _RESET = ("startup", "initialize", "randomize")
-"""The functions that a reset runs, in order, on the engine's initial state."""
+"""The functions that a reset runs on the engine's initial state, in order."""
 
 _FEW = 20
-"""Steps on an engine whose steps take long, MuJoCo Warp's on a CPU."""
+"""Steps on an engine with slow steps, MuJoCo Warp on a CPU."""
 
 _MOST_LISTED = 8
 """Problems that the message of a failure lists."""
@@ -27,8 +27,8 @@ _MOST_LISTED = 8
 def check_bounds(ctx: Context) -> None:
     """No function of the task reads or writes a row, a vector or a matrix out of range.
 
-    An index that is negative counts as out of range too, because Warp takes it from the other end, unless it is written
-    as a constant such as ``-1``. Copies of the functions with checks run on the states of random steps.
+    A negative index, which Warp counts from the end, is out of range, too, unless it is a constant such as ``-1``.
+    Copies of the functions with checks run on the states of random steps.
     """
     run = _Run(ctx)
     with ctx.changed(ctx.a, autoreset=False):
@@ -39,17 +39,16 @@ def check_bounds(ctx: Context) -> None:
 
 
 class _Run:
-    """The checked functions of a task, the arrays that they get, and the states to run them on."""
+    """Runs the checked functions of a task on the states of random steps."""
 
     def __init__(self, ctx: Context) -> None:
         self.ctx, self.env, self.worlds = ctx, ctx.a, ctx.a.worlds
         task = self.env.task
         self.functions = {name: function for name, function in task.functions.items() if function is not None}
         self.functions |= {observer_name(group): function for group, function in task.observers.items()}
-        name = f"{task.task.__module__}.{task.task.__qualname__}"
         try:
             self.checked: CheckedFunctions = checked_functions(
-                name, self.functions, task.source.world, task.kernels.Batch, self.env.device
+                task.source.path, self.functions, task.source.world, task.kernels.Batch, self.env.device
             )
         except Unchecked as error:
             ctx.fail(f"the functions could not be checked: {error}")
@@ -57,10 +56,8 @@ class _Run:
         self.keep: list[wp.array] = []
         self.before, self.after, self.start = (self._batch() for _ in range(3))
         self.rng = np.random.default_rng(ctx.seed)
-        n = self.env.nworld
-        sizes = {
-            "action": self.worlds.action_space.size, "ctrl": task.model.nu, "metrics": len(task.task.metrics),
-        }  # fmt: skip
+        n, nact, nmetrics = self.env.nworld, self.worlds.action_space.size, len(task.task.metrics)
+        sizes = {"action": nact, "ctrl": task.model.nu, "metrics": nmetrics}
         self.rows = {name: self._array((n, size), wp.float32) for name, size in sizes.items()}
         self.obs = {
             observer_name(group): self._array((n, space.size), wp.float32)
@@ -69,11 +66,11 @@ class _Run:
         self.rows["rng"] = self._array((n, 1), wp.uint32)
 
     def steps(self) -> None:
-        """Run the functions on the states of random steps, and of resets between them."""
+        """Run the functions on the states of random steps and of resets between them."""
         env = self.env
         self._keep_start()
         self.ctx.restart()
-        # the functions are the same on every engine: where one is slow, a few steps will do
+        # the functions are the same on every engine: a few steps suffice on a slow one
         slow = env.engine.capturable and env.device.is_cpu
         for i, action in enumerate(self.ctx.actions(min(self.ctx.steps, _FEW) if slow else self.ctx.steps)):
             ended = env.done.clone()
@@ -91,9 +88,9 @@ class _Run:
             self._run_step(self.worlds)
 
     def _run_before_restart(self, state: torch.Tensor, action: torch.Tensor) -> None:
-        """Run the functions of a step on the state that a fault ended, which the step has replaced by a new one.
+        """Run the functions of a step on the state in which a fault ended the episode; ``env`` has restarted since.
 
-        What lies beyond an array may be not-a-number, so that the read itself is what ends the episode.
+        A read out of range may return NaN and so cause the fault.
         """
         env = self.ctx.b
         env.set_state(state)
@@ -104,14 +101,14 @@ class _Run:
         self._run_step(env.worlds)
 
     def _run_step(self, worlds: Worlds) -> None:
-        """Run the functions of a step on the transition that it made, and on the state that it led to."""
+        """Run the functions of a step on its transition and on its last state."""
         dirty = True
         for name, function in self.functions.items():
             if name in (*_RESET, "control"):
                 continue
             if dirty:
                 self._copy(worlds.after, self.after)
-            if name == "advance":  # it finds them as the step before left them
+            if name == "advance":  # it gets the memory of the previous step
                 for memory in MEMORIES:
                     if memory in self.env.task.types:
                         wp.copy(getattr(self.after, memory), getattr(self.before, memory))
@@ -127,7 +124,7 @@ class _Run:
             self._run(name, self.after)
 
     def _keep_start(self) -> None:
-        """Keep the state that a reset starts from, before the task changes it."""
+        """Keep the initial state before the task's functions change it."""
         env = self.ctx.b
         env.engine.reset(env.worlds.everyone)
         self._copy(env.worlds.after, self.start)
@@ -137,7 +134,7 @@ class _Run:
         env.reset()
 
     def _run(self, name: str, state: Any) -> None:
-        """Run the copy of a function of the task, if it has it; ``state`` is ``s`` or ``s1``."""
+        """Run the copy of a function, if the task has the function; ``state`` is ``s`` or ``s1``."""
         if name not in self.functions:
             return
         draws = self.rng.integers(0, 2**32, (self.env.nworld, 1), dtype=np.uint32)
@@ -159,7 +156,7 @@ class _Run:
         return batch
 
     def _array(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        """An array of zeros; where a row has no elements, with memory for one that a checked function may touch."""
+        """An array of zeros. A row without elements has memory for one, which a checked function may touch."""
         with wp.ScopedDevice(self.env.device):
             made: wp.array = wp.zeros([max(size, 1) for size in shape], dtype=dtype)
             self.keep.append(made)

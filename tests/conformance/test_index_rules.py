@@ -1,4 +1,4 @@
-"""The rule about indices: mistakes in a task's file that give wrong numbers silently are found and named."""
+"""The rule about indices finds mistakes in a task's file that otherwise give wrong numbers without an error."""
 
 import re
 
@@ -6,9 +6,8 @@ import pytest
 import tiny_task
 from conftest import TaskFile
 
-from lyceum_warp.testing import bounds_rules, check_task
-from lyceum_warp.testing.bounds_rules import check_bounds
-from lyceum_warp.testing.checked_functions import Unchecked
+from lyceum_warp.testing import check_task
+from lyceum_warp.testing.index_rules import check_bounds
 
 ENGINES = ["mujoco", "warp"]
 
@@ -90,14 +89,3 @@ def test_an_element_of_a_field_without_elements_is_named(task_file: TaskFile, en
     file = task_file("without.py", text)
     with pytest.raises(AssertionError, match=r"observe reads s\.ten_length\[1\] out of range .* there are no elements"):
         check_task(file, engine=engine, steps=2, checks=[check_bounds])
-
-
-def test_a_function_that_cannot_be_checked_breaks_the_rule(monkeypatch: pytest.MonkeyPatch) -> None:
-    def unchecked(*args: object) -> None:
-        raise Unchecked("observe uses last as a value (wrong.py, line 3): call it instead")
-
-    monkeypatch.setattr(bounds_rules, "checked_functions", unchecked)
-    with pytest.raises(
-        AssertionError, match="the rule 'bounds': the functions could not be checked: observe uses last"
-    ):
-        check_task("hopper", engine="mujoco", checks=[check_bounds])

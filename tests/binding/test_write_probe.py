@@ -24,7 +24,7 @@ ROWS = {
     "randomize": (11, 6, "qpos", "the model has 6"),
     "randomize of a stream": (12, 1, "rng", "a stream has 1"),
 }
-"""By the name of a function: its number in the task, the size of its row, its name and where that size comes from."""
+"""By the name of a function: its number in the task, the size and the name of its row, and the source of that size."""
 
 PROGRAM = """
 import sys

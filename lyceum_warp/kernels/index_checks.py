@@ -1,7 +1,7 @@
-"""Checks of indices, for the copies of a task's functions that ``check_task`` runs.
+"""Check array indices in the instrumented copies of a task's functions that ``check_task`` runs.
 
-``report`` is (places, 3): for each place in the source the number of times that an index was out of range, the first
-such index, and the size that it was compared with. The functions are not inlined: that would take the compiler long.
+``report`` is (places, 3). Each row belongs to one place in the source: how often its index was out of range, the first
+bad index, and the size of the array. The functions are not inlined, to keep compile times short.
 """
 
 from typing import Any
@@ -9,12 +9,12 @@ from typing import Any
 import warp as wp
 
 MOST_ROUNDS = wp.constant(1_000_000)
-"""Rounds after which a ``while`` loop is reported as endless."""
+"""Iterations after which a ``while`` loop is reported as endless."""
 
 
 @wp.func(inline=False)
 def note(report: wp.array2d[int], place: int, index: int, size: int):
-    """Keep the first index that is out of range at a place."""
+    """Count an index out of range at a place, and store the first one."""
     if wp.atomic_add(report, place, 0, 1) == 0:
         report[place, 1] = index
         report[place, 2] = size
@@ -22,7 +22,7 @@ def note(report: wp.array2d[int], place: int, index: int, size: int):
 
 @wp.func(inline=False)
 def at(report: wp.array2d[int], place: int, index: Any, size: int) -> int:
-    """An index within a size; 0 for one that is out of range, also a negative one."""
+    """Return an index from 0 to size - 1 unchanged; note any other index and return 0."""
     i = int(index)
     if i < 0 or i >= size:
         note(report, place, i, size)
@@ -32,7 +32,7 @@ def at(report: wp.array2d[int], place: int, index: Any, size: int) -> int:
 
 @wp.func(inline=False)
 def from_end(report: wp.array2d[int], place: int, index: int, size: int) -> int:
-    """The same for a negative constant, which counts from the end as in Python."""
+    """Convert a negative constant, which counts from the end as in Python, and check it."""
     if index < -size:
         note(report, place, index, size)
         return 0
@@ -41,13 +41,13 @@ def from_end(report: wp.array2d[int], place: int, index: int, size: int) -> int:
 
 @wp.func
 def element(report: wp.array2d[int], place: int, values: Any, index: Any):
-    """An element of the result of a call, which is evaluated once."""
+    """An element of a call's result. The argument evaluates the call only once."""
     return values[at(report, place, index, len(values))]
 
 
 @wp.func
 def is_endless(report: wp.array2d[int], place: int, rounds: int) -> bool:
-    """Whether a loop has run too often, here or before."""
+    """Whether this loop, in this run or an earlier one, has exceeded ``MOST_ROUNDS``."""
     if rounds > MOST_ROUNDS:
         note(report, place, rounds, 0)
     return report[place, 0] > 0

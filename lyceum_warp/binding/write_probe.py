@@ -1,34 +1,28 @@
-"""Run a task's functions once for one world, on rows of exact size in memory of their own, to find faulty writes."""
+"""Run a task's functions once in one world, on rows with guard memory around them, to find faulty writes."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.kernels import steps
 from lyceum_warp.support.arrays import launch_parts, launch_worlds
 from lyceum_warp.task import MEMORIES, observer_name
 
 _ROOM = 2**18
-"""Bytes before and after every row, in which writes out of range are found and do no damage."""
+"""Bytes of guard memory before and after every row. Writes out of range land there and do no damage."""
 
 _ALIGNED = 64
 
 _UNWRITTEN = 0x7FA5C3E1
-"""Bits of a signaling NaN. Arithmetic turns it into another NaN, so that adding to an element counts as writing it."""
+"""The sentinel, a signaling NaN. Arithmetic turns it into a quiet NaN, so that ``+=`` counts as a write."""
 
 
-class RoomyRows:
-    """Rows, (n, ...), with room around each of them.
-
-    Args:
-        shape: The shape of all rows.
-        dtype: Type of an element.
-        device: Where the rows are.
-        values: Their values, at least n rows; by default elements are unwritten.
-    """
+class GuardedRows:
+    """Rows, (n, ...), with guard memory around each. Elements are sentinels, or the first n of ``values``."""
 
     def __init__(self, shape: Sequence[int], dtype: Any, device: wp.Device, values: wp.array | None = None) -> None:
         self.size = math.prod(shape[1:])
@@ -45,7 +39,7 @@ class RoomyRows:
             wp.copy(self.array, values[: shape[0]])
 
     def outside(self) -> np.ndarray:
-        """The indices at which something was written outside of a row, in its elements, ascending."""
+        """Indices of elements outside of a row that were written, ascending; negative before its start."""
         words: np.ndarray = self._memory.numpy()
         changed = 4 * np.flatnonzero(words != _UNWRITTEN)[:, None] + np.arange(4)
         unwritten = np.array(_UNWRITTEN, dtype=np.uint32).reshape(1).view(np.uint8)
@@ -55,46 +49,28 @@ class RoomyRows:
         return np.unique(index[(index < 0) | (index >= self.size)])
 
     def written(self) -> np.ndarray:
-        """Which elements of a single row of 32-bit numbers were written."""
+        """A mask of the elements that were written, for a single row of 32-bit numbers."""
         start = _ROOM // 4
         written: np.ndarray = self._memory.numpy()[start : start + self.size] != _UNWRITTEN
         return written
 
 
 class Probe:
-    """The functions of a task in the first world of a batch, whose own arrays they only read.
+    """Runs the functions of a task in the first world of a batch, whose arrays stay unchanged.
 
     Args:
-        name: The task's name, for messages.
-        kernels: The task's kernels.
-        writes: The fields of World that each function writes, by the functions' names.
+        task: The task.
         batch: The fields of the worlds.
         params: The parameters.
-        device: Where all of them are.
-        layouts: The parts of each group of observations and their sizes.
-        nu: Number of controls.
-        naction: Size of an action.
-        metrics: Names of the metrics.
+        device: The device of the batch.
     """
 
-    def __init__(
-        self,
-        name: str,
-        kernels: Any,
-        writes: Mapping[str, frozenset[str]],
-        batch: Any,
-        params: wp.array,
-        device: wp.Device,
-        *,
-        layouts: Mapping[str, Mapping[str, int]],
-        nu: int,
-        naction: int,
-        metrics: Sequence[str],
-    ) -> None:
-        self._name, self._kernels, self._writes, self._params = name, kernels, writes, params
-        self._metrics, self._device = list(metrics), device
+    def __init__(self, task: BoundTask, batch: Any, params: wp.array, device: wp.Device) -> None:
+        self._name, self._kernels, self._writes, self._params = task.name, task.kernels, task.writes, params
+        self._metrics, self._device = list(task.task.metrics), device
+        kernels, nu = task.kernels, task.model.nu
         self._world, self._fields = kernels.Batch(), {}
-        written = frozenset[str]().union(*writes.values())
+        written = frozenset[str]().union(*task.writes.values())
         for field in kernels.Batch.vars:
             array = getattr(batch, field)
             if field in written:
@@ -102,28 +78,24 @@ class Probe:
                 array = self._fields[field].array
             setattr(self._world, field, array)
         self._observations, self._groups = kernels.Observations(), {}
-        for group, layout in layouts.items():
+        for group, layout in task.obs_layouts.items():
             self._groups[group] = self._rows((1, sum(layout.values())))
             setattr(self._observations, group, self._groups[group].array)
-        self._ctrl, self._measured = self._rows((1, nu)), self._rows((1, len(metrics)))
-        self._streams = self._rows((len(layouts), 1), wp.uint32)
+        self._ctrl, self._measured = self._rows((1, nu)), self._rows((1, len(self._metrics)))
+        self._streams = self._rows((len(task.obs_layouts), 1), wp.uint32)
         with wp.ScopedDevice(self._device):
-            self._action = wp.zeros((1, naction), dtype=float)
+            self._action = wp.zeros((1, sum((task.task.actions or {"": nu}).values())), dtype=float)
             self._yes, self._no = wp.full(1, True, dtype=bool), wp.full(1, False, dtype=bool)
             self._counters = steps.Counters()
             self._counters.step, self._counters.episode = wp.zeros(1, dtype=int), wp.zeros(1, dtype=int)
             self._counters.key = wp.zeros(1, dtype=wp.uint32)
             self._counters.rng = self._streams.array
 
-    def _rows(self, shape: Sequence[int], dtype: Any = wp.float32, values: wp.array | None = None) -> RoomyRows:
-        return RoomyRows(shape, dtype, self._device, values)
+    def _rows(self, shape: Sequence[int], dtype: Any = wp.float32, values: wp.array | None = None) -> GuardedRows:
+        return GuardedRows(shape, dtype, self._device, values)
 
     def check_bounds(self) -> None:
-        """Refuse functions that write out of range.
-
-        Raises:
-            ValueError: A function does so.
-        """
+        """Raise a ValueError if a function writes out of range."""
         kernels, s, p, action, counters = self._kernels, self._world, self._params, self._action, self._counters
         self._observe()
         self._launch(kernels.measure_worlds, s, p, action, self._measured.array)
@@ -145,11 +117,7 @@ class Probe:
             self._check_fields(function)
 
     def check_observations(self) -> None:
-        """Refuse observations that are not written as they are declared.
-
-        Raises:
-            ValueError: A function writes out of range, leaves an element unwritten, or writes not-a-number.
-        """
+        """Raise a ValueError if a function writes out of range, leaves an element unwritten, or writes NaN."""
         self._observe()
         for group, rows in self._groups.items():
             written, bad = rows.written(), np.isnan(rows.array.numpy()[0])
@@ -178,13 +146,13 @@ class Probe:
             launch_worlds(kernel, 1, args, self._device)
 
     def _check_fields(self, function: str) -> None:
-        """Look for writes of a function out of the fields that it may write, and of its random stream."""
+        """Raise a ValueError if a function wrote beyond a field or beyond its random stream."""
         for name in sorted(self._writes.get(function, ())):
             owner = "task declares" if name in MEMORIES else "model has"
             self._check(function, self._fields[name], name, f"the {owner} {self._fields[name].size}")
         self._check(function, self._streams, "rng", "a stream has 1")
 
-    def _check(self, function: str, rows: RoomyRows, target: str, declared: str) -> None:
+    def _check(self, function: str, rows: GuardedRows, target: str, declared: str) -> None:
         if not (outside := rows.outside()).size:
             return
         last = int(outside[-1]) + 1

@@ -1,0 +1,535 @@
+"""Run tasks for very long with injected faults, watch the memory, and kill and resume trainings.
+
+    lyceum-warp bench soak --threads 2
+    lyceum-warp bench soak --parts faults --device cuda --work runs/soak
+
+Part faults: worlds step under random actions, and every thousandth step of a world gets a fault. States that are
+not-a-number or too fast, and actions that are not finite, come from outside. For the others the soak writes a variant
+of the task beside a copy of its source (``VARIANT``): a further number of the action asks for a reward or an
+observation that is not-a-number, or for a negative mass. Every fault must be found in its world and in its step,
+nothing else may be found, and ``env.fault_counts`` must agree. A second environment without faults must have equal
+numbers, to the bit, in each world up to its first fault, and in every fourth world, which gets none, always.
+
+A run is divided into chunks. A chunk is one result, and ends with a file of the worlds' states in the folder
+``--work``, from which the next chunk continues, also on another machine that gets this folder.
+
+Part memory: environments are made and deleted. Part kills: trainings are killed and resumed, and must end like a
+training that nothing interrupted.
+"""
+
+import collections
+import csv
+import dataclasses
+import functools
+import gc
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import experiment
+import numpy as np
+import torch
+import warp as wp
+from experiment import Experiment, Row, Skipped, Table
+
+import lyceum_warp as lw
+from lyceum_warp.binding.functions import TaskSource
+from lyceum_warp.binding.registry import find_task
+from lyceum_warp.done import FAULTS, Done
+from lyceum_warp.support.files import replaced
+from lyceum_warp.support.validate import whole_number
+
+PARTS = ("faults", "memory", "kills")
+KINDS = {"state": Done.NAN, "speed": Done.NAN, "action": Done.ACTION, "reward": Done.REWARD,
+         "observation": Done.OBSERVATION, "model": Done.MODEL}  # fmt: skip
+"""The faults by the place where they are injected, numbered from 1, and how they must be found."""
+NBIT = len(Done)
+EVERY = 16
+"""Steps between two in which states are changed; as many times more worlds then get such a fault."""
+SAMPLES = 5
+"""Samples of the memory in a chunk."""
+TASKS = {
+    "point_mass": (1024, 10**7, 10, 4.0), "hopper": (512, 10**6, 10, 100.0), "soft_ball": (256, 10**6, 10, 100.0),
+    "panda_lift": (256, 10**6, 10, 250.0), "adroit_relocate": (256, 10**6, 10, 250.0),
+    "humanoid": (256, 10**6, 10, 300.0), "go1_velocity": (256, 10**6, 10, 300.0),
+}  # fmt: skip
+"""Worlds, steps of a chunk, chunks, and seconds for a million steps on two cores."""
+OTHERS = (256, 10**6, 1, 300.0)
+"""The same for all other tasks."""
+SHORT = (64, 20_000, 2, 0.0)
+GPU_TASKS = {"half_cheetah": (16_384, 10**8, 10, 0.5)}
+SAME_BITS = {"half_cheetah": (4096, 10**6, 10, 20.0)}
+"""The same in the deterministic mode, without which a GPU's numbers differ in the last bits from run to run."""
+TRAININGS = {
+    "hopper": "--iterations 400 --nthread 2",
+    "point_mass": "--algorithm ppo --iterations 300 --nworld 256 --nthread 2",
+}
+SHORT_TRAINING = "--algorithm ppo --iterations 60 --nworld 8 --nthread 1 --hidden 8 --save-every 5"
+
+VARIANT = """
+
+@wp.func
+def soak_control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
+    {control}
+    s.userdata[0] = action[action.shape[0] - 1]
+
+
+@wp.func
+def soak_observe(s: World, p: Params, obs: Row[float]{rng_argument}):
+    observe(s, p, obs{rng})
+    if s.userdata[0] == 5.0:
+        obs[0] = wp.nan
+
+
+@wp.func
+def soak_reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    if s1.userdata[0] == 4.0:
+        return wp.nan
+    return reward(s0, action, s1, p)
+
+
+@wp.func
+def soak_randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    randomize(s, p, rng)
+    s.body_mass[1] = s.body_mass[1] * lw.uniform(rng, 0.95, 1.05)
+
+
+@wp.func
+def soak_event(s: World, p: Params, rng: Row[wp.uint32]):
+    {event}
+    if s.userdata[0] == 6.0:
+        s.body_mass[1] = -1.0
+
+
+class Soak({parent}):
+    control, observe, reward = soak_control, soak_observe, soak_reward
+    randomize, event = soak_randomize, soak_event
+    actions, action_range = {{"action": {nact}, "fault": 1}}, None
+
+    @staticmethod
+    def edit_model(spec):
+        {parent}.edit_model(spec)
+        spec.nuserdata = 1
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(experiment.Options):
+    """Very long runs with injected faults, memory, and kills."""
+
+    parts: tuple[str, ...] = ()
+    """faults, memory, kills; by default all."""
+    engine: str = "auto"
+    """Engine of the parts faults and memory."""
+    nworld: int | None = None
+    """Worlds; by default the task's."""
+    steps: int | None = None
+    """Steps of a chunk, of all worlds together; by default the task's."""
+    kill_every: float = 40.0
+    """Seconds of training between two kills, on average."""
+    work: Path = Path("runs/soak")
+    """Folder of variants, of states between two chunks, and of trainings."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Faults:
+    """A chunk of a task's run."""
+
+    task: str
+    chunk: int
+    steps: int
+    nworld: int
+    engine: str
+    device: str
+    compared: bool
+    rate: float
+    seed: int
+    part: str = "faults"
+
+    def state(self, work: Path, chunk: int) -> Path:
+        """Return the file of the state before a chunk."""
+        run = f"{self.task}-{self.engine}-{self.device.partition(':')[0]}-{self.nworld}-{self.steps}-{self.seed}"
+        return work / f"{run}{'-same-bits' if self.compared else ''}-{chunk}.pt"
+
+
+@dataclasses.dataclass(frozen=True)
+class Memory:
+    """Environments that are made and deleted."""
+
+    task: str
+    made: int
+    nworld: int
+    engine: str
+    device: str
+    part: str = "memory"
+
+
+@dataclasses.dataclass(frozen=True)
+class Kills:
+    """A training that is killed and resumed."""
+
+    task: str
+    words: str
+    kills: int
+    kill_every: float
+    seed: int
+    part: str = "kills"
+
+
+def cases(options: Options) -> list[Any]:
+    parts, short, cuda = experiment.choose(options.parts, PARTS, what="part"), options.short, options.device != "cpu"
+    everything = TASKS | {task: OTHERS for task in lw.task_names() if task not in TASKS}
+    known = {"point_mass": SHORT} if short else GPU_TASKS if cuda else everything
+    runs = [(task, known.get(task, SHORT if short else OTHERS), not cuda)
+            for task in experiment.choose(options.tasks, lw.task_names(), tuple(known), what="task")]  # fmt: skip
+    if cuda and not short and not options.tasks:
+        runs += [(task, sizes, True) for task, sizes in SAME_BITS.items()]
+    found: list[Any] = []
+    for seed in options.seeds or (0,):
+        for task, sizes, compared in runs if "faults" in parts else ():
+            nworld = whole_number("--nworld", options.nworld or sizes[0], low=8)
+            steps = whole_number("--steps", options.steps or sizes[1], low=nworld * SAMPLES)
+            chunks = [Faults(task, chunk, steps, nworld, options.engine, options.device, compared,
+                             1e-2 if short else 1e-3, seed) for chunk in range(sizes[2])]  # fmt: skip
+            # a machine that gets another one's folder goes on from there
+            done = max((i for i in range(1, len(chunks) + 1) if chunks[0].state(options.work, i).exists()), default=1)
+            found += chunks[done - 1 :]
+        if "kills" in parts and not cuda:
+            trainings = {"point_mass": SHORT_TRAINING} if short else TRAININGS
+            kills = (1, 0.2) if short else (10, options.kill_every)
+            found += [Kills(task, words, *kills, seed) for task, words in trainings.items()]
+    if "memory" in parts:
+        found.append(Memory("hopper", 10 if short else 100, 32, options.engine, options.device))
+    return found
+
+
+def estimate(case: Any) -> float:
+    if isinstance(case, Faults):
+        table = SAME_BITS if case.compared and case.device != "cpu" else TASKS | GPU_TASKS
+        return 5.0 + table.get(case.task, OTHERS)[3] * case.steps / 1e6
+    return 20.0 if isinstance(case, Memory) else 20.0 + 2.0 * case.kills * case.kill_every
+
+
+def measure(case: Any, options: Options) -> dict[str, Any]:
+    options.work.mkdir(parents=True, exist_ok=True)
+    return {"faults": inject, "memory": make_and_delete, "kills": kill}[case.part](case, options)  # type: ignore[operator]
+
+
+# faults
+
+
+def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
+    """Write a task's variant, whose last action number asks for a fault; return it with the range of the others."""
+    parent, plain = find_task(task), lw.make(task, nworld=1, engine="mujoco")
+    own = TaskSource(parent, task)
+    functions, nact = own.functions, plain.action.shape[1]
+    file = Path(sys.modules[parent.__module__].__file__ or "")
+    source = file.read_text().replace("@lw.register\n", "")
+    own_model = r'"(\w+\.xml)"'  # beside the task's file
+    source = re.sub(own_model, lambda m: repr(str(path)) if (path := file.parent / m[1]).exists() else m[0], source)
+    fields = [f"    {name}: Row[float]\n" for name in ("userdata", "body_mass") if name not in own.world.vars]
+    source = source.replace("class World:\n", "".join(["class World:\n", *fields]), 1)
+    noisy = functions["observe"] is not None and len(functions["observe"].input_types) > 3
+    copy = "for i in range(ctrl.shape[0]):\n        ctrl[i] = action[i]"
+    source += VARIANT.format(
+        parent=parent.__name__, nact=nact, rng=", rng" if noisy else "",
+        rng_argument=", rng: Row[wp.uint32]" if noisy else "",
+        control="control(s, action, p, ctrl)" if functions["control"] else copy,
+        event="event(s, p, rng)" if functions["event"] else "pass",
+    )  # fmt: skip
+    path = work / f"soak_{task}.py"
+    if not path.exists() or path.read_text() != source:
+        path.write_text(source)
+    space, limited = plain.action_space, plain.model.actuator_ctrllimited[:, None].astype(bool)
+    low, high = np.where(limited, plain.model.actuator_ctrlrange, np.inf).T  # the variant does not scale actions
+    if functions["control"]:
+        low, high = (np.full(nact, np.inf) if bound is None else bound for bound in (space.low, space.high))
+    bounded = np.isfinite(low) & np.isfinite(high)
+    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+    return f"{path}:Soak", torch.as_tensor(low).float(), torch.as_tensor(high).float()
+
+
+@wp.kernel(enable_backward=False)
+def draw(
+    seed: int, step: int, rate: float, low: wp.array[float], high: wp.array[float],
+    pending: wp.array[bool], row: wp.array[int], kind_out: wp.array[int], action_out: wp.array2d[float],
+    twin_action_out: wp.array2d[float],
+):  # fmt: skip
+    """Draw actions, and faults that begin with this step: a function of seed, step and world; launched over (nworld,).
+
+    Every fourth world gets no fault, nor does a world in which a fault waits to be found.
+    """
+    w = wp.tid()
+    rng = wp.rand_init(int(wp.rand_init(seed, step)), w)
+    place, share, kind = wp.randf(rng), rate * 4.0 / 18.0, wp.int32(0)
+    for k in range(6):
+        width = wp.where(k > 1, share, wp.where(step % wp.static(EVERY) == 0, share * float(wp.static(EVERY)), 0.0))
+        if place >= 0.0 and place < width and w % 4 != 3 and not pending[w]:
+            kind = k + 1
+        place -= width
+    kind_out[w] = kind
+    n = low.shape[0]
+    for i in range(n):
+        action_out[w, i] = low[i] + (high[i] - low[i]) * wp.randf(rng)
+        if row[w] >= 0:
+            twin_action_out[row[w], i] = action_out[w, i]
+    if kind == 3:
+        action_out[w, step % n] = wp.nan
+    action_out[w, n] = wp.where(kind > 3, float(kind), 0.0)
+
+
+@wp.kernel(enable_backward=False)
+def tally(
+    row: wp.array[int], kind_in: wp.array[int], reason_in: wp.array[int], done_in: wp.array[bool],
+    obs_in: wp.array2d[float], reward_in: wp.array[float], twin_reason_in: wp.array[int],
+    twin_obs_in: wp.array2d[float], twin_reward_in: wp.array[float], pending_inout: wp.array[bool],
+    clean_inout: wp.array[bool], injected_inout: wp.array2d[int], reasons_inout: wp.array2d[int],
+    outcome_inout: wp.array2d[int],
+):  # fmt: skip
+    """Count faults after a step, and compare clean worlds with those of the twin; launched over (nworld,)."""
+    w = wp.tid()
+    due = wp.where(pending_inout[w], 6, wp.where(kind_in[w] < 6, kind_in[w], 0))
+    pending_inout[w] = kind_in[w] == 6 and not done_in[w]  # no event happens in a world that restarts
+    injected_inout[w, due] += 1
+    for bit in range(wp.static(NBIT)):
+        reasons_inout[w, due * wp.static(NBIT) + bit] += reason_in[w] >> bit & 1
+    clean_inout[w] = clean_inout[w] and due == 0 and not pending_inout[w]
+    compared = row[w] >= 0 and clean_inout[w] and kind_in[w] == 0  # the reward may see the whole action
+    twin = wp.max(row[w], 0)
+    same = reward_in[w] == twin_reward_in[twin] and reason_in[w] == twin_reason_in[twin]
+    finite = wp.isfinite(reward_in[w])
+    for i in range(obs_in.shape[1]):
+        finite = finite and wp.isfinite(obs_in[w, i])
+        same = same and obs_in[w, i] == twin_obs_in[twin, i]
+    outcome_inout[w, 0] += int(compared)
+    outcome_inout[w, 1] += int(compared and not same)
+    outcome_inout[w, 2] += int(not finite)
+
+
+def inject(case: Faults, options: Options) -> dict[str, Any]:
+    """Step a task for a chunk with injected faults, beside a twin without any."""
+    torch.set_num_threads(1)
+    gc.collect()  # environments of the chunk before
+    before = case.state(options.work, case.chunk)
+    if case.chunk and not before.exists():
+        raise Skipped(f"there is no {before}: give the folder in which chunk {case.chunk - 1} ran as --work")
+    try:
+        file, low, high = variant(case.task, options.work)
+    except (FileNotFoundError, ImportError) as error:
+        raise Skipped(f"{case.task}: {error}") from error
+    make = functools.partial(
+        lw.make, file, engine=case.engine, device=case.device, seed=case.seed, nthread=options.threads,
+        deterministic=case.compared and case.device != "cpu",
+    )  # fmt: skip
+    env = twin = make(nworld=case.nworld)
+    worlds = torch.arange(case.nworld, device=env.obs.device)
+    start = {"pending": torch.zeros_like(env.done), "clean": torch.ones_like(env.done)}
+    if case.chunk:
+        start = torch.load(before, map_location=worlds.device, weights_only=True)
+        env.set_state(start["state"])
+    pending, clean, row = start["pending"], start["clean"], torch.full_like(worlds, -1, dtype=torch.int32)
+    paired = worlds[worlds % 4 == 3] if case.chunk else worlds
+    twin_action = torch.zeros_like(env.action)
+    if case.compared:
+        row[paired] = torch.arange(len(paired), dtype=torch.int32, device=row.device)
+        twin = make(nworld=len(paired))
+        twin_action = twin.action.zero_()
+        if case.chunk:
+            twin.set_state(start["twin"])
+    kind, qpos, qvel = torch.zeros_like(row), *(env.state_space.parts[name].start for name in ("qpos", "qvel"))
+    injected, reasons, outcome = (row.new_zeros(case.nworld, n) for n in (7, 7 * NBIT, 3))
+    drawn = [low.to(worlds.device), high.to(worlds.device), pending, row, kind, env.action, twin_action]
+    tallied = [row, kind, env.done_reason, env.done, env.obs, env.reward, twin.done_reason, twin.obs, twin.reward,
+               pending, clean, injected, reasons, outcome]  # fmt: skip
+    drawn, tallied = (list(map(wp.from_torch, tensors)) for tensors in (drawn, tallied))
+    steps, samples, began = -(-case.steps // case.nworld), [], time.perf_counter()
+    for t in range(case.chunk * steps, case.chunk * steps + steps):
+        wp.launch(draw, case.nworld, [case.seed, t, case.rate, *drawn], device=env.device)
+        if t % EVERY == 0 and (mask := (kind == 1) | (kind == 2)).any():
+            state = env.get_state()
+            state[kind == 1, torch.where(worlds % 2 == 0, qpos, qvel)[kind == 1]] = torch.nan
+            state[kind == 2, qvel] = 1e11
+            env.set_state(state, mask, check=False)
+        env.step()
+        if case.compared:
+            twin.step()
+        wp.launch(tally, case.nworld, tallied, device=env.device)
+        done = t % steps + 1
+        if done * SAMPLES // steps > (done - 1) * SAMPLES // steps:
+            samples.append([done * case.nworld, *memory(worlds.device)])
+    compared, different, infinite = outcome.sum(0).tolist()
+    seconds = time.perf_counter() - began
+    end = {"state": env.get_state(), "pending": pending, "clean": clean}
+    if case.compared:
+        last = twin.get_state()
+        end["twin"] = last[paired % 4 == 3]
+        different += int((end["state"][paired].view(torch.int64) != last.view(torch.int64)).any(1)[clean[paired]].sum())
+    with replaced(case.state(options.work, case.chunk + 1)) as temporary:
+        torch.save(end, temporary)
+    case.state(options.work, case.chunk - 1).unlink(missing_ok=True)
+    names = {bit.name.lower(): bit.bit_length() - 1 for bit in FAULTS if bit.name}
+    own = list(enumerate((bit.bit_length() - 1 for bit in KINDS.values()), start=1))
+    by_kind = reasons.sum(0).view(7, NBIT)
+    counts = {name: int(by_kind[:, bit].sum()) for name, bit in names.items()}
+    found = [int(by_kind[k, bit]) for k, bit in own]
+    for k, bit in own:
+        by_kind[k, bit] = 0
+    beside, other = ({name: int(row[bit]) for name, bit in names.items() if row[bit]}
+                     for row in (by_kind[1:].sum(0), by_kind[0]))  # fmt: skip
+    return {
+        "injected": dict(zip(KINDS, injected.sum(0).tolist()[1:], strict=True)),
+        "found": dict(zip(KINDS, found, strict=True)), "beside": beside, "other": other,
+        "counts_agree": counts == env.fault_counts,
+        "twin_faults": sum(twin.fault_counts.values()) if case.compared else 0,
+        "compared": compared, "different": different, "not_finite": infinite, "steps": steps * case.nworld,
+        "memory": samples, "steps_per_second": steps * case.nworld / seconds,
+    }  # fmt: skip
+
+
+# memory
+
+
+def memory(device: torch.device) -> tuple[int, int]:
+    """Return the resident memory of this process and the used memory of its GPU, in bytes."""
+    resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
+    if device.type == "cpu":
+        return resident, 0
+    free, total = torch.cuda.mem_get_info(device)
+    return resident, total - free
+
+
+def slope(samples: Sequence[Sequence[int]], column: int) -> float:
+    """Return the growth of the memory per step, or per environment, without the first sample."""
+    points = np.array(samples[1:], dtype=float)
+    return float(np.polyfit(points[:, 0], points[:, column], 1)[0])
+
+
+def make_and_delete(case: Memory, options: Options) -> dict[str, Any]:
+    """Make, step and delete environments."""
+    samples = []
+    for number in range(1, case.made + 1):
+        env = lw.make(case.task, nworld=case.nworld, engine=case.engine, device=case.device, nthread=options.threads)
+        env.step()
+        device = env.obs.device
+        del env
+        gc.collect()
+        if number * SAMPLES % case.made == 0:
+            samples.append([number, *memory(device)])
+    return {"memory": samples, "bytes_per_env": slope(samples, 1), "gpu_bytes_per_env": slope(samples, 2)}
+
+
+# kills
+
+
+def kill(case: Kills, options: Options) -> dict[str, Any]:
+    """Train without interruption, and with kills that each come after some progress; compare."""
+    straight, killed = (options.work / f"{case.task}-{case.seed}-{name}" for name in ("straight", "killed"))
+    for folder in (straight, killed):
+        shutil.rmtree(folder, ignore_errors=True)
+    program, quiet = [sys.executable, "-m", "lyceum_warp.cli", "train"], ["--no-video", "--no-plot"]
+    start = [*program, case.task, *case.words.split(), *quiet, "--seed", str(case.seed), "--out"]
+    subprocess.run([*start, str(straight)], check=True, stdout=subprocess.DEVNULL)
+    resume = [*program, "--resume", str(killed), "--iterations", str(len(table(straight))), *quiet]
+    draws, kills, restarts, code = random.Random(case.seed), 0, 0, -1
+    while code < 0:
+        saved = (killed / "checkpoint.pt").exists()
+        if killed.exists() and not saved:
+            restarts += 1
+            shutil.rmtree(killed)
+        rows = len(table(killed))
+        process = subprocess.Popen(resume if saved else [*start, str(killed)], stdout=subprocess.DEVNULL)
+        try:
+            while process.poll() is None and len(table(killed)) <= rows:
+                time.sleep(0.05)
+            process.wait(case.kill_every * draws.uniform(0.5, 1.5) if kills < case.kills else None)
+        except subprocess.TimeoutExpired:
+            kills += 1
+        finally:
+            process.kill()
+        code = process.wait()
+    policies = [lw.load(folder).state_dict() for folder in (straight, killed)]
+    return {
+        "kills": kills, "restarts": restarts, "exit_code": code, "iterations": len(table(straight)),
+        "equal_rows": table(straight) == table(killed),
+        "equal_policy": all(torch.equal(value, policies[1][name]) for name, value in policies[0].items()),
+    }  # fmt: skip
+
+
+def table(folder: Path) -> list[dict[str, str]]:
+    """Return the rows of a run's metrics.csv without measured times."""
+    path = folder / "metrics.csv"
+    rows = csv.DictReader(path.read_text().splitlines()) if path.exists() else ()
+    measured = ("seconds", "samples_per_second")
+    return [{k: v for k, v in row.items() if "time" not in k and k not in measured} for row in rows]
+
+
+# tables
+
+
+def tables(rows: Sequence[Row]) -> list[Table]:
+    faults, grown, made, kills = [], [], [], []
+    runs: dict[str, list[Row]] = {}
+    for row in rows:
+        case, result = row.case, row.result
+        runs.setdefault(experiment.key({**case, "chunk": None}), []).append(row)
+        if case["part"] == "memory":
+            made.append([case["task"], case["device"], f"{case['nworld']}", f"{case['made']}",
+                         f"{result['bytes_per_env']:,.0f}", f"{result['gpu_bytes_per_env']:,.0f}"])  # fmt: skip
+        elif case["part"] == "kills":
+            kills.append([f"{case['task']} {case['words']}", *(f"{result[name]}" for name in (
+                "kills", "iterations", "equal_rows", "equal_policy"))])  # fmt: skip
+    for run in runs.values():
+        case, results = run[0].case, [row.result for row in run]
+        if case["part"] != "faults":
+            continue
+        injected, found, beside, other = (
+            sum((collections.Counter(result[name]) for result in results), collections.Counter())
+            for name in ("injected", "found", "beside", "other")
+        )
+        cells = [f"{found[kind]:,}" + ("" if found[kind] == injected[kind] else f" of {injected[kind]:,}")
+                 for kind in KINDS]  # fmt: skip
+        steps, compared, different, infinite = (sum(result[name] for result in results) for name in (
+            "steps", "compared", "different", "not_finite"))  # fmt: skip
+        name = f"{case['task']}, {case['device']}{', deterministic' * (case['compared'] and case['device'] != 'cpu')}"
+        faults.append([name, f"{case['nworld']:,}", f"{steps:.4g}", *cells, *(
+            ", ".join(f"{kind} {number:,}" for kind, number in counts.items()) for counts in (beside, other)
+        ), f"{all(result['counts_agree'] for result in results)}", f"{infinite}", f"{compared:.4g}", f"{different}",
+        ])  # fmt: skip
+        for column, what in ((1, "resident"), (2, "GPU")):
+            levels = [sample[column] / 2**20 for result in results for sample in result["memory"]]
+            if any(levels):
+                slopes = [round(1e6 * slope(result["memory"], column)) for result in results]
+                grown.append([name, what, f"{levels[0]:,.0f}", f"{max(levels):,.0f}", f"{levels[-1]:,.0f}",
+                              experiment.median_and_range(slopes, ",.0f")])  # fmt: skip
+    return [
+        Table(
+            "Faults found where they were injected (one number if all were), other bits beside them, and faults where "
+            "none was injected; whether fault_counts agrees; steps whose numbers are not finite; steps of worlds "
+            "without faults that were compared to the bit with those of an environment without faults, and how many "
+            "differ.",
+            ["task", "worlds", "steps", *KINDS, "beside", "others", "counts agree", "not finite", "compared", "differ"],
+            faults,
+        ),
+        Table("Memory, MiB, and its growth, bytes per million steps: median over chunks and range.",
+              ["task", "memory", "first", "most", "last", "growth"], grown),
+        Table("Bytes that stay for each environment that is made and deleted.",
+              ["task", "device", "worlds", "made", "resident", "GPU"], made),
+        Table("Trainings that were killed and resumed, beside one that was not interrupted.",
+              ["training", "kills", "iterations", "equal metrics", "equal policy"], kills),
+    ]  # fmt: skip
+
+
+EXPERIMENT = Experiment(
+    name="soak", summary="Very long runs with injected faults, memory, and trainings that are killed and resumed.",
+    cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
+)  # fmt: skip
+
+if __name__ == "__main__":
+    sys.exit(experiment.main(EXPERIMENT))

@@ -1,0 +1,93 @@
+"""Test the experiment of very long runs."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import experiment
+import pytest
+import soak
+import torch
+
+import lyceum_warp as lw
+
+FAULTS = ("--short", "--parts", "faults", "--threads", "1", "--nworld", "16")
+
+
+@pytest.fixture
+def work(request: pytest.FixtureRequest, pytestconfig: pytest.Config, tmp_path: Path) -> Path:
+    """A folder of the test's own at the same path in every run, so that kernels are compiled once, without states."""
+    cache = getattr(pytestconfig, "cache", None)
+    folder: Path = cache.mkdir(request.node.name) if cache else tmp_path / "work"
+    for file in folder.glob("*.pt"):
+        file.unlink()
+    return folder
+
+
+def run(out: Path, *words: str) -> list[dict[str, Any]]:
+    """The results of a run."""
+    assert experiment.main(soak.EXPERIMENT, ["--out", str(out), *words]) == 0
+    return [json.loads(line)["result"] for line in out.read_text().splitlines()]
+
+
+def test_every_injected_fault_is_found_and_counted(
+    work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = run(tmp_path / "soak.jsonl", *FAULTS, "--steps", "9600", "--work", str(work))
+    assert len(results) == 2
+    for result in results:
+        assert result["found"] == result["injected"] and min(result["injected"].values()) > 3
+        assert result["counts_agree"] and result["other"] == {} and result["not_finite"] == 0
+        assert result["compared"] > 16 * 600 / 4 - 1 and result["different"] == 0
+        assert len(result["memory"]) == soak.SAMPLES
+    assert re.search(r"\| point_mass, cpu \| 16 \| 1.92e\+04 \|", capsys.readouterr().out)
+
+
+def test_chunks_continue_each_other_to_the_bit(work: Path, tmp_path: Path) -> None:
+    for name, steps in (("two", "4800"), ("one", "9600")):
+        run(tmp_path / f"{name}.jsonl", *FAULTS, "--steps", steps, "--work", str(work))
+    ends = [torch.load(work / f"point_mass-auto-cpu-16-{steps}-0-same-bits-{chunk}.pt", weights_only=True)
+            for steps, chunk in ((4800, 2), (9600, 1))]  # fmt: skip
+    assert ends[0].keys() == ends[1].keys()
+    assert all(torch.equal(end, ends[1][name]) for name, end in ends[0].items())
+
+
+def test_another_machine_continues_in_the_folder_of_states(
+    work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = (*FAULTS, "--steps", "1600", "--work", str(work))
+    first = run(tmp_path / "here.jsonl", *words)
+    assert run(tmp_path / "there.jsonl", *words)[0]["found"] == first[1]["found"]  # its last row may be lost
+    for file in work.glob("*.pt"):
+        file.unlink()
+    (tmp_path / "here.jsonl").write_text((tmp_path / "here.jsonl").read_text().splitlines(keepends=True)[0])
+    assert len(run(tmp_path / "here.jsonl", *words)) == 1
+    assert "skipped: there is no " in capsys.readouterr().out
+
+
+def test_what_spreads_or_is_missed_is_reported(work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(soak, "VARIANT", soak.VARIANT.replace("== 4.0", "== 7.0").replace("== 5.0", "== 6.0"))
+    make, made = soak.lw.make, []
+
+    def other_twin(task: str, **words: Any) -> lw.Env:
+        made.append(make(task, **(words | ({"seed": 1} if len(made) == 2 else {}))))
+        return made[-1]
+
+    monkeypatch.setattr(soak.lw, "make", other_twin)
+    result = run(tmp_path / "soak.jsonl", *FAULTS, "--steps", "4800", "--work", str(work))[0]
+    assert result["found"]["reward"] == result["found"]["observation"] == 0 < result["injected"]["reward"]
+    assert result["other"]["observation"] > 0 and result["counts_agree"] and result["different"] > 0
+
+
+@pytest.mark.long
+def test_a_killed_training_ends_like_an_uninterrupted_one(work: Path, tmp_path: Path) -> None:
+    memory, kills = sorted(run(tmp_path / "soak.jsonl", "--short", "--parts", "kills", "memory", "--work", str(work)),
+                           key=len)  # fmt: skip
+    assert kills["kills"] == 1 and kills["exit_code"] == 0 and kills["iterations"] == 60
+    assert kills["equal_rows"] and kills["equal_policy"]
+    assert len(memory["memory"]) == soak.SAMPLES and memory["bytes_per_env"] < 1e6
+
+
+def test_growth_is_measured_without_the_first_sample() -> None:
+    assert soak.slope([[100, 9**9], [200, 3000], [300, 5000], [400, 7000]], 1) == pytest.approx(20.0)

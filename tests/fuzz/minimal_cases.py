@@ -1,0 +1,116 @@
+"""List minimal cases of failures that were fixed: files, arguments and command lines."""
+
+import io
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+
+def _json(**changes: Any) -> Callable[[bytes], bytes]:
+    return lambda data: json.dumps({**json.loads(data), **changes}).encode()
+
+
+def _saved(change: Callable[[dict[str, Any]], Any]) -> Callable[[bytes], bytes]:
+    """Change the content of a file of torch."""
+
+    def changed(data: bytes) -> bytes:
+        content = torch.load(io.BytesIO(data), weights_only=True)
+        file = io.BytesIO()
+        torch.save(change(content) or content, file)
+        return file.getvalue()
+
+    return changed
+
+
+def _top(**changes: Any) -> Callable[[bytes], bytes]:
+    return _saved(lambda content: content.update(changes))
+
+
+def _policy(**changes: Any) -> Callable[[bytes], bytes]:
+    return _saved(lambda content: content["policy"].update(changes))
+
+
+def _shape(**sizes: Any) -> Callable[[bytes], bytes]:
+    return _saved(lambda content: content["policy"]["shape"].update(sizes))
+
+
+def _info(**changes: Any) -> Callable[[bytes], bytes]:
+    """Change the description of a saved episode."""
+
+    def changed(data: bytes) -> bytes:
+        with np.load(io.BytesIO(data)) as file:
+            arrays = dict(file)
+        arrays["info"] = np.array(json.dumps({**json.loads(str(arrays["info"])), **changes}))
+        new = io.BytesIO()
+        np.savez(new, **arrays)
+        return new.getvalue()
+
+    return changed
+
+
+def _header(data: bytes) -> bytes:
+    """Put a shape of 40 GB into a table's header."""
+    return data.replace(b"(40, 2), }        ", b"(9999999999,), }  ")
+
+
+Change = Callable[[bytes], bytes]
+_SOURCE = {"task": "point_mass", "options": {"engine": "x"}}
+
+FILES: dict[str, tuple[str, str, Change]] = {
+    "config.json whose task is a number": ("config.json", "eval", _json(task=3)),
+    "config.json whose kept is a list": ("config.json", "open", _json(kept=[])),
+    "config.json without params": ("config.json", "eval", _json(params=None)),
+    "config.json nested too deep": ("config.json", "open", lambda data: b"[" * 100_000),
+    "config.json whose kept file is a number": ("kept config.json", "eval kept", _json(kept={"file": 3, "name": "x"})),
+    "config.json whose algorithm is a list": ("config.json", "resume", _json(algorithm=[1])),
+    "config.json of another device": ("config.json", "eval", _json(device="x")),
+    "config.json with a text for a number": ("config.json", "resume", _json(keep_every="x")),
+    "config.json with a seed of 2^63": ("config.json", "from", _json(seed=2**63)),
+    "versions.json that is a list": ("versions.json", "eval", lambda data: b"[]"),
+    "metrics.csv with a word for a number": ("metrics.csv", "resume", lambda data: data.replace(b"\n1,", b"\none,", 1)),
+    "metrics.csv that is not UTF-8": ("metrics.csv", "resume", lambda data: data + b"\xff"),
+    "policy.pt whose shape is a text": ("policy.pt", "load", _policy(shape="x")),
+    "policy.pt whose state is a text": ("policy.pt", "load", _policy(state="x")),
+    "policy.pt of sizes of 10^9": ("policy.pt", "load", _shape(nobs=10**9)),
+    "policy.pt with widths that are a number": ("policy.pt", "load", _shape(hidden=3)),
+    "best.pt without the value of its score": ("best.pt", "resume", _top(score={})),
+    "checkpoint.pt whose iteration is a list": ("checkpoint.pt", "resume alone", _top(iteration=[1])),
+    "checkpoint.pt whose state is of another iteration": ("checkpoint.pt", "resume alone", _top(iteration=7)),
+    "checkpoint.pt whose policy is a list": ("checkpoint.pt", "resume alone", _top(policy=[])),
+    "checkpoint.pt whose samples are a text": (
+        "checkpoint.pt", "resume alone", _saved(lambda content: content["state"].update(samples="x"))
+    ),
+    "an episode whose state_parts have numbers": ("episode.npz", "episodes", _info(state_parts={"time": 3})),
+    "an episode whose options have another engine": ("episode.npz", "episodes", _info(source=_SOURCE)),
+    "a table whose header asks for 40 GB": ("table.npy", "table", _header),
+    "a table whose header does not end": ("table.npy", "table", lambda data: data.replace(b"}", b"(", 1)),
+}  # fmt: skip
+"""A kind of file, a reader and a change. The file must be refused, or read if the change does not matter."""
+
+KEYWORDS: dict[str, tuple[str, dict[str, Any]]] = {
+    "fields that are a tensor": ("make", {"fields": torch.tensor(3)}),
+    "physics that is a number of NumPy": ("make", {"physics": np.float32(2), "cone": "elliptic"}),
+    "iterations of 1e9": ("MPPI", {"iterations": 1e9}),
+    "a policy of other sizes": ("evaluate", {"policy": torch.nn.Linear(3, 2)}),
+    "a policy of 2^31 actions": ("GaussianPolicy", {"nact": 2**31 - 1}),
+    "a policy that is not a function": ("evaluate", {"policy": 3}),
+    "an environment that is a text": ("control_async", {"env": "hopper"}),
+    "a time feature of 10^9 powers": ("ValueFunction", {"time_orders": 10**9}),
+    "10^9 plants": ("CEM", {"plants": 10**9}),
+    "10^9 episodes": ("evaluate", {"episodes": 10**9}),
+    "a horizon of 10^9 steps": ("OpenLoop", {"horizon": 10**9}),
+    "a period of 2^63 seconds": ("control_async", {"period": 2**63}),
+    "a rollout of 10^9 steps": ("Rollout", {"steps": 10**9}),
+    "a run that is a list": ("load", {"run": []}),
+    "resume that is a number": ("train", {"resume": 7}),
+}
+"""A call and arguments that it must refuse by their names or values."""
+
+COMMANDS = {
+    "a negative number of steps": "check point_mass --steps -5",
+    "a folder with markup": "train point_mass --out [/bold]x --iterations 1 --samples 8 --nworld 2 --horizon 4",
+}
+"""Command lines that must not end with a traceback."""
