@@ -74,10 +74,10 @@ class Ghost:
 class SetGhosts:
     """Choose which ghosts are drawn."""
 
-    worlds: tuple[int, ...] = ()
-    """Other worlds, at most ``MOST_GHOSTS``."""
-    episodes: tuple[int, ...] = ()
-    """Other episodes, at the same step, at most ``MOST_GHOSTS``."""
+    worlds: int = 0
+    """Number of other worlds, at most ``MOST_GHOSTS``: those after the shown one."""
+    episodes: int = 0
+    """Number of other episodes, at the same step, at most ``MOST_GHOSTS``: those after the shown one."""
     burst: int = 0
     """Number of states along the trajectory, at most ``MOST_BURST``."""
     fade: float = 1.0

@@ -45,7 +45,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         self.actions = Actions(scene, send)
         self.mouse = Mouse(send)
         self.values = ModelValues(model)
-        self.windows = Windows(self.actions, self.values, limit)
+        self.windows = Windows(self.actions, limit)
         self._send, self._newest, self._screen, self._opened, self._limit = send, newest, screen, opened, limit
         self._geoms = ExtraGeoms(model, limit)
         self._swapped = -SWAP_TIME
