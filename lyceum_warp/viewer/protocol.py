@@ -8,8 +8,6 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-Graphics: TypeAlias = Literal["web", "native"]
-
 Mode: TypeAlias = Literal["passive", "controller", "playback"]
 
 WorldChoice: TypeAlias = int | Literal["next", "previous", "best", "worst", "last_ended"]
@@ -264,21 +262,18 @@ class Opening:
     """The first message to the window process."""
 
     scene: Scene
-    graphics: Graphics
     host: str
     """Address that the page is served on."""
     port: int | None
     """Port of the page; None for the first free port from 8080."""
-    browser: bool
-    """Whether to open the page in a browser on this machine."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Opened:
     """The window is open."""
 
-    address: str = ""
-    """The page's address with its token; empty for a native window."""
+    address: str
+    """The page's address with its token."""
     instructions: tuple[str, ...] = ()
     """Lines to print."""
 

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -67,10 +66,6 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         frame = self._newest()
         if frame is not None:
             self.take(frame)
-        dropped = self.viewer.get_drop_file()  # on the page or the window
-        if dropped:
-            title = self.actions.scene.title
-            self.actions.say(f"{Path(dropped).name} was not loaded: this viewer shows {title} only")
         if self.actions.frame is None:
             return
         viewer = self.viewer

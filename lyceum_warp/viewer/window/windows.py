@@ -189,7 +189,7 @@ class Windows:
             ("ghosts", len(frame.ghosts), self.drawn.ghosts),
             ("traces", 0 if frame.traces is None else len(frame.traces), self.drawn.traces),
         )
-        why = f"{self._limit:,} shapes at most" if self._limit else "only a browser draws them"
+        why = f"{self._limit:,} shapes at most"
         return [(name, f"{drawn} of {given} drawn: {why}") for name, given, drawn in counts if drawn < given]
 
     def _last_values(self) -> list[tuple[str, float]]:
