@@ -21,7 +21,7 @@ _COMMANDS = {
     "eval": ("evaluate", "Eval", "Evaluate the policy of a run, and print statistics of its episodes."),
     "export": ("export", "Export", "Write the policy of a run to an ONNX or .pt2 file."),
     "plan": ("plan", "Plan", "Control a task with a planner, and report rewards, success and planning times."),
-    "view": ("view", "View", "Show a task, a policy, a planner or saved episodes in a browser or a window."),
+    "view": ("view", "View", "Show a task, a policy, a planner or saved episodes in a browser."),
     "warmup": ("warmup", "Warmup", "Compile a task's kernels ahead of time, and print the memory of a world."),
     "bench": ("bench", "Bench", "Run an experiment or another program of bench/."),
 }

@@ -24,7 +24,7 @@ from lyceum_warp.support.validate import whole_number
 from lyceum_warp.viewer.follow import Follower, Parent, wait_for_run
 from lyceum_warp.viewer.session.clock import Watcher
 from lyceum_warp.viewer.session.stage import check_world
-from lyceum_warp.viewer.show import chosen_graphics, view
+from lyceum_warp.viewer.show import view
 
 _RUN_WORLDS = 16
 _WAIT = 10.0  # seconds that --follow waits for a run
@@ -43,14 +43,14 @@ class Place:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View:
-    """Show a task, a policy, a planner or episodes, in a browser or in a window.
+    """Show a task, a policy, a planner or episodes in a browser.
 
     With a task the viewer shows its worlds, lets you push bodies with the mouse, and with --mppi runs a planner in real
     time. With a run it shows the run's policy, and with --follow the newest policy while the run trains. Files of
     episodes, or a folder of lyceum-warp plan, are played back.
 
     The viewer is a web page. The command prints its address, which contains a secret, and over ssh the command that
-    forwards the port. With --gfx native it is a window, on a machine with a display.
+    forwards the port.
 
     $ lyceum-warp view hopper
     $ lyceum-warp view runs/hopper-20260101-120000 --which best
@@ -79,14 +79,10 @@ class View:
     """Whether to start paused."""
     trace: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """The site or body whose path is drawn for each of the planner's samples; by default the task's choice."""
-    gfx: Annotated[str, tyro.conf.arg(metavar="web|native")] = "web"
-    """web for a page in a browser, native for a window on this machine's screen."""
     host: str = "127.0.0.1"
     """Address on which the page is served. Other machines can reach the page only with another address than this."""
     port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Port of the page; by default the first free port from 8080 on."""
-    browser: bool = False
-    """Whether to open the page in this machine's browser."""
     param: ParamWords = ()
     trust: Trust = False
     fps: float = 30.0
@@ -104,7 +100,6 @@ class View:
         Args:
             parent: The program that started this one. The viewer ends with it.
         """
-        chosen_graphics(self.gfx)
         _check(self)
         torch.set_num_threads(1)
         kind = _kind(self.what)
@@ -112,7 +107,7 @@ class View:
             if getattr(self, flag) and kind not in fits:
                 raise ValueError(f"--{flag} needs a {' or a '.join(fits)}, and {self.what[0]} is not one: leave it out")
         shown: dict[str, Any] = {
-            name: getattr(self, name) for name in ("world", "paused", "trace", "gfx", "host", "port", "browser", "fps")
+            name: getattr(self, name) for name in ("world", "paused", "trace", "host", "port", "fps")
         }
         watchers: list[Watcher] = [] if parent is None else [_Ends(parent)]
         if kind == "episodes":

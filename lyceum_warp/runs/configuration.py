@@ -39,17 +39,6 @@ _RSL_RL = {
 """New names of hyperparameters of the former algorithm rsl-rl."""
 
 
-def algorithm_of(name: str) -> tuple[Any, Any]:
-    """The classes of an algorithm and its hyperparameters.
-
-    Raises:
-        ValueError: There is no such algorithm.
-    """
-    if name not in ALGORITHMS:
-        raise ValueError(f"there is no algorithm {name!r}: use {' or '.join(ALGORITHMS)}")
-    return ALGORITHMS[name]
-
-
 def describe(learner: Learner) -> dict[str, Any]:
     """The content of config.json, from which ``Configuration`` makes the same learner."""
     env, options = learner.env, learner.env.options
@@ -153,29 +142,24 @@ class Configuration:
             FileNotFoundError: The task or its model is missing.
         """
         with contextlib.nullcontext() if run is None else run.settings():
-            return self._learner(team, run, networks, note, task, trust)
-
-    def _learner(
-        self, team: Team, run: Run | None, networks: tuple[Any, Any], note: Callable[[str], None], task: str | None,
-        trust: bool,
-    ) -> Learner:  # fmt: skip
-        learner, _ = algorithm_of(self.algorithm)
-        if self.threads < 1:
-            raise ValueError(f"threads must be at least 1, not {self.threads}")
-        torch.set_num_threads(self.threads)
-        nworld = team.share(self.options.nworld)
-        own = {"nworld": nworld, "first_world": team.rank * nworld, "device": team.device or self.options.device}
-        options = self.options.changed(own)
-        if options.nthread is None and team.neighbours > 1 and engine_name(options.engine, options.device) == "mujoco":
-            options = options.changed({"nthread": max(1, cpu_cores() // team.neighbours)})
-        if run is None:
-            assert self.task is not None
-            env = Env(self.task, options, **self.params)
-        else:
-            # rank 0 checks the run; other machines may have no record of it
-            env = run_env(run, options, self.params, note=note, task=task, trust=trust or not team.leads)
-        seed = self.options.seed if self.seed is None else self.seed
-        return learner(env, *networks, self.hyperparameters, seed=seed, team=team)
+            if self.threads < 1:
+                raise ValueError(f"threads must be at least 1, not {self.threads}")
+            torch.set_num_threads(self.threads)
+            nworld = team.share(self.options.nworld)
+            own = {"nworld": nworld, "first_world": team.rank * nworld, "device": team.device or self.options.device}
+            options = self.options.changed(own)
+            engine = engine_name(options.engine, options.device)
+            if options.nthread is None and team.neighbours > 1 and engine == "mujoco":
+                options = options.changed({"nthread": max(1, cpu_cores() // team.neighbours)})
+            if run is None:
+                assert self.task is not None
+                env = Env(self.task, options, **self.params)
+            else:
+                # rank 0 checks the run; other machines may have no record of it
+                env = run_env(run, options, self.params, note=note, task=task, trust=trust or not team.leads)
+            seed = self.options.seed if self.seed is None else self.seed
+            learner: Learner = ALGORITHMS[self.algorithm][0](env, *networks, self.hyperparameters, seed=seed, team=team)
+            return learner
 
 
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:

@@ -114,7 +114,7 @@ class RunViewer:
 
     Args:
         folder: The run's folder, which need not exist yet.
-        options: Further flags of ``lyceum-warp view`` by name, such as ``gfx="web"``, ``port=8080``, ``nworld=64``.
+        options: Further flags of ``lyceum-warp view`` by name, such as ``port=8080``, ``nworld=64``.
     """
 
     def __init__(self, folder: str | Path, **options: Any) -> None:

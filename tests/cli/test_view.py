@@ -24,9 +24,9 @@ class Opened:
         self.options: dict[str, Any] = {}
         self.number = 3
 
-    def __call__(self, scene: Scene, graphics: str, **options: Any) -> MemoryWindow:
+    def __call__(self, scene: Scene, **options: Any) -> MemoryWindow:
         self.scenes.append(scene)
-        self.options = {"gfx": graphics, **options}
+        self.options = options
 
         def after(frame: Frame, number: int) -> list[Any] | None:
             self.frames.append(frame)
@@ -39,8 +39,6 @@ class Opened:
 def opened(monkeypatch: pytest.MonkeyPatch) -> Opened:
     collected = Opened()
     monkeypatch.setattr(views, "opened", collected)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     return collected
 
 
@@ -63,7 +61,7 @@ def test_a_task_is_shown(opened: Opened) -> None:
     assert cli.main(["view", "point_mass", *options]) == 0
     (scene,) = opened.scenes
     assert scene.title == "point_mass" and scene.nworld == 3 and scene.modes == ("passive",)
-    assert opened.options == {"gfx": "web", "host": "127.0.0.1", "port": 8123, "browser": False}
+    assert opened.options == {"host": "127.0.0.1", "port": 8123}
     assert opened.frames[0].status.world == 2
 
 
@@ -99,7 +97,6 @@ def test_episodes_are_played_back(opened: Opened, files: list[Path]) -> None:
     [
         (["hoper"], ["there is no task 'hoper'"]),
         (["point_mass", "--world", "1"], ["there is no world 1: there is 1 world, number 0"]),
-        (["point_mass", "--gfx", "native"], ["there is no display for a native window"]),
         (["point_mass", "--follow"], ["--follow needs a run", "point_mass"]),
         (["point_mass", "--samples", "4"], ["--samples is a setting of the planner: add --mppi"]),
         (["point_mass", "hopper"], ["one task can be shown at a time, not 2"]),

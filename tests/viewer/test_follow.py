@@ -67,7 +67,7 @@ def trained(folder: Path, callback: Callable[[lw.Iteration], object] | None = No
 def test_a_run_with_a_viewer_has_the_same_numbers_to_the_bit(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     alone = trained(tmp_path / "alone")
     begun, printed = time.monotonic(), ""
-    with lw.RunViewer(tmp_path / "shown", gfx="web", nworld=2) as viewer:
+    with lw.RunViewer(tmp_path / "shown", nworld=2) as viewer:
 
         def callback(iteration: lw.Iteration) -> None:
             nonlocal printed
@@ -99,7 +99,7 @@ def test_a_viewer_of_a_task_that_is_not_found_ends_with_one_line(
     assert train(tmp_path / "run", "--iterations", "1") == 0
     run = Run.open(tmp_path / "run")
     run.amend(task="missing_task")
-    with lw.RunViewer(tmp_path / "run", gfx="web") as viewer:
+    with lw.RunViewer(tmp_path / "run") as viewer:
         begun = time.monotonic()
         while viewer.is_open and time.monotonic() < begun + 60:
             time.sleep(0.1)

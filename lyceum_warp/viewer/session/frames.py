@@ -67,7 +67,8 @@ class FrameMaker:
             status: Completes the status.
             paused: Whether the frame must show the present state; otherwise it may lag by one frame.
         """
-        wanted = self.ghosts.worlds if live is main else (), self.ghosts.burst
+        shown = _following(main.world, main.env.nworld, self.ghosts.worlds)
+        wanted = shown if live is main else [], self.ghosts.burst
         rows, points = live.take(), []
         if rows is not None and rows.worlds[0] == live.world:
             points.append(rows.points)
@@ -83,20 +84,20 @@ class FrameMaker:
         state, parts = rows.states[0], live.env.state_space.parts
         self._report(rows, main.world if live is not main else None)
         others = rows.states[1:]
-        if live is not main and self.ghosts.worlds:  # other worlds wait
-            main.request(self.ghosts.worlds)
+        if live is not main and shown:  # other worlds wait
+            main.request(shown)
             waiting = main.take()
             others = others if waiting is None else waiting.states[1:]
         ghosts = [] if traces is None else [Ghost(traces.final, (*_PLAN, _OPACITY))]
         ghosts += [*self._coloured(others), *self._burst(rows.back, _PAST)]
         step, past = int(state[parts["step"]][0]), live.past
         text = [("return", f"{rows.episode_return:.6g}"), ("past", past_text(live)), *self.text.items()]
-        shown = status(
+        complete = status(
             world=main.world, step=step, steps=live.env.horizon, time=float(state[parts["time"]][0]),
             text=tuple(text), seekable=(max(0, step - past.behind), step + past.ahead),
         )  # fmt: skip
         return Frame(
-            self._pose(state), self._physics(state), self._model_fields(state), shown, tuple(ghosts),
+            self._pose(state), self._physics(state), self._model_fields(state), complete, tuple(ghosts),
             None if traces is None else traces.paths, None if traces is None else traces.best,
             np.concatenate(points), self._take_messages(),
         )  # fmt: skip
@@ -104,7 +105,8 @@ class FrameMaker:
     def of_playback(self, playback: Playback, status: Callable[..., Status]) -> Frame:
         """Make a frame of a playback; ``status`` completes the status."""
         episode, state = playback.episode, playback.state
-        others = [playback.episodes[index].states for index in self.ghosts.episodes if index != playback.index]
+        shown = _following(playback.index, len(playback.episodes), self.ghosts.episodes)
+        others = [playback.episodes[index].states for index in shown]
         ghosts = self._coloured(states[min(playback.step, len(states) - 1)] for states in others)
         around = playback.around(self.ghosts.burst)
         ghosts += self._burst((episode.states[s] for s in reversed(around) if s < playback.step), _PAST)
@@ -114,13 +116,13 @@ class FrameMaker:
             text.append(("end", reasons(episode.done_reason)))
         if np.isfinite(episode.rewards).all() and episode.steps:
             text.append(("return", f"{episode.rewards[: playback.step].sum():.6g} of {episode.rewards.sum():.6g}"))
-        shown = status(
+        complete = status(
             world=0, step=playback.step, steps=episode.steps, time=playback.step * self._env.timestep,
             text=tuple(text), seekable=(0, episode.steps),
         )  # fmt: skip
         points, self._points = self._points, []
         return Frame(
-            self._pose(state), self._physics(state), self._model_fields(state), shown, tuple(ghosts),
+            self._pose(state), self._physics(state), self._model_fields(state), complete, tuple(ghosts),
             samples=np.array(points, dtype=float).reshape(-1, 1 + self._curves), messages=self._take_messages(),
         )  # fmt: skip
 
@@ -165,6 +167,11 @@ class FrameMaker:
     def _take_messages(self) -> tuple[str, ...]:
         messages, self.messages = self.messages, []
         return tuple(messages)
+
+
+def _following(index: int, number: int, count: int) -> list[int]:
+    """Indices of the other worlds or episodes that come after one, at most ``count``."""
+    return [(index + i) % number for i in range(1, min(count, number - 1) + 1)]
 
 
 def past_text(live: Live) -> str:

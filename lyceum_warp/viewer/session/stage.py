@@ -43,7 +43,6 @@ class Stage:
         seed: int | None = None,
         paused: bool = False,
         trace: str | None = None,
-        title: str | None = None,
     ) -> None:
         check_kind("env", env, Env, "as lw.make('hopper') returns it")
         check_world(world, env.nworld)
@@ -71,7 +70,7 @@ class Stage:
         modes += ["controller"] if self.controllers else []
         modes.append("passive")
         self.scene = Scene(
-            title=title or env.task.name, model=model_bytes(env.task.model), nworld=env.nworld,
+            title=env.task.name, model=model_bytes(env.task.model), nworld=env.nworld,
             modes=tuple(modes), controllers=tuple(self.controllers),
             episodes=tuple(episode.name for episode in self.playback.episodes),
             curves=("reward", "eval", *env.metrics),

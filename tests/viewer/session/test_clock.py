@@ -15,7 +15,6 @@ import lyceum_warp as lw
 from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import Command, Frame
 from lyceum_warp.viewer.session.clock import Session
-from lyceum_warp.viewer.show import chosen_graphics
 from lyceum_warp.viz.video import Recorder
 
 
@@ -52,7 +51,7 @@ def test_a_refused_port_leaves_no_thread(shared_env: SharedEnv) -> None:
     with socket.create_server(("127.0.0.1", 0)) as busy:
         before = threading.enumerate()
         with pytest.raises(ValueError, match="port"):
-            lw.view(env, controllers={"mppi": mppi}, port=busy.getsockname()[1], gfx="web")
+            lw.view(env, controllers={"mppi": mppi}, port=busy.getsockname()[1])
     assert [thread.name for thread in threading.enumerate() if thread not in before] == []
 
 
@@ -92,7 +91,7 @@ def test_watchers_are_called_and_their_messages_shown(shared_env: SharedEnv) -> 
     assert window.messages == ["news"]
 
 
-def test_wrong_arguments_are_refused(shared_env: SharedEnv, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_arguments_are_refused(shared_env: SharedEnv) -> None:
     env, small = shared_env("hopper", nworld=2), dict(horizon=2, samples=2)
     wrong: list[tuple[dict[str, Any], str]] = [
         (dict(world=2), "there is no world 2: there are 2 worlds, 0 to 1"),
@@ -107,10 +106,3 @@ def test_wrong_arguments_are_refused(shared_env: SharedEnv, monkeypatch: pytest.
     for options, message in wrong:
         with pytest.raises(ValueError, match=message):
             Session(**{"env": env} | options)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    assert chosen_graphics(None) == "web"
-    with pytest.raises(ValueError, match="there is no display for a native window"):
-        chosen_graphics("native")
-    with pytest.raises(ValueError, match="gfx must be 'web' or 'native', not 'x'"):
-        chosen_graphics("x")

@@ -132,7 +132,3 @@ def test_controllers_are_switched_and_passive_worlds_have_no_controls(shared_env
         session.obey(command)
         session.stage.advance()
         assert env.action.abs().max() == action and session.stage.frame().status.controller == name
-    session.obey(SetMode("controller", "none"))
-    assert session.stage.frame().messages == ("there is no controller 'none': there are push, half",)
-    session.obey(SetMode("playback"))
-    assert "there is no mode 'playback' here" in session.stage.frame().messages[0]

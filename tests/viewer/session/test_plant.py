@@ -47,8 +47,8 @@ def test_a_planner_controls_a_copy_of_the_shown_world(shared_env: SharedEnv) -> 
     assert torch.equal(env.get_state(), before)
     moved = session.stage.live.env.get_state()[0]
     assert not torch.equal(moved, before[1])
-    session.obey(protocol.SetGhosts(worlds=(0,)))
-    np.testing.assert_array_equal(session.stage.frame().ghosts[0].pose.qpos, before[0, qpos].numpy())
+    session.obey(protocol.SetGhosts(worlds=1))
+    np.testing.assert_array_equal(session.stage.frame().ghosts[0].pose.qpos, before[2, qpos].numpy())
     session.obey(protocol.SetWorld(2))  # world 1 takes over the state of the copy
     assert torch.equal(env.get_state()[1, qpos], moved[qpos])
     assert torch.equal(session.stage.live.env.get_state()[0, qpos], before[2, qpos])

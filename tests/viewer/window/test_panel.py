@@ -59,7 +59,7 @@ def ghost_beside(data: mujoco.MjData) -> Ghost:
 
 @pytest.mark.parametrize(
     ("limit", "drawn", "why"),
-    [(100, 10, None), (3, 1, "3 shapes at most"), (0, 0, "only a browser draws them")],
+    [(100, 10, None), (3, 1, "3 shapes at most")],
 )
 def test_ghosts_and_traces_are_drawn_or_reported(limit: int, drawn: int, why: str | None) -> None:
     model = robot()
@@ -68,15 +68,6 @@ def test_ghosts_and_traces_are_drawn_or_reported(limit: int, drawn: int, why: st
     assert len(bench.viewer.extra_geoms) == drawn  # the goal does not move
     rows = [] if why is None else [("ghosts", f"{min(drawn, 1)} of 2 drawn: {why}"), ("traces", f"0 of 2 drawn: {why}")]
     assert bench.panel.windows.dropped() == rows
-
-
-def test_dropped_model_is_refused_with_a_message(bench: Bench) -> None:
-    bench.show(status_of())
-    bench.viewer.dropped = "/tmp/mujoco_drop_1/other.xml"
-    assert bench.draw() == []
-    bench.draw(frame_of(bench.model, bench.data, messages=("one", "two")))
-    (refusal, *others) = bench.panel.actions.messages
-    assert refusal.startswith("other.xml was not loaded") and others == ["one", "two"]
 
 
 # keys
