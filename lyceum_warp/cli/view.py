@@ -23,7 +23,6 @@ from lyceum_warp.support.interrupts import Interrupted, signals
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.viewer.follow import Follower, Parent, wait_for_run
 from lyceum_warp.viewer.session.clock import Watcher
-from lyceum_warp.viewer.session.stage import check_world
 from lyceum_warp.viewer.show import view
 
 _RUN_WORLDS = 16
@@ -71,22 +70,16 @@ class View:
     """The task of a run or of episodes, a name or a file, if it is not found."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of worlds: by default 16 for a run, 1 otherwise."""
-    world: int = 0
-    """Number of the first shown world."""
     seed: int = 0
     """Seed of the initial states."""
     paused: bool = False
     """Whether to start paused."""
-    trace: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """The site or body whose path is drawn for each of the planner's samples; by default the task's choice."""
     host: str = "127.0.0.1"
     """Address on which the page is served. Other machines can reach the page only with another address than this."""
     port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Port of the page; by default the first free port from 8080 on."""
     param: ParamWords = ()
     trust: Trust = False
-    fps: float = 30.0
-    """Maximal number of frames per second."""
     place: tyro.conf.OmitArgPrefixes[Place] = dataclasses.field(default_factory=Place)
     planner: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
 
@@ -106,9 +99,7 @@ class View:
         for flag, fits in (("follow", ("run",)), ("mppi", ("task", "run")), ("trust", ("run",))):
             if getattr(self, flag) and kind not in fits:
                 raise ValueError(f"--{flag} needs a {' or a '.join(fits)}, and {self.what[0]} is not one: leave it out")
-        shown: dict[str, Any] = {
-            name: getattr(self, name) for name in ("world", "paused", "trace", "host", "port", "fps")
-        }
+        shown: dict[str, Any] = {name: getattr(self, name) for name in ("paused", "host", "port")}
         watchers: list[Watcher] = [] if parent is None else [_Ends(parent)]
         if kind == "episodes":
             episodes = load_episodes(self.what)
@@ -171,14 +162,12 @@ def _episodes_env(options: View, episodes: dict[Path, Trajectory]) -> Env:
     """A world for the playback of episodes."""
     if options.nworld is not None and options.nworld > 1:
         raise ValueError(f"--nworld {options.nworld} has no effect for episodes: leave it out")
-    check_world(options.world, 1)
     return episode_env(episodes, task=options.task, **parameters(options.param, options))
 
 
 def _task_worlds(options: View) -> Env:
     params = parameters(options.param, options)
     nworld = options.nworld or 1
-    check_world(options.world, nworld)
     if options.mppi and nworld == 1:  # the plant itself
         return Env(options.what[0], autoreset=False, nthread=1, **params)
     return Env(options.what[0], nworld=nworld, **given(options.place), **params)
@@ -204,7 +193,6 @@ def _run(options: View, parent: Parent | None) -> Run:
 
 def _run_worlds(options: View, run: Run) -> Env:
     nworld = options.nworld or _RUN_WORLDS
-    check_world(options.world, nworld)
     params = parameters(options.param, options)
     return run_worlds(run, options.place, params, nworld=nworld, task=options.task, trust=options.trust)
 

@@ -57,7 +57,7 @@ class Follower:
             self._seen = stamp
             return [f"the policy of {self.run.folder} was not read: {str(error).splitlines()[0]}"]
         self._seen, self.iteration = stamp, content["iteration"]
-        return [f"policy of iteration {self.iteration}{self._return()}"]
+        return [f"policy of iteration {self.iteration}"]
 
     def _read(self) -> dict[str, Any]:
         return read_checkpoint(self.run.policy_file(), self.device, parts=("iteration", "policy"))
@@ -69,15 +69,6 @@ class Follower:
         except OSError:
             return None
         return found.st_mtime_ns, found.st_ino, found.st_size
-
-    def _return(self) -> str:
-        """The last return in the run's table, as text."""
-        with contextlib.suppress(FileNotFoundError, ValueError, IndexError):
-            row = self.run.rows()[-1]
-            for name in ("mean_return", "return_mean"):
-                if (value := row.get(name)) is not None and value == value:
-                    return f", return {value:.6g}"
-        return ""
 
 
 def wait_for_run(folder: Path, *, seconds: float, going_on: Any = lambda: True) -> Run:

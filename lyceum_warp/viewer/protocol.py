@@ -77,11 +77,7 @@ class SetGhosts:
     episodes: int = 0
     """Number of other episodes, at the same step, at most ``MOST_GHOSTS``: those after the shown one."""
     burst: int = 0
-    """Number of states along the trajectory, at most ``MOST_BURST``."""
-    fade: float = 1.0
-    """Factor of opacity from each state of the burst to the next."""
-    doppler: bool = False
-    """Whether past states are red and future states blue."""
+    """Number of states along the trajectory, past red and future blue, at most ``MOST_BURST``."""
     plan: bool = True
     """Whether the plan's final pose and the samples' traces are drawn."""
 

@@ -1,9 +1,8 @@
 """Show worlds, controllers and episodes in a viewer: ``lw.view``."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import Scene
 from lyceum_warp.viewer.session.clock import Session, Watcher
@@ -15,15 +14,11 @@ def view(
     controllers: Mapping[str, Any] | None = None,
     *,
     episodes: Any = None,
-    world: int = 0,
     seed: int | None = None,
     paused: bool = False,
-    trace: str | None = None,
-    fps: float = 30.0,
     host: str = "127.0.0.1",
     port: int | None = None,
     watchers: Sequence[Watcher] = (),
-    on_trajectory: Callable[[Trajectory], object] | None = None,
 ) -> None:
     """Show worlds, controllers and episodes on a page in a browser, until the user quits.
 
@@ -43,27 +38,18 @@ def view(
             ``lw.Controller``.
         episodes: Episodes to play back: trajectories, files of trajectories, or states, (steps + 1, state_space.size),
             as rows of ``env.get_state()``; one of these, a sequence, or a mapping from names to them.
-        world: Index of the world that is shown first.
         seed: Seed of a random reset at the start; by default there is no reset.
         paused: Whether to start paused.
-        trace: Name of the site or body whose path is drawn for a planner's samples; by default ``Task.trace``. Without
-            either, it is the centre of mass of a robot with an unactuated base, or the end of an arm.
-        fps: Maximum number of frames per second.
         host: Address to serve the page on. The default is the loopback address, which other machines cannot reach.
         port: Port of the page; by default the first free port from 8080.
         watchers: Functions that are called about twice a second and return new messages, a sequence of strings.
-        on_trajectory: Called with a ``Trajectory`` of each real-time run of a controller of one world. A run ends with
-            its episode or with a command that interrupts it. Example: ``lambda episode: episode.save("episode.npz")``.
 
     Raises:
         ValueError: An argument is invalid, or the port is in use.
         FileNotFoundError: An episode's file is missing.
         NoWindowError: The window cannot be opened, or ended with an error.
     """
-    session = Session(
-        env, controllers=controllers, episodes=episodes, world=world, seed=seed, paused=paused, trace=trace, fps=fps,
-        watchers=watchers, on_trajectory=on_trajectory,
-    )  # fmt: skip
+    session = Session(env, controllers, episodes=episodes, seed=seed, paused=paused, watchers=watchers)
     try:
         window = opened(session.stage.scene, host=host, port=port)
         session.run(window)

@@ -57,12 +57,11 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def test_a_task_is_shown(opened: Opened) -> None:
-    options = ["--nworld", "3", "--world", "2", "--port", "8123", "--param", "success_distance=0.2"]
+    options = ["--nworld", "3", "--port", "8123", "--param", "success_distance=0.2"]
     assert cli.main(["view", "point_mass", *options]) == 0
     (scene,) = opened.scenes
     assert scene.title == "point_mass" and scene.nworld == 3 and scene.modes == ("passive",)
     assert opened.options == {"host": "127.0.0.1", "port": 8123}
-    assert opened.frames[0].status.world == 2
 
 
 def test_a_task_is_shown_under_a_planner(opened: Opened) -> None:
@@ -96,13 +95,11 @@ def test_episodes_are_played_back(opened: Opened, files: list[Path]) -> None:
     ("words", "messages"),
     [
         (["hoper"], ["there is no task 'hoper'"]),
-        (["point_mass", "--world", "1"], ["there is no world 1: there is 1 world, number 0"]),
         (["point_mass", "--follow"], ["--follow needs a run", "point_mass"]),
         (["point_mass", "--samples", "4"], ["--samples is a setting of the planner: add --mppi"]),
         (["point_mass", "hopper"], ["one task can be shown at a time, not 2"]),
         (["missing.npz"], ["there is no file missing.npz"]),
         (["point_mass", "--param", "nworld=3"], ["nworld is an option"]),
-        (["point_mass", "--mppi", "--trace", "nose"], ["no site and no body 'nose' to trace"]),
     ],
 )
 def test_a_mistake_is_one_line(

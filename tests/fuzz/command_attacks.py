@@ -42,7 +42,6 @@ SMALL: dict[str, dict[str, tuple[str, ...]]] = {
         "--steps": ("2",), "--samples": ("2",), "--horizon": ("2",), "--out": ("out",), "--no-video": (),
         "--no-plot": (),
     },
-    "view": {"--world": ("-1",)},
     "warmup": {"--nworld": ("2",)},
     "bench": {},
 }  # fmt: skip

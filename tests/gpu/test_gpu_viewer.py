@@ -18,7 +18,8 @@ def pushing(obs: torch.Tensor) -> torch.Tensor:
 
 def test_steps_and_frames_are_asked_for_without_waiting() -> None:
     env = lw.make("hopper", nworld=1024, device="cuda")
-    session = Session(env, controllers={"policy": lw.GaussianPolicy(11, 3)}, world=3, seed=0)
+    session = Session(env, controllers={"policy": lw.GaussianPolicy(11, 3)}, seed=0)
+    session.obey(SetWorld(3))
     session.obey(SetGhosts(worlds=2, burst=4))
     for _ in range(3):
         session.stage.advance(2)
@@ -31,7 +32,8 @@ def test_steps_and_frames_are_asked_for_without_waiting() -> None:
 
 def test_any_world_is_shown_a_frame_later() -> None:
     env = lw.make("hopper", nworld=4096, device="cuda")
-    session = Session(env, controllers={"policy": pushing}, world=3000, seed=0)
+    session = Session(env, controllers={"policy": pushing}, seed=0)
+    session.obey(SetWorld(3000))
     assert session.stage.live.past.states.nbytes <= 256 * 2**20
     session.stage.frame()
     session.stage.advance(5)
@@ -71,7 +73,8 @@ def test_going_on_after_stepping_back_gives_the_same_numbers_to_the_bit() -> Non
 def test_a_planner_controls_a_copy_of_a_world_on_a_gpu() -> None:
     env = lw.make("reach", nworld=256, device="cuda")
     session = Session(env, controllers={"policy": lw.GaussianPolicy(env.obs_space.size, 7), "mppi": lw.MPPI("reach")},
-                      world=100, paused=True, seed=0)  # fmt: skip
+                      paused=True, seed=0)  # fmt: skip
+    session.obey(SetWorld(100))
     session.stage.advance(3)
     before = env.get_state()
     session.obey(SetMode("controller", "mppi"))

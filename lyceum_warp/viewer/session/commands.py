@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.session.stage import Stage, check_world
+from lyceum_warp.viewer.session.stage import Stage
 
 
 def obey(stage: Stage, command: protocol.Command) -> None:
@@ -21,7 +21,9 @@ def obey(stage: Stage, command: protocol.Command) -> None:
         case protocol.SetWorld(choice):
             if (world := stage.main.choose(choice)) is None:
                 raise ValueError("no episode has ended yet")
-            stage.show_world(check_world(world, stage.env.nworld))
+            if not 0 <= world < stage.env.nworld:
+                raise ValueError(f"there is no world {world}: there are {stage.env.nworld} worlds, from 0")
+            stage.show_world(world)
         case protocol.SetPaused(paused):
             stage.paused = paused
             stage.progress.clear()

@@ -17,8 +17,8 @@ _COLOURS = (
     (0.20, 0.55, 0.95), (0.95, 0.60, 0.15), (0.35, 0.75, 0.35), (0.75, 0.40, 0.85), (0.90, 0.80, 0.20),
     (0.30, 0.80, 0.80),
 )  # fmt: skip
-_PAST, _FUTURE, _NEUTRAL, _PLAN = (0.90, 0.25, 0.20), (0.25, 0.40, 0.95), (0.70, 0.70, 0.75), (0.25, 0.90, 0.45)
-_OPACITY = 0.35
+_PAST, _FUTURE, _PLAN = (0.90, 0.25, 0.20), (0.25, 0.40, 0.95), (0.25, 0.90, 0.45)
+_OPACITY, _FADE = 0.35, 0.95  # fade: opacity of a state of the burst relative to the one before
 
 
 class FrameMaker:
@@ -32,8 +32,6 @@ class FrameMaker:
     def __init__(self, env: Env, curves: int) -> None:
         self.ghosts = SetGhosts()
         """The ghosts that are drawn."""
-        self.text: dict[str, str] = {}
-        """Further lines of the panel."""
         self.messages: list[str] = []
         """Messages of the next frame."""
         self._env, self._curves = env, curves
@@ -91,10 +89,9 @@ class FrameMaker:
         ghosts = [] if traces is None else [Ghost(traces.final, (*_PLAN, _OPACITY))]
         ghosts += [*self._coloured(others), *self._burst(rows.back, _PAST)]
         step, past = int(state[parts["step"]][0]), live.past
-        text = [("return", f"{rows.episode_return:.6g}"), ("past", past_text(live)), *self.text.items()]
         complete = status(
             world=main.world, step=step, steps=live.env.horizon, time=float(state[parts["time"]][0]),
-            text=tuple(text), seekable=(max(0, step - past.behind), step + past.ahead),
+            text=(("return", f"{rows.episode_return:.6g}"),), seekable=(max(0, step - past.behind), step + past.ahead),
         )  # fmt: skip
         return Frame(
             self._pose(state), self._physics(state), self._model_fields(state), complete, tuple(ghosts),
@@ -144,8 +141,7 @@ class FrameMaker:
 
     def _burst(self, states: Iterable[np.ndarray], colour: tuple[float, float, float]) -> list[Ghost]:
         """Ghosts along a trajectory, the nearest to the present first."""
-        colour, fade = colour if self.ghosts.doppler else _NEUTRAL, self.ghosts.fade
-        return [Ghost(self._pose(row), (*colour, _OPACITY * fade ** (i + 1))) for i, row in enumerate(states)]
+        return [Ghost(self._pose(row), (*colour, _OPACITY * _FADE ** (i + 1))) for i, row in enumerate(states)]
 
     def _pose(self, state: np.ndarray) -> Any:
         return pose(state, self._env.state_space.parts, self._env.task.model.nmocap)
@@ -172,15 +168,6 @@ class FrameMaker:
 def _following(index: int, number: int, count: int) -> list[int]:
     """Indices of the other worlds or episodes that come after one, at most ``count``."""
     return [(index + i) % number for i in range(1, min(count, number - 1) + 1)]
-
-
-def past_text(live: Live) -> str:
-    """Describe the length of the history."""
-    past = live.past
-    if not past.length:
-        return "none: the worlds' states are too large"
-    ahead = f", {past.ahead} ahead" if past.ahead else ""
-    return f"{past.behind} of at most {past.length - 1} steps{ahead}"
 
 
 def model_bytes(model: mujoco.MjModel) -> bytes:

@@ -65,16 +65,11 @@ class Windows:
             return
         imgui.SetNextWindowPos(imgui.Vec2(max(left, 0), max(top, 0)), cond)
         imgui.SetNextWindowSize(imgui.Vec2(max(width, 200), max(height, 80)), cond)
-        if first and self._actions.fold is not None:
-            imgui.SetNextWindowCollapsed(self._actions.fold)
-            self._actions.fold = None
         unfolded, still_open = imgui.Begin(title, None if first else True)
         if unfolded:
             content()
         imgui.End()
-        if first:
-            self._actions.folded = not unfolded
-        elif not still_open:
+        if not first and not still_open:
             self._actions.windows.discard(title)
 
     def _session(self) -> None:
@@ -212,12 +207,6 @@ class Windows:
                 if changed:  # a typed number may be beyond the ends of the slider
                     self._actions.set_ghosts(**{name: min(max(count, 0), most)})
                 imgui.SetItemTooltip(what)
-        changed, fade = imgui.SliderFloat("fade", ghosts.fade, 0.5, 1.0)
-        if changed:
-            self._actions.set_ghosts(fade=fade)
-        changed, doppler = imgui.Checkbox("past red, future blue", ghosts.doppler)
-        if changed:
-            self._actions.set_ghosts(doppler=doppler)
         changed, plan = imgui.Checkbox("plan", ghosts.plan)
         if changed:
             self._actions.set_ghosts(plan=plan)

@@ -44,7 +44,7 @@ def test_a_playback_is_sought_reversed_and_looped(shared_env: SharedEnv, traject
     session.stage.advance(3)
     points = session.stage.frame().samples
     np.testing.assert_allclose(points[:, 1], trajectories[1].rewards[:3])
-    session.obey(protocol.SetGhosts(episodes=2, burst=4, doppler=True))
+    session.obey(protocol.SetGhosts(episodes=2, burst=4))
     ghosts = session.stage.frame().ghosts
     np.testing.assert_array_equal(ghosts[0].pose.qpos, trajectories[0].states[3, qpos])
     past = [ghost for ghost in ghosts[1:] if ghost.colour[0] > ghost.colour[2]]
